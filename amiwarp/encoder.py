@@ -1,0 +1,217 @@
+"""The prism's encoder: samples of an angle over time, from which every event gets its angle.
+
+Angles are radians, unwrapped (they grow past 2 pi), positive in the direction of rotation the optics call positive.
+The encoder may run on a clock of its own: an event at time ``t`` belongs to the encoder's time ``t + clock_offset_us``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from amiwarp.errors import AmiwarpError
+
+TURN = 2.0 * math.pi
+"""One turn [rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Encoder:
+    """Encoder samples. Raises :class:`AmiwarpError` for fewer than two, unsorted or non-finite samples."""
+
+    t: NDArray[np.int64]
+    """Sample times on the encoder's clock [us], strictly increasing, shape ``(m,)``."""
+    angle: NDArray[np.float64]
+    """Unwrapped prism angle [rad], shape ``(m,)``."""
+    clock_offset_us: float = 0.0
+    """Encoder's time minus event's time [us]."""
+    index_t: NDArray[np.int64] | None = None
+    """Times of the index pulses on the encoder's clock [us], shape ``(k,)``, where there are any."""
+
+    def __post_init__(self) -> None:
+        if self.t.ndim != 1 or self.t.shape != self.angle.shape or self.t.size < 2:
+            shapes = f"t {self.t.shape}, angle {self.angle.shape}"
+            raise AmiwarpError(f"encoder samples have shapes {shapes}; expected two equal lengths of at least 2")
+        if self.t.dtype != np.int64 or self.angle.dtype != np.float64:
+            raise AmiwarpError(f"encoder t is {self.t.dtype}, angle is {self.angle.dtype}; expected int64 and float64")
+        late = self.t[1:] <= self.t[:-1]
+        if late.any():
+            at = int(np.argmax(late)) + 1
+            raise AmiwarpError(f"encoder sample {at} (t = {self.t[at]} us) is not later than the one before; sort them")
+        if not np.isfinite(self.angle).all():
+            at = int(np.argmin(np.isfinite(self.angle)))
+            raise AmiwarpError(f"encoder sample {at} has angle {self.angle[at]}; expected a finite number")
+        if not math.isfinite(self.clock_offset_us):
+            raise AmiwarpError(f"encoder clock_offset_us = {self.clock_offset_us} is not finite")
+        if self.index_t is not None:
+            self._check_index(self.index_t)
+
+    def _check_index(self, index_t: NDArray[np.int64]) -> None:
+        inside = (index_t >= self.t[0]) & (index_t <= self.t[-1])
+        if not inside.all():
+            bad = index_t[int(np.argmin(inside))]
+            raise AmiwarpError(f"index pulse at {bad} us lies outside the encoder's {self.t[0]} .. {self.t[-1]} us")
+
+    @classmethod
+    def from_angles(cls, t_us: ArrayLike, angle: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
+        """Samples of an angle [rad], unwrapped or wrapped to a turn (see :func:`unwrap`)."""
+        t = _sample_times(t_us)
+        return cls(t, unwrap(t, np.asarray(angle, np.float64), TURN), clock_offset_us)
+
+    @classmethod
+    def from_counts(
+        cls,
+        t_us: ArrayLike,
+        count: ArrayLike,
+        *,
+        counts_per_turn: int,
+        direction: int = 1,
+        index_t_us: ArrayLike | None = None,
+        clock_offset_us: float = 0.0,
+    ) -> Encoder:
+        """Samples of a counter, running on or starting anew each turn; ``direction`` -1 where it counts backwards.
+
+        Index pulses make the angle absolute: it is a multiple of 2 pi at them (at their median, see :meth:`slip`).
+        Raises :class:`AmiwarpError` for a ``counts_per_turn`` below 1 or a ``direction`` other than 1 and -1.
+        """
+        if counts_per_turn < 1:
+            raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; expected the encoder's positive counts per turn")
+        if direction not in (1, -1):
+            raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
+        t = _sample_times(t_us)
+        counts = unwrap(t, np.asarray(count, np.float64), float(counts_per_turn))
+        encoder = cls(t, counts * (direction * TURN / counts_per_turn), clock_offset_us)
+        return encoder if index_t_us is None else encoder.with_index(index_t_us)
+
+    @classmethod
+    def constant_speed(
+        cls, rpm: float, t_first: int, t_last: int, *, direction: int = 1, interval_us: int = 1000
+    ) -> Encoder:
+        """A prism turning at ``rpm``, at angle 0 at ``t_first`` [us], sampled every ``interval_us`` past ``t_last``."""
+        if not (math.isfinite(rpm) and interval_us >= 1 and t_last >= t_first):
+            given = f"{rpm} rpm from {t_first} to {t_last} us every {interval_us} us"
+            raise AmiwarpError(f"no constant speed of {given}; expected a finite speed and a span of time")
+        elapsed = np.arange(0, t_last - t_first + 2 * interval_us, interval_us, dtype=np.int64)
+        return cls(elapsed + t_first, elapsed * (direction * rpm * TURN / 60e6))
+
+    def with_clock_offset(self, clock_offset_us: float) -> Encoder:
+        """The same samples with another clock offset [us]."""
+        return dataclasses.replace(self, clock_offset_us=float(clock_offset_us))
+
+    def with_index(self, index_t_us: ArrayLike) -> Encoder:
+        """The same samples, shifted to be at a multiple of 2 pi at the index pulses (encoder's clock, [us])."""
+        index_t = np.atleast_1d(_sample_times(index_t_us))
+        if not index_t.size:
+            raise AmiwarpError("no index pulse given; leave the index out where there is none")
+        self._check_index(index_t)
+        at_pulse = np.interp(index_t - self.t[0], self.t - self.t[0], self.angle)
+        # The circular mean finds the turn's cut, the median around it withstands a spurious pulse.
+        mean = float(np.angle(np.exp(1j * at_pulse).mean()))
+        zero = mean + float(np.median(_wrap(at_pulse - mean)))
+        return dataclasses.replace(self, angle=self.angle - zero, index_t=index_t)
+
+    def slip(self) -> NDArray[np.float64]:
+        """Angle at each index pulse [rad], in -pi .. pi, shape ``(k,)``: 0 throughout where no count was lost."""
+        if self.index_t is None:
+            return np.zeros(0)
+        return _wrap(np.interp(self.index_t - self.t[0], self.t - self.t[0], self.angle))
+
+    def angle_at(self, t: ArrayLike) -> NDArray[np.float64]:
+        """Unwrapped angle [rad] at event times ``t`` [us], any shape, interpolated linearly.
+
+        Raises :class:`AmiwarpError` for a time beyond the samples by more than one (median) sample interval.
+        """
+        elapsed = self._elapsed(t)
+        steps = self.t - self.t[0]
+        result = np.interp(elapsed, steps, self.angle)
+        for end, outside in ((0, elapsed < 0), (-2, elapsed > steps[-1])):
+            if outside.any():
+                slope = (self.angle[end + 1] - self.angle[end]) / (steps[end + 1] - steps[end])
+                result = np.where(outside, self.angle[end] + slope * (elapsed - steps[end]), result)
+        return np.asarray(result, np.float64)
+
+    def speed_at(self, t: ArrayLike) -> NDArray[np.float64]:
+        """Speed [rad/s] at event times ``t`` [us]: the slope of the linear piece that :meth:`angle_at` uses."""
+        elapsed = self._elapsed(t)
+        steps = self.t - self.t[0]
+        piece = np.clip(np.searchsorted(steps, elapsed, side="right") - 1, 0, steps.size - 2)
+        slope = 1e6 * np.diff(self.angle) / np.diff(steps)
+        return np.asarray(slope[piece], np.float64)
+
+    def covers(self, t_start: int, t_end: int) -> bool:
+        """Whether :meth:`angle_at` answers for all event times ``t_start`` .. ``t_end`` [us]."""
+        first, last = self.coverage
+        return first <= t_start and t_end <= last
+
+    @property
+    def coverage(self) -> tuple[int, int]:
+        """First and last event time [us] for which :meth:`angle_at` answers."""
+        margin = self.interval_us
+        first, last = int(self.t[0]), int(self.t[-1])
+        return math.ceil(first - margin - self.clock_offset_us), math.floor(last + margin - self.clock_offset_us)
+
+    @property
+    def interval_us(self) -> float:
+        """Median time between samples [us]."""
+        return float(np.median(np.diff(self.t)))
+
+    def gaps(self, max_interval_us: float) -> list[tuple[int, int]]:
+        """Pairs of neighbouring sample times (encoder's clock, [us]) more than ``max_interval_us`` apart."""
+        before = np.flatnonzero(np.diff(self.t) > max_interval_us)
+        return [(int(self.t[i]), int(self.t[i + 1])) for i in before]
+
+    @property
+    def rpm(self) -> float:
+        """Mean speed over all samples [turns/min], negative where the angle falls."""
+        return float((self.angle[-1] - self.angle[0]) / TURN * 60e6 / float(self.t[-1] - self.t[0]))
+
+    def _elapsed(self, t: ArrayLike) -> NDArray[np.float64]:
+        """Encoder's time since its first sample [us]; raises beyond the coverage."""
+        times = np.asarray(t, np.int64)
+        if times.size and not self.covers(int(times.min()), int(times.max())):
+            first, last = self.coverage
+            span = f"events at {times.min()} .. {times.max()} us"
+            raise AmiwarpError(f"{span} lie outside the encoder's {first} .. {last} us; cut the events to it")
+        # Subtracted as integers: times since 1970 leave float64 less than a nanosecond, but it costs nothing.
+        return np.asarray((times - self.t[0]).astype(np.float64) + self.clock_offset_us)
+
+
+def unwrap(t: NDArray[np.int64], value: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+    """Unwrap samples of a periodic value; samples that span more than one period count as unwrapped already.
+
+    Each step is taken as the one nearest to what the median speed predicts, so that a gap of many turns in an otherwise
+    well sampled rotation is bridged right; at least two samples per turn are needed elsewhere.
+    Raises :class:`AmiwarpError` for shapes that differ or values that are not finite.
+    """
+    if value.shape != t.shape or value.ndim != 1:
+        raise AmiwarpError(f"encoder t has shape {t.shape}, its values {value.shape}; expected one length")
+    if not np.isfinite(value).all():
+        at = int(np.argmin(np.isfinite(value)))
+        raise AmiwarpError(f"encoder sample {at} is {value[at]}; expected a finite number")
+    if value.size < 2 or np.ptp(value) > period * (1 + 1e-9):
+        return value
+    interval = np.diff(t).astype(np.float64)
+    if not (interval > 0).all():
+        return value  # Encoder's own check names the sample.
+    step = np.diff(value)
+    step -= period * np.round(step / period)
+    predicted = np.median(step / interval) * interval
+    step += period * np.round((predicted - step) / period)
+    return np.asarray(value[0] + np.concatenate([[0.0], np.cumsum(step)]))
+
+
+def _sample_times(t_us: ArrayLike) -> NDArray[np.int64]:
+    array = np.asarray(t_us)
+    if array.dtype.kind == "f":
+        if not bool(np.all(np.isfinite(array) & (np.abs(array) < 2.0**62))):
+            raise AmiwarpError("an encoder time is not finite or beyond int64; expected microseconds")
+        array = np.rint(array)
+    return array.astype(np.int64)
+
+
+def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(angle - TURN * np.round(angle / TURN))

@@ -1,0 +1,160 @@
+"""Device side of the camera: pixel to bearing and back, with OpenCV's two distortion models."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+PINHOLE = wp.constant(0)
+RADIAL_TANGENTIAL = wp.constant(1)
+FISHEYE = wp.constant(2)
+
+NEWTON_STEPS = wp.constant(12)
+NAN = wp.constant(float("nan"))
+
+
+@wp.struct
+class CameraParams:
+    """A camera on the device. ``k`` holds k1 k2 p1 p2 k3 (radial-tangential) or k1 .. k4 (fisheye)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    kind: int
+    k: wp.types.vector(length=5, dtype=float)
+    limit: float  # largest tan (radial-tangential) or angle (fisheye) up to which the distortion is one-to-one
+    rays: wp.array2d(dtype=wp.vec3)  # bearing of each pixel centre; NaN where there is none; empty for a pinhole
+
+
+@wp.func
+def invalid_pixel() -> wp.vec2:
+    return wp.vec2(NAN, NAN)
+
+
+@wp.func
+def invalid_ray() -> wp.vec3:
+    return wp.vec3(NAN, NAN, NAN)
+
+
+@wp.func
+def distort_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.vec2:
+    """OpenCV's model: normalised (tan) coordinates, undistorted to distorted."""
+    r2 = wp.dot(p, p)
+    radial = 1.0 + r2 * (c.k[0] + r2 * (c.k[1] + r2 * c.k[4]))
+    x = p[0] * radial + 2.0 * c.k[2] * p[0] * p[1] + c.k[3] * (r2 + 2.0 * p[0] * p[0])
+    y = p[1] * radial + c.k[2] * (r2 + 2.0 * p[1] * p[1]) + 2.0 * c.k[3] * p[0] * p[1]
+    return wp.vec2(x, y)
+
+
+@wp.func
+def jacobian_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.mat22:
+    r2 = wp.dot(p, p)
+    radial = 1.0 + r2 * (c.k[0] + r2 * (c.k[1] + r2 * c.k[4]))
+    slope = 2.0 * (c.k[0] + r2 * (2.0 * c.k[1] + r2 * 3.0 * c.k[4]))
+    xx = radial + slope * p[0] * p[0] + 2.0 * c.k[2] * p[1] + 6.0 * c.k[3] * p[0]
+    xy = slope * p[0] * p[1] + 2.0 * c.k[2] * p[0] + 2.0 * c.k[3] * p[1]
+    yy = radial + slope * p[1] * p[1] + 6.0 * c.k[2] * p[1] + 2.0 * c.k[3] * p[0]
+    return wp.mat22(xx, xy, xy, yy)
+
+
+@wp.func
+def undistort_radial_tangential(c: CameraParams, d: wp.vec2) -> wp.vec3:
+    """Newton's method from the distorted point; invalid where it does not converge inside the one-to-one disc."""
+    p = d
+    if wp.length(p) > 0.9 * c.limit:
+        p = p * (0.9 * c.limit / wp.length(p))
+    for _ in range(NEWTON_STEPS):
+        p = p - wp.inverse(jacobian_radial_tangential(c, p)) * (distort_radial_tangential(c, p) - d)
+    error = wp.length(distort_radial_tangential(c, p) - d)
+    if not (error < 1.0e-5 * (1.0 + wp.length(d)) and wp.length(p) <= c.limit):
+        return invalid_ray()
+    return wp.normalize(wp.vec3(p[0], p[1], 1.0))
+
+
+@wp.func
+def fisheye_radius(c: CameraParams, angle: float) -> float:
+    a2 = angle * angle
+    return angle * (1.0 + a2 * (c.k[0] + a2 * (c.k[1] + a2 * (c.k[2] + a2 * c.k[3]))))
+
+
+@wp.func
+def fisheye_slope(c: CameraParams, angle: float) -> float:
+    a2 = angle * angle
+    return 1.0 + a2 * (3.0 * c.k[0] + a2 * (5.0 * c.k[1] + a2 * (7.0 * c.k[2] + a2 * 9.0 * c.k[3])))
+
+
+@wp.func
+def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
+    radius = wp.length(d)
+    if radius < 1.0e-8:
+        return wp.normalize(wp.vec3(d[0], d[1], 1.0))
+    angle = wp.min(radius, 0.9 * c.limit)
+    for _ in range(NEWTON_STEPS):
+        angle = wp.clamp(angle - (fisheye_radius(c, angle) - radius) / fisheye_slope(c, angle), 0.0, c.limit)
+    if not (wp.abs(fisheye_radius(c, angle) - radius) < 1.0e-5 * (1.0 + radius)):
+        return invalid_ray()
+    s = wp.sin(angle) / radius
+    return wp.vec3(s * d[0], s * d[1], wp.cos(angle))
+
+
+@wp.func
+def solve_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
+    """Pixel to unit bearing, computed afresh (no table)."""
+    d = wp.vec2((xy[0] - c.cx) / c.fx, (xy[1] - c.cy) / c.fy)
+    if c.kind == RADIAL_TANGENTIAL:
+        return undistort_radial_tangential(c, d)
+    if c.kind == FISHEYE:
+        return undistort_fisheye(c, d)
+    return wp.normalize(wp.vec3(d[0], d[1], 1.0))
+
+
+@wp.func
+def pixel_to_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
+    """Pixel to unit bearing; whole pixels of a distorted camera come from its table. Invalid: NaN."""
+    if c.kind != PINHOLE:
+        col = int(xy[0])
+        row = int(xy[1])
+        inside = col >= 0 and row >= 0 and col < c.width and row < c.height
+        if inside and float(col) == xy[0] and float(row) == xy[1]:
+            return c.rays[row, col]
+    return solve_ray(c, xy)
+
+
+@wp.func
+def ray_to_pixel(c: CameraParams, ray: wp.vec3) -> wp.vec2:
+    """Unit bearing to pixel. Invalid (NaN): behind the image plane, or past where the distortion folds back."""
+    if not (ray[2] > 1.0e-6):
+        return invalid_pixel()
+    p = wp.vec2(ray[0] / ray[2], ray[1] / ray[2])
+    if c.kind == RADIAL_TANGENTIAL:
+        if wp.length(p) > c.limit:
+            return invalid_pixel()
+        p = distort_radial_tangential(c, p)
+    if c.kind == FISHEYE:
+        r = wp.length(wp.vec2(ray[0], ray[1]))
+        angle = wp.atan2(r, ray[2])
+        if angle > c.limit:
+            return invalid_pixel()
+        if r > 1.0e-8:
+            p = wp.vec2(ray[0], ray[1]) * (fisheye_radius(c, angle) / r)
+    return wp.vec2(c.fx * p[0] + c.cx, c.fy * p[1] + c.cy)
+
+
+@wp.kernel
+def fill_rays(c: CameraParams, rays: wp.array2d(dtype=wp.vec3)):
+    row, col = wp.tid()
+    rays[row, col] = solve_ray(c, wp.vec2(float(col), float(row)))
+
+
+@wp.kernel
+def pixels_to_rays(c: CameraParams, xy: wp.array(dtype=wp.vec2), rays: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    rays[i] = pixel_to_ray(c, xy[i])
+
+
+@wp.kernel
+def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), xy: wp.array(dtype=wp.vec2)):
+    i = wp.tid()
+    xy[i] = ray_to_pixel(c, rays[i])

@@ -1,0 +1,57 @@
+"""Launching: one launch on CUDA, slices from a thread pool on the CPU (Warp runs one thread a launch there)."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+SMALLEST_SLICE = 1 << 15  # below this many threads a slice costs more to launch than to run
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cpu_threads(), thread_name_prefix="amiwarp")
+
+
+def cpu_threads() -> int:
+    """Number of CPU cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:
+    """At most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``, none much below ``smallest``."""
+    parts = max(1, min(parts, n // smallest))
+    edges = [n * k // parts for k in range(parts + 1)]
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+def launch(
+    kernel: Any,
+    n: int,
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    *,
+    device: Any,
+    smallest: int = SMALLEST_SLICE,
+) -> None:
+    """Run a kernel whose last input is ``start: int`` over ``range(n)``, on all cores of a CPU.
+
+    Each thread of the kernel must write places of its own: slices run at the same time.
+    """
+    device = wp.get_device(device)
+    if n == 0:
+        return
+    if not device.is_cpu:
+        wp.launch(kernel, dim=n, inputs=[*inputs, 0], outputs=list(outputs), device=device)
+        return
+    ranges = slices(n, cpu_threads(), smallest)
+    kernel.module.load(device)  # once, before the threads would each try
+
+    def run(span: tuple[int, int]) -> None:
+        inputs_ = [*inputs, span[0]]
+        wp.launch(kernel, dim=span[1] - span[0], inputs=inputs_, outputs=list(outputs), device=device)
+
+    list(_pool().map(run, ranges)) if len(ranges) > 1 else run(ranges[0])

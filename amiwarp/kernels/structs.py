@@ -1,0 +1,42 @@
+"""Host objects to device structs."""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import warp as wp
+
+from amiwarp.camera import Camera, Fisheye, RadialTangential
+from amiwarp.kernels import camera as kernels
+
+
+@lru_cache(maxsize=16)
+def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
+    """The camera on ``device``, with its table of bearings where the lens distorts."""
+    c = kernels.CameraParams()
+    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    c.width, c.height = camera.width, camera.height
+    c.kind, c.limit = int(kernels.PINHOLE), 1.0e30
+    d = camera.distortion
+    if d is None:
+        c.rays = wp.empty((0, 0), dtype=wp.vec3, device=device)
+        return c
+    if isinstance(d, RadialTangential):
+        coefficients = (d.k1, d.k2, d.p1, d.p2, d.k3)
+        c.kind, c.limit = int(kernels.RADIAL_TANGENTIAL), fold(d.k1, d.k2, d.k3, largest=100.0)
+    elif isinstance(d, Fisheye):
+        coefficients = (d.k1, d.k2, d.k3, d.k4, 0.0)
+        c.kind, c.limit = int(kernels.FISHEYE), fold(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
+    c.k = type(c.k)(*coefficients)
+    rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
+    wp.launch(kernels.fill_rays, dim=rays.shape, inputs=[c], outputs=[rays], device=device)
+    c.rays = rays
+    return c
+
+
+def fold(*k: float, largest: float) -> float:
+    """Radius up to which r(1 + k1 r² + k2 r⁴ + …) grows: the first root of its slope, at most ``largest``."""
+    slope = np.array([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
+    roots = np.roots(slope[::-1]) if np.any(slope[1:]) else np.empty(0)
+    squares = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0)]
+    return float(min(largest, math.sqrt(squares.min()))) if len(squares) else largest
