@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import warp as wp
@@ -25,7 +26,7 @@ def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int
     """At most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``, none much below ``smallest``."""
     parts = max(1, min(parts, n // smallest))
     edges = [n * k // parts for k in range(parts + 1)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))
 
 
 def launch(
@@ -48,10 +49,35 @@ def launch(
         wp.launch(kernel, dim=n, inputs=[*inputs, 0], outputs=list(outputs), device=device)
         return
     ranges = slices(n, cpu_threads(), smallest)
-    kernel.module.load(device)  # once, before the threads would each try
+    kernel.module.load(device, block_dim=1)  # once, before the threads would each try
 
     def run(span: tuple[int, int]) -> None:
         inputs_ = [*inputs, span[0]]
         wp.launch(kernel, dim=span[1] - span[0], inputs=inputs_, outputs=list(outputs), device=device)
 
     list(_pool().map(run, ranges)) if len(ranges) > 1 else run(ranges[0])
+
+
+def launch_slices(kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
+    """As :func:`launch`, but slice k writes into ``outputs[k]`` alone: for threads that add to shared places.
+
+    On CUDA one launch adds into ``outputs[0]`` with atomics.
+    """
+    device = wp.get_device(device)
+    if n == 0:
+        return
+    ranges = slices(n, len(outputs)) if device.is_cpu else [(0, n)]
+    if device.is_cpu:
+        kernel.module.load(device, block_dim=1)
+
+    def run(job: tuple[tuple[int, int], Any]) -> None:
+        (start, stop), out = job
+        wp.launch(kernel, dim=stop - start, inputs=[*inputs, start], outputs=[out], device=device)
+
+    jobs = list(zip(ranges, outputs, strict=False))
+    list(_pool().map(run, jobs)) if len(jobs) > 1 else run(jobs[0])
+
+
+def slice_count(device: Any) -> int:
+    """How many outputs :func:`launch_slices` can use on ``device``."""
+    return cpu_threads() if wp.get_device(device).is_cpu else 1

@@ -1,0 +1,88 @@
+"""Refusals: what a recording must have before, and after, its parameters can be believed."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import ndimage
+
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.encoder import Encoder
+
+FEWEST_EVENTS = 2000
+SMALLEST_TURN = math.pi / 2
+LEAST_SIGNIFICANCE = 5.0
+"""By how many standard deviations the optimum must be sharper than the same events with the phase turned round."""
+LARGEST_COHERENCE = 0.9
+"""Of the edge directions: 0 where all are as frequent, 1 where all edges are parallel."""
+
+
+def check_events(count: int, name: str) -> None:
+    if count < FEWEST_EVENTS:
+        raise AmiwarpError(f"{name}: {count} events are too few to calibrate; record at least {FEWEST_EVENTS}")
+
+
+def check_coverage(encoder: Encoder, t_first: int, t_last: int, name: str) -> None:
+    """The encoder must know the angle of every event."""
+    if not encoder.covers(t_first, t_last):
+        first, last = encoder.coverage
+        raise AmiwarpError(
+            f"{name}: encoder samples cover {first} .. {last} us, the events {t_first} .. {t_last} us; "
+            "record the encoder for as long as the events, or cut the events with a window"
+        )
+
+
+def check_turn(theta: NDArray[np.float64], name: str) -> None:
+    """Under a quarter turn, size and phase trade against each other."""
+    turned = float(np.ptp(theta))
+    if turned < SMALLEST_TURN:
+        raise AmiwarpError(
+            f"{name}: the prism turned {math.degrees(turned):.1f} degrees during the events; "
+            "at least a quarter turn (90 degrees) is needed, a whole one is better"
+        )
+
+
+def check_texture(best: NDArray[np.float64], turned: NDArray[np.float64], name: str) -> float:
+    """The optimum must be sharper than chance: each array holds the sharpness of disjoint parts of the events.
+
+    ``turned`` is the same with half a turn added to the phase. Returns the significance in standard deviations.
+    """
+    gain = best - turned
+    spread = float(gain.std(ddof=1)) / math.sqrt(len(gain))
+    significance = float(gain.mean()) / max(spread, 1e-12)
+    if not significance >= LEAST_SIGNIFICANCE:
+        raise AmiwarpError(
+            f"{name}: no motion of a prism makes the image sharper than chance does ({significance:.1f} standard "
+            "deviations): no texture, too few events, or a wrong encoder; show the camera a scene with edges"
+        )
+    return significance
+
+
+def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
+    """Coherence of the edge directions of an image: |Σ g² e^{2iφ}| / Σ g² over gradients (g, φ), 0 to 1.
+
+    Noise has no direction of its own and lowers it, so gradients weaker than the median are left out.
+    """
+    smooth = ndimage.gaussian_filter(image.astype(np.float64), smoothing)
+    gy, gx = np.gradient(smooth)
+    energy = gx**2 + gy**2
+    strong = energy > 0.1 * energy.max()
+    total = float(energy[strong].sum())
+    if total <= 0.0:
+        return 0.0
+    return math.hypot(float((gx**2 - gy**2)[strong].sum()), float((2 * gx * gy)[strong].sum())) / total
+
+
+def check_directions(image: NDArray[np.float32], name: str) -> None:
+    coherence = edge_coherence(image)
+    if coherence > LARGEST_COHERENCE:
+        raise AmiwarpError(
+            f"{name}: all edges run in one direction (coherence {coherence:.2f} of 1), so motion along them "
+            "is not seen; show the camera edges in at least two directions"
+        )

@@ -1,0 +1,216 @@
+"""What is free in a calibration: parameters by name, their bounds and units, and the vector that NLopt moves.
+
+The vector is in pixels: one unit of any entry moves events by about one pixel (rms over image and turn), so that one
+tolerance and one first step serve all. Size and phase together become Cartesian (size·cos, size·sin) where the phase
+is free over the full turn: no wrap-around, no second optimum at (−size, phase + π), even resolution.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics import (
+    CircleModel,
+    EllipseModel,
+    ExactModel,
+    Prism,
+    RadialCircleModel,
+    deflection_from_apex,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.camera import Camera
+    from amiwarp.optics import Model
+
+UNITS = {
+    "apex": "rad",
+    "deflection": "rad",
+    "phase": "rad",
+    "clock_offset": "us",
+    "rpm": "1/min",
+    "tilt_x": "rad",
+    "tilt_y": "rad",
+    "index": "1",
+}
+"""Every parameter that can be free, with its unit. ``clock_offset`` is added to the encoder's (see Encoder)."""
+
+DRIFTS = ("clock_offset", "rpm")
+_EXACT_ONLY = ("tilt_x", "tilt_y", "index")
+_DEFAULT_RANGE = {"tilt_x": math.radians(5.0), "tilt_y": math.radians(5.0), "clock_offset": 5000.0, "index": 0.2}
+"""Half width of the default bounds about the start."""
+TURN = (-math.pi, math.pi)
+
+
+@dataclass(frozen=True)
+class Space:
+    """Free parameters of one model of one camera: names, bounds, start, and the way to the vector and back."""
+
+    model: str
+    camera: Camera
+    prism: Prism
+    names: tuple[str, ...]
+    low: Mapping[str, float]
+    high: Mapping[str, float]
+    start: Mapping[str, float]
+    """All parameters of the model, the free ones' start included."""
+    pixels: Mapping[str, float]
+    """Motion of events [px rms] per unit of each free parameter."""
+
+    @property
+    def size_name(self) -> str:
+        return size_name(self.model)
+
+    @property
+    def cartesian(self) -> bool:
+        """Whether the first two entries are (size·cos phase, size·sin phase)."""
+        full = self.high.get("phase", 0.0) - self.low.get("phase", 0.0) >= 2.0 * math.pi - 1e-9
+        return self.names[:2] == (self.size_name, "phase") and full
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper corner of the box in which the vector moves [px]."""
+        low = np.array([self.low[n] * self.pixels[n] for n in self.names])
+        high = np.array([self.high[n] * self.pixels[n] for n in self.names])
+        if self.cartesian:
+            high[1] = high[0]
+            low[:2] = -high[:2]
+        return low, high
+
+    def to_vector(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        v = np.array([values[n] * self.pixels[n] for n in self.names])
+        if self.cartesian:
+            v[:2] = v[0] * math.cos(values["phase"]), v[0] * math.sin(values["phase"])
+        return v
+
+    def to_values(self, v: NDArray[np.float64]) -> dict[str, float]:
+        """All parameters of the model at ``v``; a size outside its bounds is held at the nearer one."""
+        values = dict(self.start)
+        for name, entry in zip(self.names, v, strict=True):
+            values[name] = float(entry) / self.pixels[name]
+        if self.cartesian:
+            values[self.size_name] = math.hypot(v[0], v[1]) / self.pixels[self.size_name]
+            values["phase"] = math.atan2(v[1], v[0])
+        for name in self.names:
+            values[name] = min(max(values[name], self.low[name]), self.high[name])
+        return values
+
+    def build(self, values: Mapping[str, float]) -> Model:
+        return build_model(self.model, self.camera, self.prism, values)
+
+    def drift(self, values: Mapping[str, float]) -> float:
+        """Distance of the drifting parameter, if one is free, from its start."""
+        return sum(values[n] - self.start[n] for n in self.names if n in DRIFTS)
+
+
+def size_name(model: str) -> str:
+    """The name of the parameter that sizes the orbit in ``model``: its apex, or its deflection."""
+    return "apex" if model in ("exact", "ellipse") else "deflection"
+
+
+def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
+    """A model of the ladder from parameter values; what they do not name comes from ``prism``."""
+    if model == "circle":
+        return CircleModel(camera, values["deflection"], values["phase"], prism.flat_side)
+    if model == "radial":
+        return RadialCircleModel(camera, values["deflection"], values["phase"], prism.index, prism.flat_side)
+    wedge = replace(prism, apex=values["apex"], index=values.get("index", prism.index))
+    exact = ExactModel(camera, wedge, values["phase"], (values.get("tilt_x", 0.0), values.get("tilt_y", 0.0)))
+    return EllipseModel.from_model(exact) if model == "ellipse" else exact
+
+
+def make_space(
+    model: str,
+    camera: Camera,
+    prism: Prism,
+    *,
+    free: tuple[str, ...] | None,
+    start: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]],
+    rad_per_us: float,
+    duration_us: float,
+) -> Space:
+    """Checks names and bounds and measures how far each parameter moves events.
+
+    ``prism`` is the nominal one: the size may go from 0 to twice its apex unless ``bounds`` say otherwise.
+    ``rad_per_us``: mean speed of the prism; ``duration_us``: of the events. Raises :class:`AmiwarpError` for unknown,
+    unfit or contradicting names.
+    """
+    size = size_name(model)
+    names = _order(model, (size, "phase") if free is None else free)
+    nominal = {"apex": prism.apex, "deflection": prism.deflection, "phase": 0.0, "index": prism.index}
+    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (size, "phase", *names)}
+    low, high = {}, {}
+    for name in names:
+        low[name], high[name] = bounds.get(name) or _default_bounds(name, values[name], prism)
+        if not low[name] < high[name]:
+            raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower first")
+        values[name] = min(max(values[name], low[name]), high[name])
+    shifts = _pixels_per_unit(model, camera, prism, values, rad_per_us, duration_us)
+    return Space(model, camera, prism, names, low, high, values, {n: shifts[n] for n in names})
+
+
+def _order(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
+    size = size_name(model)
+    wanted = {size if n in ("apex", "deflection") else n for n in free}
+    unknown = wanted - set(UNITS)
+    if unknown:
+        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {', '.join(UNITS)}")
+    if not wanted:
+        raise AmiwarpError("no parameter is free; name at least one")
+    if model in ("circle", "radial") and wanted & set(_EXACT_ONLY):
+        raise AmiwarpError(f"the {model} model has no {sorted(wanted & set(_EXACT_ONLY))[0]}; use model 'exact'")
+    if set(DRIFTS) <= wanted:
+        raise AmiwarpError("clock_offset and rpm cannot both be free: rpm is for recordings without an encoder")
+    return tuple(n for n in (size, "phase", *DRIFTS, *_EXACT_ONLY) if n in wanted)
+
+
+def _default_bounds(name: str, value: float, prism: Prism) -> tuple[float, float]:
+    if name == "apex":
+        return 0.0, 2.0 * prism.apex
+    if name == "deflection":
+        return 0.0, deflection_from_apex(2.0 * prism.apex, prism.index, prism.flat_side)
+    if name == "phase":
+        return TURN
+    half = 0.02 * abs(value) if name == "rpm" else _DEFAULT_RANGE[name]
+    return value - half, value + half
+
+
+def _pixels_per_unit(
+    model: str, camera: Camera, prism: Prism, values: Mapping[str, float], rad_per_us: float, duration_us: float
+) -> dict[str, float]:
+    """Finite differences of the displacement over a grid of pixels and angles, at the nominal size."""
+    nominal = {**values, "apex": prism.apex, "deflection": prism.deflection}
+    x, y, theta = (
+        m.ravel()
+        for m in np.meshgrid(
+            np.linspace(0, camera.width - 1, 8), np.linspace(0, camera.height - 1, 6), np.arange(8) * (np.pi / 4),
+            indexing="ij",
+        )
+    )  # fmt: skip
+    xy = np.stack([x, y], axis=1)
+    kind = "exact" if model == "ellipse" else model  # its tables follow the exact model
+
+    def at(name: str, step: float) -> NDArray[np.float64]:
+        built = build_model(kind, camera, prism, {**nominal, name: nominal[name] + step})
+        return cast("NDArray[np.float64]", built.compensate_points(xy, theta))
+
+    def rms(name: str, step: float) -> float:
+        moved = (at(name, step) - at(name, -step)) / (2.0 * step)
+        moved = moved[np.isfinite(moved).all(axis=1)]
+        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+    steps = {size_name(model): 0.25 * nominal[size_name(model)], "phase": 0.05}
+    steps |= {n: 0.02 for n in _EXACT_ONLY if n in values}
+    shifts = {name: rms(name, step) for name, step in steps.items()}
+    shifts["clock_offset"] = shifts["phase"] * abs(rad_per_us)
+    shifts["rpm"] = shifts["phase"] * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
+    if not all(math.isfinite(s) and s > 0.0 for s in shifts.values()):
+        raise AmiwarpError("the nominal prism moves no event; give its nominal apex (above 0) and the encoder's speed")
+    return shifts

@@ -1,0 +1,204 @@
+"""What a calibration found: parameters with units and uncertainty, how it got there, and its JSON file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.calib.parameters import UNITS, build_model
+from amiwarp.camera import Camera, Fisheye, RadialTangential
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics import MODELS, FlatSide, Prism
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib.solve import Stage
+    from amiwarp.optics import Model
+
+FORMAT = "amiwarp-calibration"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class StageSummary:
+    """One stage of the search, as it is kept in the file."""
+
+    name: str
+    algorithm: str
+    evaluations: int
+    seconds: float
+    sharpness: float
+    """The stage's own score: its image may be coarser than the last stage's."""
+    ended: str
+    points: list[dict[str, float]] = field(default_factory=list, repr=False)
+    """Parameters of every evaluation, each with its ``score``, in order."""
+
+    @classmethod
+    def of(cls, name: str, stage: Stage, points: list[dict[str, float]]) -> StageSummary:
+        return cls(name, stage.algorithm, stage.evaluations, stage.seconds, stage.score, stage.ended, points)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Parameters of one model of one camera and prism. Angles in rad; the JSON file gives degrees beside them."""
+
+    model_name: str
+    camera: Camera
+    prism: Prism
+    """The nominal prism: index and flat side where they were not free."""
+    parameters: Mapping[str, float]
+    """By name (see ``amiwarp.calib.parameters.UNITS``); ``clock_offset`` [us] and ``rpm`` where they were free."""
+    uncertainty: Mapping[str, float]
+    """Standard deviation of the free ones, in the same units."""
+    free: tuple[str, ...]
+    sharpness_name: str
+    sharpness_before: float
+    """Of the events as recorded."""
+    sharpness_after: float
+    stages: tuple[StageSummary, ...]
+    events: int
+    """How many events the last stage used."""
+    seconds: float
+    """Whole time, reading included."""
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def model(self) -> Model:
+        """The calibrated model."""
+        return build_model(self.model_name, self.camera, self.prism, self.parameters)
+
+    def encoder_for(self, encoder: Encoder | None, t_first: int, t_last: int) -> Encoder:
+        """The recording's encoder with the clock offset that was found, or a constant speed where it has none.
+
+        Raises :class:`AmiwarpError` where there is neither an encoder nor a calibrated rpm.
+        """
+        if encoder is not None:
+            return encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
+        if "rpm" not in self.parameters:
+            raise AmiwarpError("the recording has no encoder and the calibration no rpm; calibrate this recording")
+        return Encoder.constant_speed(self.parameters["rpm"], t_first, t_last)
+
+    def to_json(self) -> dict[str, Any]:
+        """The file's content as plain objects."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "model": self.model_name,
+            "camera": camera_to_json(self.camera),
+            "prism": {"apex_rad": self.prism.apex, "index": self.prism.index, "flat_side": self.prism.flat_side.value},
+            "parameters": {name: self._parameter(name) for name in self.parameters},
+            "sharpness": {
+                "kind": self.sharpness_name,
+                "before": self.sharpness_before,
+                "after": self.sharpness_after,
+            },
+            "events": self.events,
+            "seconds": self.seconds,
+            "warnings": list(self.warnings),
+            "stages": [asdict(stage) for stage in self.stages],
+        }
+
+    def _parameter(self, name: str) -> dict[str, Any]:
+        value = self.parameters[name]
+        out: dict[str, Any] = {"value": value, "unit": UNITS[name], "free": name in self.free}
+        if name in self.uncertainty:
+            out["std"] = self.uncertainty[name]
+        if UNITS[name] == "rad":
+            out["degrees"] = math.degrees(value)
+        return out
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the JSON file, beside first and then by renaming."""
+        path = Path(path)
+        beside = path.with_name(path.name + ".part")
+        try:
+            beside.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+            os.replace(beside, path)
+        except OSError as error:
+            beside.unlink(missing_ok=True)
+            raise AmiwarpError(f"{path}: cannot be written: {error.strerror}; choose another place") from error
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Calibration:
+        """Reads a file that :meth:`save` wrote. Raises :class:`AmiwarpError` naming file and field."""
+        try:
+            data = json.loads(Path(path).read_text())
+        except (OSError, ValueError) as error:
+            raise AmiwarpError(f"{path}: cannot be read as a calibration: {error}") from error
+        if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
+            raise AmiwarpError(
+                f"{path}: is not an {FORMAT} file of version {VERSION}; make one with 'amiwarp calibrate'"
+            )
+        try:
+            return cls._from_json(data)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            what = f"field {error}" if isinstance(error, KeyError) else str(error)
+            raise AmiwarpError(f"{path}: damaged calibration: {what}; calibrate again") from error
+
+    @classmethod
+    def _from_json(cls, data: dict[str, Any]) -> Calibration:
+        if data["model"] not in MODELS:
+            raise AmiwarpError(f"model {data['model']!r} is unknown")
+        parameters = {name: _finite(name, entry["value"]) for name, entry in data["parameters"].items()}
+        prism = data["prism"]
+        result = cls(
+            model_name=data["model"],
+            camera=camera_from_json(data["camera"]),
+            prism=Prism(prism["apex_rad"], prism["index"], FlatSide(prism["flat_side"])),
+            parameters=parameters,
+            uncertainty={n: _finite(n, e["std"]) for n, e in data["parameters"].items() if "std" in e},
+            free=tuple(n for n, e in data["parameters"].items() if e["free"]),
+            sharpness_name=data["sharpness"]["kind"],
+            sharpness_before=data["sharpness"]["before"],
+            sharpness_after=data["sharpness"]["after"],
+            stages=tuple(StageSummary(**stage) for stage in data["stages"]),
+            events=data["events"],
+            seconds=data["seconds"],
+            warnings=tuple(data["warnings"]),
+        )
+        _ = replace(result, model_name="exact" if result.model_name == "ellipse" else result.model_name).model
+        return result
+
+
+def _finite(name: str, value: Any) -> float:
+    if name not in UNITS:
+        raise AmiwarpError(f"parameter {name!r} is unknown")
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise AmiwarpError(f"parameter {name} is {value!r}, not a finite number")
+    return float(value)
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    out = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    if camera.distortion is not None:
+        kind = "fisheye" if isinstance(camera.distortion, Fisheye) else "radial_tangential"
+        out["distortion"] = {"kind": kind, **asdict(camera.distortion)}
+    return out
+
+
+def camera_from_json(data: dict[str, Any]) -> Camera:
+    d = dict(data.get("distortion") or {})
+    kind = d.pop("kind", None)
+    distortion = None if kind is None else (Fisheye(**d) if kind == "fisheye" else RadialTangential(**d))
+    numbers = {name: data[name] for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return Camera(**numbers, distortion=distortion)
+
+
+def cost_surface(stages: tuple[StageSummary, ...], size: str) -> NDArray[np.float64]:
+    """Samples of all stages that carry a size and a phase, shape (n, 4): size, phase, score, stage number."""
+    rows = [
+        (point[size], point["phase"], point["score"], k)
+        for k, stage in enumerate(stages)
+        for point in stage.points
+        if size in point and "phase" in point
+    ]
+    return np.array(rows, dtype=np.float64).reshape(-1, 4)

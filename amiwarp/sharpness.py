@@ -1,0 +1,116 @@
+"""Sharpness of an image of warped events: five costs under one signature, all the higher the sharper."""
+
+from __future__ import annotations
+
+import enum
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.iwe import CanvasShape, Votes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PAPER_ETA = 1.0
+"""η of the paper's J [events]; He et al. give none."""
+
+
+class Sharpness(enum.Enum):
+    """What is measured; higher is sharper for each."""
+
+    VARIANCE = "variance"
+    """Variance over mean: 1 for events scattered at random, more where they gather."""
+    GRADIENT = "gradient"
+    """Mean squared gradient over mean."""
+    LAPLACIAN = "laplacian"
+    """Mean squared Laplacian over mean."""
+    PAPER_J = "paper_j"
+    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)); see ``docs/calibration.md`` for where it fails."""
+    ENTROPY = "entropy"
+    """Minus the entropy of the votes' distribution over pixels [nat]."""
+
+
+class SharpnessMeter:
+    """Smooths and measures images of one canvas; owns its buffers."""
+
+    def __init__(self, canvas: CanvasShape, kind: Sharpness, *, smoothing: float, device: Any) -> None:
+        """``smoothing``: standard deviation of the Gaussian in canvas pixels; 0 for none."""
+        import warp as wp
+
+        from amiwarp.kernels import iwe as kernels
+
+        self.kind = kind
+        self.smoothing = smoothing
+        self._layers, self._height, self._width = canvas.shape
+        self._n = self._layers * self._height * self._width
+        self._device = device
+        self._weights = wp.array(gaussian(smoothing), dtype=float, device=device)
+        self._image = wp.empty(self._n, dtype=float, device=device)
+        self._smooth = wp.empty(self._n, dtype=float, device=device) if smoothing > 0 else self._image
+        segments = -(-self._n // int(kernels.SEGMENT))
+        self._sums = wp.empty(segments, dtype=wp.vec2d, device=device)
+
+    def measure(self, flat_votes: Any) -> float:
+        """Sharpness of the votes in ``flat_votes``, an int32 Warp array of shape (slices, pixels)."""
+        from amiwarp.kernels import iwe as kernels
+        from amiwarp.kernels.launch import launch
+
+        launch(kernels.smooth_along_x, self._n, [flat_votes, self._weights, self._width], [self._image],
+               device=self._device)  # fmt: skip
+        if self.smoothing > 0:
+            launch(kernels.smooth_along_y, self._n, [self._image, self._weights, self._width, self._height],
+                   [self._smooth], device=self._device)  # fmt: skip
+        kind = list(Sharpness).index(self.kind)
+        launch(kernels.sum_terms, len(self._sums), [kind, self._smooth, self._width, self._height, PAPER_ETA],
+               [self._sums], device=self._device, smallest=256)  # fmt: skip
+        total, terms = self._sums.numpy().sum(axis=0)
+        return self._score(float(total), float(terms))
+
+    def _score(self, total: float, terms: float) -> float:
+        if total <= 0.0:
+            return 0.0
+        if self.kind is Sharpness.VARIANCE:
+            return terms / total - total / self._n
+        if self.kind is Sharpness.PAPER_J:
+            return -terms
+        if self.kind is Sharpness.ENTROPY:
+            return terms / total - math.log(total)
+        return terms / total
+
+
+def gaussian(sigma: float) -> NDArray[np.float32]:
+    """Weights of a Gaussian at 0, 1, … 3 sigma, the full symmetric kernel summing to 1; just [1] for sigma 0."""
+    if sigma < 0.0 or not math.isfinite(sigma):
+        raise AmiwarpError(f"smoothing {sigma} px is not a standard deviation; give 0 or more")
+    if sigma == 0.0:
+        return np.ones(1, dtype=np.float32)
+    k = np.arange(math.ceil(3.0 * sigma) + 1)
+    weights = np.exp(-0.5 * (k / sigma) ** 2)
+    return (weights / (weights[0] + 2.0 * weights[1:].sum())).astype(np.float32)
+
+
+def sharpness(
+    image: NDArray[np.float32],
+    kind: Sharpness = Sharpness.VARIANCE,
+    *,
+    smoothing: float = 0.0,
+    device: Any = "cpu",
+) -> float:
+    """Sharpness of an image [events per pixel] of shape (height, width) or (layers, height, width).
+
+    ``smoothing``: standard deviation [px]. The image is rounded to 1/256 event, as votes are.
+    """
+    import warp as wp
+
+    stack = np.atleast_3d(image) if image.ndim != 2 else image[None]
+    canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
+    if len(stack) > 2 or not np.all(np.isfinite(image)):
+        raise AmiwarpError(f"image of shape {image.shape} is not a finite (height, width) or (2, height, width) image")
+    votes = wp.array(np.rint(stack * 256.0).astype(np.int32).reshape(1, -1), dtype=wp.int32, device=device)
+    return SharpnessMeter(canvas, kind, smoothing=smoothing, device=device).measure(votes)
+
+
+__all__ = ["PAPER_ETA", "CanvasShape", "Sharpness", "SharpnessMeter", "Votes", "gaussian", "sharpness"]
