@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events import as_times
 
 TURN = 2.0 * math.pi
 """One turn [rad]."""
@@ -59,7 +60,7 @@ class Encoder:
     @classmethod
     def from_angles(cls, t_us: ArrayLike, angle: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
         """Samples of an angle [rad], unwrapped or wrapped to a turn (see :func:`unwrap`)."""
-        t = _sample_times(t_us)
+        t = as_times(t_us)
         return cls(t, unwrap(t, np.asarray(angle, np.float64), TURN), clock_offset_us)
 
     @classmethod
@@ -82,7 +83,7 @@ class Encoder:
             raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; expected the encoder's positive counts per turn")
         if direction not in (1, -1):
             raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
-        t = _sample_times(t_us)
+        t = as_times(t_us)
         counts = unwrap(t, np.asarray(count, np.float64), float(counts_per_turn))
         encoder = cls(t, counts * (direction * TURN / counts_per_turn), clock_offset_us)
         return encoder if index_t_us is None else encoder.with_index(index_t_us)
@@ -96,7 +97,7 @@ class Encoder:
             given = f"{rpm} rpm from {t_first} to {t_last} us every {interval_us} us"
             raise AmiwarpError(f"no constant speed of {given}; expected a finite speed and a span of time")
         elapsed = np.arange(0, t_last - t_first + 2 * interval_us, interval_us, dtype=np.int64)
-        return cls(elapsed + t_first, elapsed * (direction * rpm * TURN / 60e6))
+        return cls(elapsed + t_first, elapsed.astype(np.float64) * (direction * rpm * TURN / 60e6))
 
     def with_clock_offset(self, clock_offset_us: float) -> Encoder:
         """The same samples with another clock offset [us]."""
@@ -104,7 +105,7 @@ class Encoder:
 
     def with_index(self, index_t_us: ArrayLike) -> Encoder:
         """The same samples, shifted to be at a multiple of 2 pi at the index pulses (encoder's clock, [us])."""
-        index_t = np.atleast_1d(_sample_times(index_t_us))
+        index_t = np.atleast_1d(as_times(index_t_us))
         if not index_t.size:
             raise AmiwarpError("no index pulse given; leave the index out where there is none")
         self._check_index(index_t)
@@ -123,23 +124,21 @@ class Encoder:
     def angle_at(self, t: ArrayLike) -> NDArray[np.float64]:
         """Unwrapped angle [rad] at event times ``t`` [us], any shape, interpolated linearly.
 
-        Raises :class:`AmiwarpError` for a time beyond the samples by more than one (median) sample interval.
+        Raises :class:`AmiwarpError` for a time outside :attr:`coverage`.
         """
-        elapsed = self._elapsed(t)
-        steps = self.t - self.t[0]
-        result = np.interp(elapsed, steps, self.angle)
-        for end, outside in ((0, elapsed < 0), (-2, elapsed > steps[-1])):
+        elapsed, sampled, angle = self._near(t)
+        result = np.interp(elapsed, sampled, angle)
+        for end, outside in ((0, elapsed < 0), (-2, elapsed > sampled[-1])):
             if outside.any():
-                slope = (self.angle[end + 1] - self.angle[end]) / (steps[end + 1] - steps[end])
-                result = np.where(outside, self.angle[end] + slope * (elapsed - steps[end]), result)
+                slope = (angle[end + 1] - angle[end]) / (sampled[end + 1] - sampled[end])
+                result = np.where(outside, angle[end] + slope * (elapsed - sampled[end]), result)
         return np.asarray(result, np.float64)
 
     def speed_at(self, t: ArrayLike) -> NDArray[np.float64]:
         """Speed [rad/s] at event times ``t`` [us]: the slope of the linear piece that :meth:`angle_at` uses."""
-        elapsed = self._elapsed(t)
-        steps = self.t - self.t[0]
-        piece = np.clip(np.searchsorted(steps, elapsed, side="right") - 1, 0, steps.size - 2)
-        slope = 1e6 * np.diff(self.angle) / np.diff(steps)
+        elapsed, sampled, angle = self._near(t)
+        piece = np.clip(np.searchsorted(sampled, elapsed, side="right") - 1, 0, sampled.size - 2)
+        slope = 1e6 * np.diff(angle) / np.diff(sampled)
         return np.asarray(slope[piece], np.float64)
 
     def covers(self, t_start: int, t_end: int) -> bool:
@@ -149,15 +148,17 @@ class Encoder:
 
     @property
     def coverage(self) -> tuple[int, int]:
-        """First and last event time [us] for which :meth:`angle_at` answers."""
-        margin = self.interval_us
+        """First and last event time [us] with an angle: the samples and one sample interval beyond either end."""
+        # Where a gap ends the samples, the mean interval keeps it from being extrapolated over.
+        before = min(float(self.t[1] - self.t[0]), self.interval_us)
+        after = min(float(self.t[-1] - self.t[-2]), self.interval_us)
         first, last = int(self.t[0]), int(self.t[-1])
-        return math.ceil(first - margin - self.clock_offset_us), math.floor(last + margin - self.clock_offset_us)
+        return math.ceil(first - before - self.clock_offset_us), math.floor(last + after - self.clock_offset_us)
 
     @property
     def interval_us(self) -> float:
-        """Median time between samples [us]."""
-        return float(np.median(np.diff(self.t)))
+        """Mean time between samples [us]."""
+        return float(self.t[-1] - self.t[0]) / (self.t.size - 1)
 
     def gaps(self, max_interval_us: float) -> list[tuple[int, int]]:
         """Pairs of neighbouring sample times (encoder's clock, [us]) more than ``max_interval_us`` apart."""
@@ -169,15 +170,23 @@ class Encoder:
         """Mean speed over all samples [turns/min], negative where the angle falls."""
         return float((self.angle[-1] - self.angle[0]) / TURN * 60e6 / float(self.t[-1] - self.t[0]))
 
-    def _elapsed(self, t: ArrayLike) -> NDArray[np.float64]:
-        """Encoder's time since its first sample [us]; raises beyond the coverage."""
+    def _near(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Encoder's times of ``t``, and the times and angles of the samples around them; times since the first sample.
+
+        Only those samples: the cost is that of the block asked for, not of the recording.
+        """
         times = np.asarray(t, np.int64)
-        if times.size and not self.covers(int(times.min()), int(times.max())):
+        low, high = (int(times.min()), int(times.max())) if times.size else self.coverage
+        if not self.covers(low, high):
             first, last = self.coverage
-            span = f"events at {times.min()} .. {times.max()} us"
-            raise AmiwarpError(f"{span} lie outside the encoder's {first} .. {last} us; cut the events to it")
-        # Subtracted as integers: times since 1970 leave float64 less than a nanosecond, but it costs nothing.
-        return np.asarray((times - self.t[0]).astype(np.float64) + self.clock_offset_us)
+            raise AmiwarpError(f"events at {low} .. {high} us lie outside the encoder's {first} .. {last} us; cut them")
+        start = int(np.searchsorted(self.t, math.floor(low + self.clock_offset_us))) - 1
+        start = min(max(start, 0), self.t.size - 2)
+        stop = max(int(np.searchsorted(self.t, math.ceil(high + self.clock_offset_us))) + 1, start + 2)
+        # Subtracted as integers: float64 has no room for microseconds since 1970 and their fractions.
+        elapsed = (times - self.t[start]).astype(np.float64) + self.clock_offset_us
+        sampled = (self.t[start:stop] - self.t[start]).astype(np.float64)
+        return elapsed, sampled, self.angle[start:stop]
 
 
 def unwrap(t: NDArray[np.int64], value: NDArray[np.float64], period: float) -> NDArray[np.float64]:
@@ -202,15 +211,6 @@ def unwrap(t: NDArray[np.int64], value: NDArray[np.float64], period: float) -> N
     predicted = np.median(step / interval) * interval
     step += period * np.round((predicted - step) / period)
     return np.asarray(value[0] + np.concatenate([[0.0], np.cumsum(step)]))
-
-
-def _sample_times(t_us: ArrayLike) -> NDArray[np.int64]:
-    array = np.asarray(t_us)
-    if array.dtype.kind == "f":
-        if not bool(np.all(np.isfinite(array) & (np.abs(array) < 2.0**62))):
-            raise AmiwarpError("an encoder time is not finite or beyond int64; expected microseconds")
-        array = np.rint(array)
-    return array.astype(np.int64)
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:

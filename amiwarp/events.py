@@ -57,7 +57,7 @@ class Events:
 
         Raises :class:`AmiwarpError` where a coordinate does not fit uint16 or a time is not a finite whole number.
         """
-        return cls(_coordinate("x", x), _coordinate("y", y), _times(t), (np.asarray(p) > 0).astype(np.uint8))
+        return cls(_coordinate("x", x), _coordinate("y", y), as_times(t), (np.asarray(p) > 0).astype(np.uint8))
 
     @classmethod
     def empty(cls) -> Events:
@@ -96,18 +96,17 @@ def _coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
     return array.astype(np.uint16)
 
 
-def _times(values: ArrayLike) -> NDArray[np.int64]:
+def as_times(values: ArrayLike) -> NDArray[np.int64]:
+    """Times of any numeric type as int64 [us], rounded; :class:`AmiwarpError` for one not finite or not below 2**62.
+
+    The margin keeps the difference and the sum of any two times within int64.
+    """
     array = np.asarray(values)
-    if array.dtype.kind == "f":
-        # 2**62 leaves room for differences of any two times.
-        if not bool(np.all(np.isfinite(array) & (np.abs(array) < 2.0**62))):
-            raise AmiwarpError("an event's time is not finite or beyond int64; expected microseconds")
-        return np.rint(array).astype(np.int64)
-    if array.dtype.kind not in "iub":
-        raise AmiwarpError(f"events' t is of type {array.dtype}; expected numbers")
-    if array.dtype == np.uint64 and array.size and array.max() >= 2**62:
-        raise AmiwarpError(f"an event's time of {array.max()} us is beyond int64; expected microseconds")
-    return array.astype(np.int64, copy=False)
+    if array.dtype.kind not in "iubf":
+        raise AmiwarpError(f"times are of type {array.dtype}; expected numbers")
+    if array.size and not (array.min() > -(2**62) and array.max() < 2**62):
+        raise AmiwarpError(f"times span {array.min()} .. {array.max()} us: not finite or beyond int64")
+    return np.asarray(np.rint(array) if array.dtype.kind == "f" else array, np.int64)
 
 
 def check_events(

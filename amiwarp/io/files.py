@@ -1,4 +1,4 @@
-"""What all readers and writers share: errors with a place, files never half written, files never overwritten while read."""
+"""What all readers and writers share: errors with a place, no file half written, none overwritten while it is read."""
 
 from __future__ import annotations
 
@@ -58,7 +58,11 @@ def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
     """
     try:
         yield
-    except (AmiwarpError, KeyboardInterrupt, SystemExit, GeneratorExit):
+    except AmiwarpError as error:
+        if str(path) in str(error):
+            raise
+        raise AmiwarpError(f"{path}: {place()}: {error}") from error
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except FileNotFoundError as error:
         raise AmiwarpError(f"{path}: no such file") from error

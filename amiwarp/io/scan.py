@@ -1,7 +1,7 @@
 """Files without an index as event sources: one pass to count, check and repair, then packets again for every reading.
 
-Two faults that real recordings have are repaired and counted, in each format alike: an event earlier than one before it is
-moved to the largest time so far, an event outside the frame is dropped. Where more than 1 % of the events need either,
+Two faults that real recordings have are repaired and counted, in each format alike: an event earlier than one before it
+is moved to the largest time so far, an event outside the frame is dropped. Where over 1 % of the events need either,
 the file is refused: then the format, the size or the order is wrong, not the event.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import DEFAULT_BLOCK, Events, regroup
+from amiwarp.events import DEFAULT_BLOCK, Events, as_times, regroup
 from amiwarp.io.files import errors_name, register_reader
 
 Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
@@ -70,9 +70,13 @@ class FileEvents:
         size: tuple[int, int] | None,
     ) -> None:
         """``packets`` starts a new pass and counts oddities into the dictionary given; ``size`` None is found out."""
+        if size is not None and not (1 <= size[0] <= 65536 and 1 <= size[1] <= 65536):
+            raise AmiwarpError(f"{path}: tells a size of {size[0]}x{size[1]}; expected 1 .. 65536 pixels each way")
         self.path = path
         self._packets = packets
         self._size = size
+        self.size_is_known = size is not None
+        """Whether the file told the sensor's size; else it is the smallest in use that holds all events."""
         self._kept: list[Events] | None = []
         self._tally = Tally()
         for block in self._pass(self._tally):
@@ -85,12 +89,12 @@ class FileEvents:
 
     def _judge(self) -> None:
         tally = self._tally
-        if not tally.count:
-            raise AmiwarpError(f"{self.path}: holds no events")
         for bad, what in ((tally.outside, f"lie outside the frame {self._size}"), (tally.late, "are out of order")):
             if bad * 100 > tally.count + tally.outside:
                 total = tally.count + tally.outside
                 raise AmiwarpError(f"{self.path}: {bad} of {total} events {what}; the file is damaged or mislabelled")
+        if not tally.count:
+            raise AmiwarpError(f"{self.path}: holds no events")
 
     @property
     def repairs(self) -> dict[str, int]:
@@ -165,9 +169,7 @@ class FileEvents:
             x, y, t, p = x[inside], y[inside], t[inside], p[inside]
         if not t.size:
             return Events.empty()
-        times = t.astype(np.int64)
-        if t.dtype == np.uint64 and int(t.max()) >= 1 << 62:
-            raise AmiwarpError(f"{self.path}: {tally.place()}: a time of {int(t.max())} us is beyond int64")
+        times = as_times(t)
         floor = tally.t_last if tally.count else int(times[0])
         ordered = np.maximum(np.maximum.accumulate(times), floor)
         tally.late += int(np.count_nonzero(ordered != times))

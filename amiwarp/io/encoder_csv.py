@@ -1,0 +1,95 @@
+"""Encoder logs as comma-separated text: columns ``t_us``, ``angle_deg`` or ``count``, optionally ``index`` (0 or 1)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name
+
+
+def read_encoder_csv(
+    path: str | os.PathLike[str], *, counts_per_turn: int | None = None, direction: int = 1
+) -> Encoder:
+    """Read an encoder log; its header names the columns, in any order.
+
+    ``t_us``: time [us], strictly increasing. ``angle_deg``: angle [deg], wrapped or not; or ``count``: the counter,
+    which needs ``counts_per_turn``. ``index``: 1 in the samples at the index pulse, which becomes angle 0.
+    ``direction`` -1 turns the sign. Raises :class:`AmiwarpError` naming the file and line for anything else.
+    """
+    path = Path(path)
+    with errors_name(path, lambda: "reading the encoder"):
+        names, table, lines = _read_table(path)
+        columns = {name: table[:, at] for at, name in enumerate(names)}
+        t = np.rint(columns["t_us"]).astype(np.int64)
+        late = np.flatnonzero(t[1:] <= t[:-1])
+        if late.size:
+            line = lines[int(late[0]) + 1]
+            raise AmiwarpError(f"{path}: line {line}: t_us is not later than in the line before; sort and deduplicate")
+        encoder = _encoder(path, columns, t, counts_per_turn, direction)
+        if "index" not in columns:
+            return encoder
+        bad = np.flatnonzero((columns["index"] != 0) & (columns["index"] != 1))
+        if bad.size:
+            raise AmiwarpError(f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1")
+        pulses = columns["index"] == 1
+        # A pulse that stays high over several samples is one pulse, at its first sample.
+        rising = pulses & ~np.concatenate([[False], pulses[:-1]])
+        return encoder.with_index(t[rising]) if rising.any() else encoder
+
+
+def _encoder(
+    path: Path,
+    columns: dict[str, NDArray[np.float64]],
+    t: NDArray[np.int64],
+    counts_per_turn: int | None,
+    direction: int,
+) -> Encoder:
+    if "count" in columns:
+        if counts_per_turn is None:
+            raise AmiwarpError(f"{path}: holds counts; give counts_per_turn")
+        return Encoder.from_counts(t, columns["count"], counts_per_turn=counts_per_turn, direction=direction)
+    if direction not in (1, -1):
+        raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
+    return Encoder.from_angles(t, direction * np.radians(columns["angle_deg"]))
+
+
+def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
+    """Column names, values of shape ``(rows, columns)`` and the line number of each row."""
+    text = path.read_text(encoding="utf-8-sig")
+    rows = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    if not rows:
+        raise AmiwarpError(f"{path}: is empty; expected a header t_us,angle_deg or t_us,count")
+    names = [name.strip().lower() for name in rows[0][1].split(",")]
+    known = {"t_us", "angle_deg", "count", "index"}
+    if len(set(names)) != len(names) or not set(names) <= known or "t_us" not in names:
+        raise AmiwarpError(f"{path}: header '{rows[0][1][:80]}'; expected t_us,angle_deg or t_us,count, then index")
+    if ("count" in names) == ("angle_deg" in names):
+        raise AmiwarpError(f"{path}: header '{rows[0][1][:80]}'; expected one of angle_deg and count")
+    numbers, lines = [number for number, _ in rows[1:]], [line for _, line in rows[1:]]
+    if len(lines) < 2:
+        raise AmiwarpError(f"{path}: has {len(lines)} samples; expected at least 2")
+    try:
+        table = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
+    except ValueError:
+        table = np.zeros((0, 0))
+    # Beyond 2**53 a float64 no longer holds whole microseconds.
+    if table.shape != (len(lines), len(names)) or not (np.abs(table) < 2.0**53).all():
+        raise AmiwarpError(f"{path}: {_first_bad(numbers, lines, len(names))}")
+    return names, table, numbers
+
+
+def _first_bad(numbers: list[int], lines: list[str], width: int) -> str:
+    for number, line in zip(numbers, lines, strict=True):
+        try:
+            values = np.array([float(word) for word in line.split(",")])
+        except ValueError:
+            return f"line {number} is '{line[:80]}'; expected {width} numbers"
+        if values.size != width or not (np.abs(values) < 2.0**53).all():
+            return f"line {number} is '{line[:80]}'; expected {width} finite numbers"
+    return f"expected {width} finite numbers in each line"

@@ -1,0 +1,107 @@
+"""Opening a recording of any format: the file's content decides which, its ending only where the content cannot."""
+
+from __future__ import annotations
+
+import enum
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Recording
+from amiwarp.io.files import errors_name
+
+
+class Format(enum.Enum):
+    """Formats that can be read."""
+
+    HDF5 = "hdf5"
+    """Native recording, or DSEC's events."""
+    EVT = "evt"
+    """Prophesee RAW, EVT 2.0 and 3.0."""
+    DAT = "dat"
+    """Prophesee DAT."""
+    AEDAT4 = "aedat4"
+    """iniVation AEDAT 4.0."""
+    ES = "es"
+    """Event Stream."""
+    TEXT = "text"
+    """Event Camera Dataset: lines ``t x y p``, seconds."""
+    NPZ = "npz"
+    """NumPy archive of arrays x, y, t, p."""
+
+
+def detect_format(path: Path) -> Format:
+    """Tell a file's format from its first bytes. Raises :class:`AmiwarpError` where it is none of them."""
+    with errors_name(path, lambda: "opening"):
+        if path.is_dir():
+            raise AmiwarpError(f"{path}: is a folder; give a file")
+        with path.open("rb") as file:
+            head = file.read(4096)
+    if not head:
+        raise AmiwarpError(f"{path}: is empty")
+    for magic, found in (
+        (b"\x89HDF\r\n\x1a\n", Format.HDF5),
+        (b"#!AER-DAT4", Format.AEDAT4),
+        (b"Event Stream", Format.ES),
+        (b"PK\x03\x04", Format.NPZ),
+    ):
+        if head.startswith(magic):
+            return found
+    if head.startswith(b"#!AER-DAT"):
+        raise AmiwarpError(f"{path}: is AEDAT {head[9:12].decode('ascii', 'replace')}; only AEDAT 4 is read")
+    if head.startswith(b"%"):
+        return Format.EVT if _is_evt(head) else Format.DAT
+    if _looks_like_text(head):
+        return Format.TEXT
+    known = ", ".join(member.value for member in Format)
+    raise AmiwarpError(f"{path}: content is of no known format ({known})")
+
+
+def _is_evt(head: bytes) -> bool:
+    lines = head.split(b"\n")
+    return any(line.startswith((b"% evt ", b"% format EVT")) for line in lines)
+
+
+def _looks_like_text(head: bytes) -> bool:
+    line = next((line for line in head.split(b"\n") if line.strip() and not line.lstrip().startswith(b"#")), b"")
+    try:
+        return len([float(word) for word in line.split()]) in (2, 4)
+    except ValueError:
+        return False
+
+
+def open_recording(path: str | os.PathLike[str], *, format: Format | str | None = None) -> Recording:
+    """Open a recording; ``format`` overrides what its content says.
+
+    Formats without an index are passed through once, to count, check and repair; ``metadata`` tells what was repaired.
+    Raises :class:`AmiwarpError` naming the file and the place for whatever cannot be read.
+    """
+    path = Path(path)
+    try:
+        chosen = detect_format(path) if format is None else Format(format)
+    except ValueError as error:
+        if isinstance(error, AmiwarpError):
+            raise
+        known = ", ".join(member.value for member in Format)
+        raise AmiwarpError(f"{path}: format '{format}' is not one of {known}") from error
+    return _opener(chosen)(path)
+
+
+def _opener(chosen: Format) -> Callable[[Path], Recording]:
+    # Each reader's library is loaded with it, so that no reader costs those who do not use it.
+    if chosen is Format.HDF5:
+        from amiwarp.io.native import open_native as opener
+    elif chosen is Format.EVT:
+        from amiwarp.io.prophesee import open_evt as opener
+    elif chosen is Format.DAT:
+        from amiwarp.io.prophesee import open_dat as opener
+    elif chosen is Format.AEDAT4:
+        from amiwarp.io.aedat import open_aedat4 as opener
+    elif chosen is Format.ES:
+        from amiwarp.io.event_stream import open_es as opener
+    elif chosen is Format.TEXT:
+        from amiwarp.io.text import open_text as opener
+    else:
+        from amiwarp.io.npz import open_npz as opener
+    return opener

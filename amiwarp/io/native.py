@@ -1,0 +1,299 @@
+"""Reading the native HDF5 recording and the DSEC event files whose layout it extends (docs/recording-format.md)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import DEFAULT_BLOCK, Events, MetadataValue, Recording, Truth, as_times, check_events, regroup
+from amiwarp.io.files import errors_name, register_reader
+from amiwarp.io.native_writer import FORMAT, FORMAT_VERSION
+from amiwarp.io.scan import smallest_sensor
+
+if TYPE_CHECKING:
+    from amiwarp.optics import Prism
+
+DSEC_SIZE = (640, 480)
+"""Size of DSEC's sensors [px]; its files do not tell."""
+
+BLOSC = 32001
+"""Number of the Blosc filter in HDF5."""
+
+
+class NativeEvents:
+    """Events of an HDF5 recording, read only where asked for. Raises :class:`AmiwarpError` for a damaged file."""
+
+    def __init__(self, path: Path, file: Any) -> None:
+        self.path = path
+        self._file = file
+        self._columns = {name: _dataset(file, f"events/{name}", "iub") for name in ("t", "p")}
+        self._columns |= {name: _dataset(file, f"events/{name}", "iuf") for name in ("x", "y")}
+        if "inside" in file["events"]:
+            self._columns["inside"] = _dataset(file, "events/inside", "iub")
+        lengths = {name: int(column.shape[0]) for name, column in self._columns.items()}
+        if len(set(lengths.values())) != 1:
+            raise AmiwarpError(f"{path}: events differ in length: {lengths}; the file is damaged")
+        self._count = lengths["t"]
+        self._offset = as_times(file["t_offset"][()]).item() if "t_offset" in file else 0
+        self._ms_to_idx = _dataset(file, "ms_to_idx", "iu") if "ms_to_idx" in file else None
+        self._size = self._find_size()
+        self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
+        register_reader(self)
+
+    def _find_size(self) -> tuple[int, int]:
+        attributes = self._file.attrs
+        if "width" in attributes and "height" in attributes:
+            width, height = int(attributes["width"]), int(attributes["height"])
+            if not (1 <= width <= 65536 and 1 <= height <= 65536):
+                raise AmiwarpError(f"{self.path}: size {width}x{height}; expected 1 .. 65536 pixels each way")
+            return width, height
+        largest = [0, 0]
+        for start in range(0, self._count, DEFAULT_BLOCK):
+            for axis, name in enumerate(("x", "y")):
+                largest[axis] = max(largest[axis], int(self._columns[name][start : start + DEFAULT_BLOCK].max()))
+        width, height = smallest_sensor(*largest)
+        return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def t_first(self) -> int:
+        """Time of the first event [us]."""
+        return self._end(0)
+
+    @property
+    def t_last(self) -> int:
+        """Time of the last event [us]."""
+        return self._end(-1)
+
+    def _end(self, which: int) -> int:
+        if not self._ends:
+            raise AmiwarpError(f"{self.path}: holds no events, so it has no first or last time")
+        return int(self._ends[which][0])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Sensor's (width, height) [px]."""
+        return self._size
+
+    def slice(self, start: int, stop: int) -> Events:
+        """Events ``start <= index < stop``; they are checked as they are read."""
+        start, stop = max(start, 0), min(max(stop, start, 0), self._count)
+        with errors_name(self.path, lambda: f"events {start} .. {stop}"):
+            x, y, p = (self._columns[name][start:stop] for name in ("x", "y", "p"))
+            events = Events.from_arrays(x, y, self._times(start, stop), p)
+            nan = "inside" in self._columns
+            check_events(events, *self._size, where=str(self.path), first_index=start, allow_nan=nan)
+        return events
+
+    def inside(self, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """Of compensated events, which lie on the picture: shape ``(n,)``, or None where the file does not tell."""
+        if "inside" not in self._columns:
+            return None
+        with errors_name(self.path, lambda: f"events/inside {start} .. {stop}"):
+            return np.asarray(self._columns["inside"][max(start, 0) : max(stop, 0)], np.bool_)
+
+    def between(self, t_start: int, t_end: int) -> Events:
+        """Events with ``t_start <= t < t_end`` [us]; the file's millisecond index finds them."""
+        with errors_name(self.path, lambda: f"events between {t_start} and {t_end} us"):
+            return self.slice(self._find(t_start), self._find(t_end))
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+        """See :meth:`amiwarp.events.EventSource.blocks`."""
+        read = (self.slice(start, start + DEFAULT_BLOCK) for start in range(0, self._count, DEFAULT_BLOCK))
+        return regroup(read, count=count, duration_us=duration_us)
+
+    def _times(self, start: int, stop: int) -> NDArray[np.int64]:
+        return as_times(self._columns["t"][start:stop]) + self._offset
+
+    def _find(self, t: int) -> int:
+        """Index of the first event at or after ``t``."""
+        if not self._count or t <= self.t_first:
+            return 0
+        if t > self.t_last:
+            return self._count
+        low, high = self._bracket(t)
+        at = low + int(np.searchsorted(self._times(low, high), t))
+        around = self._times(at - 1, at + 1) if 0 < at < self._count else np.zeros(0, np.int64)
+        if around.size != 2 or not around[0] < t <= around[1]:
+            raise AmiwarpError(f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it")
+        return at
+
+    def _bracket(self, t: int) -> tuple[int, int]:
+        """A short range of indices in which ``t`` falls: from the index, or by bisection without one."""
+        ms = (t - self._offset) // 1000
+        if self._ms_to_idx is not None and 0 <= ms < self._ms_to_idx.shape[0]:
+            ends = self._ms_to_idx[ms : ms + 2].tolist()
+            return max(0, min(ends[0], self._count)), max(
+                0, min(ends[1] if len(ends) > 1 else self._count, self._count)
+            )
+        low, high = 0, self._count
+        while high - low > 1024:
+            middle = (low + high) // 2
+            low, high = (middle, high) if int(self._times(middle, middle + 1)[0]) < t else (low, middle)
+        return low, high
+
+
+class _StoredPoints:
+    """truth/x and truth/y as one ``(n, 2)`` array, read where asked for."""
+
+    def __init__(self, path: Path, x: Any, y: Any) -> None:
+        self._path, self._x, self._y = path, x, y
+
+    def __getitem__(self, which: slice, /) -> NDArray[np.float32]:
+        with errors_name(self._path, lambda: f"truth {which.start} .. {which.stop}"):
+            return np.stack([self._x[which], self._y[which]], axis=1).astype(np.float32, copy=False)
+
+
+def open_native(path: Path) -> Recording:
+    """Open a native recording or a DSEC event file. Raises :class:`AmiwarpError` for anything else."""
+    # Imported for its effect: it registers the Blosc filter.
+    import h5py
+    import hdf5plugin  # noqa: F401
+
+    with errors_name(path, lambda: "opening HDF5"):
+        file = h5py.File(path, "r")
+        try:
+            return _read_recording(path, file)
+        except BaseException:
+            file.close()
+            raise
+
+
+def _read_recording(path: Path, file: Any) -> Recording:
+    import h5py
+
+    version = _attribute(file, "format_version", int, FORMAT_VERSION)
+    if version > FORMAT_VERSION:
+        raise AmiwarpError(f"{path}: format_version {version} is newer than {FORMAT_VERSION}; update amiwarp")
+    if not isinstance(file.get("events"), h5py.Group):
+        raise AmiwarpError(f"{path}: HDF5 without a group 'events'; expected events/x, y, t, p")
+    events = NativeEvents(path, file)
+    stored = file["metadata"].attrs.items() if "metadata" in file else ()
+    metadata: dict[str, MetadataValue] = {name: _plain(value) for name, value in stored}
+    metadata["format"] = "native" if _attribute(file, "format", str, "") == FORMAT else "dsec"
+    camera = _read_camera(file["camera"]) if "camera" in file else None
+    if camera is not None and (camera.width, camera.height) != events.size:
+        raise AmiwarpError(f"{path}: camera is {camera.width}x{camera.height}, events are {events.size}; give one size")
+    return Recording(
+        events=events,
+        camera=camera,
+        encoder=_read_encoder(file) if "encoder" in file else None,
+        prism=_read_prism(file["prism"]) if "prism" in file else None,
+        truth=_read_truth(path, file, len(events)) if "truth" in file else None,
+        metadata=metadata,
+        name=path.stem,
+    )
+
+
+def _dataset(file: Any, name: str, kinds: str) -> Any:
+    import h5py
+
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1:
+        raise AmiwarpError(f"{file.filename}: no one-dimensional dataset '{name}'; the file is incomplete")
+    if dataset.dtype.kind not in kinds:
+        raise AmiwarpError(f"{file.filename}: dataset '{name}' is {dataset.dtype}; see docs/recording-format.md")
+    if dataset.chunks is not None and _chunks_are_damaged(dataset):
+        raise AmiwarpError(f"{file.filename}: dataset '{name}' has a damaged chunk; copy the file anew")
+    return dataset
+
+
+def _chunks_are_damaged(dataset: Any) -> bool:
+    """Whether HDF5 or its Blosc filter would read beyond a chunk: neither looks, and the process would die of it."""
+    creation = dataset.id.get_create_plist()
+    filters = [creation.get_filter(at) for at in range(creation.get_nfilters())]
+    chunk_bytes = dataset.chunks[0] * dataset.dtype.itemsize
+    for code, _, values, _ in filters:
+        # The filter's parameters: two versions, bytes per element, bytes per chunk.
+        if code == BLOSC and tuple(values[2:4]) != (dataset.dtype.itemsize, chunk_bytes):
+            return True
+    if not filters or filters[0][0] != BLOSC:
+        return False
+    file_bytes = os.path.getsize(dataset.file.filename)
+    damaged = False
+    with open(dataset.file.filename, "rb") as raw:
+
+        def visit(chunk: Any) -> None:
+            nonlocal damaged
+            raw.seek(chunk.byte_offset)
+            header = raw.read(16)
+            # Blosc's header: four bytes, then the bytes before and after decompression, little-endian.
+            fits = chunk.byte_offset + chunk.size <= file_bytes and len(header) == 16
+            damaged |= not fits or int.from_bytes(header[4:8], "little") != chunk_bytes or chunk.filter_mask != 0
+
+        dataset.id.chunk_iter(visit)
+    return damaged
+
+
+def _attribute(group: Any, name: str, kind: type[Any], default: Any = None) -> Any:
+    if name not in group.attrs and default is None:
+        raise AmiwarpError(f"{group.file.filename}: {group.name} has no attribute '{name}'; add it")
+    value = group.attrs.get(name, default)
+    try:
+        return kind(value.decode() if isinstance(value, bytes) else value)
+    except (TypeError, ValueError) as error:
+        expected = f"expected {kind.__name__}"
+        raise AmiwarpError(
+            f"{group.file.filename}: {group.name} attribute '{name}' is {value!r}; {expected}"
+        ) from error
+
+
+def _plain(value: Any) -> MetadataValue:
+    plain = value.item() if isinstance(value, np.generic) else value
+    plain = plain.decode(errors="replace") if isinstance(plain, bytes) else plain
+    return plain if isinstance(plain, (str, int, float, bool)) else str(plain)
+
+
+def _read_camera(group: Any) -> Camera:
+    model = _attribute(group, "distortion_model", str, "none")
+    kinds: dict[str, tuple[type[RadialTangential] | type[Fisheye], int]]
+    kinds = {"radial_tangential": (RadialTangential, 5), "fisheye": (Fisheye, 4)}
+    distortion: Distortion | None = None
+    if model in kinds:
+        kind, length = kinds[model]
+        coefficients = np.asarray(group.attrs.get("distortion", ()), np.float64)
+        if coefficients.shape != (length,) or not np.isfinite(coefficients).all():
+            raise AmiwarpError(f"camera distortion is {coefficients.tolist()}; expected {length} numbers for {model}")
+        distortion = kind(*coefficients.tolist())
+    elif model != "none":
+        raise AmiwarpError(f"camera distortion_model '{model}'; expected none, radial_tangential or fisheye")
+    width, height = (_attribute(group, name, int) for name in ("width", "height"))
+    fx, fy, cx, cy = (_attribute(group, name, float) for name in ("fx", "fy", "cx", "cy"))
+    return Camera(width, height, fx, fy, cx, cy, distortion)
+
+
+def _read_prism(group: Any) -> Prism:
+    from amiwarp.optics import FlatSide, Prism
+
+    side = _attribute(group, "flat_side", str, FlatSide.SCENE.value)
+    if side not in {member.value for member in FlatSide}:
+        raise AmiwarpError(f"prism flat_side '{side}'; expected {' or '.join(member.value for member in FlatSide)}")
+    return Prism(_attribute(group, "apex", float), _attribute(group, "index", float), flat_side=FlatSide(side))
+
+
+def _read_encoder(file: Any) -> Encoder:
+    t = as_times(_dataset(file, "encoder/t", "iu")[:])
+    angle = _dataset(file, "encoder/angle", "f")[:].astype(np.float64)
+    index_t = as_times(_dataset(file, "encoder/index_t", "iu")[:]) if "index_t" in file["encoder"] else None
+    return Encoder(t, angle, _attribute(file["encoder"], "clock_offset_us", float, 0.0), index_t)
+
+
+def _read_truth(path: Path, file: Any, count: int) -> Truth:
+    group = file["truth"]
+    parameters = {name: _attribute(group, name, float) for name in group.attrs}
+    if "x" not in group:
+        return Truth(parameters)
+    x, y = (_dataset(file, f"truth/{name}", "f") for name in ("x", "y"))
+    if x.shape != (count,) or y.shape != (count,):
+        raise AmiwarpError(f"{path}: truth has {x.shape[0]} and {y.shape[0]} points for {count} events")
+    return Truth(parameters, _StoredPoints(path, x, y))

@@ -1,0 +1,113 @@
+"""Text of the Event Camera Dataset: one event per line, ``t x y p``, t in seconds, p 1 or 0.
+
+A first line ``width height`` gives the sensor's size, as some exporters write it. Without one it is the smallest sensor
+in use that holds all events (240x180 for that data set). A ``calib.txt`` beside the file gives the camera:
+``fx fy cx cy k1 k2 p1 p2 k3``. Empty lines and those with ``#`` in front are passed over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.camera import Camera, RadialTangential
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Recording
+from amiwarp.io.files import errors_name
+from amiwarp.io.scan import FileEvents, Packet
+
+READ_BYTES = 1 << 22
+"""Text that is parsed at once: some 200,000 events."""
+
+LONGEST_LINE = 1000
+"""Characters beyond which a line is none of an event."""
+
+
+def open_text(path: Path) -> Recording:
+    """Open a text recording, with the camera of the ``calib.txt`` beside it where there is one."""
+    with errors_name(path, lambda: "line 1"), path.open("rb") as file:
+        size, _ = _read_size(path, file)
+    events = FileEvents(path, partial(_packets, path), size=size)
+    calib = path.with_name("calib.txt")
+    camera = read_calib(calib, *events.size) if calib.is_file() and calib != path else None
+    return Recording(events=events, camera=camera, metadata={"format": "text", **events.repairs}, name=path.stem)
+
+
+def read_calib(path: Path, width: int, height: int) -> Camera:
+    """The camera of a ``calib.txt``. Raises :class:`AmiwarpError` where it does not hold nine finite numbers."""
+    with errors_name(path, lambda: "reading the calibration"):
+        with path.open("rb") as file:
+            words = file.read(10_000).decode("utf-8").split()
+        numbers = [float(word) for word in words]
+        if len(numbers) != 9 or not np.isfinite(numbers).all():
+            raise AmiwarpError(f"{path}: has {len(numbers)} numbers; expected finite fx fy cx cy k1 k2 p1 p2 k3")
+        fx, fy, cx, cy = numbers[:4]
+        return Camera(width, height, fx, fy, cx, cy, RadialTangential(*numbers[4:]))
+
+
+def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]:
+    """The size in a first line of two numbers and the number of lines it took; the file is left after it."""
+    words = file.readline(LONGEST_LINE).split()
+    if len(words) != 2:
+        file.seek(0)
+        return None, 0
+    if not (words[0].isdigit() and words[1].isdigit()):
+        given = b" ".join(words).decode("ascii", "replace")
+        raise AmiwarpError(f"{path}: line 1 '{given}' is not a size in pixels; expected 'width height' or 't x y p'")
+    return (int(words[0]), int(words[1])), 1
+
+
+def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
+    with path.open("rb") as file:
+        _, line_number = _read_size(path, file)
+        rest = b""
+        while data := file.read(READ_BYTES):
+            whole, newline, rest = (rest + data).rpartition(b"\n")
+            if len(rest) > LONGEST_LINE:
+                raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")
+            if newline:
+                lines = whole.split(b"\n")
+                yield _parse(path, lines, line_number)
+                line_number += len(lines)
+        if rest.strip():
+            yield _parse(path, [rest], line_number)
+
+
+def _parse(path: Path, lines: list[bytes], line_number: int) -> Packet:
+    kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
+    if not kept:
+        nothing = np.zeros(0, np.int64)
+        return nothing, nothing, nothing, nothing
+    try:
+        table = np.loadtxt(kept, ndmin=2, comments=None, encoding="ascii")
+    except ValueError:
+        table = np.zeros((0, 0))
+    if table.shape != (len(kept), 4) or not _plausible(table).all():
+        raise AmiwarpError(f"{path}: {_first_bad(lines, line_number)}; expected 't x y p' with t in seconds, p 0 or 1")
+    t, x, y, p = table.T
+    return x.astype(np.int64), y.astype(np.int64), np.rint(t * 1e6).astype(np.int64), p.astype(np.int64)
+
+
+def _plausible(table: NDArray[np.float64]) -> NDArray[np.bool_]:
+    t, x, y, p = table.T
+    # Pixels are whole and fit 32 bits (those outside the frame are dropped later); NaN fails every comparison.
+    whole: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31) & (np.floor(x) == x) & (np.floor(y) == y)
+    return np.asarray((np.abs(t) < 2**62 / 1e6) & whole & ((p == 0) | (p == 1) | (p == -1)))
+
+
+def _first_bad(lines: list[bytes], line_number: int) -> str:
+    for number, line in enumerate(lines, line_number + 1):
+        if not line.strip() or line.lstrip().startswith(b"#"):
+            continue
+        try:
+            row = np.array([[float(word) for word in line.split()]])
+        except ValueError:
+            row = np.zeros((1, 0))
+        if row.shape != (1, 4) or not _plausible(row).all():
+            return f"line {number} is '{line[:80].decode('ascii', 'replace').strip()}'"
+    return f"line {line_number + 1} or after it is malformed"

@@ -1,0 +1,206 @@
+"""The encoder: angle at a time, unwrapping, index pulses, gaps and coverage; and its logs as text."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from amiwarp.encoder import TURN, Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.io import read_encoder_csv
+
+SPEED = TURN * 50e-6
+"""3000 turns a minute [rad/us]."""
+
+
+def wrapped(angle):
+    return (angle + np.pi) % TURN - np.pi
+
+
+def test_constant_speed():
+    encoder = Encoder.constant_speed(3000.0, 1_000_000, 1_250_500)
+    t = np.array([1_000_000, 1_000_001, 1_123_457, 1_250_500])
+    np.testing.assert_allclose(encoder.angle_at(t), SPEED * (t - 1_000_000), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(encoder.speed_at(t), SPEED * 1e6, rtol=0, atol=1e-6)
+    assert encoder.rpm == pytest.approx(3000.0, abs=1e-6)
+    backwards = Encoder.constant_speed(3000.0, 0, 1000, direction=-1)
+    assert backwards.rpm == pytest.approx(-3000.0, abs=1e-6)
+    assert backwards.angle_at(500) == pytest.approx(-SPEED * 500, abs=1e-9)
+
+
+@pytest.mark.parametrize("epoch", [0, 1_700_000_000_000_000])
+def test_wrapped_angles_unwrap_at_any_epoch(epoch):
+    t = epoch + np.arange(0, 200_000, 1000)
+    truth = SPEED * (t - epoch) + 0.3
+    for given_angle in (truth, wrapped(truth), truth % TURN):
+        encoder = Encoder.from_angles(t, given_angle)
+        middle = t[:-1] + 437
+        error = wrapped(encoder.angle_at(middle) - (SPEED * (middle - epoch) + 0.3))
+        np.testing.assert_allclose(error, 0.0, rtol=0, atol=1e-9)
+        assert encoder.rpm == pytest.approx(3000.0, abs=1e-6)
+
+
+@given(st.floats(-9000, 9000), st.floats(-10, 10), st.integers(0, 2**32))
+@settings(deadline=None, max_examples=100)
+def test_counts_find_any_speed_below_half_a_turn_per_sample(rpm, phase, seed):
+    rng = np.random.default_rng(seed)
+    # Intervals jitter by a tenth; at 9000 rpm 2 ms are 0.3 turns.
+    t = np.cumsum(rng.integers(1800, 2200, 300))
+    turns = rpm / 60e6 * (t - t[0]) + phase
+    count = np.floor(turns * 4096) % 4096
+    encoder = Encoder.from_counts(t, count, counts_per_turn=4096)
+    expected = (turns[-1] - turns[0]) * TURN
+    assert encoder.angle[-1] - encoder.angle[0] == pytest.approx(expected, abs=1.001 * TURN / 4096)
+
+
+def test_gap_of_many_turns_is_bridged_by_the_speed():
+    t = np.arange(0, 400_000, 1000)
+    kept = (t < 100_000) | (t > 217_300)
+    count = np.round(50e-6 * t * 4096) % 4096
+    encoder = Encoder.from_counts(t[kept], count[kept], counts_per_turn=4096)
+    assert encoder.rpm == pytest.approx(3000.0, abs=0.1)
+    assert encoder.gaps(5000) == [(99_000, 218_000)]
+    assert encoder.gaps(200_000) == []
+
+
+def test_direction_and_running_counter():
+    t = np.arange(0, 100_000, 1000)
+    count = 1_000_000 - np.round(50e-6 * t * 2000)
+    encoder = Encoder.from_counts(t, count, counts_per_turn=2000, direction=-1)
+    assert encoder.rpm == pytest.approx(3000.0, abs=0.1)
+
+
+def test_index_pulses_make_the_angle_absolute_and_show_slip():
+    t = np.arange(0, 400_000, 100)
+    pulses = np.arange(7_300, 400_000 - 100, 20_000)
+    turns = 50e-6 * t
+    encoder = Encoder.from_counts(t, np.round(turns * 4096) % 4096, counts_per_turn=4096, index_t_us=pulses)
+    count = TURN / 4096
+    np.testing.assert_allclose(wrapped(encoder.angle_at(pulses)), 0.0, rtol=0, atol=1.5 * count)
+    assert np.abs(encoder.slip()).max() < 1.5 * count
+    # From the ninth turn on the counter misses a quarter of a turn: a minority of pulses disagree.
+    lost = np.where(t > 300_000, 1024, 0)
+    slipped = Encoder.from_counts(t, np.round(turns * 4096) - lost, counts_per_turn=4096, index_t_us=pulses)
+    np.testing.assert_allclose(slipped.slip()[pulses < 300_000], 0.0, rtol=0, atol=1.5 * count)
+    np.testing.assert_allclose(slipped.slip()[pulses > 300_100], -TURN / 4, rtol=0, atol=1.5 * count)
+    assert Encoder.constant_speed(60, 0, 10).slip().size == 0
+
+
+def test_clock_offset_shifts_angle_and_coverage():
+    encoder = Encoder.constant_speed(3000.0, 0, 100_000).with_clock_offset(2500.0)
+    assert encoder.angle_at(10_000) == pytest.approx(SPEED * 12_500, abs=1e-9)
+    assert encoder.coverage == (-3500, 99_500)
+    assert encoder.covers(-3500, 99_500)
+    assert not encoder.covers(-3501, 0)
+    assert encoder.clock_offset_us == 2500.0
+
+
+def test_extrapolates_one_interval_and_no_more():
+    encoder = Encoder.from_angles([0, 1000, 2000], [0.0, 0.1, 0.3])
+    np.testing.assert_allclose(encoder.angle_at([-1000, 3000]), [-0.1, 0.5], rtol=0, atol=1e-12)
+    for t in (-1001, 3001):
+        with pytest.raises(AmiwarpError, match="outside the encoder"):
+            encoder.angle_at(t)
+    assert encoder.angle_at(np.zeros(0, np.int64)).shape == (0,)
+
+
+def test_a_block_gets_the_angles_of_the_whole():
+    rng = np.random.default_rng(3)
+    t = np.cumsum(rng.integers(1, 300, 500))
+    encoder = Encoder(t, np.cumsum(rng.normal(size=500))).with_clock_offset(-7.25)
+    first, last = encoder.coverage
+    times = np.sort(rng.integers(first, last + 1, 2000))
+    angle, speed = encoder.angle_at(times), encoder.speed_at(times)
+    within = (times - 7.25 >= t[0]) & (times - 7.25 <= t[-1])
+    np.testing.assert_allclose(angle[within], np.interp(times[within] - 7.25, t, encoder.angle), rtol=0, atol=1e-9)
+    for start in range(0, 2000, 13):
+        some = slice(start, start + 13)
+        np.testing.assert_allclose(encoder.angle_at(times[some]), angle[some], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(encoder.speed_at(times[some]), speed[some], rtol=0, atol=1e-3)
+
+
+def test_a_gap_at_the_end_is_not_extrapolated_over():
+    encoder = Encoder(np.array([0, 100, 200, 300, 10_000]), np.arange(5.0))
+    assert encoder.coverage == (-100, 12_500)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Encoder.from_angles([0], [0.0]), "at least 2"),
+        (lambda: Encoder.from_angles([0, 0], [0.0, 0.1]), "sample 1 .* not later"),
+        (lambda: Encoder.from_angles([0, 1], [0.0, np.nan]), "sample 1 is nan"),
+        (lambda: Encoder.from_angles([0, 1, 2], [0.0, 0.1]), "one length"),
+        (lambda: Encoder.from_angles([0.0, np.inf], [0.0, 0.1]), "not finite"),
+        (lambda: Encoder.from_counts([0, 1], [0, 1], counts_per_turn=0), "counts_per_turn"),
+        (lambda: Encoder.from_counts([0, 1], [0, 1], counts_per_turn=10, direction=2), "direction"),
+        (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[10]), "pulse at 10 us"),
+        (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[]), "no index pulse"),
+        (lambda: Encoder.constant_speed(np.nan, 0, 1), "constant speed"),
+        (lambda: Encoder.constant_speed(1.0, 0, 1).with_clock_offset(np.inf), "clock_offset_us"),
+        (lambda: Encoder(np.arange(3), np.array([0.0, np.inf, 1.0])), "sample 1 has angle inf"),
+        (lambda: Encoder(np.arange(3, dtype=np.int32), np.zeros(3)), "int64"),
+    ],
+)
+def test_refuses(make, message):
+    with pytest.raises(AmiwarpError, match=message):
+        make()
+
+
+def test_arrays_given_are_not_changed():
+    t, angle = np.arange(0, 5000, 1000), wrapped(np.arange(5) * 2.0)
+    before = angle.copy()
+    Encoder.from_angles(t, angle).with_index([1500])
+    np.testing.assert_array_equal(angle, before)
+
+
+def test_csv_of_angles_counts_and_index(tmp_path):
+    t = np.arange(0, 100_000, 1000)
+    path = tmp_path / "angles.csv"
+    rows = "".join(f"{ti},{np.degrees(SPEED * ti) % 360:.6f}\n" for ti in t)
+    path.write_text("# bench 3\nt_us, angle_deg\n" + rows)
+    assert read_encoder_csv(path).rpm == pytest.approx(3000.0, abs=1e-3)
+    assert read_encoder_csv(path, direction=-1).rpm == pytest.approx(-3000.0, abs=1e-3)
+    counts = np.round(50e-6 * t * 2000).astype(int) + 700
+    path.write_text(
+        "index,count,t_us\n"
+        + "".join(f"{int(c % 2000 < 200)},{c % 2000},{ti}\n" for c, ti in zip(counts, t, strict=True))
+    )
+    encoder = read_encoder_csv(path, counts_per_turn=2000)
+    assert encoder.rpm == pytest.approx(3000.0, abs=0.1)
+    # 13 ms lead to the first pulse, and each pulse counts once however long it is high.
+    assert encoder.index_t is not None
+    assert encoder.index_t.tolist() == [13_000, 33_000, 53_000, 73_000, 93_000]
+    np.testing.assert_allclose(encoder.slip(), 0.0, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("t_us,angle_deg\n", "0 samples"),
+        ("t_us,angle\n0,1\n1,2\n", "header"),
+        ("angle_deg\n0\n1\n", "header"),
+        ("t_us,t_us,count\n0,0,1\n1,1,1\n", "header"),
+        ("t_us,angle_deg,count\n0,0,1\n1,1,1\n", "one of"),
+        ("t_us,angle_deg\n0,1\n1,2,3\n", "line 3 is '1,2,3'"),
+        ("t_us,angle_deg\n0,1\n\n1,x\n", "line 4 is '1,x'"),
+        ("t_us,angle_deg\n0,1\n1,nan\n", "line 3 is '1,nan'"),
+        ("t_us,angle_deg\n0,1\n1e300,2\n", "line 3"),
+        ("t_us,angle_deg\n0,1\n0,2\n", "line 3: t_us is not later"),
+        ("t_us,count\n0,1\n1,2\n", "counts_per_turn"),
+        ("t_us,angle_deg,index\n0,1,0\n1,2,7\n", "line 3: index"),
+        ("t_us,angle_deg\n\udcff,1\n", "reading the encoder"),
+    ],
+)
+def test_csv_refuses(tmp_path, text, message):
+    path = tmp_path / "bad.csv"
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(AmiwarpError, match=message) as caught:
+        read_encoder_csv(path)
+    assert "bad.csv" in str(caught.value)
+
+
+def test_csv_missing(tmp_path):
+    with pytest.raises(AmiwarpError, match="no such file"):
+        read_encoder_csv(tmp_path / "none.csv")

@@ -1,0 +1,331 @@
+"""The native recording: written and read back, lazily, by time and index, whole or not at all."""
+
+import itertools
+import math
+import os
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from amiwarp.camera import Camera, Fisheye, RadialTangential
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, EventSource, MemoryEvents, Recording, Truth
+from amiwarp.io import RecordingWriter, open_recording, save_recording
+from amiwarp.io.native_writer import CHUNK
+from amiwarp.optics import FlatSide, Prism
+
+SIZE = (320, 240)
+
+
+def make(count: int, seed: int = 0, start: int = 5_000_000, mean_us: int = 3) -> Events:
+    rng = np.random.default_rng(seed)
+    t = start + np.cumsum(rng.integers(0, 2 * mean_us + 1, count))
+    return Events.from_arrays(
+        rng.integers(0, SIZE[0], count), rng.integers(0, SIZE[1], count), t, rng.integers(0, 2, count)
+    )
+
+
+def write(path: Path, events: Events, **options) -> Path:
+    with RecordingWriter(path, width=SIZE[0], height=SIZE[1], **options) as writer:
+        writer.append(events)
+    return path
+
+
+def assert_equal(given_events: Events, expected: Events) -> None:
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(given_events, name), getattr(expected, name), err_msg=name, strict=True)
+
+
+def assert_nothing_left(folder: Path) -> None:
+    assert sorted(os.listdir(folder)) == []
+
+
+@pytest.mark.parametrize(
+    "distortion", [None, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01), Fisheye(0.1, 0.2, 0.3, 0.4)]
+)
+def test_everything_comes_back(tmp_path, distortion):
+    events = make(3 * CHUNK + 17)
+    points = np.random.default_rng(1).normal(size=(len(events), 2)).astype(np.float32)
+    recording = Recording(
+        events=MemoryEvents(events, *SIZE),
+        camera=Camera(*SIZE, 200.5, 201.5, 150.25, 110.75, distortion),
+        encoder=Encoder.constant_speed(3000.0, 4_999_000, events.t[-1])
+        .with_index([5_000_123])
+        .with_clock_offset(-12.5),
+        prism=Prism(math.radians(2.0), 1.52, flat_side=FlatSide.CAMERA),
+        truth=Truth({"apex": 0.0351, "phase": -1.25}, points),
+        metadata={"seed": 7, "rate": 0.5, "made": True, "scene": "checkerboard"},
+        name="whole",
+    )
+    save_recording(tmp_path / "whole.h5", recording)
+    back = open_recording(tmp_path / "whole.h5")
+    assert isinstance(back.events, EventSource)
+    assert_equal(back.events.slice(0, len(events)), events)
+    assert (back.camera, back.prism, back.name) == (recording.camera, recording.prism, "whole")
+    assert back.metadata == {**recording.metadata, "format": "native"}
+    assert back.encoder is not None
+    assert back.encoder.clock_offset_us == -12.5
+    for name in ("t", "angle", "index_t"):
+        np.testing.assert_array_equal(getattr(back.encoder, name), getattr(recording.encoder, name))
+    assert back.truth is not None
+    assert back.truth.parameters == recording.truth.parameters
+    np.testing.assert_array_equal(back.truth.points(70_000, 70_010), points[70_000:70_010], strict=True)
+    assert sorted(os.listdir(tmp_path)) == ["whole.h5"]
+
+
+def test_only_events_are_needed(tmp_path):
+    back = open_recording(write(tmp_path / "bare.h5", make(10)))
+    assert (back.camera, back.encoder, back.prism, back.truth) == (None, None, None, None)
+    assert back.metadata == {"format": "native"}
+    assert back.events.size == SIZE
+
+
+@given(
+    st.integers(0, 400),
+    st.lists(st.integers(0, 400), max_size=4),
+    st.sampled_from([0, 1, 300, 40_000]),
+    st.integers(-(10**15), 10**15),
+    st.integers(0, 2**32),
+)
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_slices_by_time_and_index_are_those_of_memory(tmp_path, count, edges, mean_us, start, seed):
+    events = make(count, seed, start, mean_us)
+    path = tmp_path / f"{count}-{seed}-{start}-{mean_us}-{len(edges)}.h5"
+    places = [0, *sorted(min(edge, count) for edge in edges), count]
+    with RecordingWriter(path, width=SIZE[0], height=SIZE[1]) as writer:
+        for a, b in itertools.pairwise(places):
+            writer.append(events[a:b])
+    source, memory = open_recording(path).events, MemoryEvents(events, *SIZE)
+    assert len(source) == count
+    rng = np.random.default_rng(seed)
+    for _ in range(6 if count else 0):
+        low, high = sorted(rng.integers(start - 2000, int(events.t[-1]) + 2000, 2).tolist())
+        assert_equal(source.between(low, high), memory.between(low, high))
+        at = int(events.t[rng.integers(count)])
+        assert_equal(source.between(at, at + 1), memory.between(at, at + 1))
+    assert_equal(source.slice(3, 50), memory.slice(3, 50))
+    for options in ({"count": 37}, {"duration_us": 1 + 60 * mean_us}, {}):
+        for got, expected in zip(source.blocks(**options), memory.blocks(**options), strict=True):
+            assert_equal(got, expected)
+    with h5py.File(path) as file:
+        index, t = file["ms_to_idx"][:], file["events/t"][:]
+        np.testing.assert_array_equal(index, np.searchsorted(t, 1000 * np.arange(index.size)))
+        assert index[-1] == count
+    del source
+    path.unlink()
+
+
+def test_without_the_millisecond_index_bisection_finds_times(tmp_path):
+    events = make(20_000)
+    path = write(tmp_path / "a.h5", events)
+    with h5py.File(path, "r+") as file:
+        del file["ms_to_idx"]
+    source, memory = open_recording(path).events, MemoryEvents(events, *SIZE)
+    for low in (0, 5_000_001, 5_012_345, 5_050_000, 6_000_000):
+        assert_equal(source.between(low, low + 7777), memory.between(low, low + 7777))
+
+
+def test_plain_dsec_file(tmp_path):
+    events = make(5000)
+    path = tmp_path / "events.h5"
+    with h5py.File(path, "w") as file:
+        for name, kind in (("x", "u2"), ("y", "u2"), ("t", "u4"), ("p", "u1")):
+            values = getattr(events, name) - (5_000_000 if name == "t" else 0)
+            file.create_dataset(f"events/{name}", data=values.astype(kind), chunks=(512,), compression="gzip")
+        file["t_offset"] = np.int64(5_000_000)
+        relative = events.t - 5_000_000
+        file["ms_to_idx"] = np.searchsorted(relative, 1000 * np.arange(relative[-1] // 1000 + 1)).astype(np.uint64)
+    back = open_recording(path)
+    assert back.metadata == {"format": "dsec"}
+    assert back.events.size == (640, 480)
+    assert_equal(back.events.slice(0, 5000), events)
+    memory = MemoryEvents(events, *SIZE)
+    for low in range(5_000_000, int(events.t[-1]) + 2000, 777):
+        assert_equal(back.events.between(low, low + 1500), memory.between(low, low + 1500))
+
+
+def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
+    sensor = make(2000)
+    x = sensor.x.astype(np.float32) - 20.25
+    x[5] = np.nan
+    inside = np.isfinite(x) & (x >= 0)
+    events = Events(x, sensor.y.astype(np.float32), sensor.t, sensor.p)
+    with RecordingWriter(tmp_path / "c.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        writer.append(events[:700], inside=inside[:700])
+        writer.append(events[700:], inside=inside[700:])
+    recording = open_recording(tmp_path / "c.h5")
+    save_recording(tmp_path / "copy.h5", recording)
+    for source in (recording.events, open_recording(tmp_path / "copy.h5").events):
+        assert_equal(source.slice(0, 2000), events)
+        np.testing.assert_array_equal(source.inside(0, 2000), inside)
+
+
+def test_empty_recording(tmp_path):
+    with RecordingWriter(tmp_path / "none.h5", width=4, height=3):
+        pass
+    source = open_recording(tmp_path / "none.h5").events
+    assert (len(source), list(source.blocks()), len(source.between(0, 10)), len(source.slice(0, 5))) == (0, [], 0, 0)
+    with pytest.raises(AmiwarpError, match="no events"):
+        source.t_last  # noqa: B018
+
+
+def test_encoder_may_come_last(tmp_path):
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        writer.append(make(5))
+        writer.set_encoder(Encoder.constant_speed(60.0, 5_000_000, 5_001_000))
+    assert open_recording(tmp_path / "a.h5").encoder.rpm == pytest.approx(60.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("append", "message"),
+    [
+        (lambda w: w.append(make(5)[::-1]), "event 11 .* earlier"),
+        (lambda w: w.append(make(5, start=1000)), "event 10 .* earlier than the one before"),
+        (lambda w: w.append(Events.from_arrays([320], [0], [9_000_000], [0])), "event 10 .* outside the 320x240 frame"),
+        (lambda w: w.append(make(5, start=6_000_000), inside=np.ones(5)), "those before"),
+        (lambda w: w.append(make(5, start=6_000_000), truth_points=np.zeros((4, 2))), "expected \\(5, 2\\)"),
+        (lambda w: w.append(make(1, start=2**61)), "timestamp is damaged"),
+        (lambda w: 1 / 0, "division"),
+    ],
+)
+def test_failure_leaves_nothing(tmp_path, append, message):
+    with pytest.raises((AmiwarpError, ZeroDivisionError), match=message):  # noqa: PT012, SIM117
+        with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+            writer.append(make(10))
+            append(writer)
+    assert_nothing_left(tmp_path)
+
+
+def test_failure_keeps_the_file_that_was_there(tmp_path):
+    path = write(tmp_path / "a.h5", make(10))
+    before = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt):  # noqa: PT012, SIM117
+        with RecordingWriter(path, width=SIZE[0], height=SIZE[1]) as writer:
+            writer.append(make(99))
+            raise KeyboardInterrupt
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.h5"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"width": 0}, "size 0x240"),
+        ({"camera": Camera(10, 10, 5.0, 5.0, 4.5, 4.5)}, "give both one size"),
+        ({"metadata": {"big": 10**30}}, "a.h5: making the file"),
+        ({"metadata": {"nul": "a\0b"}}, "a.h5: making the file"),
+    ],
+)
+def test_writer_refuses_its_options(tmp_path, options, message):
+    with (
+        pytest.raises(AmiwarpError, match=message),
+        RecordingWriter(tmp_path / "a.h5", **{"width": 320, "height": 240, **options}),
+    ):
+        pass
+    assert_nothing_left(tmp_path)
+
+
+def test_writer_refuses_its_path(tmp_path):
+    path = write(tmp_path / "a.h5", make(10))
+    recording = open_recording(path)
+    (tmp_path / "link.h5").symlink_to(path)
+    for target in (path, tmp_path / "link.h5"):
+        with pytest.raises(AmiwarpError, match="write to another file"):
+            save_recording(target, recording)
+        with pytest.raises(AmiwarpError, match="is being read"):
+            write(target, make(10))
+    with pytest.raises(AmiwarpError, match="is a folder"):
+        write(tmp_path, make(10))
+    with pytest.raises(AmiwarpError, match="does not exist"):
+        write(tmp_path / "no" / "a.h5", make(10))
+    with pytest.raises(AmiwarpError, match="outside the writer's with block"):
+        RecordingWriter(tmp_path / "b.h5", width=1, height=1).append(make(1))
+    del recording
+    write(path, make(20))
+    assert len(open_recording(path).events) == 20
+
+
+def _replace(name: str, values):
+    def edit(file):
+        del file[name]
+        file[name] = values
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda f: f["events"].pop("t"), "events/t"),
+        (lambda f: f.pop("events"), "without a group 'events'"),
+        (_replace("events", np.zeros(3)), "without a group 'events'"),
+        (_replace("events/x", np.zeros(3, np.uint16)), "differ in length"),
+        (_replace("events/x", np.zeros((50, 2), np.uint16)), "one-dimensional"),
+        (_replace("events/p", np.zeros(50)), "dataset 'events/p' is float64"),
+        (_replace("events/t", np.arange(50)[::-1]), "event 1 .* sort by time"),
+        (_replace("events/t", np.full(50, 2**63 - 1, np.uint64)), "beyond int64"),
+        (_replace("events/x", np.full(50, 320, np.uint16)), "event 0 .* outside the 320x240 frame"),
+        (_replace("events/x", np.full(50, np.nan, np.float32)), "differ|both uint16"),
+        (lambda f: f.attrs.modify("format_version", 2), "newer than 1"),
+        (lambda f: f.attrs.create("format_version", "two"), "format_version"),
+        (lambda f: f.attrs.modify("width", -1), "size -1x240"),
+        (lambda f: f.create_group("camera"), "camera has no attribute 'width'"),
+        (lambda f: f.create_group("prism").attrs.update(apex=9.0, index=1.5), "prism apex"),
+        (lambda f: f.create_group("prism").attrs.update(apex=0.1, index=1.5, flat_side="up"), "flat_side 'up'"),
+        (lambda f: f.create_group("encoder"), "encoder/t"),
+        (lambda f: f.update({"encoder/t": [0, 0], "encoder/angle": [0.0, 1.0]}), "sample 1"),
+        (lambda f: f.update({"truth/x": np.zeros(9), "truth/y": np.zeros(9)}), "truth has 9 and 9 points"),
+    ],
+)
+def test_damaged_files_name_the_place(tmp_path, edit, message):
+    path = write(tmp_path / "a.h5", make(50))
+    with h5py.File(path, "r+") as file:
+        edit(file)
+    with pytest.raises(AmiwarpError, match=message) as caught:
+        open_recording(path).events.slice(0, 50)
+    assert "a.h5" in str(caught.value)
+
+
+def test_index_that_disagrees_is_noticed(tmp_path):
+    path = write(tmp_path / "a.h5", make(5000))
+    with h5py.File(path, "r+") as file:
+        file["ms_to_idx"][:] = 17
+    source = open_recording(path).events
+    with pytest.raises(AmiwarpError, match="ms_to_idx disagrees"):
+        source.between(5_003_000, 5_004_000)
+
+
+def test_blosc_parameters_that_would_crash_are_noticed(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for name, kind in (("x", "u2"), ("y", "u2"), ("t", "u4"), ("p", "u1")):
+            # The last number says bytes per chunk: 64 elements would need more.
+            file.create_dataset(f"events/{name}", data=np.zeros(64, kind), chunks=(64,), compression=32001)
+            assert file[f"events/{name}"].id.get_create_plist().get_filter(0)[2][3] == 64 * np.dtype(kind).itemsize
+    raw = bytearray(path.read_bytes())
+    with h5py.File(path) as file:
+        at = file["events/t"].id.get_chunk_info(0).byte_offset
+    raw[at + 4 : at + 8] = (1 << 20).to_bytes(4, "little")
+    path.write_bytes(raw)
+    with pytest.raises(AmiwarpError, match="'events/t' has a damaged chunk"):
+        open_recording(path)
+
+
+def test_example_of_the_documentation(tmp_path, monkeypatch):
+    text = (Path(__file__).parents[1] / "docs" / "recording-format.md").read_text(encoding="utf-8")
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(code) == 1
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code[0], "recording-format.md", "exec"), {})
+    recording = open_recording("recording.h5")
+    assert recording.metadata == {"format": "native"}
+    assert (len(recording.events), recording.events.size) == (100_000, (640, 480))
+    assert recording.encoder is not None
+    assert recording.encoder.covers(recording.events.t_first, recording.events.t_last)
+    assert len(recording.events.between(5_010_000, 5_020_000)) == pytest.approx(10_000, abs=500)

@@ -1,0 +1,334 @@
+"""Every format reads back exactly; what is damaged is repaired and counted, or refused with file and place."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sample
+
+from amiwarp.camera import Camera, RadialTangential
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, EventSource, MemoryEvents
+from amiwarp.io import Format, Summary, convert, detect_format, open_recording, scan
+from amiwarp.optics import Prism
+
+EVENTS = make_events()
+
+REAL = {
+    # file: (events, span [ms] to the digits that are known, size)
+    "evt/evt3_driving_1280x720.raw": (219_596, 8.8, (1280, 720)),
+    "evt/evt2_balls_640x480.raw": (521_252, 95.9, (640, 480)),
+    "aedat/aedat4_dvxplorerlite_320x240.aedat4": (111_954, 590, (320, 240)),
+    "aedat/aedat4_davis346_cars.aedat4": (6_676, 170, (346, 260)),
+    "text/shapes_rotation/events.txt": (20_000, 98.6, (240, 180)),
+    "text/dynamic_rotation/events.txt": (30_000, 21, (240, 180)),
+    "text/slider_depth/events_chunk.txt": (50_000, 170, (240, 180)),
+    "small/ncars.dat": (2_009, 100, (128, 128)),
+}
+
+
+def assert_equal(given: Events, expected: Events) -> None:
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(given, name), getattr(expected, name), err_msg=name, strict=True)
+
+
+def assert_same_source(given: EventSource, expected: EventSource) -> None:
+    assert (len(given), given.t_first, given.t_last) == (len(expected), expected.t_first, expected.t_last)
+    for got, wanted in zip(given.blocks(count=1000), expected.blocks(count=1000), strict=True):
+        assert_equal(got, wanted)
+    for got, wanted in zip(given.blocks(duration_us=700), expected.blocks(duration_us=700), strict=True):
+        assert_equal(got, wanted)
+    middle = (given.t_first + given.t_last) // 2
+    assert_equal(given.between(middle, middle + 1234), expected.between(middle, middle + 1234))
+    assert_equal(given.slice(31, 57), expected.slice(31, 57))
+
+
+@pytest.mark.parametrize("file", REAL)
+def test_real_files_to_the_exact_count(data_dir, tmp_path, file):
+    count, span_ms, size = REAL[file]
+    recording = open_recording(data_dir / file)
+    source = recording.events
+    assert (len(source), source.size) == (count, size)
+    assert (source.t_last - source.t_first) / 1000 == pytest.approx(span_ms, abs=0.6 if span_ms > 99 else 0.06)
+    assert set(recording.metadata) == {"format"}
+    summary = convert(data_dir / file, tmp_path / "out.h5")
+    assert (summary.events, summary.t_first, summary.t_last, summary.repairs) == (
+        count,
+        source.t_first,
+        source.t_last,
+        {},
+    )
+    assert_same_source(open_recording(tmp_path / "out.h5").events, source)
+
+
+def test_real_text_has_its_camera(data_dir):
+    camera = open_recording(data_dir / "text/shapes_rotation/events.txt").camera
+    distortion = RadialTangential(-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0)
+    assert camera == Camera(240, 180, 199.092366542, 198.82882047, 132.192071378, 110.712660011, distortion)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("keep", [True, False])
+def test_every_format_reads_back(tmp_path, monkeypatch, name, keep):
+    if not keep:
+        monkeypatch.setattr(scan, "KEEP", 0)
+    recording = open_recording(write_sample(tmp_path, name, EVENTS))
+    assert recording.events.size == SIZE
+    assert recording.metadata["format"] == WRITERS[name][0]
+    assert recording.name == "sample"
+    assert_same_source(recording.events, MemoryEvents(EVENTS, *SIZE))
+    if name == "text":
+        assert recording.camera == Camera(*SIZE, 200, 201, 150, 110, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_content_decides_not_the_ending(tmp_path, name):
+    path = write_sample(tmp_path, name, EVENTS, ending="bin")
+    assert len(open_recording(path).events) == len(EVENTS)
+    assert open_recording(path, format=detect_format(path).value).metadata["format"] == WRITERS[name][0]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_truncated_files(tmp_path, name):
+    path = write_sample(tmp_path, name, EVENTS)
+    whole = path.read_bytes()
+    for share in (0.0, 0.01, 0.3, 0.6, 0.95):
+        path.write_bytes(whole[: int(share * len(whole))])
+        said = refusal(open_recording, path)
+        if said is not None:
+            assert str(path) in said
+            assert "\n" not in said
+            continue
+        # Whole words are read; the last one may have lost bits that only its place in the file decides.
+        source = open_recording(path).events
+        assert 0 < len(source) < len(EVENTS)
+        assert_equal(source.slice(0, len(source) - 1), EVENTS[: len(source) - 1])
+    assert os.listdir(tmp_path).count(path.name) == 1
+
+
+@pytest.mark.parametrize("ending", ["raw", "dat", "aedat4", "es", "txt", "npz", "h5"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\0" * 5000, b"\xff\xd8\xff\xe0JFIF", os.urandom(16) + b"\xfe" * 99, b"hello\n"]
+)
+def test_garbage_is_refused(tmp_path, ending, content):
+    path = tmp_path / f"garbage.{ending}"
+    path.write_bytes(content)
+    with pytest.raises(AmiwarpError, match=f"garbage.{ending}: (is empty|content is of no known format)"):
+        open_recording(path)
+    for chosen in Format:
+        with pytest.raises(AmiwarpError, match=f"garbage.{ending}"):
+            open_recording(path, format=chosen)
+
+
+def test_paths_and_formats_that_are_none(tmp_path):
+    with pytest.raises(AmiwarpError, match="no such file"):
+        open_recording(tmp_path / "none.raw")
+    with pytest.raises(AmiwarpError, match="is a folder"):
+        open_recording(tmp_path)
+    with pytest.raises(AmiwarpError, match="format 'wav' is not one of hdf5, evt"):
+        open_recording(tmp_path / "none.raw", format="wav")
+    (tmp_path / "old.aedat").write_bytes(b"#!AER-DAT2.0\r\n")
+    with pytest.raises(AmiwarpError, match=r"is AEDAT 2\.0; only AEDAT 4"):
+        open_recording(tmp_path / "old.aedat")
+
+
+def write_lines(path: Path, lines: list[str]) -> Path:
+    path.write_text("".join(line + "\n" for line in lines))
+    return path
+
+
+LINES = [f"{i * 1e-4:.6f} {i % 240} {i % 180} {i % 2}" for i in range(1000)]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("0.03 nan 5 1", "line 301 is '0.03 nan 5 1'"),
+        ("nan 5 5 1", "line 301"),
+        ("0.03 5 5", "line 301"),
+        ("0.03 5 5 1 9", "line 301"),
+        ("0.03 5.5 5 1", "line 301"),
+        ("0.03 5 5 2", "line 301"),
+        ("1e300 5 5 1", "line 301"),
+        ("0.03 1e99 5 1", "line 301"),
+        ("t x y p", "line 301"),
+        ("0.03 5 5 1\xff", "line 301"),
+        ("7" * 5000, "line 301|longer than"),
+    ],
+)
+def test_text_names_the_bad_line(tmp_path, monkeypatch, line, message):
+    monkeypatch.setattr("amiwarp.io.text.READ_BYTES", 1000)
+    path = write_lines(tmp_path / "events.txt", [*LINES[:300], line, *LINES[300:]])
+    with pytest.raises(AmiwarpError, match=f"events.txt: .*{message}"):
+        open_recording(path)
+
+
+def test_text_with_a_size_comments_and_no_last_newline(tmp_path):
+    path = tmp_path / "events.txt"
+    path.write_text("500 400\n# from a bench\n\n" + "\n".join(LINES))
+    source = open_recording(path).events
+    assert (len(source), source.size) == (1000, (500, 400))
+    path.write_text("500 -4\n" + "\n".join(LINES))
+    with pytest.raises(AmiwarpError, match="line 1 '500 -4' is not a size"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("calib", ["1 2 3", "a", "nan 1 1 1 0 0 0 0 0", "-1 1 1 1 0 0 0 0 0", ""])
+def test_bad_calibration_is_named(tmp_path, calib):
+    path = write_lines(tmp_path / "events.txt", LINES)
+    (tmp_path / "calib.txt").write_text(calib)
+    with pytest.raises(AmiwarpError, match=r"calib\.txt"):
+        open_recording(path)
+
+
+def write_unsound(path: Path, name: str, events: Events) -> Path:
+    """DAT, text and npz take events in any order and anywhere; faery's encoders do not."""
+    if name == "dat":
+        words = np.stack([events.t, events.x | (events.y.astype(int) << 14) | (events.p.astype(int) << 28)], axis=1)
+        path.write_bytes(b"% Version 2\n% Width 320\n% Height 240\n\x0c\x08" + words.astype("<u4").tobytes())
+    elif name == "text":
+        write_lines(
+            path,
+            [
+                "320 240",
+                *(
+                    f"{t / 1e6:.6f} {x} {y} {p}"
+                    for t, x, y, p in zip(events.t, events.x, events.y, events.p, strict=True)
+                ),
+            ],
+        )
+    else:
+        np.savez(path, x=events.x, y=events.y, t=events.t, p=events.p, width=320, height=240)
+        os.replace(f"{path}.npz", path) if not path.exists() else None
+    return path
+
+
+@pytest.mark.parametrize("name", ["dat", "text", "npz"])
+def test_few_faults_are_repaired_and_counted(tmp_path, name):
+    t, x = EVENTS.t.copy(), EVENTS.x.copy()
+    t[100], t[400] = t[100] - 5000, t[400] - 40
+    x[50] = 320
+    path = write_unsound(tmp_path / "faults", name, Events(x, EVENTS.y, t, EVENTS.p))
+    recording = open_recording(path)
+    assert recording.metadata["repaired_time_events"] == 2
+    assert recording.metadata["dropped_outside_events"] == 1
+    assert len(recording.events) == len(EVENTS) - 1
+    events = recording.events.slice(0, len(EVENTS))
+    expected = np.delete(np.maximum.accumulate(t), 50)
+    np.testing.assert_array_equal(events.t, expected)
+    summary = convert(path, tmp_path / "out.h5")
+    assert summary.repairs == {"repaired_time_events": 2, "dropped_outside_events": 1}
+    assert open_recording(tmp_path / "out.h5").metadata["repaired_time_events"] == 2
+
+
+@pytest.mark.parametrize("name", ["dat", "text", "npz"])
+def test_many_faults_are_refused(tmp_path, name):
+    path = write_unsound(tmp_path / "backwards", name, Events(EVENTS.x, EVENTS.y, EVENTS.t[::-1].copy(), EVENTS.p))
+    with pytest.raises(AmiwarpError, match=r"backwards: \d+ of 600 events are out of order"):
+        open_recording(path)
+    path = write_unsound(tmp_path / "wide", name, Events(EVENTS.x + np.uint16(100), EVENTS.y, EVENTS.t, EVENTS.p))
+    with pytest.raises(AmiwarpError, match=r"wide: \d+ of 600 events lie outside the frame \(320, 240\)"):
+        open_recording(path)
+
+
+def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch):
+    monkeypatch.setattr("amiwarp.io.prophesee.DEFAULT_BLOCK", 7)
+    t = 3_000_000_000 + np.arange(0, 600) * 15_000_000
+    events = Events(EVENTS.x, EVENTS.y, t, EVENTS.p)
+    path = write_unsound(tmp_path / "long.dat", "dat", events[:0])
+    words = np.stack([t % 2**32, EVENTS.x | (EVENTS.y.astype(np.int64) << 14)], axis=1).astype("<u4")
+    path.write_bytes(path.read_bytes() + words.tobytes() + b"\1\2\3")
+    recording = open_recording(path)
+    np.testing.assert_array_equal(recording.events.slice(0, 600).t, t)
+    assert recording.metadata["truncated_bytes"] == 3
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"t": np.arange(5.0)}, "array t is float64; expected integers"),
+        ({"x": np.full(5, np.nan)}, "array x is float64"),
+        ({"x": np.arange(4)}, "array x has shape"),
+        ({"p": np.zeros((5, 1), int)}, "array p has shape"),
+        ({"t": np.full(5, 2**63, np.uint64)}, "beyond int64"),
+        ({"t": np.array([None] * 5)}, "pickle"),
+        ({"x": np.zeros(0, int), "y": np.zeros(0, int), "t": np.zeros(0, int), "p": np.zeros(0, int)}, "no events"),
+        ({"width": 0}, "size of 0x9"),
+    ],
+)
+def test_npz_refuses(tmp_path, arrays, message):
+    good = {"x": np.arange(5), "y": np.arange(5), "t": np.arange(5), "p": np.zeros(5, int), "width": 9, "height": 9}
+    np.savez(tmp_path / "a.npz", **{**good, **arrays})
+    with pytest.raises(AmiwarpError, match=f"a.npz.*{message}"):
+        open_recording(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", x=np.arange(5), t=np.arange(5))
+    with pytest.raises(AmiwarpError, match="no array y, p"):
+        open_recording(tmp_path / "b.npz")
+
+
+def test_evt_headers(tmp_path):
+    path = tmp_path / "a.raw"
+    write_evt("evt2", dimensions=(1280, 720))(path, EVENTS)
+    body = path.read_bytes()[path.read_bytes().rindex(b"% ") :]
+    body = body[body.index(b"\n") + 1 :]
+    for header, size in (
+        (b"% evt 2.0\n% geometry 400x300\n", (400, 300)),
+        (b"% evt 2.0\n% plugin_name hal_plugin_gen41_evk3\n", (1280, 720)),
+        (b"% evt 2.0\n% plugin_name hal_plugin_gen3_fx3\n", (640, 480)),
+        (b"% evt 2.0\n", (320, 240)),
+    ):
+        path.write_bytes(header + body + b"\1")
+        recording = open_recording(path)
+        assert (recording.events.size, recording.metadata["truncated_bytes"]) == (size, 1)
+        assert_equal(recording.events.slice(0, 999), EVENTS)
+    for header, message in ((b"% evt 9.0\n", "no EVT version"), (b"% evt 2.0\n% geometry 10x10\n", "after|before")):
+        path.write_bytes(header + body)
+        with pytest.raises(AmiwarpError, match=f"a.raw: .*{message}"):
+            open_recording(path)
+
+
+def test_convert_puts_in_encoder_camera_and_prism(tmp_path):
+    path = write_unsound(tmp_path / "events.npz", "npz", EVENTS)
+    np.savez(path, x=EVENTS.x % 200, y=EVENTS.y % 150, t=EVENTS.t, p=EVENTS.p)
+    t = np.arange(990_000, 1_020_000, 100)
+    t = t[(t < 1_002_000) | (t > 1_004_000)]
+    encoder = Encoder.from_counts(t, np.round(t * 0.02) % 400, counts_per_turn=400, index_t_us=[1_000_000])
+    camera, prism = Camera(*SIZE, 200.0, 200.0, 150.0, 110.0), Prism(0.03)
+    seen: list[tuple[int, int | None]] = []
+    summary = convert(
+        path, tmp_path / "out.h5", encoder=encoder, camera=camera, prism=prism, progress=lambda *a: seen.append(a)
+    )
+    back = open_recording(tmp_path / "out.h5")
+    assert (back.camera, back.prism, back.events.size) == (camera, prism, SIZE)
+    assert back.metadata == {"source_name": "events", "source_format": "npz", "format": "native"}
+    assert seen == [(600, 600)]
+    assert summary == Summary(
+        events=600,
+        t_first=int(EVENTS.t[0]),
+        t_last=int(EVENTS.t[-1]),
+        width=320,
+        height=240,
+        repairs={},
+        encoder_covers=True,
+        encoder_gaps=((1_001_900, 1_004_100),),
+        index_slip=summary.index_slip,
+    )
+    assert summary.index_slip == pytest.approx(0.0, abs=1e-9)
+    again = convert(tmp_path / "out.h5", tmp_path / "again.h5")
+    assert again == summary
+    assert open_recording(tmp_path / "again.h5").encoder.index_t.tolist() == [1_000_000]
+
+
+def test_convert_refuses(tmp_path):
+    path = write_sample(tmp_path, "npz", EVENTS)
+    (tmp_path / "link").symlink_to(path)
+    before = path.read_bytes()
+    for target in (path, tmp_path / "link"):
+        with pytest.raises(AmiwarpError, match="is the input"):
+            convert(path, target)
+    with pytest.raises(AmiwarpError, match="give both one size"):
+        convert(path, tmp_path / "out.h5", camera=Camera(10, 10, 5.0, 5.0, 4.5, 4.5))
+    assert path.read_bytes() == before
+    assert sorted(os.listdir(tmp_path)) == ["link", "sample.npz"]
