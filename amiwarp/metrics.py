@@ -22,8 +22,8 @@ ACROSS = 3.0
 """Half width of the strip about an edge whose events are counted to it [px]."""
 RIDGE_SCALE = 1.0
 """Standard deviation of the derivatives that find edges [px]."""
-STRONGEST = 0.3
-"""Share of the edge pixels, the strongest, that are measured."""
+WEAKEST = 0.3
+"""Edges weaker than this share of the strong ones (the 95th percentile) are left out: noise has ridges too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Edges:
 def find_edges(image: NDArray[np.float32]) -> Edges:
     """Ridges of an image of events: where the second derivative across is most negative and the first one vanishes.
 
-    Steger, "An unbiased detector of curvilinear structures", PAMI 1998. Only the strongest :data:`STRONGEST` of them.
+    Steger, "An unbiased detector of curvilinear structures", PAMI 1998. Those under :data:`WEAKEST` are left out.
     Raises :class:`AmiwarpError` where the image has none.
     """
 
@@ -61,7 +61,7 @@ def find_edges(image: NDArray[np.float32]) -> Edges:
     ridge = (across < 0.0) & (np.abs(offset) <= 0.6) & (np.abs(along) < 0.5 * np.abs(across))
     if not ridge.any():
         raise AmiwarpError("the image of events has no edges to measure blur at")
-    ridge &= across <= np.quantile(across[ridge], STRONGEST)
+    ridge &= across <= WEAKEST * np.quantile(across[ridge], 0.05)
     rows, cols = np.nonzero(ridge)
     points = np.stack([cols + offset[ridge] * nx[ridge], rows + offset[ridge] * ny[ridge]], axis=1)
     nearest = ndimage.distance_transform_edt(~ridge, return_distances=False, return_indices=True)
@@ -75,39 +75,59 @@ def edge_blur(
 ) -> float:
     """Standard deviation of events across edges [px], the paper's compensation error.
 
-    Edges are found in the IWE of ``sharp_xy`` (n, 2), and each event within :data:`ACROSS` px of one belongs to it.
+    Edges are found in the IWE of ``sharp_xy`` (n, 2), and each event within :data:`ACROSS` px of one belongs to it, with
+    the probability that it is not of the even background that noise and neighbouring texture lay over the edge.
     Measured are the same events at ``of`` (n, 2), by default at ``sharp_xy`` itself: give the raw places there to
-    learn the blur before compensation. With ``of`` left out the value cannot exceed ``ACROSS / sqrt(3)``, the
-    spread of events strewn evenly. Pixel quantisation alone leaves 0.29 px.
+    learn the blur before compensation. Pixel quantisation alone leaves 0.29 px.
+    Raises :class:`AmiwarpError` where there are no edges.
     """
+    edges = find_edges(_image(sharp_xy, width, height))
+    with np.errstate(invalid="ignore"):
+        pixel = np.rint(sharp_xy)
+        inside = ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
+    sharp = sharp_xy[inside].astype(np.float64)
+    cols, rows = pixel[inside].astype(np.int64).T
+    label = edges.label[rows, cols]
+    normal = edges.normal[label]
+    away = sharp - edges.xy[label]
+    across = np.sum(away * normal, axis=1)
+    along = away[:, 0] * normal[:, 1] - away[:, 1] * normal[:, 0]
+    near = (np.abs(across) < ACROSS) & (np.abs(along) <= 1.0)
+    moved = across if of is None else np.sum((np.asarray(of, np.float64)[inside] - edges.xy[label]) * normal, axis=1)
+    near &= np.isfinite(moved)
+    weight = _belonging(across[near])
+    if not weight.sum() > 0.0:
+        raise AmiwarpError("no event lies near an edge")
+    mean = np.average(moved[near], weights=weight)
+    return float(np.sqrt(np.average((moved[near] - mean) ** 2, weights=weight)))
+
+
+def _image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     import warp as wp
 
     from amiwarp.iwe import PIECE, CanvasShape, Votes
 
-    points = np.ascontiguousarray(sharp_xy, dtype=np.float32)
     votes = Votes(CanvasShape(width, height), "cpu")
-    for start in range(0, len(points), PIECE):
-        piece = points[start : start + PIECE]
+    for start in range(0, len(xy), PIECE):
+        piece = np.ascontiguousarray(xy[start : start + PIECE], dtype=np.float32)
         votes.add_points(
             wp.array(piece, dtype=wp.vec2, device="cpu"), wp.zeros(len(piece), dtype=wp.uint8, device="cpu")
         )
-    edges = find_edges(votes.take()[0])
-    with np.errstate(invalid="ignore"):
-        inside = np.isfinite(points).all(axis=1) & (np.rint(points) >= 0).all(axis=1)
-        inside &= (np.rint(points) < (width, height)).all(axis=1)
-    sharp = points[inside].astype(np.float64)
-    moved = sharp if of is None else np.asarray(of, dtype=np.float64)[inside]
-    cols, rows = np.rint(sharp).astype(np.int64).T
-    label = edges.label[rows, cols]
-    normal = edges.normal[label]
-    away = sharp - edges.xy[label]
-    near = np.abs(np.sum(away * normal, axis=1)) <= ACROSS
-    near &= np.abs(away[:, 0] * normal[:, 1] - away[:, 1] * normal[:, 0]) <= 1.0
-    across = np.sum((moved - edges.xy[label]) * normal, axis=1)[near]
-    across = across[np.isfinite(across)]
-    if not len(across):
-        raise AmiwarpError("no event lies near an edge")
-    return float(across.std())
+    return votes.take()[0]
+
+
+def _belonging(across: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Probability of each event, by its distance across the edge, not to be of the even background.
+
+    The density over all edges is counted in bins of 0.1 px; the background is its level in the outermost sixth.
+    """
+    bins = np.clip(((across + ACROSS) * 10.0).astype(np.int64), 0, round(20 * ACROSS) - 1)
+    density = np.bincount(bins, minlength=round(20 * ACROSS)).astype(np.float64)
+    margin = len(density) // 12
+    background = np.concatenate([density[:margin], density[-margin:]]).mean()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(density > 0.0, np.maximum(0.0, 1.0 - background / density), 0.0)
+    return np.asarray(share[bins])
 
 
 def truth_model(camera: Camera, truth: Truth, flat_side: FlatSide) -> ExactModel:

@@ -1,10 +1,18 @@
 """Shared fixtures: the device, and the real recordings where there are any."""
 
+import math
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import warp as wp
+
+from amiwarp.camera import Camera
+from amiwarp.events import Recording
+from amiwarp.motion import PrismMotion
+from amiwarp.optics import Prism
+from amiwarp.simulate import simulate
 
 wp.config.quiet = True
 wp.init()
@@ -26,3 +34,30 @@ def data_dir() -> Path:
     if not (folder / "README.md").is_file():
         pytest.skip(f"no real recordings at {folder}; set AMIWARP_TEST_DATA")
     return folder
+
+
+@pytest.fixture(scope="session")
+def texture() -> np.ndarray:
+    """A picture with edges in every direction: overlapping discs of random brightness, seeded; 240 × 320, 8 bit."""
+    rng = np.random.default_rng(7)
+    rows, columns = np.mgrid[:240, :320]
+    picture = np.full((240, 320), 90, dtype=np.uint8)
+    for _ in range(120):
+        x, y, radius = rng.uniform(0, 320), rng.uniform(0, 240), rng.uniform(6, 30)
+        picture[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = rng.integers(20, 250)
+    return picture
+
+
+TRUE_PRISM = Prism(math.radians(2.2), 1.52)
+NOMINAL_PRISM = Prism(math.radians(2.6), 1.52)
+TRUE_PHASE = 2.0
+
+
+@pytest.fixture(scope="session")
+def recording(texture: np.ndarray) -> Recording:
+    """Three turns in front of the texture, 200 × 150, noise on; the nominal apex is not the true one."""
+    camera = Camera.from_fov(200, 150, math.radians(50.0))
+    return simulate(
+        texture, camera, TRUE_PRISM, duration_s=0.25, motion=PrismMotion(720.0, phase=TRUE_PHASE),
+        nominal_prism=NOMINAL_PRISM, seed=3,
+    )  # fmt: skip

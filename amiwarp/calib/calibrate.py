@@ -136,7 +136,7 @@ def _camera(recording: Recording) -> Camera:
 
 def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], tuple[str, ...]]:
     """The recording's encoder; or constant speeds found in the events, both ways round. And what is to be free."""
-    free = settings.free or (size_name(settings.model), "phase")
+    free = (size_name(settings.model), "phase") if settings.free is None else settings.free
     if recording.encoder is not None:
         if "rpm" in free:
             raise AmiwarpError(f"{recording.name}: rpm cannot be free, the encoder gives it; free clock_offset instead")
@@ -204,10 +204,17 @@ class _Search:
         self.stages: list[StageSummary] = []
         self.fine = self._objective(material, 1.0, settings.smoothing_px)
 
-    def _objective(self, m: Material, scale: float, smoothing: float) -> Objective:
+    def _parts(self, kind: Sharpness) -> list[Objective]:
+        smoothing = max(1.0, self.settings.smoothing_px)
+        return [self._objective(self.material.every(PARTS, k), 1.0, smoothing, kind) for k in range(PARTS)]
+
+    def _objective(self, m: Material, scale: float, smoothing: float, kind: Sharpness | None = None) -> Objective:
         s = self.settings
+        kind = kind or s.sharpness
+        if kind is Sharpness.PAPER_J:
+            smoothing = 0.0  # the tails of a Gaussian are pixels with h > 0, each of which J would count
         return Objective(
-            self.space, m.events, m.theta, m.slope, kind=s.sharpness, smoothing=smoothing, scale=scale,
+            self.space, m.events, m.theta, m.slope, kind=kind, smoothing=smoothing, scale=scale,
             per_polarity=s.per_polarity, device=self.device,
         )  # fmt: skip
 
@@ -262,13 +269,12 @@ class _Search:
     def judge(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Refuses what chance could have made; returns warnings and standard deviations."""
         best = self.best
-        parts = [
-            self._objective(self.material.every(PARTS, k), 1.0, max(1.0, self.settings.smoothing_px))
-            for k in range(PARTS)
-        ]
+        parts = self._parts(self.settings.sharpness)
+        # by variance, whatever the cost: the paper's J may like an image without motion best
+        plain = parts if self.settings.sharpness is Sharpness.VARIANCE else self._parts(Sharpness.VARIANCE)
         turned = {**best, "phase": best["phase"] + math.pi}
         checks.check_texture(
-            np.array([p.values(best) for p in parts]), np.array([p.values(turned) for p in parts]), name
+            np.array([p.values(best) for p in plain]), np.array([p.values(turned) for p in plain]), name
         )
         pad = (self.fine.image(best).shape[2] - self.space.camera.width) // 2
         checks.check_directions(self.fine.image(best).sum(axis=0)[pad:-pad, pad:-pad], name)

@@ -106,7 +106,7 @@ class Space:
 
     def drift(self, values: Mapping[str, float]) -> float:
         """Distance of the drifting parameter, if one is free, from its start."""
-        return sum(values[n] - self.start[n] for n in self.names if n in DRIFTS)
+        return float(sum(values[n] - self.start[n] for n in self.names if n in DRIFTS))
 
 
 def size_name(model: str) -> str:

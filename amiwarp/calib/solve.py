@@ -96,13 +96,21 @@ def maximise(
     check_algorithm(algorithm, names)
     points: list[NDArray[np.float64]] = []
     scores: list[float] = []
+    failure: list[BaseException] = []
 
     def cost(x: NDArray[np.float64], _gradient: Any) -> float:
-        if len(scores) >= evaluations:  # some algorithms of NLopt overrun their budget
-            raise nlopt.ForcedStop
-        value = score(x)
-        if not math.isfinite(value):
-            raise AmiwarpError(f"sharpness is {value} at {x} px; check camera and prism")
+        # NLopt's C code may go on calling after an exception, so none is let through: it is kept, and NLopt stopped.
+        if failure or len(scores) >= evaluations:  # some algorithms overrun their budget
+            optimiser.force_stop()
+            return -min(scores, default=0.0)
+        try:
+            value = score(x)
+            if not math.isfinite(value):
+                raise AmiwarpError(f"sharpness is {value} at {x} px; check camera and prism")
+        except BaseException as error:
+            failure.append(error)
+            optimiser.force_stop()
+            return 0.0
         points.append(x.copy())
         scores.append(value)
         return -value
@@ -119,9 +127,9 @@ def maximise(
     except nlopt.ForcedStop:
         ended = "budget"
     except (RuntimeError, ValueError) as error:
-        if isinstance(error, AmiwarpError):
-            raise
         raise AmiwarpError(f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm") from error
+    if failure:
+        raise failure[0]
     best = int(np.argmax(scores))
     return Stage(algorithm, points[best], scores[best], len(scores), time.perf_counter() - began, ended,
                  np.array(points), np.array(scores))  # fmt: skip

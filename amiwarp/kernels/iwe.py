@@ -127,9 +127,9 @@ def smooth_along_x(
     i = start + wp.tid()
     col = i % width
     radius = weights.shape[0] - 1
-    total = 0.0
+    total = float(0.0)
     for k in range(wp.max(-radius, -col), wp.min(radius, width - 1 - col) + 1):
-        votes = 0
+        votes = int(0)
         for s in range(slices.shape[0]):
             votes += slices[s, i + k]
         total += weights[wp.abs(k)] * float(votes)
@@ -148,7 +148,7 @@ def smooth_along_y(
     i = start + wp.tid()
     row = (i / width) % height
     radius = weights.shape[0] - 1
-    total = 0.0
+    total = float(0.0)
     for k in range(wp.max(-radius, -row), wp.min(radius, height - 1 - row) + 1):
         total += weights[wp.abs(k)] * image[i + k * width]
     out[i] = total

@@ -1,0 +1,79 @@
+"""Blur on edges whose spread is known, and the model error on models whose distance is known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from amiwarp.camera import Camera
+from amiwarp.errors import AmiwarpError
+from amiwarp.metrics import edge_blur, find_edges, model_error
+from amiwarp.optics import ExactModel, Prism
+
+
+def circle_events(sigma: float, noise: int = 0, seed: int = 0) -> np.ndarray:
+    """Events about a circle of radius 40 px, normally spread across it."""
+    rng = np.random.default_rng(seed)
+    n = 200_000
+    angle, radius = rng.uniform(0, math.tau, n), 40 + rng.normal(0, sigma, n)
+    xy = np.stack([64 + radius * np.cos(angle), 64 + radius * np.sin(angle)], axis=1)
+    return np.concatenate([xy, rng.uniform(0, 128, (noise, 2))]).astype(np.float32)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.6, 0.9])
+def test_blur_is_the_spread_across_the_edge(sigma: float) -> None:
+    assert edge_blur(circle_events(sigma), 128, 128) == pytest.approx(sigma, abs=0.06)
+
+
+def test_an_even_background_does_not_count() -> None:
+    """Strewn noise puts 40 % as many events as the edge's own into its strip."""
+    noisy = edge_blur(circle_events(0.6, noise=800_000), 128, 128)
+    assert noisy == pytest.approx(0.6, abs=0.12)
+
+
+def test_blur_of_other_places_of_the_same_events() -> None:
+    sharp = circle_events(0.4)
+    direction = np.random.default_rng(1).uniform(0, math.tau, len(sharp))
+    orbit = np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    raw = sharp + 5.0 * orbit.astype(np.float32)
+    expected = math.hypot(0.4, 5.0 / math.sqrt(2.0))
+    assert edge_blur(sharp, 128, 128, of=raw) == pytest.approx(expected, abs=0.1)
+
+
+def test_nan_and_outside_are_left_out() -> None:
+    sharp = circle_events(0.4)
+    marked = np.concatenate([sharp, np.full((50, 2), np.nan, np.float32), np.full((50, 2), -9.0, np.float32)])
+    assert edge_blur(marked, 128, 128) == pytest.approx(edge_blur(sharp, 128, 128), abs=1e-6)
+
+
+def test_edges_are_sub_pixel_and_normal() -> None:
+    rows, columns = np.mgrid[:60, :80]
+    line = (columns - 40.3) * math.cos(0.5) + (rows - 30) * math.sin(0.5)
+    edges = find_edges((100 * np.exp(-(line**2) / 2)).astype(np.float32))
+    inner = ((edges.xy > 8) & (edges.xy < (72, 52))).all(axis=1)
+    away = (edges.xy[inner, 0] - 40.3) * math.cos(0.5) + (edges.xy[inner, 1] - 30) * math.sin(0.5)
+    np.testing.assert_allclose(away, 0.0, rtol=0, atol=0.05)  # px
+    cosine = np.abs(edges.normal[inner] @ (math.cos(0.5), math.sin(0.5)))
+    np.testing.assert_allclose(cosine, 1.0, rtol=0, atol=0.01)
+
+
+def test_no_edges_is_an_error() -> None:
+    with pytest.raises(AmiwarpError, match="no edges"):
+        find_edges(np.zeros((20, 20), dtype=np.float32))
+
+
+def test_model_error_takes_the_lag_off() -> None:
+    camera = Camera.from_fov(320, 240, math.radians(60))
+    truth = ExactModel(camera, Prism(math.radians(2)), 0.5)
+    lagging = ExactModel(camera, Prism(math.radians(2)), 0.62)
+    error = model_error(lagging, truth)
+    assert error.rms < 2e-3
+    assert error.lag == pytest.approx(0.12, abs=1e-3)
+
+
+def test_model_error_is_the_difference_in_radius() -> None:
+    camera = Camera.from_fov(320, 240, math.radians(20))
+    truth, larger = (ExactModel(camera, Prism(math.radians(a))) for a in (2.0, 2.2))
+    xy = np.array([[159.5, 119.5]])
+    radius = [np.linalg.norm(m.compensate_points(xy, np.zeros(1)) - xy) for m in (truth, larger)]
+    assert model_error(larger, truth).rms == pytest.approx(radius[1] - radius[0], rel=0.03)
