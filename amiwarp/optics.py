@@ -40,7 +40,7 @@ class Prism:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.apex < math.radians(30.0):
-            raise AmiwarpError(f"prism apex {math.degrees(self.apex):.6g} deg is not in [0, 30); is it given in degrees?")
+            raise AmiwarpError(f"prism apex {self.apex:.6g} rad is not in [0, 0.52), 30 deg; is it given in degrees?")
         if not 1.0 < self.index < 4.0:
             raise AmiwarpError(f"prism index {self.index:.6g} is not between 1 and 4; N-BK7 has 1.5168")
 
@@ -61,7 +61,10 @@ def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSi
 
 
 def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
-    """Apex [rad] that deflects the camera's axial ray by ``deflection`` [rad]; inverse of :func:`deflection_from_apex`."""
+    """Apex [rad] that deflects the camera's axial ray by ``deflection`` [rad].
+
+    The inverse of :func:`deflection_from_apex`.
+    """
     if flat_side is FlatSide.SCENE:
         return math.atan2(math.sin(deflection), math.sqrt(index**2 - math.sin(deflection) ** 2) - 1.0)
     return math.atan2(math.sin(deflection), index - math.cos(deflection))
@@ -99,8 +102,10 @@ def _run(kernel_name: str, model: _Model, xy: Any, theta: Any) -> Any:
 
     kernel = getattr(kernels, kernel_name)
     if isinstance(xy, wp.array):
-        if xy.dtype is not wp.vec2 or xy.shape != theta.shape:
-            raise AmiwarpError(f"xy has type {xy.dtype} and shape {xy.shape}; give vec2 of theta's shape {theta.shape}")
+        if not isinstance(theta, wp.array) or theta.device != xy.device or theta.dtype is not wp.float32:
+            raise AmiwarpError(f"xy is a Warp array on {xy.device}; give theta as a float32 Warp array there too")
+        if xy.dtype is not wp.vec2 or xy.ndim != 1 or xy.shape != theta.shape:
+            raise AmiwarpError(f"xy has type {xy.dtype}, shape {xy.shape}, theta {theta.shape}; give vec2, both (n,)")
         out = wp.empty_like(xy)
         launch(kernel, len(xy), [model.params(xy.device), model_camera(model, xy.device), xy, theta], [out],
                device=xy.device)  # fmt: skip
@@ -159,7 +164,11 @@ class CircleModel(_OnDevice):
 
 @dataclass(frozen=True)
 class RadialCircleModel(_OnDevice):
-    """A rotation by an angle that grows off the axis: δ(φ) = δ₀ (√(n² − sin²φ)/cos φ − 1)/(n − 1)."""
+    """A rotation by an angle that grows off the axis: δ(φ) = δ₀ (√(n² − sin²φ)/cos φ − 1)/(n − 1).
+
+    φ is the off-axis angle of the bearing on the side of the tilted face: the observed one with the flat face to the
+    scene, the scene's with the flat face to the camera. Only so is it right to almost second order in the apex.
+    """
 
     FREE: ClassVar[tuple[str, ...]] = ("deflection", "phase")
     camera: Camera
@@ -169,6 +178,12 @@ class RadialCircleModel(_OnDevice):
     """θ_b, added to the encoder's angle [rad]."""
     index: float = 1.5168
     flat_side: FlatSide = FlatSide.SCENE
+
+    def __post_init__(self) -> None:
+        if not self.deflection >= 0.0:
+            raise AmiwarpError(f"deflection {self.deflection} rad is negative; add pi to the phase instead")
+        if not self.index > 1.0:
+            raise AmiwarpError(f"index {self.index} is not above 1; N-BK7 has 1.5168")
 
     @classmethod
     def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> RadialCircleModel:
@@ -223,7 +238,7 @@ def axis_rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
     return about_y @ about_x
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EllipseModel(_OnDevice):
     """Per observed pixel an offset and an oriented ellipse: the displacement's mean and first harmonic.
 
@@ -253,7 +268,8 @@ class EllipseModel(_OnDevice):
         tables = [wp.empty(shape, dtype=wp.vec2, device=device) for _ in range(3)]
         inputs = [replace(model, phase=0.0).params(device), model_camera(model, device)]
         wp.launch(fit_harmonics, dim=shape, inputs=inputs, outputs=tables, device=device)
-        return cls(model.camera, *(t.numpy() for t in tables), phase=model.phase)
+        offset, cosine, sine = (table.numpy() for table in tables)
+        return cls(model.camera, offset, cosine, sine, model.phase)
 
     @classmethod
     def fit(
@@ -267,13 +283,18 @@ class EllipseModel(_OnDevice):
     ) -> EllipseModel:
         """Tables from measured pairs: each of the six fields a polynomial of the pixel, by least squares.
 
-        ``xy`` observed and ``compensated`` [px], shape (n, 2); ``theta`` [rad], shape (n,). The phase is part of the
-        tables. Raises :class:`AmiwarpError` where the pairs do not determine the polynomials.
+        ``xy`` observed and ``compensated`` [px], shape (n, 2), invalid (NaN) pairs are left out; ``theta`` [rad], shape
+        (n,). The phase is part of the tables. Raises :class:`AmiwarpError` where the pairs do not determine the
+        polynomials.
         """
-        basis = _polynomials(camera, np.asarray(xy, dtype=np.float64), degree)
-        theta = np.asarray(theta, dtype=np.float64)[:, None]
-        design = np.hstack([basis, basis * np.cos(theta), basis * np.sin(theta)])
-        solution, _, rank, _ = np.linalg.lstsq(design, np.asarray(compensated) - np.asarray(xy), rcond=None)
+        xy = np.asarray(xy, dtype=np.float64)
+        theta = np.asarray(theta, dtype=np.float64)
+        shift = np.asarray(compensated, dtype=np.float64) - xy
+        valid = np.isfinite(shift).all(axis=1)
+        basis = _polynomials(camera, xy[valid], degree)
+        angle = theta[valid][:, None]
+        design = np.hstack([basis, basis * np.cos(angle), basis * np.sin(angle)])
+        solution, _, rank, _ = np.linalg.lstsq(design, shift[valid], rcond=None)
         if rank < design.shape[1]:
             raise AmiwarpError(
                 f"{len(design)} pairs determine {rank} of {design.shape[1]} coefficients: "
@@ -305,7 +326,7 @@ class EllipseModel(_OnDevice):
 
 def _polynomials(camera: Camera, xy: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     """Products of Chebyshev polynomials of total degree ≤ ``degree``, pixels scaled to [-1, 1]; shape (n, terms)."""
-    scaled = 2.0 * xy / (np.array([camera.width, camera.height]) - 1.0) - 1.0
+    scaled = 2.0 * xy / np.maximum([camera.width - 1.0, camera.height - 1.0], 1.0) - 1.0
     full = np.polynomial.chebyshev.chebvander2d(scaled[:, 0], scaled[:, 1], [degree, degree])
     return cast("NDArray[np.float64]", full.reshape(len(xy), degree + 1, degree + 1)[:, _triangle(degree)])
 
@@ -363,6 +384,7 @@ def predicted_error(model: Model, exact: Model, *, remove_lag: bool = False, gri
     lag = 0.0
     if remove_lag:
         start = min(np.arange(-12, 12) * (np.pi / 12), key=rms)
-        lag = float(minimize_scalar(rms, bounds=(start - 0.3, start + 0.3), method="bounded", options={"xatol": 1e-6}).x)
+        bounds = (start - 0.3, start + 0.3)
+        lag = float(minimize_scalar(rms, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
         lag = lag if rms(lag) < rms(0.0) else 0.0
     return ModelError(rms(lag), float(distance(lag).max()), lag)

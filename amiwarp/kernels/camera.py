@@ -9,6 +9,7 @@ RADIAL_TANGENTIAL = wp.constant(1)
 FISHEYE = wp.constant(2)
 
 NEWTON_STEPS = wp.constant(12)
+RESIDUAL = wp.constant(1.0e-6)  # of a converged inverse, relative to 1 + radius: 1e-3 px at f = 1000 px
 NAN = wp.constant(float("nan"))
 
 
@@ -68,7 +69,7 @@ def undistort_radial_tangential(c: CameraParams, d: wp.vec2) -> wp.vec3:
     for _ in range(NEWTON_STEPS):
         p = p - wp.inverse(jacobian_radial_tangential(c, p)) * (distort_radial_tangential(c, p) - d)
     error = wp.length(distort_radial_tangential(c, p) - d)
-    if not (error < 1.0e-5 * (1.0 + wp.length(d)) and wp.length(p) <= c.limit):
+    if not (error < RESIDUAL * (1.0 + wp.length(d)) and wp.length(p) <= c.limit):
         return invalid_ray()
     return wp.normalize(wp.vec3(p[0], p[1], 1.0))
 
@@ -93,7 +94,7 @@ def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
     angle = wp.min(radius, 0.9 * c.limit)
     for _ in range(NEWTON_STEPS):
         angle = wp.clamp(angle - (fisheye_radius(c, angle) - radius) / fisheye_slope(c, angle), 0.0, c.limit)
-    if not (wp.abs(fisheye_radius(c, angle) - radius) < 1.0e-5 * (1.0 + radius)):
+    if not (wp.abs(fisheye_radius(c, angle) - radius) < RESIDUAL * (1.0 + radius)):
         return invalid_ray()
     s = wp.sin(angle) / radius
     return wp.vec3(s * d[0], s * d[1], wp.cos(angle))
@@ -107,7 +108,8 @@ def solve_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
         return undistort_radial_tangential(c, d)
     if c.kind == FISHEYE:
         return undistort_fisheye(c, d)
-    return wp.normalize(wp.vec3(d[0], d[1], 1.0))
+    ray = wp.vec3(d[0], d[1], 1.0)
+    return ray / wp.length(ray)  # wp.normalize would make a broken pixel's ray zero, not NaN
 
 
 @wp.func
@@ -123,22 +125,29 @@ def pixel_to_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
 
 
 @wp.func
+def distort_fisheye(c: CameraParams, ray: wp.vec3) -> wp.vec2:
+    """OpenCV's fisheye model: bearing to distorted normalised coordinates; invalid past its fold."""
+    r = wp.length(wp.vec2(ray[0], ray[1]))
+    angle = wp.atan2(r, ray[2])
+    if angle > c.limit:
+        return invalid_pixel()
+    if r < 1.0e-8 * ray[2]:
+        return wp.vec2(ray[0], ray[1]) / ray[2]
+    return wp.vec2(ray[0], ray[1]) * (fisheye_radius(c, angle) / r)
+
+
+@wp.func
 def ray_to_pixel(c: CameraParams, ray: wp.vec3) -> wp.vec2:
-    """Unit bearing to pixel. Invalid (NaN): behind the image plane, or past where the distortion folds back."""
-    if not (ray[2] > 1.0e-6):
+    """Bearing to pixel. Invalid (NaN): behind the image plane, or past where the distortion folds back."""
+    if not (ray[2] > 1.0e-6 and wp.isfinite(ray)):
         return invalid_pixel()
     p = wp.vec2(ray[0] / ray[2], ray[1] / ray[2])
+    if c.kind == FISHEYE:
+        p = distort_fisheye(c, ray)
     if c.kind == RADIAL_TANGENTIAL:
         if wp.length(p) > c.limit:
             return invalid_pixel()
         p = distort_radial_tangential(c, p)
-    if c.kind == FISHEYE:
-        r = wp.length(wp.vec2(ray[0], ray[1]))
-        angle = wp.atan2(r, ray[2])
-        if angle > c.limit:
-            return invalid_pixel()
-        if r > 1.0e-8:
-            p = wp.vec2(ray[0], ray[1]) * (fisheye_radius(c, angle) / r)
     return wp.vec2(c.fx * p[0] + c.cx, c.fy * p[1] + c.cy)
 
 
@@ -149,12 +158,12 @@ def fill_rays(c: CameraParams, rays: wp.array2d(dtype=wp.vec3)):
 
 
 @wp.kernel
-def pixels_to_rays(c: CameraParams, xy: wp.array(dtype=wp.vec2), rays: wp.array(dtype=wp.vec3)):
-    i = wp.tid()
+def pixels_to_rays(c: CameraParams, xy: wp.array(dtype=wp.vec2), start: int, rays: wp.array(dtype=wp.vec3)):
+    i = start + wp.tid()
     rays[i] = pixel_to_ray(c, xy[i])
 
 
 @wp.kernel
-def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), xy: wp.array(dtype=wp.vec2)):
-    i = wp.tid()
+def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), start: int, xy: wp.array(dtype=wp.vec2)):
+    i = start + wp.tid()
     xy[i] = ray_to_pixel(c, rays[i])

@@ -24,7 +24,7 @@ class CircleParams:
 
 @wp.struct
 class RadialCircleParams:
-    deflection: float  # on the axis, signed as in CircleParams
+    deflection: float  # on the axis; negative with the flat face to the camera: the sign also says which side
     phase: float
     index: float
 
@@ -87,31 +87,56 @@ def radial_deflection(model: RadialCircleParams, ray: wp.vec3) -> float:
 
 
 @wp.func
+def turn_from_tilted_side(model: RadialCircleParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
+    """From the bearing on the tilted face's side, to which the angle belongs, to the one on the flat face's side."""
+    return rotate_towards(ray, w, wp.abs(radial_deflection(model, ray)))
+
+
+@wp.func
+def turn_from_flat_side(model: RadialCircleParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
+    """The reverse: the angle belongs to the bearing that is sought; a contraction, solved by iteration."""
+    found = ray
+    step = wp.length(ray)
+    for _ in range(INVERSION_STEPS):
+        better = rotate_towards(ray, w, -wp.abs(radial_deflection(model, found)))
+        step = wp.length(better - found)
+        found = better
+        if step < 2.0e-7:  # as near as float32 comes
+            break
+    if not (step < 1.0e-4):
+        return invalid_ray()
+    return found
+
+
+@wp.func
 def compensate(model: RadialCircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
     ray = pixel_to_ray(camera, xy)
-    return ray_to_pixel(camera, rotate_towards(ray, w, radial_deflection(model, ray)))
+    if model.deflection < 0.0:
+        return ray_to_pixel(camera, turn_from_flat_side(model, ray, w))
+    return ray_to_pixel(camera, turn_from_tilted_side(model, ray, w))
 
 
 @wp.func
 def deflect(model: RadialCircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    """The angle belongs to the observed bearing, which is sought: a contraction, solved by iteration."""
-    scene = pixel_to_ray(camera, xy)
-    ray = scene
-    for _ in range(INVERSION_STEPS):
-        ray = rotate_towards(scene, w, -radial_deflection(model, ray))
-    return ray_to_pixel(camera, ray)
+    ray = pixel_to_ray(camera, xy)
+    if model.deflection < 0.0:
+        return ray_to_pixel(camera, turn_from_tilted_side(model, ray, w))
+    return ray_to_pixel(camera, turn_from_flat_side(model, ray, w))
 
 
 # -- exact: both faces in closed form
 
 
 @wp.func
-def lift(x: float, y: float) -> wp.vec3:
-    """Unit bearing from its first two components; invalid past total internal reflection."""
-    z2 = 1.0 - x * x - y * y
+def shift_bearing(ray: wp.vec3, w: wp.vec2, shift: float) -> wp.vec3:
+    """Unit bearing moved by ``shift`` along w; invalid past total internal reflection.
+
+    z² by its change, not as 1 - x² - y²: far off the axis that would cancel in float32.
+    """
+    z2 = ray[2] * ray[2] - shift * (2.0 * (w[0] * ray[0] + w[1] * ray[1]) + shift)
     if not (z2 > 0.0):
         return invalid_ray()
-    return wp.vec3(x, y, wp.sqrt(z2))
+    return wp.vec3(ray[0] + shift * w[0], ray[1] + shift * w[1], wp.sqrt(z2))
 
 
 @wp.func
@@ -121,7 +146,7 @@ def enter_tilted_face(m: ExactParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
     if not (q > 0.0 and ray[2] > 0.0):
         return invalid_ray()
     shift = (wp.sqrt(m.index2 - 1.0 + q * q) - q) * m.sin_apex
-    return lift(ray[0] + shift * w[0], ray[1] + shift * w[1])
+    return shift_bearing(ray, w, shift)
 
 
 @wp.func
@@ -133,7 +158,7 @@ def leave_tilted_face(m: ExactParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
     if not (radicand > 0.0 and ray[2] > 0.0):
         return invalid_ray()
     shift = (q - wp.sqrt(radicand)) * m.sin_apex
-    return lift(ray[0] - shift * w[0], ray[1] - shift * w[1])
+    return shift_bearing(ray, w, -shift)
 
 
 @wp.func
@@ -176,6 +201,8 @@ def lookup(table: wp.array2d(dtype=wp.vec2), xy: wp.vec2) -> wp.vec2:
 
 @wp.func
 def compensate(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    if not (wp.length(xy) < 1.0e9):  # an invalid pixel must not become an index
+        return invalid_pixel()
     col = int(xy[0])
     row = int(xy[1])
     inside = col >= 0 and row >= 0 and col < model.offset.shape[1] and row < model.offset.shape[0]
@@ -188,8 +215,12 @@ def compensate(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.ve
 def deflect(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
     """The tables belong to the observed pixel, which is sought: a contraction, solved by iteration."""
     observed = xy
+    error = wp.vec2(0.0, 0.0)
     for _ in range(INVERSION_STEPS):
-        observed = observed - (compensate(model, camera, observed, w) - xy)
+        error = compensate(model, camera, observed, w) - xy
+        observed = observed - error
+    if not (wp.length(error) < 0.01):
+        return invalid_pixel()
     return observed
 
 

@@ -35,8 +35,10 @@ def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
 
 
 def fold(*k: float, largest: float) -> float:
-    """Radius up to which r(1 + k1 r² + k2 r⁴ + …) grows: the first root of its slope, at most ``largest``."""
-    slope = np.array([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
-    roots = np.roots(slope[::-1]) if np.any(slope[1:]) else np.empty(0)
-    squares = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0)]
-    return float(min(largest, math.sqrt(squares.min()))) if len(squares) else largest
+    """Radius up to which r(1 + k1 r² + k2 r⁴ + …) grows: the first root of its slope, at most ``largest``.
+
+    Solved for 1/r², where the polynomial is monic: a vanishing last coefficient then does no harm.
+    """
+    roots = np.roots([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return min(largest, 1.0 / math.sqrt(real.max())) if len(real) else largest

@@ -1,0 +1,113 @@
+"""Prints the tables of docs/optics.md: what each model costs in pixels, and what float32 costs the exact one.
+
+    python benchmarks/optics_table.py
+
+Needs a checkout: the float32 table compares with the float64 oracle in tests/reference.py.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics import (
+    CircleModel,
+    EllipseModel,
+    ExactModel,
+    FlatSide,
+    ModelError,
+    Prism,
+    RadialCircleModel,
+    apex_from_deflection,
+    predicted_error,
+)
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import reference
+
+INDEX = 1.55
+GRID = 49  # rows of pixels; 36 angles
+LENSES: dict[str, Distortion | None] = {
+    "no lens distortion": None,
+    "radial-tangential": RadialTangential(-0.368, 0.151, -3e-4, -7.6e-4),
+    "fisheye": Fisheye(-0.01, 0.005, -0.002, 0.0003),
+}
+
+
+def fitted_circle(exact: ExactModel) -> ModelError:
+    """The constant deflection of least rms error."""
+    start = CircleModel.from_prism(exact.camera, exact.prism).deflection
+
+    def error(deflection: float) -> ModelError:
+        model = CircleModel(exact.camera, deflection, flat_side=exact.prism.flat_side)
+        return predicted_error(model, exact, grid=GRID)
+
+    best = minimize_scalar(lambda d: error(d).rms, bounds=(0.8 * start, 2.0 * start), options={"xatol": 1e-6}).x
+    return error(float(best))
+
+
+def ladder_rows() -> Iterator[str]:
+    """One row for each field of view, deflection and side: rms/worst error of every rung [px]."""
+    yield "| FOV | δ₀ | flat side | circle, on-axis δ | circle, fitted δ | radial circle | ellipse |"
+    yield "|---|---|---|---|---|---|---|"
+    for fov in (40, 60, 75, 90):
+        camera = Camera.from_fov(640, 480, math.radians(fov))
+        for deflection in (0.5, 1.0, 2.0):
+            for side in FlatSide:
+                prism = Prism(apex_from_deflection(math.radians(deflection), INDEX, side), INDEX, side)
+                exact = ExactModel(camera, prism)
+                rungs = [predicted_error(CircleModel.from_prism(camera, prism), exact, grid=GRID), fitted_circle(exact)]
+                rungs += [predicted_error(m.from_prism(camera, prism), exact, grid=GRID)
+                          for m in (RadialCircleModel, EllipseModel)]  # fmt: skip
+                cells = [f"{e.rms:.2f}/{e.worst:.2f}" for e in rungs[:2]]
+                cells += [f"{e.rms:.3f}/{e.worst:.3f}" for e in rungs[2:]]
+                yield f"| {fov}° | {deflection:g}° | {side.value} | {' | '.join(cells)} |"
+
+
+def lens_camera(width: int, height: int, fov: float, lens: Distortion | None) -> Camera:
+    """A camera whose true horizontal field of view, lens included, is ``fov`` [rad]."""
+    bare = Camera(width, height, 1.0, 1.0, 0.0, 0.0, lens)
+    edge = reference.rays_to_pixels(bare, np.array([[math.sin(fov / 2), 0.0, math.cos(fov / 2)]]))[0, 0]
+    focal = width / (2.0 * float(edge))
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, lens)
+
+
+def rounding(camera: Camera, *, count: int = 20_000) -> tuple[float, float]:
+    """Worst deviation from the oracle and worst round trip [px], apex 4°, either side, with and without tilt."""
+    rng = np.random.default_rng(0)
+    given = rng.uniform(0.0, [camera.width - 1, camera.height - 1], (count, 2)).astype(np.float32)
+    given[::2] = np.round(given[::2])
+    xy, theta = given.astype(np.float64), rng.uniform(-np.pi, np.pi, count)
+    deviation, back = 0.0, 0.0
+    for side in FlatSide:
+        for tilt in ((0.0, 0.0), (0.03, -0.02)):
+            prism = Prism(math.radians(4.0), INDEX, side)
+            model = ExactModel(camera, prism, tilt=tilt)
+            seen = model.compensate_points(xy, theta)
+            for to_scene, got in ((True, seen), (False, model.deflect_points(xy, theta))):
+                expected = reference.move(camera, prism, xy, theta, to_scene=to_scene, tilt=tilt)
+                deviation = max(deviation, float(np.linalg.norm(got - expected, axis=1).max()))
+            back = max(back, float(np.linalg.norm(model.deflect_points(seen, theta) - xy, axis=1).max()))
+    return deviation, back
+
+
+def rounding_rows() -> Iterator[str]:
+    """One row for each sensor and field of view: deviation / round trip [1e-3 px]."""
+    yield f"| sensor | FOV | {' | '.join(LENSES)} |"
+    yield "|---|---|---|---|---|"
+    for width, height in ((346, 260), (640, 480), (1280, 720), (2560, 1440)):
+        for fov in (40, 60, 90):
+            pairs = [rounding(lens_camera(width, height, math.radians(fov), lens)) for lens in LENSES.values()]
+            cells = " | ".join(f"{a * 1e3:.2f} / {b * 1e3:.2f}" for a, b in pairs)
+            yield f"| {width}×{height} | {fov}° | {cells} |"
+
+
+if __name__ == "__main__":
+    for row in (*ladder_rows(), "", *rounding_rows()):
+        print(row, flush=True)

@@ -1,0 +1,211 @@
+"""Independent float64 NumPy oracle: OpenCV's published lens polynomials and a two-interface Snell trace.
+
+Nothing here shares a formula with the package: the prism is traced face by face with the vector form of Snell's law,
+and the lens is inverted by bisection and damped Newton steps instead of the kernels' closed form and plain steps.
+Every function takes and returns float64; a point or ray that does not exist is a row of NaN.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics import FlatSide, Prism
+
+Array = NDArray[np.float64]
+
+
+def polynomial(radius: Array, *k: float) -> Array:
+    """r (1 + k1 r² + k2 r⁴ + …)."""
+    factor = np.ones_like(radius)
+    for i, value in enumerate(k):
+        factor = factor + value * radius ** (2 * i + 2)
+    return radius * factor
+
+
+def monotonic_limit(*k: float, largest: float) -> float:
+    """Largest radius below which r (1 + k1 r² + …) grows, by a scan and bisection of its slope."""
+
+    def slope(r: Array) -> Array:
+        return np.sum([(2 * i + 1) * value * r ** (2 * i) for i, value in enumerate((1.0, *k))], axis=0)
+
+    radii = np.concatenate([np.linspace(0.0, 5.0, 20_001), np.linspace(5.0, 100.0, 10_001)[1:]])
+    falling = np.flatnonzero(slope(radii) <= 0.0)
+    if not len(falling) or radii[falling[0]] > largest:
+        return largest
+    low, high = radii[falling[0] - 1], radii[falling[0]]
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if slope(np.array(middle)) > 0.0 else (low, middle)
+    return float(low)
+
+
+def invert_polynomial(value: Array, *k: float, limit: float) -> Array:
+    """Radius in [0, limit] where the polynomial takes ``value``, by bisection; NaN where it never does."""
+    low, high = np.zeros_like(value), np.full_like(value, limit)
+    for _ in range(56):
+        middle = 0.5 * (low + high)
+        below = polynomial(middle, *k) < value
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.where(value <= polynomial(np.array(limit), *k), 0.5 * (low + high), np.nan)
+
+
+@cache
+def lens_limit(camera: Camera) -> float:
+    """Largest tangent (radial-tangential) or angle [rad] (fisheye) where the lens is one-to-one."""
+    d = camera.distortion
+    if isinstance(d, Fisheye):
+        return monotonic_limit(d.k1, d.k2, d.k3, d.k4, largest=0.999 * np.pi / 2)
+    return monotonic_limit(d.k1, d.k2, d.k3, largest=100.0) if d else np.inf
+
+
+def distort_radial_tangential(d: RadialTangential, p: Array) -> Array:
+    """OpenCV, Camera Calibration and 3D Reconstruction: x'' and y'' from x' and y' (tangents), shape (n, 2)."""
+    x, y = p.T
+    r2 = x**2 + y**2
+    radial = 1.0 + d.k1 * r2 + d.k2 * r2**2 + d.k3 * r2**3
+    return np.stack(
+        [
+            x * radial + 2.0 * d.p1 * x * y + d.p2 * (r2 + 2.0 * x**2),
+            y * radial + d.p1 * (r2 + 2.0 * y**2) + 2.0 * d.p2 * x * y,
+        ],
+        axis=1,
+    )
+
+
+def undistort_radial_tangential(d: RadialTangential, distorted: Array, limit: float) -> Array:
+    """Inverse: the radial part by bisection, then Newton steps, each halved until it helps; shape (n, 2)."""
+    radius = np.linalg.norm(distorted, axis=1)
+    largest = polynomial(np.array(limit), d.k1, d.k2, d.k3)
+    start = invert_polynomial(np.minimum(radius, 0.9999 * largest), d.k1, d.k2, d.k3, limit=limit)
+    p = distorted * (start / np.maximum(radius, 1e-300))[:, None]
+    for _ in range(20):
+        error = distort_radial_tangential(d, p) - distorted
+        jx, jy = (
+            (distort_radial_tangential(d, p + h) - distort_radial_tangential(d, p - h)) / 2e-7 for h in 1e-7 * np.eye(2)
+        )
+        det = jx[:, 0] * jy[:, 1] - jy[:, 0] * jx[:, 1]
+        det = np.where(np.abs(det) < 1e-12, 1e-12, det)
+        step = np.stack(
+            [jy[:, 1] * error[:, 0] - jy[:, 0] * error[:, 1], jx[:, 0] * error[:, 1] - jx[:, 1] * error[:, 0]], axis=1
+        )
+        step /= det[:, None]
+        scale = np.ones(len(p))
+        for _ in range(8):
+            after = np.linalg.norm(distort_radial_tangential(d, p - scale[:, None] * step) - distorted, axis=1)
+            scale = np.where(after <= np.linalg.norm(error, axis=1), scale, 0.5 * scale)
+        p = p - scale[:, None] * step
+    residual = np.linalg.norm(distort_radial_tangential(d, p) - distorted, axis=1)
+    good = (residual < 1e-11 * (1.0 + radius)) & (np.linalg.norm(p, axis=1) <= limit)
+    return np.where(good[:, None], p, np.nan)
+
+
+def pixels_to_rays(camera: Camera, xy: Array) -> Array:
+    """Unit bearings (n, 3) of pixels (n, 2)."""
+    d = (np.asarray(xy, dtype=np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    lens = camera.distortion
+    if isinstance(lens, Fisheye):
+        radius = np.linalg.norm(d, axis=1)
+        angle = invert_polynomial(radius, lens.k1, lens.k2, lens.k3, lens.k4, limit=lens_limit(camera))
+        direction = d / np.maximum(radius, 1e-300)[:, None]
+        return np.concatenate([np.sin(angle)[:, None] * direction, np.cos(angle)[:, None]], axis=1)
+    if lens is not None:
+        d = undistort_radial_tangential(lens, d, lens_limit(camera))
+    rays = np.concatenate([d, np.ones((len(d), 1))], axis=1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def rays_to_pixels(camera: Camera, rays: Array) -> Array:
+    """Pixels (n, 2) of bearings (n, 3); NaN behind the image and past the fold of the lens."""
+    rays = np.asarray(rays, dtype=np.float64)
+    ahead = rays[:, 2] > 1e-6
+    lens = camera.distortion
+    with np.errstate(invalid="ignore", divide="ignore"):
+        tangent = rays[:, :2] / rays[:, 2:]
+        radius = np.linalg.norm(tangent, axis=1)
+        if isinstance(lens, Fisheye):
+            angle = np.arctan(radius)
+            ahead &= angle <= lens_limit(camera)
+            scale = polynomial(angle, lens.k1, lens.k2, lens.k3, lens.k4) / np.where(radius > 0, radius, 1.0)
+            p = np.where((radius > 0)[:, None], tangent * scale[:, None], tangent)
+        elif lens is not None:
+            ahead &= radius <= lens_limit(camera)
+            p = distort_radial_tangential(lens, tangent)
+        else:
+            p = tangent
+    return np.where(ahead[:, None], p * [camera.fx, camera.fy] + [camera.cx, camera.cy], np.nan)
+
+
+def refract(ray: Array, normal: Array, ratio: float) -> Array:
+    """Snell's law in vector form: bearing (n, 3) across a face of unit normal (n, 3), ratio = n_from / n_to."""
+    cosine = np.sum(ray * normal, axis=1, keepdims=True)
+    radicand = 1.0 - ratio**2 * (1.0 - cosine**2)
+    root = np.sqrt(np.where((radicand > 0.0) & (cosine > 0.0), radicand, np.nan))
+    return ratio * ray + (root - ratio * cosine) * normal
+
+
+def through_prism(prism: Prism, rays: Array, phi: Array, *, to_scene: bool) -> Array:
+    """Bearing (n, 3) after both faces; ``phi`` (n,) [rad] is the azimuth of the tilt, rays point away from the camera.
+
+    ``to_scene``: from the observed bearing to the scene's; else back, which by reversibility of light is the same trace
+    from the other side. NaN after total internal reflection or where the ray does not meet a face.
+    """
+    flat = np.tile([0.0, 0.0, 1.0], (len(phi), 1))
+    s, c = np.sin(prism.apex), np.cos(prism.apex)
+    tilted = np.stack([s * np.cos(phi), s * np.sin(phi), np.full(len(phi), c)], axis=1)
+    first_is_tilted = (prism.flat_side is FlatSide.SCENE) == to_scene
+    faces = (tilted, flat) if first_is_tilted else (flat, tilted)
+    inside = refract(np.where(rays[:, 2:] > 0.0, rays, np.nan), faces[0], 1.0 / prism.index)
+    out = refract(inside, faces[1], prism.index)
+    return np.where(out[:, 2:] > 0.0, out, np.nan)
+
+
+def rotation(tilt: tuple[float, float]) -> Array:
+    """Matrix (3, 3) of a rotation about x by ``tilt[0]``, then about y by ``tilt[1]`` [rad]."""
+    cx, sx, cy, sy = np.cos(tilt[0]), np.sin(tilt[0]), np.cos(tilt[1]), np.sin(tilt[1])
+    return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+
+
+def move(
+    camera: Camera,
+    prism: Prism,
+    xy: Array,
+    theta: Array,
+    *,
+    to_scene: bool,
+    phase: float = 0.0,
+    tilt: tuple[float, float] = (0.0, 0.0),
+) -> Array:
+    """Pixels (n, 2) after the prism: compensated (``to_scene``) or deflected."""
+    axis = rotation(tilt)
+    rays = pixels_to_rays(camera, xy) @ axis
+    out = through_prism(prism, rays, np.asarray(theta, dtype=np.float64) + phase, to_scene=to_scene)
+    return rays_to_pixels(camera, out @ axis.T)
+
+
+def cross_section(angle: Array, apex: float, index: Array | float, *, tilted_first: bool) -> Array:
+    """The paper's plane formula δ = Φq − Φo + Φp − Φi: signed turn [rad] of a ray in the plane of the wedge.
+
+    ``angle`` [rad] is the ray's, positive towards the azimuth of the tilt; every Φ is measured from the normal of its
+    own face with that sign: (Φi, Φp) before and after the first face, (Φo, Φq) before and after the second.
+    """
+    first, second = (apex, 0.0) if tilted_first else (0.0, apex)
+    phi_i = angle - first
+    phi_p = np.arcsin(np.sin(phi_i) / index)
+    phi_o = phi_p + first - second
+    phi_q = np.arcsin(index * np.sin(phi_o))
+    return phi_q - phi_o + phi_p - phi_i
+
+
+def turn(rays: Array, phi: Array, angle: Array | float) -> Array:
+    """Bearings (n, 3) turned by ``angle`` [rad] from z towards the azimuth ``phi``, a plane rotation in that basis."""
+    along = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=1)
+    across = np.stack([-np.sin(phi), np.cos(phi), np.zeros_like(phi)], axis=1)
+    u, v, z = np.sum(rays * along, axis=1), np.sum(rays * across, axis=1), rays[:, 2]
+    c, s = np.cos(angle), np.sin(angle)
+    turned = (c * u + s * z)[:, None] * along + v[:, None] * across
+    turned[:, 2] = c * z - s * u
+    return turned

@@ -1,0 +1,521 @@
+"""The prism's models against the independent trace, the paper's formulas, and the published tables."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import reference
+import warp as wp
+
+from amiwarp.camera import Camera, Fisheye, RadialTangential
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics import (
+    MODELS,
+    CircleModel,
+    EllipseModel,
+    ExactModel,
+    FlatSide,
+    Model,
+    Prism,
+    RadialCircleModel,
+    apex_from_deflection,
+    deflection_from_apex,
+    predicted_error,
+    wrap_angle,
+)
+
+ATOL = 1e-3  # px, the promise; docs/optics.md has what was measured
+SIDES = list(FlatSide)
+BARREL = RadialTangential(-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0)
+TURN = np.arange(36) * (2.0 * np.pi / 36)
+
+
+def camera(fov_deg: float = 60.0, lens: Any = None, size: tuple[int, int] = (640, 480)) -> Camera:
+    return Camera.from_fov(*size, math.radians(fov_deg), lens)
+
+
+def prism(deflection_deg: float = 1.0, side: FlatSide = FlatSide.SCENE, index: float = 1.55) -> Prism:
+    return Prism(apex_from_deflection(math.radians(deflection_deg), index, side), index, side)
+
+
+def samples(cam: Camera, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
+    """Random pixels, half of them whole, that float32 holds exactly, and angles; both float64."""
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(0.0, [cam.width - 1, cam.height - 1], (count, 2)).astype(np.float32)
+    xy[::2] = np.round(xy[::2])
+    return xy.astype(np.float64), rng.uniform(-np.pi, np.pi, count)
+
+
+def lattice(cam: Camera, columns: int = 33, rows: int = 25) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels evenly over the image and angles over one turn: the points of the published tables."""
+    axes = np.linspace(0, cam.width - 1, columns), np.linspace(0, cam.height - 1, rows), TURN
+    mesh = np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
+    return mesh[:, :2], mesh[:, 2]
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.asarray(a, dtype=np.float64) - b, axis=1)
+
+
+def on(device: str, xy: np.ndarray, theta: np.ndarray) -> tuple[wp.array, wp.array]:
+    points = wp.array(xy.astype(np.float32), dtype=wp.vec2, device=device)
+    return points, wp.array(theta.astype(np.float32), dtype=float, device=device)
+
+
+# -- apex and deflection
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("index", [1.33, 1.5168, 1.9])
+@pytest.mark.parametrize("apex_deg", [0.0, 0.1, 1.817, 4.0, 15.0])
+def test_conversions_meet_the_traced_axial_ray(side: FlatSide, index: float, apex_deg: float) -> None:
+    wedge = Prism(math.radians(apex_deg), index, side)
+    out = reference.through_prism(wedge, np.array([[0.0, 0.0, 1.0]]), np.zeros(1), to_scene=True)[0]
+    turned = math.atan2(out[0], out[2]) * (1.0 if side is FlatSide.SCENE else -1.0)
+    assert wedge.deflection == pytest.approx(turned, abs=1e-12)
+    assert apex_from_deflection(wedge.deflection, index, side) == pytest.approx(wedge.apex, abs=1e-12)
+    assert deflection_from_apex(wedge.apex, index, side) == wedge.deflection
+
+
+def test_deflection_is_not_the_apex() -> None:
+    for deflection, apex in [(0.5, 0.909), (1.0, 1.817), (2.0, 3.627)]:  # the published pairs, n = 1.55
+        assert math.degrees(prism(deflection, FlatSide.CAMERA).apex) == pytest.approx(apex, abs=6e-4)
+    thin = Prism(1e-4, 1.55)
+    assert thin.deflection == pytest.approx(0.55e-4, abs=1e-11)
+
+
+@pytest.mark.parametrize("values", [(1.8, 1.5), (-0.01, 1.5), (math.nan, 1.5), (0.03, 1.0), (0.03, math.nan)])
+def test_impossible_prisms_are_refused(values: tuple[float, float]) -> None:
+    with pytest.raises(AmiwarpError, match=r"prism (apex|index)"):
+        Prism(*values)
+
+
+# -- the exact model
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("lens", [None, BARREL, Fisheye(-0.01, 0.005, -0.002, 0.0003)], ids=str)
+def test_exact_model_meets_the_two_interface_trace(device: str, side: FlatSide, lens: Any) -> None:
+    cam, wedge = camera(70.0, lens), Prism(math.radians(4.0), 1.55, side)
+    model = ExactModel(cam, wedge, phase=0.7, tilt=(0.02, -0.03))
+    xy, theta = samples(cam)
+    points, angles = on(device, xy, theta)
+    seen = model.compensate_points(points, angles)
+    expected = reference.move(cam, wedge, xy, theta, to_scene=True, phase=0.7, tilt=(0.02, -0.03))
+    assert distance(seen.numpy(), expected).max() < ATOL
+    assert distance(model.deflect_points(seen, angles).numpy(), xy).max() < ATOL
+    expected = reference.move(cam, wedge, xy, theta, to_scene=False, phase=0.7, tilt=(0.02, -0.03))
+    assert distance(model.deflect_points(points, angles).numpy(), expected).max() < ATOL
+
+
+@pytest.mark.parametrize(("side", "sign"), [(FlatSide.SCENE, 1.0), (FlatSide.CAMERA, -1.0)])
+@pytest.mark.parametrize("theta", [0.0, math.pi / 2, -2.0])
+def test_axis_is_moved_along_the_tilt(side: FlatSide, sign: float, theta: float) -> None:
+    """θ is the azimuth of the tilted face's normal, from x right to y down: that is where the scene's pixel lies."""
+    cam = Camera(641, 481, 600.0, 600.0, 320.0, 240.0)
+    radius = sign * 600.0 * math.tan(math.radians(1.0))
+    expected = [[320.0 + radius * math.cos(theta), 240.0 + radius * math.sin(theta)]]
+    for name in ("circle", "radial", "exact", "ellipse"):
+        model = MODELS[name].from_prism(cam, prism(1.0, side))
+        got = model.compensate_points(np.array([[320.0, 240.0]]), np.array([theta]))
+        np.testing.assert_allclose(got, expected, rtol=0, atol=0.02)
+
+
+def test_swapping_the_faces_swaps_the_directions() -> None:
+    cam, wedge = camera(), Prism(0.03, 1.5)
+    xy, theta = samples(cam, 500)
+    turned = ExactModel(cam, replace(wedge, flat_side=FlatSide.CAMERA))
+    np.testing.assert_array_equal(ExactModel(cam, wedge).deflect_points(xy, theta), turned.compensate_points(xy, theta))
+
+
+def test_phase_adds_to_the_angle_and_whole_turns_do_not_count() -> None:
+    cam = camera()
+    xy, theta = samples(cam, 500)
+    model = ExactModel(cam, prism())
+    base = model.compensate_points(xy, theta + 0.4)
+    assert distance(replace(model, phase=0.4).compensate_points(xy, theta), base).max() < 1e-4
+    assert distance(model.compensate_points(xy, theta + 0.4 + 2.0 * np.pi * 100_000), base).max() < 1e-4
+
+
+def test_tilt_about_x_moves_the_axis_of_rotation_up() -> None:
+    """The prism's z axis turned about x by a, then about y by b: its mean image moves by second order only."""
+    cam, wedge = camera(), prism(2.0)
+    straight, tilted = ExactModel(cam, wedge), ExactModel(cam, wedge, tilt=(math.radians(1.0), 0.0))
+    assert 0.05 < predicted_error(tilted, straight).rms < 1.0
+
+
+# -- the paper's cross-section
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("apex_deg", [1.0, 4.0])
+def test_paper_formula_in_the_plane_of_the_wedge(side: FlatSide, apex_deg: float) -> None:
+    """δ = Φq − Φo + Φp − Φi with signed angles is the trace of rays in the plane of the optical axis and the tilt."""
+    wedge = Prism(math.radians(apex_deg), 1.55, side)
+    angle = np.radians(np.linspace(-60.0, 60.0, 121))
+    rays = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1)
+    for to_scene in (True, False):
+        out = reference.through_prism(wedge, rays, 0.0 * angle, to_scene=to_scene)
+        tilted_first = (side is FlatSide.SCENE) == to_scene
+        delta = reference.cross_section(angle, wedge.apex, 1.55, tilted_first=tilted_first)
+        np.testing.assert_allclose(np.arctan2(out[:, 0], out[:, 2]) - angle, delta, rtol=0, atol=1e-13)
+
+
+def test_paper_formula_needs_signed_angles() -> None:
+    """From the scene at α = 1°, φ = 45°: −0.93°; with both faces' turns counted towards the normal, −34.8°."""
+    apex, phi_i = math.radians(1.0), np.array(math.radians(45.0))
+    signed = reference.cross_section(phi_i, apex, 1.55, tilted_first=False)
+    assert math.degrees(signed) == pytest.approx(-0.93, abs=5e-3)
+    phi_p = np.arcsin(np.sin(phi_i) / 1.55)
+    phi_o = phi_p - apex
+    phi_q = np.arcsin(1.55 * np.sin(phi_o))
+    assert math.degrees(signed) == pytest.approx(math.degrees((phi_q - phi_o) + (phi_p - phi_i)), abs=1e-9)
+    assert math.degrees((phi_o - phi_q) + (phi_p - phi_i)) == pytest.approx(-34.8, abs=0.05)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_skew_rays_follow_the_cross_section_with_the_bravais_index(side: FlatSide) -> None:
+    """Out of that plane: s = bearing · axis is kept, and the projection refracts by √(n² − s²)/√(1 − s²)."""
+    rng = np.random.default_rng(2)
+    rays = reference.pixels_to_rays(camera(80.0), samples(camera(80.0), 500)[0])
+    phi = rng.uniform(-np.pi, np.pi, len(rays))
+    wedge = Prism(math.radians(4.0), 1.55, side)
+    along = np.stack([np.cos(phi), np.sin(phi)], axis=1)
+    axis = np.stack([-np.sin(phi), np.cos(phi), 0.0 * phi], axis=1)
+    out = reference.through_prism(wedge, rays, phi, to_scene=True)
+    s = np.sum(rays * axis, axis=1)
+    np.testing.assert_allclose(np.sum(out * axis, axis=1), s, rtol=0, atol=1e-14)
+    before = np.arctan2(np.sum(rays[:, :2] * along, axis=1), rays[:, 2])
+    after = np.arctan2(np.sum(out[:, :2] * along, axis=1), out[:, 2])
+    index = np.sqrt(1.55**2 - s**2) / np.sqrt(1.0 - s**2)
+    delta = reference.cross_section(before, wedge.apex, index, tilted_first=side is FlatSide.SCENE)
+    np.testing.assert_allclose(after - before, delta, rtol=0, atol=1e-13)
+    plain = reference.cross_section(before, wedge.apex, 1.55, tilted_first=side is FlatSide.SCENE)
+    assert np.abs(after - before - plain).max() > 1e-3
+
+
+# -- circles
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_circle_is_a_rotation_of_the_bearing(device: str, side: FlatSide) -> None:
+    cam = camera(80.0, BARREL)
+    xy, theta = samples(cam, 1000)
+    model = CircleModel.from_prism(cam, prism(1.0, side), phase=0.3)
+    sign = 1.0 if side is FlatSide.SCENE else -1.0
+    rays = reference.turn(reference.pixels_to_rays(cam, xy), theta + 0.3, sign * math.radians(1.0))
+    points, angles = on(device, xy, theta)
+    seen = model.compensate_points(points, angles)
+    assert distance(seen.numpy(), reference.rays_to_pixels(cam, rays)).max() < ATOL
+    assert distance(model.deflect_points(seen, angles).numpy(), xy).max() < ATOL
+
+
+def growth(rays: np.ndarray, index: float) -> np.ndarray:
+    return (np.sqrt(index**2 - 1.0 + rays[:, 2] ** 2) / rays[:, 2] - 1.0) / (index - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("fov", "deflection", "one", "per_pixel"),
+    [
+        (40.0, 0.5, (0.48, 1.65), (0.03, 0.11)),
+        (60.0, 1.0, (1.60, 6.78), (0.14, 0.71)),
+        (75.0, 1.0, (2.28, 11.1), (0.18, 1.18)),
+        (90.0, 0.5, (1.63, 8.49), (0.06, 0.51)),
+        (90.0, 2.0, (6.74, 47.0), (1.07, 11.4)),
+    ],
+)
+def test_published_circle_table(
+    fov: float, deflection: float, one: tuple[float, float], per_pixel: tuple[float, float]
+) -> None:
+    """Mean and worst error in px of one δ and of δ(φ) of the observed ray, for the flat face to the camera."""
+    cam, wedge = camera(fov), prism(deflection, FlatSide.CAMERA)
+    xy, theta = lattice(cam)
+    exact = reference.move(cam, wedge, xy, theta, to_scene=True)
+    rays = reference.pixels_to_rays(cam, xy)
+    for factor, (mean, worst) in ((1.0, one), (growth(rays, 1.55), per_pixel)):
+        turned = reference.turn(rays, theta, -factor * math.radians(deflection))
+        error = distance(reference.rays_to_pixels(cam, turned), exact)
+        assert error.mean() == pytest.approx(mean, abs=0.006 + 0.015 * mean)
+        assert error.max() == pytest.approx(worst, abs=0.006 + 0.015 * worst)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_radial_circle_takes_its_angle_on_the_tilted_side(device: str, side: FlatSide) -> None:
+    cam = camera(75.0)
+    xy, theta = samples(cam, 1000)
+    points, angles = on(device, xy, theta)
+    model = RadialCircleModel.from_prism(cam, prism(1.0, side))
+    rays = reference.pixels_to_rays(cam, xy)
+    turned = reference.turn(rays, theta, math.radians(1.0) * growth(rays, 1.55))
+    direct, back = model.compensate_points, model.deflect_points
+    if side is FlatSide.CAMERA:
+        direct, back = back, direct
+    moved = direct(points, angles)
+    assert distance(moved.numpy(), reference.rays_to_pixels(cam, turned)).max() < ATOL
+    assert distance(back(moved, angles).numpy(), xy).max() < ATOL
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_radial_circle_errs_in_second_order_only(side: FlatSide) -> None:
+    """Four times the error for twice the prism; 0.036 px rms at 60 degrees and 1 degree, either way round."""
+    cam = camera(60.0)
+    errors = [predicted_error(RadialCircleModel.from_prism(cam, p), ExactModel(cam, p))
+              for p in (prism(1.0, side), prism(2.0, side))]  # fmt: skip
+    assert errors[0].rms == pytest.approx(0.036, abs=0.003)
+    assert errors[0].worst < 0.1
+    assert errors[1].rms / errors[0].rms == pytest.approx(4.0, abs=0.2)
+
+
+def test_radial_circle_refuses_what_would_divide_by_zero() -> None:
+    with pytest.raises(AmiwarpError, match="index"):
+        RadialCircleModel(camera(), 0.01, index=1.0)
+    with pytest.raises(AmiwarpError, match="deflection"):
+        RadialCircleModel(camera(), -0.01)
+
+
+# -- ellipse
+
+
+@pytest.mark.parametrize(
+    ("fov", "apex_deg", "mean", "worst"),
+    [(40.0, 1.0, 0.001, 0.004), (60.0, 1.0, 0.003, 0.024), (60.0, 2.0, 0.011, 0.097), (75.0, 2.0, 0.030, 0.27),
+     (90.0, 2.0, 0.076, 0.75)],
+)  # fmt: skip
+def test_published_ellipse_table(device: str, fov: float, apex_deg: float, mean: float, worst: float) -> None:
+    cam, wedge = camera(fov), Prism(math.radians(apex_deg), 1.55)
+    xy, theta = lattice(cam, 17, 13)
+    xy = np.round(xy).astype(np.float64)
+    model = EllipseModel.from_model(ExactModel(cam, wedge), device)
+    points, angles = on(device, xy, theta)
+    exact = reference.move(cam, wedge, xy, theta, to_scene=True)
+    error = distance(model.compensate_points(points, angles).numpy(), exact)
+    assert error.mean() == pytest.approx(mean, abs=0.001 + 0.2 * mean)
+    assert error.max() == pytest.approx(worst, abs=0.002 + 0.1 * worst)
+
+
+def test_ellipse_tables_are_the_mean_and_first_harmonic() -> None:
+    cam, wedge = camera(60.0, BARREL, (64, 48)), prism(2.0)
+    model = EllipseModel.from_prism(cam, wedge, phase=0.5)
+    xy = np.array([[10.0, 20.0], [63.0, 47.0]])
+    turn = np.arange(64) * (2.0 * np.pi / 64)
+    for pixel in xy:
+        moved = reference.move(cam, wedge, np.tile(pixel, (64, 1)), turn, to_scene=True) - pixel
+        at = int(pixel[1]), int(pixel[0])
+        np.testing.assert_allclose(model.offset[at], moved.mean(axis=0), rtol=0, atol=1e-4)
+        np.testing.assert_allclose(model.cosine[at], 2.0 * (moved.T @ np.cos(turn)) / 64, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(model.sine[at], 2.0 * (moved.T @ np.sin(turn)) / 64, rtol=0, atol=1e-4)
+    assert model.phase == 0.5
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("lens", [None, BARREL], ids=str)
+def test_ellipse_round_trip_and_between_pixels(device: str, side: FlatSide, lens: Any) -> None:
+    cam = camera(60.0, lens, (160, 120))
+    model = EllipseModel.from_model(ExactModel(cam, prism(2.0, side), 0.2), device)
+    xy, theta = samples(cam)
+    points, angles = on(device, xy, theta)
+    seen = model.compensate_points(points, angles)
+    assert distance(model.deflect_points(seen, angles).numpy(), xy).max() < ATOL
+    exact = reference.move(cam, prism(2.0, side), xy, theta, to_scene=True, phase=0.2)
+    assert distance(seen.numpy(), exact).max() < 1.0
+
+
+def test_ellipse_of_the_other_models() -> None:
+    cam = camera(60.0, None, (160, 120))
+    for name in ("circle", "radial"):
+        model = MODELS[name].from_prism(cam, prism(1.0), phase=0.1)
+        assert not isinstance(model, EllipseModel)
+        ellipse = EllipseModel.from_model(model)
+        xy, theta = samples(cam, 500)
+        assert distance(ellipse.compensate_points(xy, theta), model.compensate_points(xy, theta)).max() < 0.1
+
+
+def test_ellipse_keeps_invalid_pixels_invalid_and_in_bounds(device: str) -> None:
+    """A lens that folds inside the image leaves corners without a ray; nothing reads beyond the tables for them."""
+    cam = camera(90.0, RadialTangential(k1=-0.4), (64, 48))
+    model = EllipseModel.from_model(ExactModel(cam, prism(1.0)), device)
+    broken = [[math.nan, 3.0], [3.0, math.nan], [math.inf, 1.0], [1e30, 0.0]]
+    xy = np.array([[0.0, 0.0], [0.5, 0.5], *broken, [31.0, 23.0], [31.5, 23.0]])
+    points, angles = on(device, xy, np.zeros(len(xy)))
+    valid = [False] * 6 + [True] * 2
+    for move in (model.compensate_points, model.deflect_points):
+        got = move(points, angles).numpy()
+        np.testing.assert_array_equal(np.isfinite(got).all(axis=1), valid)
+        np.testing.assert_array_equal(np.isnan(got).all(axis=1), np.logical_not(valid))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (5, 1), (2, 2)])
+@pytest.mark.parametrize("name", list(MODELS))
+def test_tiny_images(size: tuple[int, int], name: str) -> None:
+    cam = camera(40.0, None, size)
+    model = MODELS[name].from_prism(cam, prism(1.0))
+    xy = np.array([[0.0, 0.0], [size[0] - 1.0, size[1] - 1.0], [0.3, 0.1]])
+    theta = np.array([0.0, 1.0, 2.0])
+    seen = model.compensate_points(xy, theta)
+    assert distance(seen, ExactModel(cam, prism(1.0)).compensate_points(xy, theta)).max() < 0.1
+    assert distance(model.deflect_points(seen, theta), xy).max() < 1e-4
+    assert predicted_error(model, ExactModel(cam, prism(1.0))).worst < 0.2  # 1 x 5 pixels span 110 degrees
+
+
+def test_fit_recovers_a_known_field() -> None:
+    """Random pairs of a known field of degree 2, with 0.1 px of noise: the field comes back ten times better."""
+    cam = camera(60.0, None, (160, 120))
+    rng = np.random.default_rng(3)
+    xy, theta = samples(cam, 20_000)
+    u, v = (2.0 * xy / [159.0, 119.0] - 1.0).T
+    field = {
+        "offset": np.stack([0.1 * u - 0.2 * v, 0.3 * u * v], axis=1),
+        "cosine": np.stack([5.0 + u**2, 0.5 * u * v], axis=1),
+        "sine": np.stack([0.4 * u, 5.0 - v**2], axis=1),
+    }
+    moved = xy + field["offset"] + field["cosine"] * np.cos(theta)[:, None] + field["sine"] * np.sin(theta)[:, None]
+    noisy = moved + rng.normal(0.0, 0.1, moved.shape)
+    noisy[::100] = np.nan
+    model = EllipseModel.fit(cam, xy, theta, noisy, degree=2)
+    whole = (xy == np.round(xy)).all(axis=1)
+    at = xy[whole].astype(int)
+    for name, values in field.items():
+        table = getattr(model, name)[at[:, 1], at[:, 0]]
+        np.testing.assert_allclose(table, values[whole], rtol=0, atol=0.02)
+    assert distance(model.compensate_points(xy, theta), moved).max() < 0.03
+
+
+def test_fit_of_a_real_prism_needs_no_optics() -> None:
+    cam, wedge = camera(60.0, BARREL, (160, 120)), prism(1.0)
+    xy, theta = samples(cam, 5000)
+    model = EllipseModel.fit(cam, xy, theta, reference.move(cam, wedge, xy, theta, to_scene=True, phase=0.4))
+    assert predicted_error(model, ExactModel(cam, wedge, 0.4)).rms < 0.03
+
+
+def test_fit_says_when_pairs_do_not_determine_it() -> None:
+    xy, theta = samples(camera(), 30)
+    with pytest.raises(AmiwarpError, match="30 pairs determine 30 of 45"):
+        EllipseModel.fit(camera(), xy, theta, xy)
+    with pytest.raises(AmiwarpError, match="spread them over image and angle"):
+        EllipseModel.fit(camera(), *(samples(camera(), 500)[0], np.zeros(500)), samples(camera(), 500)[0])
+
+
+# -- invalid rays
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_grazing_rays_end_where_the_trace_ends(device: str, side: FlatSide) -> None:
+    """Thick wedge, 170 degree lens: total reflection and rays that miss a face are NaN, the rest exact."""
+    focal = 640 / math.radians(170.0)
+    cam = Camera(640, 640, focal, focal, 319.5, 319.5, Fisheye())
+    wedge = Prism(math.radians(20.0), 1.5, side)
+    xy, theta = samples(cam, 20_000)
+    points, angles = on(device, xy, theta)
+    model = ExactModel(cam, wedge)
+    for to_scene, move in ((True, model.compensate_points), (False, model.deflect_points)):
+        got, expected = move(points, angles).numpy(), reference.move(cam, wedge, xy, theta, to_scene=to_scene)
+        lost = np.isnan(expected).all(axis=1)
+        assert 500 < lost.sum() < 15_000
+        assert (np.isnan(got).all(axis=1) != lost).sum() <= 5  # float32 decides otherwise right at the edge
+        both = np.isfinite(got).all(axis=1) & ~lost
+        assert np.quantile(distance(got[both], expected[both]), 0.99) < ATOL
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_broken_rows_stay_alone(device: str, name: str) -> None:
+    cam = camera(60.0, BARREL, (64, 48))
+    model = MODELS[name].from_prism(cam, prism(1.0))
+    xy = np.array([[5.0, 6.0], [math.nan, 6.0], [5.0, 6.0], [5.0, 6.0]])
+    points, angles = on(device, xy, np.array([0.1, 0.1, math.nan, 0.1]))
+    for move in (model.compensate_points, model.deflect_points):
+        got = move(points, angles).numpy()
+        np.testing.assert_array_equal(np.isnan(got).all(axis=1), [False, True, True, False])
+        np.testing.assert_array_equal(got[0], got[3])
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_radial_circle_never_returns_an_unsolved_point(device: str, side: FlatSide) -> None:
+    """Near the horizon its angle runs away and the iteration need not settle: such points are marked, not guessed."""
+    focal = 640 / math.radians(178.0)
+    cam = Camera(640, 640, focal, focal, 319.5, 319.5, Fisheye())
+    model = RadialCircleModel.from_prism(cam, prism(2.0, side))
+    xy, theta = samples(cam, 20_000)
+    points, angles = on(device, xy, theta)
+    direct, solved = model.compensate_points, model.deflect_points
+    if side is FlatSide.CAMERA:
+        direct, solved = solved, direct
+    found = solved(points, angles)
+    back = direct(found, angles).numpy()
+    valid = np.isfinite(back).all(axis=1)
+    assert 0.5 < valid.mean() < 1.0
+    assert distance(back[valid], xy[valid]).max() < 0.5
+
+
+# -- predicted error
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("lens", [None, BARREL], ids=str)
+def test_predicted_error_is_that_of_a_dense_independent_evaluation(side: FlatSide, lens: Any) -> None:
+    cam, wedge = camera(60.0, lens, (320, 240)), prism(1.0, side)
+    xy, theta = lattice(cam, 46, 35)
+    rays = reference.pixels_to_rays(cam, xy)
+    sign = 1.0 if side is FlatSide.SCENE else -1.0
+    circle = reference.rays_to_pixels(cam, reference.turn(rays, theta, sign * math.radians(1.0)))
+    error = distance(circle, reference.move(cam, wedge, xy, theta, to_scene=True))
+    got = predicted_error(CircleModel.from_prism(cam, wedge), ExactModel(cam, wedge))
+    assert got.rms == pytest.approx(math.sqrt(np.mean(error**2)), abs=0.1 * got.rms)
+    assert got.worst == pytest.approx(error.max(), abs=0.05 * got.worst)
+    assert got.lag == 0.0
+
+
+def test_predicted_error_removes_a_lag() -> None:
+    cam, wedge = camera(60.0, None, (160, 120)), prism(1.0)
+    got = predicted_error(ExactModel(cam, wedge, 0.3), ExactModel(cam, wedge), remove_lag=True)
+    assert got.lag == pytest.approx(0.3, abs=1e-3)
+    assert got.worst < 5e-3
+    far = predicted_error(ExactModel(cam, wedge, 3.0), ExactModel(cam, wedge), remove_lag=True)
+    assert far.rms < 5e-3
+    assert predicted_error(ExactModel(cam, wedge, 0.3), ExactModel(cam, wedge)).rms > 0.5
+
+
+def test_predicted_error_needs_a_common_point() -> None:
+    cam = Camera(8, 8, 4.0, 4.0, 400.0, 3.5, RadialTangential(k1=-0.4))
+    with pytest.raises(AmiwarpError, match="no valid point in common"):
+        predicted_error(CircleModel(cam, 0.01), ExactModel(cam, prism(1.0)))
+
+
+# -- arrays in and out
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_same_kind_out_and_untouched(name: str) -> None:
+    model: Model = MODELS[name].from_prism(camera(60.0, None, (64, 48)), prism(1.0))
+    xy = np.array([[1, 2], [3, 4]])
+    theta = np.array([0.0, 100.0])
+    for dtype, wanted in ((np.float64, np.float64), (np.float32, np.float32), (np.uint16, np.float32)):
+        given = xy.astype(dtype)
+        got = model.compensate_points(given, theta)
+        assert isinstance(got, np.ndarray)
+        assert got.dtype == wanted
+        np.testing.assert_array_equal(given, xy)
+    np.testing.assert_array_equal(theta, [0.0, 100.0])
+    assert model.deflect_points(np.empty((0, 2)), np.empty(0)).shape == (0, 2)
+    points, angles = on("cpu", xy, theta)
+    assert isinstance(model.compensate_points(points, angles), wp.array)
+    np.testing.assert_array_equal(points.numpy(), xy)
+
+
+def test_wrong_arrays_are_named() -> None:
+    model = CircleModel(camera(), 0.01)
+    with pytest.raises(AmiwarpError, match=r"give \(n, 2\) and \(n,\)"):
+        model.compensate_points(np.zeros((3, 2)), np.zeros(2))
+    with pytest.raises(AmiwarpError, match=r"give \(n, 2\) and \(n,\)"):
+        model.compensate_points(np.zeros(3), np.zeros(3))
+    points, angles = on("cpu", np.zeros((3, 2)), np.zeros(3))
+    with pytest.raises(AmiwarpError, match="give theta as a float32 Warp array"):
+        model.compensate_points(points, np.zeros(3))
+    with pytest.raises(AmiwarpError, match="give vec2"):
+        model.compensate_points(points, angles[:2])
+
+
+def test_wrap_angle_before_rounding() -> None:
+    angle = np.array([0.5, -np.pi, np.pi, 0.5 + 2e7 * np.pi])
+    np.testing.assert_allclose(wrap_angle(angle), [0.5, -np.pi, -np.pi, 0.5], rtol=0, atol=1e-8)
