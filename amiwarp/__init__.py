@@ -3,25 +3,43 @@
 from __future__ import annotations
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from amiwarp.calib import Calibration, Settings, calibrate
     from amiwarp.camera import Camera, Fisheye, RadialTangential
+    from amiwarp.compensate import compensate, compensate_events
     from amiwarp.encoder import Encoder
     from amiwarp.errors import AmiwarpError
     from amiwarp.events import Events, MemoryEvents, Recording, Truth
     from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
+    from amiwarp.iwe import iwe
+    from amiwarp.metrics import edge_blur, model_error, truth_model
+    from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
     from amiwarp.optics import CircleModel, EllipseModel, ExactModel, FlatSide, Prism, RadialCircleModel
+    from amiwarp.sharpness import Sharpness, sharpness
+    from amiwarp.simulate import Scene, SensorModel, Simulation, simulate
+    from amiwarp.translate import translate
 
 _PUBLIC = {
+    "calib": ("Calibration", "Settings", "calibrate"),
     "camera": ("Camera", "Fisheye", "RadialTangential"),
+    "compensate": ("compensate", "compensate_events"),
     "encoder": ("Encoder",),
     "errors": ("AmiwarpError",),
     "events": ("Events", "MemoryEvents", "Recording", "Truth"),
     "io": ("RecordingWriter", "convert", "open_recording", "save_recording"),
+    "iwe": ("iwe",),
+    "metrics": ("edge_blur", "model_error", "truth_model"),
+    "motion": ("CameraMotion", "EncoderModel", "PrismMotion"),
     "optics": ("CircleModel", "EllipseModel", "ExactModel", "FlatSide", "Prism", "RadialCircleModel"),
+    "sharpness": ("Sharpness", "sharpness"),
+    "simulate": ("Scene", "SensorModel", "Simulation", "simulate"),
+    "translate": ("translate",),
 }
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}
 __all__ = ["__version__", *_HOME]
@@ -36,3 +54,14 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+class _FrontDoor(ModuleType):
+    """Where a function has its module's name, ``amiwarp.name`` is the function, whatever was imported before."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _FrontDoor

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from conftest import TRUE_PRISM
 
-from amiwarp.calib import calibrate
-from amiwarp.calib.calibrate import PARTS, thin
+from amiwarp.calib import Settings, calibrate
+from amiwarp.calib.calibrate import prepare, thin
 from amiwarp.calib.checks import edge_coherence
+from amiwarp.calib.search import PARTS
 from amiwarp.calib.speed import estimate_rpm
 from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
@@ -89,14 +90,8 @@ def test_the_paper_s_cost_is_refused_where_it_fails(recording: Recording) -> Non
 
 
 def test_no_point_of_a_dense_grid_is_better(recording: Recording) -> None:
-    from amiwarp.calib.calibrate import Settings, _material, _Search, _space
-
-    settings = Settings(events=60_000)
-    events = thin(recording, settings.events)
-    assert recording.camera is not None
-    assert recording.encoder is not None
-    space = _space(recording, recording.camera, recording.encoder, events, settings, ("apex", "phase"))
-    search = _Search(space, _material(events, recording.encoder, space), settings, "cpu", None)
+    search = prepare(recording, Settings(events=60_000))[0]
+    space = search.space
     search.run()
     low, high = space.bounds()
     grid = np.stack(np.meshgrid(*(np.arange(a, b, 0.75) for a, b in zip(low, high, strict=True))), axis=-1)

@@ -1,6 +1,6 @@
 """Device side of the simulator: one thread a pixel walks through the steps of a chunk and writes its events as keys.
 
-Times are ticks of 1/16 us since the chunk's start, in integers: nothing depends on where a chunk begins. An event is one
+Times are ticks of 1/16 us since the chunk's start, in integers: nothing depends on where a chunk begins. An event is an
 int64 key, ``time | pixel | reversed lag | polarity``, so that sorting the keys makes the stream whatever the order in
 which threads wrote it.
 """
@@ -15,9 +15,10 @@ wp.set_module_options({"enable_backward": False})
 TICKS = wp.constant(16)  # per microsecond
 HALF_TICKS = wp.constant(8)
 TICK_BITS = wp.constant(4)
-LAG_BITS = wp.constant(19)
-PIXEL_BITS = wp.constant(22)
-TIME_SHIFT = wp.constant(42)  # polarity (1), lag (19), pixel (22); 21 bits of time are left
+LOW_BITS = wp.constant(
+    20
+)  # of a key: lag (19) and polarity; then the pixel, in as many bits as it needs; then the time
+LOW_MASK = wp.constant((1 << 20) - 1)
 LARGEST_LAG = wp.constant((1 << 19) - 1)
 LAG_ZERO = wp.constant(16)  # ticks added to the lag: rounding a stamp may make it slightly negative
 NEVER = wp.constant(wp.int64(-(1 << 60)))
@@ -89,6 +90,7 @@ class Steps:
     count: int
     ticks: int  # per step
     per_tick: float  # steps
+    shift: int  # of the time in a key: above the bits of the pixel
 
 
 @wp.struct
@@ -192,14 +194,14 @@ def waiting(rate: float, uniform: float) -> wp.int64:
 
 
 @wp.func
-def write(sink: Sink, index: int, t: wp.int64, stamp: wp.int64, on: int):
+def write(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64, on: int):
     """Append the key of an event that happened at tick ``t`` and is stamped ``stamp`` [us]."""
     lag = wp.clamp(int(stamp * wp.int64(TICKS) - t) + LAG_ZERO, 0, LARGEST_LAG)
     segment = (index / sink.run) % sink.keys.shape[0]
     place = wp.atomic_add(sink.count, segment, 1)
     if place < sink.keys.shape[1]:
-        low = wp.int64(index) << wp.int64(LAG_BITS + 1) | wp.int64((LARGEST_LAG - lag) << 1 | on)
-        sink.keys[segment, place] = stamp << wp.int64(TIME_SHIFT) | low
+        low = wp.int64(index) << wp.int64(LOW_BITS) | wp.int64((LARGEST_LAG - lag) << 1 | on)
+        sink.keys[segment, place] = stamp << wp.int64(shift) | low
 
 
 @wp.func
@@ -235,7 +237,7 @@ def react(
                 latency = wp.max(latency + s.jitter * 1.7320508 * (four - 2.0), 0.0)
             stamp = (t + wp.int64(latency) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
             stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
-            write(sink, index, t, stamp, on)
+            write(sink, steps.shift, index, t, stamp, on)
             p.last_stamp = stamp
             if s.refractory > wp.int64(0):
                 p.blind_until = t + s.refractory
@@ -243,6 +245,15 @@ def react(
                 p.next_noise = wp.max(t, p.blind_until) + waiting(p.noise, wp.randf(rng))
             p.rng = rng
     return p
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__syncwarp();
+#endif
+""")
+def reconverge():
+    """Bring a warp back together: after an event its lanes would else run apart to the end of the chunk."""
 
 
 @wp.kernel
@@ -285,6 +296,7 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
         p.level = level
         p.reference -= drift
         t0 += length
+        reconverge()
     if p.blind_until > NEVER:
         p.blind_until -= t0
     p.next_noise -= t0
@@ -296,15 +308,13 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
 
 
 @wp.kernel
-def unpack(
-    view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.int64, start: int, block: Block
-):
+def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.int64, start: int, block: Block):
     """Event ``i`` of sorted keys, and its point without the prism: compensated at the true angle of its crossing."""
     i = start + wp.tid()
     key = keys[i]
-    t = key >> wp.int64(TIME_SHIFT)
-    low = int(key & wp.int64((1 << 20) - 1))
-    index = int(key >> wp.int64(LAG_BITS + 1)) & ((1 << 22) - 1)
+    t = key >> wp.int64(steps.shift)
+    low = int(key & wp.int64(LOW_MASK))
+    index = int((key - (t << wp.int64(steps.shift))) >> wp.int64(LOW_BITS))
     row = index / view.camera.width
     col = index - row * view.camera.width
     block.x[i] = wp.uint16(col)
@@ -357,7 +367,7 @@ def pack(sink: Sink, offset: wp.array(dtype=int), out: wp.array(dtype=wp.int64))
 def rebase(keys: wp.array(dtype=wp.int64), passed: wp.int64):
     """Take the time of a chunk that has ended off the keys of events that come after it."""
     i = wp.tid()
-    keys[i] = keys[i] - (passed << wp.int64(TIME_SHIFT))
+    keys[i] -= passed
 
 
 @wp.kernel

@@ -1,0 +1,253 @@
+"""One search for the sharpest image: a global stage on a coarse image, then a local one on a fine image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.calib import checks
+from amiwarp.calib.objective import Objective
+from amiwarp.calib.result import StageSummary
+from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics import MODELS
+from amiwarp.sharpness import Sharpness
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib.parameters import Space
+    from amiwarp.events import Events
+
+CANDIDATES = 3
+"""Optima of the coarse image that are looked at on the fine one."""
+PARTS = 8
+"""Disjoint parts of the events that tell chance from signal."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage's name, evaluations done, and its budget."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to calibrate; every default was chosen by measurement, see ``docs/calibration.md``."""
+
+    model: str = "exact"
+    sharpness: Sharpness = Sharpness.VARIANCE
+    global_algorithm: str | None = "GN_DIRECT_L"
+    """None starts the local search at ``start`` at once."""
+    local_algorithm: str = "LN_BOBYQA"
+    free: tuple[str, ...] | None = None
+    """Names of what to find; None: size and phase (and rpm, without an encoder)."""
+    start: Mapping[str, float] = field(default_factory=dict)
+    """Known values [rad, us, 1/min], by parameter name."""
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    global_evaluations: int = 300
+    local_evaluations: int = 200
+    tolerance_px: float = 0.002
+    """The local search ends when its steps move events by less [px]."""
+    smoothing_px: float = 1.0
+    """Of the fine image [px]; the coarse one has 4 px."""
+    per_polarity: bool = False
+    """ON and OFF events in images of their own."""
+    events: int = 1_000_000
+    """At most so many events, thinned evenly; the global search uses a fifth of them."""
+    seed: int = 0
+
+    def check(self) -> None:
+        if self.model not in MODELS:
+            raise AmiwarpError(f"model {self.model!r} is unknown; choose among {', '.join(MODELS)}")
+        if self.global_algorithm is not None:
+            check_algorithm(self.global_algorithm, GLOBAL_ALGORITHMS)
+        check_algorithm(self.local_algorithm, LOCAL_ALGORITHMS)
+        for name in ("global_evaluations", "local_evaluations", "events"):
+            if getattr(self, name) < 1:
+                raise AmiwarpError(f"{name} = {getattr(self, name)}; give 1 or more")
+
+
+@dataclass(frozen=True)
+class Material:
+    """The events of a calibration with their angles."""
+
+    events: Events
+    theta: NDArray[np.float64]
+    slope: NDArray[np.float64] | None
+
+    def every(self, step: int, first: int = 0) -> Material:
+        cut = slice(first, None, step)
+        return Material(self.events[cut], self.theta[cut], None if self.slope is None else self.slope[cut])
+
+
+class Search:
+    """One calibration under way: coarse and fine objective over the same space."""
+
+    def __init__(
+        self, space: Space, material: Material, settings: Settings, device: Any, progress: Progress | None
+    ) -> None:
+        self.space, self.material, self.settings, self.device = space, material, settings, device
+        self.progress = progress
+        self.stages: list[StageSummary] = []
+        self.fine = self._objective(material, 1.0, settings.smoothing_px)
+
+    def _parts(self, kind: Sharpness) -> list[Objective]:
+        smoothing = max(1.0, self.settings.smoothing_px)
+        return [self._objective(self.material.every(PARTS, k), 1.0, smoothing, kind) for k in range(PARTS)]
+
+    def _objective(self, m: Material, scale: float, smoothing: float, kind: Sharpness | None = None) -> Objective:
+        s = self.settings
+        kind = kind or s.sharpness
+        if kind is Sharpness.PAPER_J:
+            smoothing = 0.0  # the tails of a Gaussian are pixels with h > 0, each of which J would count
+        return Objective(
+            self.space, m.events, m.theta, m.slope, kind=kind, smoothing=smoothing, scale=scale,
+            per_polarity=s.per_polarity, device=self.device,
+        )  # fmt: skip
+
+    def run(self) -> None:
+        """Finds ``best``, its ``score``, and keeps the ``stages`` that led there."""
+        starts = [self.space.to_vector(self.space.start)]
+        if self.settings.global_algorithm is not None:
+            stage = self._run_global(self.settings.global_algorithm, starts[0])
+            starts = distinct_optima(stage, CANDIDATES)
+            self.stages.append(self._summary("global", stage))
+        runs = [self._run_local(start) for start in starts]
+        best = max(runs, key=lambda run: run.score)
+        self.stages.extend(self._summary("local", run) for run in runs)
+        self.best, self.score = self.space.to_values(best.x), best.score
+
+    def _run_global(self, algorithm: str, start: NDArray[np.float64]) -> Stage:
+        s = self.settings
+        coarse = self._objective(
+            self.material.every(max(1, len(self.material.events) // (s.events // 5 + 1))), 0.5, 4.0
+        )
+        return self._maximise(coarse, algorithm, start, s.global_evaluations, step=1.0)
+
+    def _run_local(self, start: NDArray[np.float64]) -> Stage:
+        return self._maximise(
+            self.fine, self.settings.local_algorithm, start, self.settings.local_evaluations, step=0.7
+        )
+
+    def _maximise(
+        self, objective: Objective, algorithm: str, start: NDArray[np.float64], budget: int, step: float
+    ) -> Stage:
+        low, high = self.space.bounds()
+        name = "global" if algorithm.startswith("G") else "local"
+
+        def score(v: NDArray[np.float64]) -> float:
+            if self.progress is not None:
+                self.progress(name, objective.evaluations, budget)
+            return objective(v)
+
+        s = self.settings
+        return maximise(
+            score, algorithm, low=low, high=high, start=start, evaluations=budget, tolerance=s.tolerance_px, step=step,
+            inner=s.local_algorithm, seed=s.seed,
+        )  # fmt: skip
+
+    def _summary(self, name: str, stage: Stage) -> StageSummary:
+        points = [
+            {**{n: values[n] for n in self.space.names}, "score": float(score)}
+            for values, score in ((self.space.to_values(x), v) for x, v in zip(stage.points, stage.scores, strict=True))
+        ]
+        return StageSummary.of(name, stage, points)
+
+    def judge(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
+        """Refuses what chance could have made; returns warnings and standard deviations."""
+        best = self.best
+        parts = self._parts(self.settings.sharpness)
+        # by variance, whatever the cost: the paper's J may like an image without motion best
+        plain = parts if self.settings.sharpness is Sharpness.VARIANCE else self._parts(Sharpness.VARIANCE)
+        turned = {**best, "phase": best["phase"] + math.pi}
+        checks.check_texture(
+            np.array([p.values(best) for p in plain]), np.array([p.values(turned) for p in plain]), name
+        )
+        pad = (self.fine.image(best).shape[2] - self.space.camera.width) // 2
+        checks.check_directions(self.fine.image(best).sum(axis=0)[pad:-pad, pad:-pad], name)
+        v = self.space.to_vector(best)
+        covariance, warnings = scatter(parts, self.fine, v)
+        return self._at_bounds(best) + warnings, self._deviations(v, covariance)
+
+    def _at_bounds(self, best: dict[str, float]) -> tuple[str, ...]:
+        s = self.space
+        stuck = [
+            n for n in s.names if n != "phase" and min(best[n] - s.low[n], s.high[n] - best[n]) * s.pixels[n] < 0.05
+        ]
+        return tuple(f"{n} = {best[n]:.6g} lies on its bound; widen it" for n in stuck)
+
+    def _deviations(self, v: NDArray[np.float64], covariance: NDArray[np.float64]) -> dict[str, float]:
+        """Standard deviations of the named parameters from the vector's covariance, by central differences."""
+        names = self.space.names
+        jacobian = np.empty((len(names), len(names)))
+        for k in range(len(names)):
+            h = np.zeros(len(names))
+            h[k] = 1e-3
+            up, down = self.space.to_values(v + h), self.space.to_values(v - h)
+            jacobian[:, k] = [_difference(n, up[n], down[n]) / 2e-3 for n in names]
+        variances = np.diag(jacobian @ covariance @ jacobian.T)
+        return {n: float(math.sqrt(max(s, 0.0))) for n, s in zip(names, variances, strict=True)}
+
+
+def _difference(name: str, a: float, b: float) -> float:
+    return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
+
+
+def distinct_optima(stage: Stage, most: int, apart: float = 4.0) -> list[NDArray[np.float64]]:
+    """The best points of a stage that lie at least ``apart`` px from each better one."""
+    chosen: list[NDArray[np.float64]] = []
+    for k in np.argsort(-stage.scores, kind="stable"):
+        if all(np.linalg.norm(stage.points[k] - other) >= apart for other in chosen):
+            chosen.append(stage.points[k])
+            if len(chosen) == most:
+                break
+    return chosen
+
+
+def scatter(
+    parts: list[Objective], whole: Objective, v: NDArray[np.float64], step: float = 0.25
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Covariance of the optimum [px²]: the cost's curvature, and the scatter of its slope over parts of the events.
+
+    H⁻¹ cov(g) H⁻¹, the sandwich estimate, g being a part's slope at the whole's optimum and H the mean curvature of
+    the parts; the whole has ``len(parts)`` times the events. A direction without curvature is named in a warning.
+    """
+    n = len(v)
+    gradients = np.empty((len(parts), n))
+    hessian = np.zeros((n, n))
+    steps = np.eye(n) * step
+    for k, part in enumerate(parts):
+        up, down = (np.array([part(v + sign * h) for h in steps]) for sign in (1.0, -1.0))
+        gradients[k] = (up - down) / (2.0 * step)
+        hessian += _curvature(part, v, steps, step, up, down) / len(parts)
+    values, vectors = np.linalg.eigh(-hessian)
+    largest = max(float(values.max()), 1e-12)
+    weak = values < 1e-3 * largest
+    inverse = vectors @ np.diag(1.0 / np.maximum(values, 1e-3 * largest)) @ vectors.T
+    names = whole.space.names
+    warnings = tuple(
+        f"the events hardly determine {names[int(np.argmax(np.abs(vectors[:, k])))]} (curvature "
+        f"{values[k] / largest:.1e} of the best determined)"
+        for k in np.flatnonzero(weak)
+    )
+    return inverse @ np.atleast_2d(np.cov(gradients.T)) @ inverse / len(parts), warnings
+
+
+def _curvature(
+    part: Objective,
+    v: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    step: float,
+    up: NDArray[np.float64],
+    down: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    n = len(v)
+    centre = part(v)
+    hessian = np.diag((up - 2.0 * centre + down) / step**2)
+    for i in range(n):
+        for j in range(i):
+            both = part(v + steps[i] + steps[j]) + part(v - steps[i] - steps[j])
+            hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] - down[i] - down[j] + 2.0 * centre) / (2.0 * step**2)
+    return hessian

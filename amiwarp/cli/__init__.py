@@ -1,0 +1,4 @@
+"""The command line: subcommands, the choice of a device, everything that is printed.
+
+Results go to stdout, progress and errors to stderr. Exit codes: 0 done, 1 bad input, 2 wrong usage, 130 interrupted.
+"""

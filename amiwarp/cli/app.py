@@ -1,0 +1,73 @@
+"""The application: which subcommands there are, and how each way of failing ends."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from amiwarp.cli import calibrate, compensate, convert, demo, info, simulate, translate
+from amiwarp.cli.options import command
+from amiwarp.errors import AmiwarpError
+
+BAD_INPUT, USAGE, INTERRUPTED = 1, 2, 130
+
+_UsageError: Any = typer.BadParameter.__base__
+"""Typer carries its own copy of click since 0.2x, and used the real one before: this is either's."""
+
+
+class _Group(TyperGroup):
+    """Every failure a user can meet becomes one line on stderr and an exit code."""
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        extra["standalone_mode"] = False
+        try:
+            code = super().main(*args, **extra)
+        except _UsageError as error:
+            path = error.ctx.command_path if error.ctx else "amiwarp"
+            _fail(USAGE, f"{error.format_message().rstrip('.')}; see {path} --help")
+        except (AmiwarpError, OSError) as error:
+            _fail(BAD_INPUT, str(error))
+        except (KeyboardInterrupt, typer.Abort):
+            code = INTERRUPTED
+        if code == INTERRUPTED:
+            _fail(INTERRUPTED, "interrupted; nothing was left half-written")
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(code: int, message: str) -> None:
+    print(f"amiwarp: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+app = typer.Typer(
+    cls=_Group,
+    name="amiwarp",
+    help="Take the motion of a rotating wedge prism out of the events of the camera behind it.",
+    epilog="Start with: amiwarp demo",
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback(invoke_without_command=True)
+def _version(ctx: typer.Context, version: bool = typer.Option(False, "--version", help="Print the version.")) -> None:
+    if version:
+        import amiwarp
+
+        print(amiwarp.__version__)
+    elif ctx.invoked_subcommand is None:
+        print(ctx.get_help())
+
+
+for module in (demo, info, convert, simulate, translate, calibrate, compensate):
+    command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
+
+
+def main() -> None:
+    """Run the command line; ends the process."""
+    app(prog_name="amiwarp")

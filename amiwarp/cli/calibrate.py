@@ -1,0 +1,235 @@
+"""``amiwarp calibrate``: the prism's parameters from the recording itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli.console import Advance, choose_device, progress, report, table
+from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, number
+from amiwarp.cli.options import Common
+from amiwarp.errors import AmiwarpError
+from amiwarp.sharpness import Sharpness
+
+if TYPE_CHECKING:
+    from amiwarp.calib import Calibration, Settings
+    from amiwarp.events import Recording
+
+EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
+
+_SEARCH, _PARAMETERS = "Search", "Parameters"
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How to search; what is left out takes the default of ``amiwarp.calib.Settings``."""
+
+    model: Annotated[
+        str | None, typer.Option(help="circle, radial, ellipse or exact (default).", rich_help_panel=_SEARCH)
+    ] = None
+    sharpness: Annotated[
+        Sharpness | None, typer.Option(help="What is maximised. Default: variance.", rich_help_panel=_SEARCH)
+    ] = None
+    global_algorithm: Annotated[
+        str | None,
+        typer.Option(help="NLopt's name, as GN_DIRECT_L; none starts at --start at once.", rich_help_panel=_SEARCH),
+    ] = None
+    local_algorithm: Annotated[
+        str | None, typer.Option(help="NLopt's name, as LN_BOBYQA.", rich_help_panel=_SEARCH)
+    ] = None
+    global_evaluations: Annotated[
+        int | None, typer.Option(min=1, help="Budget of the global search.", rich_help_panel=_SEARCH)
+    ] = None
+    local_evaluations: Annotated[
+        int | None, typer.Option(min=1, help="Budget of each local search.", rich_help_panel=_SEARCH)
+    ] = None
+    tolerance_px: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="The local search ends when its steps are smaller.", rich_help_panel=_SEARCH),
+    ] = None
+    smoothing_px: Annotated[
+        float | None, typer.Option(min=0.0, help="Smoothing of the fine image.", rich_help_panel=_SEARCH)
+    ] = None
+    per_polarity: Annotated[
+        bool, typer.Option("--per-polarity", help="ON and OFF events in images apart.", rich_help_panel=_SEARCH)
+    ] = False
+    events: Annotated[
+        int | None, typer.Option(min=1, help="At most so many events, thinned evenly.", rich_help_panel=_SEARCH)
+    ] = None
+
+    def changes(self) -> dict[str, Any]:
+        """Fields of the settings that were given."""
+        given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
+        if (given.get("global_algorithm") or "").lower() == "none":
+            given["global_algorithm"] = None
+        return given
+
+
+@dataclass(frozen=True)
+class ParameterOptions:
+    """What is free, where it starts and how far it may go."""
+
+    free: Annotated[
+        str | None,
+        typer.Option(
+            help="Names separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, tilt_y, index. "
+            "Default: apex,phase, and rpm without an encoder.",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None
+    start: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Known value, as apex=1.1deg or clock_offset=-250us; can be given more than once.",
+            metavar="NAME=VALUE",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None
+    bound: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Bounds of a free parameter, as phase=-10deg:10deg; can be given more than once.",
+            metavar="NAME=LOW:HIGH",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None
+    rpm: Annotated[
+        float | None,
+        typer.Option(
+            help="Speed where there is no encoder, negative backwards; it is refined. Default: found in the events.",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None
+
+    def changes(self) -> dict[str, Any]:
+        """Fields of the settings that were given. Raises :class:`AmiwarpError` for names and values that are none."""
+        start = {name: number(text, unit, f"--start {name}") for name, unit, text in map(_named, self.start or ())}
+        bounds = {}
+        for name, unit, text in map(_named, self.bound or ()):
+            low, colon, high = text.partition(":")
+            if not colon:
+                raise AmiwarpError(f"--bound {name}: {text!r} has no colon; write {name}=LOW:HIGH")
+            bounds[name] = (number(low, unit, f"--bound {name}"), number(high, unit, f"--bound {name}"))
+        if self.rpm is not None:
+            start["rpm"] = self.rpm
+        free = None if self.free is None else tuple(name.strip() for name in self.free.split(",") if name.strip())
+        return {"start": start, "bounds": bounds} | ({} if free is None else {"free": free})
+
+
+def _named(text: str) -> tuple[str, str, str]:
+    from amiwarp.calib.parameters import UNITS
+
+    name, equals, value = text.partition("=")
+    name = name.strip()
+    if not equals or name not in UNITS:
+        raise AmiwarpError(f"{text!r} names no parameter; write NAME=VALUE with one of {', '.join(UNITS)}")
+    return name, UNITS[name], value
+
+
+def run(
+    recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    out: Annotated[
+        Path | None, typer.Argument(help="Calibration to write; default: NAME.calibration.json beside the recording.")
+    ] = None,
+    *,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw the cost surface, and the events' image before and after (.png).")
+    ] = None,
+    window: Annotated[
+        str | None, typer.Option(help="Only these seconds of the recording.", metavar="START:END")
+    ] = None,
+    search: SearchOptions,
+    parameters: ParameterOptions,
+    camera: CameraOptions,
+    prism: NominalPrismOptions,
+    common: Common,
+) -> None:
+    """Find the prism's parameters: those that make the image of the events sharpest. No guess is needed."""
+    from amiwarp.calib import Settings, calibrate
+    from amiwarp.io import open_recording
+
+    device = choose_device(common.device)
+    settings = Settings(seed=common.seed, **search.changes(), **parameters.changes())
+    opened = complete(open_recording(recording), camera, prism)
+    opened = cut(opened, window) if window else opened
+    out = out or recording.with_name(f"{recording.stem}.calibration.json")
+    with progress("calibrating") as advance:
+        found = calibrate(opened, settings, device=device, progress=staged(advance, settings))
+    found.save(out)
+    if figure is not None:
+        from amiwarp.figures import draw_calibration
+
+        draw_calibration(figure, opened, found, device=device)
+    data = summary(found) | {"file": str(out), "figure": None if figure is None else str(figure), "device": device}
+    report(common, data, lines(found, data))
+
+
+def cut(recording: Recording, window: str) -> Recording:
+    """The recording's ``START:END`` seconds after its first event; either may be left out.
+
+    Raises :class:`AmiwarpError` for a window that is none or holds no event.
+    """
+    from amiwarp.events import MemoryEvents
+
+    first, last = recording.events.t_first, recording.events.t_last
+    start, colon, end = window.partition(":")
+    try:
+        low = first + round(float(start) * 1e6) if start.strip() else first
+        high = first + round(float(end) * 1e6) if end.strip() else last + 1
+    except (ValueError, OverflowError):
+        low, high = 0, 0
+    if not colon or not low < high:
+        raise AmiwarpError(f"--window {window!r} is no span of time; write START:END in seconds, as 0.5:2")
+    events = recording.events.between(low, high)
+    if not len(events):
+        span = (last - first) * 1e-6
+        raise AmiwarpError(f"{recording.name}: no events in the window {window} s; the recording has {span:.6g} s")
+    return replace(recording, events=MemoryEvents(events, *recording.events.size))
+
+
+def staged(advance: Advance, settings: Settings) -> Any:
+    """A calibration's progress as one share: the global search is about half of the work."""
+    start = 0.0 if settings.global_algorithm is None else 0.5
+
+    def update(stage: str, done: int, budget: int) -> None:
+        share = done / max(budget, 1)
+        advance(0.5 * share if stage == "global" else start + (1.0 - start) * share, f"calibrating, {stage}")
+
+    return update
+
+
+def summary(c: Calibration) -> dict[str, Any]:
+    """What was found, angles in degrees beside radians; without the samples, which are in the file."""
+    data = c.to_json()
+    data["stages"] = [{k: v for k, v in stage.items() if k != "points"} for stage in data["stages"]]
+    return data
+
+
+def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
+    """The tables for people."""
+    rows = [(name, *_shown(entry)) for name, entry in data["parameters"].items()]
+    stages = [
+        (s["name"], s["algorithm"], str(s["evaluations"]), f"{s['seconds']:.2f} s", f"{s['sharpness']:.5g}", s["ended"])
+        for s in data["stages"]
+    ]
+    sharp = data["sharpness"]
+    return [
+        table(rows, "parameter", "value", "± std", "unit"),
+        "",
+        table(stages, "stage", "algorithm", "evaluations", "time", "sharpness", "ended by"),
+        "",
+        f"sharpness ({sharp['kind']}): {sharp['before']:.5g} before, {sharp['after']:.5g} after",
+        *(f"warning: {text}" for text in c.warnings),
+        f"{data['file']}: {data['model']} model, {c.events:,} events, {c.seconds:.2f} s on {data['device']}",
+    ]
+
+
+def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:
+    angle = entry["unit"] == "rad"
+    scale = 180.0 / math.pi if angle else 1.0
+    std = f"{entry['std'] * scale:.2g}" if "std" in entry else "given"
+    return f"{entry['value'] * scale:.6g}", std, "deg" if angle else entry["unit"]

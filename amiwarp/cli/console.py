@@ -1,0 +1,106 @@
+"""What commands share at run time: the device, progress on stderr, the result on stdout."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from amiwarp.cli.options import Common
+from amiwarp.errors import AmiwarpError
+
+
+class Advance(Protocol):
+    """Called with the share that is done, 0 to 1, and with what is being done where that changes."""
+
+    def __call__(self, share: float, what: str | None = None, /) -> None: ...
+
+
+def choose_device(name: str | None) -> str:
+    """The device to work on, once Warp is loaded and silenced. Raises :class:`AmiwarpError` where it is not here."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    with _without("Could not find or load the NVIDIA CUDA driver"):
+        wp.init()
+    known = [device.alias for device in wp.get_devices()]
+    chosen = name or ("cuda:0" if "cuda:0" in known else "cpu")
+    if chosen not in known:
+        raise AmiwarpError(f"device {chosen!r} is not here; choose among {', '.join(known)}")
+    return chosen
+
+
+@contextlib.contextmanager
+def _without(line: str) -> Iterator[None]:
+    """Drops one expected line that native code writes to stderr, and nothing else."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            caught.seek(0)
+            for text in caught.read().decode(errors="replace").splitlines():
+                if line not in text:
+                    print(text, file=sys.stderr)
+
+
+@contextlib.contextmanager
+def progress(what: str) -> Iterator[Advance]:
+    """A progress bar on stderr, gone when it is done; nothing where stderr is no terminal."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share, what=None, /: bar.update(task, completed=share, description=what)
+
+
+def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -> None:
+    """The result: ``data`` as one JSON object, or ``lines`` for people. A number that is not finite becomes null."""
+    if common.json:
+        print(json.dumps(plain(data), allow_nan=False))
+        return
+    # Into a file or a pipe nothing is wrapped.
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 1000)
+    with console.capture() as text:
+        for line in lines:
+            console.print(line, markup=False)
+    print("\n".join(row.rstrip() for row in text.get().splitlines()))
+
+
+def plain(value: Any) -> Any:
+    """The same as objects that JSON knows."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:
+    """Two columns and more, without lines; strings are shown as they are."""
+    from rich.text import Text
+
+    grid = Table(box=None, show_header=bool(headings), pad_edge=False, header_style="bold")
+    cells = [[Text(cell) for cell in row] for row in rows]
+    for k in range(max((len(row) for row in cells), default=len(headings))):
+        grid.add_column(headings[k] if headings else "", style="dim" if k == 0 and not headings else None)
+    for row in cells:
+        grid.add_row(*row)
+    return grid

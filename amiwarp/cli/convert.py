@@ -1,0 +1,101 @@
+"""``amiwarp convert``: any recording into the native format."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from amiwarp.cli.console import progress, report
+from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
+from amiwarp.cli.options import Common
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from amiwarp.encoder import Encoder
+
+EXAMPLE = "amiwarp convert events.raw recording.h5 --encoder encoder.csv --counts-per-turn 4096 --fov-deg 60"
+
+_PANEL = "Encoder"
+
+
+@dataclass(frozen=True)
+class EncoderOptions:
+    """A log of the prism's encoder."""
+
+    encoder: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV with a header t_us,angle_deg or t_us,count, and index (0 or 1) where there is one.",
+            rich_help_panel=_PANEL,
+        ),
+    ] = None
+    counts_per_turn: Annotated[
+        int | None, typer.Option(min=1, help="Counts of the encoder per turn.", rich_help_panel=_PANEL)
+    ] = None
+    direction: Annotated[
+        Literal["1", "-1"], typer.Option(help="-1 where the encoder counts backwards.", rich_help_panel=_PANEL)
+    ] = "1"
+
+    def build(self) -> Encoder | None:
+        """The encoder of the log, or None where none is given."""
+        if self.encoder is None:
+            if self.counts_per_turn is not None or self.direction != "1":
+                raise AmiwarpError("--counts-per-turn and --direction describe an encoder log; give --encoder too")
+            return None
+        from amiwarp.io import read_encoder_csv
+
+        return read_encoder_csv(self.encoder, counts_per_turn=self.counts_per_turn, direction=int(self.direction))
+
+
+def run(
+    source: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    out: Annotated[Path, typer.Argument(help="Native recording to write (.h5).")],
+    encoder: EncoderOptions,
+    camera: CameraOptions,
+    prism: NominalPrismOptions,
+    common: Common,
+) -> None:
+    """Convert a recording to amiwarp's HDF5, with its encoder, camera and prism put in. In constant memory."""
+    from amiwarp.io import convert, open_recording
+
+    began = time.perf_counter()
+    log = encoder.build()
+    lens = wedge = None
+    if camera != CameraOptions() or prism != NominalPrismOptions():  # opening may cost a pass over the file
+        recording = open_recording(source)
+        # A file that does not tell its size takes the camera's.
+        lens = camera.build(*recording.events.size, fixed=getattr(recording.events, "size_is_known", True))
+        wedge = prism.build(recording.prism)
+    with progress("converting") as advance:
+        summary = convert(
+            source, out, encoder=log, camera=lens, prism=wedge,
+            progress=lambda done, n: advance(done / n if n else 0.0),
+        )  # fmt: skip
+    seconds = time.perf_counter() - began
+    data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
+    slip = data.pop("index_slip")
+    data["slip_deg"] = None if slip is None else math.degrees(slip)
+    report(common, data, _lines(data))
+
+
+def _lines(d: dict[str, Any]) -> list[str]:
+    rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
+    lines = [
+        f"{d['file']}: {d['events']:,} events, {d['width']} x {d['height']}, {d['seconds']:.2f} s, {rate:.3g} Mev/s"
+    ]
+    lines += [f"note: {name}: {count:,}" for name, count in d["repairs"].items()]
+    if d["encoder_covers"] is False:
+        lines.append("warning: the encoder does not cover all events")
+    if d["encoder_gaps"]:
+        first = d["encoder_gaps"][0]
+        lines.append(
+            f"warning: the encoder has {len(d['encoder_gaps'])} gaps, the first at {first[0]} .. {first[1]} us"
+        )
+    if d["slip_deg"] is not None:
+        lines.append(f"encoder slips up to {d['slip_deg']:.3g} deg at its index pulses")
+    return lines

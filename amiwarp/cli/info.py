@@ -1,0 +1,152 @@
+"""``amiwarp info``: what a recording is and holds."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from amiwarp.cli.console import progress, report, table
+from amiwarp.cli.options import Common
+
+if TYPE_CHECKING:
+    from amiwarp.encoder import Encoder
+    from amiwarp.events import EventSource, Recording
+
+EXAMPLE = "amiwarp info recording.h5"
+
+
+def run(
+    file: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")], common: Common
+) -> None:
+    """Say what a recording is: format, events, encoder, camera, prism, truth, repairs. Reads it once, in blocks."""
+    from amiwarp.io import open_recording
+
+    recording = open_recording(file)
+    data = describe(recording, str(file))
+    report(common, data, [table(_rows(data))])
+
+
+def describe(recording: Recording, file: str) -> dict[str, Any]:
+    """All there is to know, angles in degrees."""
+    source = recording.events
+    width, height = source.size
+    data: dict[str, Any] = {
+        "file": file,
+        "format": recording.metadata.get("format", "amiwarp"),
+        "width": width,
+        "height": height,
+        **_events(source),
+        "encoder": None if recording.encoder is None else _encoder(recording.encoder, source),
+        "camera": None if recording.camera is None else _camera(recording),
+        "prism": None,
+        "truth": None if recording.truth is None else _degrees(recording.truth.parameters),
+        "truth_points": recording.truth is not None and recording.truth.points(0, 1) is not None,
+        "repairs": getattr(source, "repairs", {}),
+        "metadata": recording.metadata,
+    }
+    if recording.prism is not None:
+        p = recording.prism
+        data["prism"] = {"apex_deg": math.degrees(p.apex), "index": p.index, "flat_side": p.flat_side.value}
+    return data
+
+
+def _events(source: EventSource) -> dict[str, Any]:
+    n, on, outside = len(source), 0, 0
+    compensated = False
+    with progress("reading") as advance:
+        done = 0
+        for block in source.blocks():
+            on += int(np.count_nonzero(block.p))
+            done += len(block)
+            if block.x.dtype != np.uint16:
+                compensated = True
+                inside = (np.rint(block.x) >= 0) & (np.rint(block.x) < source.size[0])
+                inside &= (np.rint(block.y) >= 0) & (np.rint(block.y) < source.size[1])
+                outside += int(np.count_nonzero(~inside))
+            advance(done / max(n, 1))
+    first, last = (source.t_first, source.t_last) if n else (None, None)
+    seconds = 0.0 if first is None or last is None else (last - first) * 1e-6
+    out = {
+        "events": n,
+        "t_first_us": first,
+        "t_last_us": last,
+        "duration_s": seconds,
+        "rate_mev_per_s": n / seconds / 1e6 if seconds > 0 else None,
+        "on_share": on / n if n else None,
+        "compensated": compensated,
+    }
+    return {**out, "outside": outside} if compensated else out
+
+
+def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
+    from amiwarp.io.convert import GAP_INTERVALS
+
+    slip = encoder.slip()
+    first, last = encoder.coverage
+    return {
+        "samples": len(encoder.t),
+        "rpm": encoder.rpm,
+        "turns": float(np.ptp(encoder.angle)) / (2.0 * math.pi),
+        "interval_us": encoder.interval_us,
+        "clock_offset_us": encoder.clock_offset_us,
+        "first_us": first,
+        "last_us": last,
+        "covers_events": encoder.covers(source.t_first, source.t_last) if len(source) else True,
+        "gaps": encoder.gaps(GAP_INTERVALS * encoder.interval_us),
+        "index_pulses": len(slip),
+        "slip_deg": math.degrees(float(np.abs(slip).max())) if len(slip) else None,
+    }
+
+
+def _camera(recording: Recording) -> dict[str, Any]:
+    from amiwarp.calib.result import camera_to_json
+
+    camera = recording.camera
+    assert camera is not None
+    return {**camera_to_json(camera), "fov_deg": math.degrees(camera.fov)}
+
+
+def _degrees(parameters: dict[str, float]) -> dict[str, float]:
+    angles = ("apex", "phase", "tilt_x", "tilt_y")
+    return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
+
+
+def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
+    n = d["events"]
+    kind = f"{d['format']}, compensated ({d['outside']:,} outside)" if d["compensated"] else str(d["format"])
+    rows = [("file", d["file"]), ("format", kind), ("size", f"{d['width']} x {d['height']} px"), ("events", f"{n:,}")]
+    if n:
+        rate = "" if d["rate_mev_per_s"] is None else f", {d['rate_mev_per_s']:.3g} Mev/s"
+        rows.append(("time", f"{d['t_first_us']} .. {d['t_last_us']} us: {d['duration_s']:.6g} s{rate}"))
+        rows.append(("polarity", f"{100 * d['on_share']:.1f} % ON"))
+    rows.append(("encoder", _encoder_text(d["encoder"])))
+    c, p = d["camera"], d["prism"]
+    lens = "" if c is None else (c.get("distortion") or {}).get("kind", "no distortion").replace("_", "-")
+    rows.append(("camera", "unknown" if c is None else f"fx {c['fx']:.6g}, fy {c['fy']:.6g}, cx {c['cx']:.6g}, "
+                 f"cy {c['cy']:.6g} px, FOV {c['fov_deg']:.4g} deg, {lens}"))  # fmt: skip
+    flat = "" if p is None else f"flat face to the {p['flat_side']}"
+    rows.append(
+        ("prism", "unknown" if p is None else f"nominal apex {p['apex_deg']:.5g} deg, n {p['index']:.6g}, {flat}")
+    )
+    if d["truth"] is not None:
+        points = "with a point for each event" if d["truth_points"] else "without points"
+        shown = [f"{n} {v:.5g}" for n, v in d["truth"].items() if n in ("apex_deg", "phase_deg", "index")]
+        rows.append(("truth", f"{', '.join(shown)}; {points}"))
+    rows.append(("repairs", ", ".join(f"{name} {count:,}" for name, count in d["repairs"].items()) or "none"))
+    rest = {k: v for k, v in d["metadata"].items() if k != "format" and k not in d["repairs"]}
+    return rows + [(name, str(value)) for name, value in rest.items()]
+
+
+def _encoder_text(e: dict[str, Any] | None) -> str:
+    if e is None:
+        return "none"
+    parts = [f"{e['samples']:,} samples, {e['rpm']:.6g} rpm, {e['turns']:.4g} turns"]
+    parts.append("covers the events" if e["covers_events"] else f"covers only {e['first_us']} .. {e['last_us']} us")
+    parts.append(f"{len(e['gaps'])} gaps" if e["gaps"] else "no gaps")
+    if e["index_pulses"]:
+        parts.append(f"{e['index_pulses']} index pulses, slip {e['slip_deg']:.3g} deg")
+    return "; ".join(parts)

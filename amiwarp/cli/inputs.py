@@ -1,0 +1,149 @@
+"""From options to cameras, prisms and numbers with units."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.camera import Camera
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics import FlatSide, Prism
+
+if TYPE_CHECKING:
+    from amiwarp.events import Recording
+
+_CAMERA = "Camera"
+_PRISM = "Prism"
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """The camera, where the recording does not tell."""
+
+    fov_deg: Annotated[
+        float | None,
+        typer.Option(help="Horizontal field of view of an ideal camera (deg).", rich_help_panel=_CAMERA),
+    ] = None
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            help="Intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration, or calib.txt "
+            "(fx fy cx cy k1 k2 p1 p2 k3).",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None
+
+    def build(self, width: int, height: int, *, fixed: bool = True) -> Camera | None:
+        """The camera that the options describe, or None.
+
+        Raises :class:`AmiwarpError` for one of another size where that is ``fixed``.
+        """
+        if self.camera is not None and self.fov_deg is not None:
+            raise AmiwarpError("--fov-deg and --camera both give a camera; give one of them")
+        if self.fov_deg is not None:
+            return Camera.from_fov(width, height, math.radians(self.fov_deg))
+        if self.camera is None:
+            return None
+        camera = read_camera(self.camera, width, height)
+        if fixed and (camera.width, camera.height) != (width, height):
+            given = f"{camera.width}x{camera.height}, the events are {width}x{height}"
+            raise AmiwarpError(f"{self.camera}: is for {given}; give this camera's intrinsics")
+        return camera
+
+
+def read_camera(path: Path, width: int, height: int) -> Camera:
+    """The camera of a JSON file, a calibration's included, or of a ``calib.txt``; the size is for the latter.
+
+    Raises :class:`AmiwarpError` naming file and field.
+    """
+    from amiwarp.calib.result import camera_from_json
+    from amiwarp.io.text import read_calib
+
+    if path.suffix.lower() != ".json":
+        return read_calib(path, width, height)
+    try:
+        data: Any = json.loads(path.read_text())
+        return camera_from_json(data.get("camera", data))
+    except FileNotFoundError as error:
+        raise AmiwarpError(f"{path}: no such file") from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise AmiwarpError(f"{path}: is no camera: {what}; expected width, height, fx, fy, cx, cy") from error
+
+
+@dataclass(frozen=True)
+class NominalPrismOptions:
+    """The prism as its data sheet has it."""
+
+    nominal_apex_deg: Annotated[
+        float | None, typer.Option(help="Apex angle that the data sheet gives (deg).", rich_help_panel=_PRISM)
+    ] = None
+    index: Annotated[float | None, typer.Option(help="Refractive index.", rich_help_panel=_PRISM)] = None
+    flat_side: Annotated[FlatSide | None, typer.Option(help="Where the flat face looks.", rich_help_panel=_PRISM)] = (
+        None
+    )
+
+    def build(self, known: Prism | None) -> Prism | None:
+        """``known`` with what is given put in its place; None where nothing is known or given."""
+        changes: dict[str, Any] = {"index": self.index, "flat_side": self.flat_side}
+        changes["apex"] = None if self.nominal_apex_deg is None else math.radians(self.nominal_apex_deg)
+        changes = {name: value for name, value in changes.items() if value is not None}
+        if not changes:
+            return known
+        from amiwarp.calib.calibrate import NOMINAL_PRISM
+
+        return replace(known or NOMINAL_PRISM, **changes)
+
+
+def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None) -> Recording:
+    """The recording with camera and prism as the options say; what they leave open stays as recorded.
+
+    An option wins over the file: whoever gives it knows better.
+    """
+    changes: dict[str, Any] = {"camera": camera.build(*recording.events.size) or recording.camera}
+    if prism is not None:
+        changes["prism"] = prism.build(recording.prism)
+    return replace(recording, **changes)
+
+
+SCALES = {
+    "deg": math.pi / 180.0,
+    "rad": 1.0,
+    "us": 1.0,
+    "ms": 1e3,
+    "rpm": 1.0,
+}
+"""Suffixes of values on the command line; what they come to [rad, us, 1/min]."""
+
+
+def number(text: str, unit: str, name: str) -> float:
+    """A value such as ``1.2deg``; angles need their unit. Raises :class:`AmiwarpError`.
+
+    ``unit``: the parameter's own, as in ``amiwarp.calib.parameters.UNITS``.
+    """
+    kinds = {"rad": ("deg", "rad"), "us": ("us", "ms"), "1/min": ("rpm",), "1": ()}[unit]
+    suffix = next((k for k in kinds if text.strip().endswith(k)), "")
+    try:
+        value = float(text.strip().removesuffix(suffix))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (unit == "rad" and not suffix):
+        form = {"rad": "1.2deg or 0.02rad", "us": "250us or 0.25ms", "1/min": "720rpm", "1": "1.5168"}[unit]
+        raise AmiwarpError(f"{name}: {text!r} is not a value; write it like {form}")
+    return value * SCALES.get(suffix, 1.0)
+
+
+def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
+    """Values separated by commas. Raises :class:`AmiwarpError` unless there are ``count``."""
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise AmiwarpError(f"{name}: {text!r} is not {count} numbers separated by commas")
+    return values

@@ -1,0 +1,111 @@
+"""``amiwarp simulate``: a recording of a picture, with its truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli.console import choose_device, progress, report
+from amiwarp.cli.inputs import numbers
+from amiwarp.cli.options import Common
+from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
+
+if TYPE_CHECKING:
+    from amiwarp.simulate import Simulation
+
+EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Where the picture is, and how the camera turns before it."""
+
+    scene_fov_deg: Annotated[
+        float | None,
+        typer.Option(
+            help="Horizontal extent of the picture (deg). Default: it fills all that is ever seen.",
+            rich_help_panel="Scene",
+        ),
+    ] = None
+    blur_px: Annotated[
+        float, typer.Option(help="Optical blur, standard deviation in the sensor's pixels.", rich_help_panel="Scene")
+    ] = 0.5
+
+    rotate_deg_s: Annotated[
+        str,
+        typer.Option(help="How the camera turns about its axes (deg/s).", metavar="X,Y,Z", rich_help_panel="Scene"),
+    ] = "0,0,0"
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Angular velocity of the camera [rad/s]."""
+        return tuple(math.radians(v) for v in numbers(self.rotate_deg_s, 3, "--rotate-deg-s"))
+
+    @property
+    def fov(self) -> float | None:
+        """Extent [rad]."""
+        return None if self.scene_fov_deg is None else math.radians(self.scene_fov_deg)
+
+
+def run(
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5).")],
+    *,
+    picture: Annotated[Path, typer.Option(help="Any picture: JPEG, PNG, TIFF ...")],
+    duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,
+    scene: SceneOptions,
+    rig: RigOptions,
+    sensor: SensorOptions,
+    encoder: EncoderModelOptions,
+    common: Common,
+) -> None:
+    """Make a recording of a picture as an event camera behind the prism would see it; the truth is stored beside it."""
+    from amiwarp.motion import CameraMotion
+    from amiwarp.simulate import Scene, Simulation
+
+    device = choose_device(common.device)
+    simulation = Simulation(
+        Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px),
+        rig.build_camera(),
+        rig.build_prism(),
+        duration,
+        motion=rig.build_motion(),
+        camera_motion=CameraMotion(scene.rates),
+        sensor=sensor.build(),
+        encoder_model=encoder.build(),
+        nominal_prism=rig.build_nominal(),
+        seed=common.seed,
+        device=device,
+    )
+    write(simulation, out, common)
+
+
+def write(simulation: Simulation, out: Path, common: Common) -> None:
+    """Runs a simulation into a file and says how that went."""
+    from amiwarp.io import open_recording
+
+    began = time.perf_counter()
+    with progress("simulating") as advance:
+        simulation.write(out, progress=advance)
+    seconds = time.perf_counter() - began
+    data: dict[str, Any] = {
+        "file": str(out),
+        "events": len(open_recording(out).events),
+        "duration_s": simulation.duration_s,
+        "seconds": seconds,
+        "times_real_time": seconds / simulation.duration_s,
+        "device": simulation.device,
+    }
+    report(common, data, [_line(data)])
+
+
+def _line(d: dict[str, Any]) -> str:
+    rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
+    return (
+        f"{d['file']}: {d['events']:,} events, {d['duration_s']:.6g} s simulated in {d['seconds']:.2f} s "
+        f"({d['times_real_time']:.3g} x real time, {rate:.3g} Mev/s on {d['device']})"
+    )

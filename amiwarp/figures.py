@@ -1,0 +1,221 @@
+"""Figures of a calibration and of the demo, drawn with Matplotlib into PNG files."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp import clouds
+from amiwarp.calib.calibrate import thin
+from amiwarp.calib.parameters import size_name
+from amiwarp.calib.result import cost_surface
+from amiwarp.iwe import iwe
+from amiwarp.iwe_files import PERCENTILE, save_png
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib import Calibration
+    from amiwarp.events import Events, Recording
+
+EVENTS = 2_000_000
+"""At most so many events, thinned evenly, make an image of a figure."""
+POINTS = 60_000
+"""At most so many points make a cloud."""
+REGION = (64, 80)
+"""Part of the image that is shown enlarged and as clouds [px]."""
+FOUND, TRUTH, LOCAL = "#d55e00", "#000000", "#e69f00"
+
+
+@dataclass(frozen=True)
+class Images:
+    """The image of the events before and after compensation, [events per pixel], shape (height, width) each."""
+
+    before: NDArray[np.float32]
+    after: NDArray[np.float32]
+
+    @property
+    def top(self) -> float:
+        """What both show as white."""
+        return float(np.percentile(self.after[self.after > 0], PERCENTILE)) if (self.after > 0).any() else 1.0
+
+
+def draw_calibration(path: Path, recording: Recording, calibration: Calibration, *, device: Any) -> None:
+    """Cost surface with the samples of all stages, and the image of the events before and after."""
+    figure, axes = _figure((14.0, 4.2), 1, 3, (1.0, 1.0, 0.8))
+    draw_images(axes[:2], images(thin(recording, EVENTS), recording, calibration, device=device))
+    draw_cost(figure, axes[2], calibration)
+    save(figure, path)
+
+
+def images(events: Events, recording: Recording, calibration: Calibration, *, device: Any) -> Images:
+    """The two images of ``events``."""
+    size = recording.events.size
+    encoder = calibration.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
+    after = iwe(events, *size, model=calibration.model, encoder=encoder, device=device)
+    return Images(iwe(events, *size, device=device), after)
+
+
+def draw_images(axes: Any, pair: Images, box: tuple[int, int] | None = None) -> None:
+    """Both images on the same scale; ``box`` marks the region whose left top pixel it is."""
+    from matplotlib.patches import Rectangle
+
+    for ax, image, title in zip(axes, (pair.before, pair.after), ("before", "after"), strict=True):
+        show(ax, image, pair.top, f"events {title} compensation")
+        if box is not None:
+            ax.add_patch(Rectangle(box, *REGION, fill=False, edgecolor=LOCAL, linewidth=1.6))
+
+
+def show(ax: Any, image: NDArray[np.float32], top: float, title: str) -> None:
+    """An image of events, its counts under a square root."""
+    from matplotlib.colors import PowerNorm
+
+    ax.imshow(image, cmap="gray", norm=PowerNorm(0.5, 0.0, top, clip=True), interpolation="nearest")
+    ax.set(xticks=(), yticks=())
+    ax.set_title(title)
+
+
+def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float, float] | None = None) -> None:
+    """The global search's cost over (size cos phase, size sin phase), all samples, what was found, and the ``truth``.
+
+    ``truth``: size and phase [rad]. Where there was no global search the samples stand alone.
+    """
+    size = size_name(calibration.model_name)
+    samples = cost_surface(calibration.stages, size)
+    x, y = (np.degrees(samples[:, 0]) * f(samples[:, 1]) for f in (np.cos, np.sin))
+    coarse = np.array([stage.name == "global" for stage in calibration.stages], bool)[samples[:, 3].astype(int)]
+    if coarse.sum() >= 10 and np.ptp(x[coarse]) > 0 and np.ptp(y[coarse]) > 0:
+        surface = ax.tricontourf(x[coarse], y[coarse], samples[coarse, 2], levels=24, cmap="cividis")
+        ax.set_facecolor(surface.cmap(0.0))
+        figure.colorbar(surface, ax=ax, label=f"sharpness ({calibration.sharpness_name}, coarse image)", shrink=0.85)
+        ax.plot(x[coarse], y[coarse], ".", color="white", markersize=2.2, label="global search")
+    ax.plot(x[~coarse], y[~coarse], "+", color=LOCAL, markersize=5, label="local search")
+    found = _polar(calibration.parameters[size], calibration.parameters["phase"])
+    ax.plot(*found, "o", markersize=13, fillstyle="none", color=FOUND, markeredgewidth=2.2, label="found")
+    if truth is not None:
+        ax.plot(*_polar(*truth), "x", color=TRUTH, markersize=9, markeredgewidth=1.8, label="true")
+    reach = 1.05 * max(np.abs([*x, *y, *found]))
+    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1.0)
+    ax.set(xlabel=f"{size} · cos phase [deg]", ylabel=f"{size} · sin phase [deg]")
+    ax.set_title("cost surface and its samples")
+    ax.legend(loc="lower left", fontsize=8, framealpha=1.0, facecolor="#9a9a9a", markerscale=0.7)
+
+
+def _polar(size: float, phase: float) -> tuple[float, float]:
+    return math.degrees(size) * math.cos(phase), math.degrees(size) * math.sin(phase)
+
+
+def draw_demo(
+    path: Path,
+    recording: Recording,
+    calibration: Calibration,
+    *,
+    headline: str,
+    truth: tuple[float, float],
+    device: Any,
+) -> tuple[str, ...]:
+    """Clouds, images and cost surface in one figure; returns notes on what could not be drawn as it should."""
+    pair = images(thin(recording, EVENTS), recording, calibration, device=device)
+    left, top = busiest(pair.after)
+    figure, axes = _figure((15.0, 9.2), 2, 3, (1.0, 1.0, 1.0))
+    figure.suptitle(headline, fontsize=15)
+    notes = _draw_clouds(figure, axes[0, :2], recording, calibration, (left, top), device)
+    draw_cost(figure, axes[0, 2], calibration, truth)
+    draw_images(axes[1, :2], pair, (left, top))
+    part = (slice(top, top + REGION[1]), slice(left, left + REGION[0]))
+    seam = np.full((REGION[1], 2), pair.top, np.float32)
+    both = np.concatenate([pair.before[part], seam, pair.after[part]], axis=1)
+    show(axes[1, 2], both, pair.top, "the marked region before and after")
+    save(figure, path)
+    return notes
+
+
+def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
+    """Left top pixel of the region in which the image has most contrast, away from its border.
+
+    Single bright spots count no more than a strong edge.
+    """
+    from scipy.ndimage import uniform_filter
+
+    width, height = REGION
+    clipped = np.minimum(image, Images(image, image).top).astype(np.float64)
+    mean, square = (uniform_filter(power, (height, width)) for power in (clipped, clipped**2))
+    contrast = square - mean**2
+    margin_y, margin_x = min(height // 2 + 8, image.shape[0] // 2 - 1), min(width // 2 + 8, image.shape[1] // 2 - 1)
+    inner = contrast[margin_y:-margin_y, margin_x:-margin_x]
+    row, column = np.unravel_index(int(np.argmax(inner)), inner.shape)
+    return max(0, int(column) + margin_x - width // 2), max(0, int(row) + margin_y - height // 2)
+
+
+def _draw_clouds(
+    figure: Any, axes: Any, recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
+) -> tuple[str, ...]:
+    pair = region_clouds(recording, calibration, corner, device)
+    pictures = clouds.render(pair)
+    for k, (ax, title) in enumerate(zip(axes, ("before", "after"), strict=True)):
+        ax.set_axis_off()
+        ax.set_title(f"{title}: one turn of the marked region")
+        if pictures is not None:
+            ax.imshow(pictures[k])
+            continue
+        ax.set_visible(False)
+        plain = figure.add_subplot(ax.get_subplotspec(), projection="3d")
+        plain.set_title(ax.get_title())
+        clouds.draw_plain(plain, pair[k])
+    return () if pictures is not None else (clouds.MISSING,)
+
+
+def region_clouds(
+    recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
+) -> tuple[clouds.Cloud, clouds.Cloud]:
+    """The same events of one turn before and after: those that end up in the region."""
+    from amiwarp.compensate import compensate_events
+
+    source = recording.events
+    encoder = calibration.encoder_for(recording.encoder, source.t_first, source.t_last)
+    turn_us = round(60e6 / max(abs(encoder.rpm), 1e-3))
+    middle = (source.t_first + source.t_last) // 2
+    events = source.between(middle - turn_us // 2, middle + turn_us // 2)
+    after = compensate_events(events, calibration.model, encoder, device=device)
+    inside = np.all((after >= corner) & (after < np.add(corner, REGION)), axis=1)
+    which = np.flatnonzero(inside)
+    which = which[:: max(1, -(-len(which) // POINTS))]
+    raw = np.stack([events.x, events.y], axis=1).astype(np.float32)
+    angle = encoder.angle_at(events.t[which])
+    height = (angle - angle.mean()) / (2.0 * math.pi) if len(angle) else angle
+    on = events.p[which] == 1
+    before, moved = (clouds.Cloud(_box(xy[which], height, corner), on) for xy in (raw, after))
+    return before, moved
+
+
+def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int, int]) -> NDArray[np.float32]:
+    centred = (xy - np.array(corner) - np.array(REGION) / 2.0) / max(REGION)
+    return np.column_stack([centred[:, 0], -centred[:, 1], height]).astype(np.float32)
+
+
+def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[float, ...]) -> tuple[Any, Any]:
+    # Not through pyplot: nothing global is touched, and no display is looked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=110, layout="compressed")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, width_ratios=widths)
+
+
+def save(figure: Any, path: Path) -> None:
+    """Writes a figure as a PNG of 256 colours, which is a third of the size and looks the same; whole or not at all."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
+    picture = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE)
+    save_png(path, picture)
+
+
+__all__ = ["draw_calibration", "draw_cost", "draw_demo", "draw_images", "images"]

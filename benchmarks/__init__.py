@@ -1,0 +1,1 @@
+"""Speed and accuracy, measured together: run with ``python -m benchmarks.NAME``."""

@@ -1,0 +1,251 @@
+"""Calibration without a guess, by the defaults, on simulated recordings of real pictures; JSON, one object.
+
+    python -m benchmarks.calibration pictures|videos|algorithms|costs FOLDER --out FILE.json [--device cuda:0] …
+
+``pictures``: every picture of FOLDER through three prisms, three seeds each. Each row carries the model error, the blur
+beside the truth's, and the best point of a dense grid of the very cost that was maximised.
+``videos``: FOLDER's clips, translated, to the same bar.
+``algorithms``: NLopt's algorithms, global at several budgets and local from 1 px away, on some of the recordings.
+``costs``: sharpness costs, smoothing and polarity on the same.
+The run fails (exit status 1) where a row misses its bar.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.calib.calibrate import prepare
+from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
+from amiwarp.camera import Camera
+from amiwarp.compensate import compensate_events
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, MemoryEvents, Recording, Truth
+from amiwarp.metrics import edge_blur, model_error, truth_model
+from amiwarp.motion import PrismMotion
+from amiwarp.optics import FlatSide, Prism
+from amiwarp.sharpness import Sharpness
+from amiwarp.simulate import Scene, Simulation
+
+APEXES_DEG = (0.5, 1.0, 2.0)
+NOMINAL = 1.3  # nominal over true apex: no box is centred on the truth
+EVERY = 16  # events kept of each recording: calibration thins further, to a million
+GRID_PX = 0.75
+BLUR_EVENTS = 1_000_000
+
+
+def simulated(scene: Scene, camera: Camera, apex_deg: float, seed: int, seconds: float, device: str) -> Recording:
+    """A recording thinned evenly while it is made; its phase differs from seed to seed."""
+    prism = Prism(math.radians(apex_deg))
+    phase = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
+    simulation = Simulation(
+        scene, camera, prism, seconds, PrismMotion(720.0, phase=phase), seed=seed, device=device,
+        nominal_prism=replace(prism, apex=NOMINAL * prism.apex),
+    )  # fmt: skip
+    kept, count = [], 0
+    for events, _ in simulation.blocks():
+        part = events[slice((-count) % EVERY, None, EVERY)]
+        kept.append(Events(part.x.copy(), part.y.copy(), part.t.copy(), part.p.copy()))
+        count += len(events)
+    return Recording(
+        MemoryEvents(Events.concatenate(kept), camera.width, camera.height), camera, simulation.encoder(),
+        simulation.nominal_prism, Truth(simulation.truth_parameters()), {"all_events": count}, "simulated",
+    )  # fmt: skip
+
+
+def pictures(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix in (".jpg", ".png"))
+
+
+def best_of_grid(search: Any, best: np.ndarray) -> dict[str, float]:
+    """The best point of a dense grid over the whole box, and of a fine one about the optimum, against the optimum."""
+    low, high = search.space.bounds()
+    wide = np.stack(np.meshgrid(*(np.arange(a, b, GRID_PX) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
+    wide = wide[np.hypot(*wide.T) <= high[0]]
+    near = best + np.stack(np.meshgrid(*[np.arange(-1.0, 1.01, 0.1)] * 2), -1).reshape(-1, 2)
+    points = np.concatenate([wide, near])
+    scores = np.array([search.fine(v) for v in points])
+    found, k = search.fine(best), int(np.argmax(scores))
+    peak = found - float(np.median(scores))
+    return {
+        "grid_points": len(points),
+        "grid_excess": float(scores[k] - found) / peak,
+        "grid_best_away_px": float(np.linalg.norm(points[k] - best)),
+    }
+
+
+def judged(recording: Recording, c: Calibration, device: str) -> dict[str, Any]:
+    """Model error and blur of a calibration against the truth."""
+    assert recording.camera is not None
+    assert recording.truth is not None
+    assert recording.encoder is not None
+    truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
+    error = model_error(c.model, truth)
+    events = recording.events.slice(0, BLUR_EVENTS)
+    after, best = (compensate_events(events, m, recording.encoder, device=device) for m in (c.model, truth))
+    raw = np.stack([events.x, events.y], axis=1).astype(np.float32)
+    width, height = recording.events.size
+    blur, blur_truth = edge_blur(after, width, height), edge_blur(best, width, height)
+    return {
+        "all_events": recording.metadata["all_events"],
+        "apex_deg": math.degrees(c.parameters["apex"]),
+        "apex_std_deg": math.degrees(c.uncertainty["apex"]),
+        "model_error_px": error.rms,
+        "model_error_worst_px": error.worst,
+        "lag_deg": math.degrees(error.lag),
+        "blur_before_px": edge_blur(after, width, height, of=raw),
+        "blur_after_px": blur,
+        "blur_with_truth_px": blur_truth,
+        "blur_ratio": blur / blur_truth,
+        "sharpness_before": c.sharpness_before,
+        "sharpness_after": c.sharpness_after,
+        "evaluations": sum(s.evaluations for s in c.stages),
+        "calibrate_s": c.seconds,
+        "warnings": list(c.warnings),
+    }
+
+
+def row_of(recording: Recording, device: str) -> dict[str, Any]:
+    """One recording calibrated by the defaults, judged; a refusal is a row that misses its bar."""
+    try:
+        c = calibrate(recording, device=device)
+    except AmiwarpError as error:
+        return {"refused": str(error), "ok": False}
+    search = prepare(recording, Settings(), device=device)[0]
+    grid = best_of_grid(search, search.space.to_vector(dict(c.parameters)))
+    row = {**judged(recording, c, device), **grid}
+    row["ok"] = row["grid_excess"] <= 1e-4 and row["blur_ratio"] <= 1.05
+    return row
+
+
+def run_pictures(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    camera = Camera.from_fov(640, 480, math.radians(60.0))
+    for picture in pictures(args.folder):
+        scene = Scene.from_picture(picture)
+        for apex in args.apex:
+            for seed in range(args.seeds):
+                recording = simulated(scene, camera, apex, seed, args.seconds, args.device)
+                yield {"picture": picture.name, "apex_true_deg": apex, "seed": seed, **row_of(recording, args.device)}
+
+
+def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    from amiwarp.translate import open_pictures
+
+    for clip in sorted(p for p in args.folder.iterdir() if p.suffix in (".npy", ".mp4")):
+        frames = open_pictures(clip, fps=240.0 if "240fps" in clip.name else 25.0 if clip.suffix == ".npy" else None)
+        camera = Camera.from_fov(*frames.size, math.radians(60.0))
+        seconds = min(args.seconds, frames.duration_us * 1e-6)
+        for apex in args.apex:
+            for seed in range(args.seeds):
+                recording = simulated(Scene(frames), camera, apex, seed, seconds, args.device)
+                yield {"clip": clip.name, "apex_true_deg": apex, "seed": seed, **row_of(recording, args.device)}
+
+
+def some(args: argparse.Namespace) -> Iterator[tuple[dict[str, Any], Recording]]:
+    """A third of the table: every picture with one prism, in turn."""
+    camera = Camera.from_fov(640, 480, math.radians(60.0))
+    for k, picture in enumerate(pictures(args.folder)):
+        apex = APEXES_DEG[k % len(APEXES_DEG)]
+        recording = simulated(Scene.from_picture(picture), camera, apex, k, args.seconds, args.device)
+        yield {"picture": picture.name, "apex_true_deg": apex}, recording
+
+
+def run_algorithms(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Whether each global search ends where the default local one reaches the optimum; how far each local one gets."""
+    for label, recording in some(args):
+        search = prepare(recording, Settings(), device=args.device)[0]
+        search.run()
+        best = search.space.to_vector(search.best)
+        low, high = search.space.bounds()
+        for name in GLOBAL_ALGORITHMS:
+            for budget in (40, 80, 150, 300):
+                trial = prepare(
+                    recording, Settings(global_algorithm=name, global_evaluations=budget), device=args.device
+                )[0]
+                began = time.perf_counter()
+                trial.run()
+                away = float(np.linalg.norm(trial.space.to_vector(trial.best) - best))
+                yield {**label, "stage": "global", "algorithm": name, "budget": budget, "away_px": away,
+                       "seconds": time.perf_counter() - began, "ok": True}  # fmt: skip
+        for name in LOCAL_ALGORITHMS:
+            for angle in (0.3, 2.0, 4.5):
+                start = best + np.array([math.cos(angle), math.sin(angle)])
+                stage = maximise(
+                    search.fine, name, low=low, high=high, start=start, evaluations=300, tolerance=0.002, step=0.7
+                )
+                yield {**label, "stage": "local", "algorithm": name, "away_px": float(np.linalg.norm(stage.x - best)),
+                       "evaluations": stage.evaluations, "seconds": stage.seconds, "ok": True}  # fmt: skip
+
+
+def run_costs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    for label, recording in some(args):
+        for kind in Sharpness:
+            for smoothing in (0.0, 1.0, 2.0):
+                for per_polarity in (False, True):
+                    what = {"cost": kind.value, "smoothing_px": smoothing, "per_polarity": per_polarity}
+                    try:
+                        c = calibrate(
+                            recording,
+                            sharpness=kind,
+                            smoothing_px=smoothing,
+                            per_polarity=per_polarity,
+                            device=args.device,
+                        )
+                        row = judged(recording, c, args.device)
+                    except AmiwarpError as error:
+                        row = {"refused": str(error)}
+                    yield {**label, **what, **row, "ok": True}
+
+
+RUNS = {"pictures": run_pictures, "videos": run_videos, "algorithms": run_algorithms, "costs": run_costs}
+
+
+def machine(device: str) -> dict[str, str]:
+    from importlib.metadata import version
+
+    name = wp.get_device(device).name if device != "cpu" else platform.processor() or platform.machine()
+    packages = {p: version(p) for p in ("numpy", "scipy", "nlopt")}
+    return {"device": name, "python": platform.python_version(), "warp": wp.__version__, **packages}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=RUNS)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--apex", type=float, nargs="+", default=list(APEXES_DEG))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--limit-s", type=float, default=math.inf, help="start no new row after so many seconds")
+    args = parser.parse_args()
+    wp.config.quiet = True
+    began, rows, complete = time.perf_counter(), [], True
+    for row in RUNS[args.what](args):
+        rows.append(row)
+        print(json.dumps(row), file=sys.stderr, flush=True)
+        if time.perf_counter() - began > args.limit_s:
+            complete = False
+            break
+    result = {"benchmark": args.what, "machine": machine(args.device), "complete": complete, "rows": rows}
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(result, indent=1) + "\n")
+    missed = [row for row in rows if not row["ok"]]
+    print(f"{len(rows)} rows, {len(missed)} miss their bar, {time.perf_counter() - began:.0f} s", file=sys.stderr)
+    return 1 if missed or not complete else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

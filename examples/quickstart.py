@@ -1,0 +1,18 @@
+"""The main job in a few lines: make a recording, calibrate it without a guess, compensate it."""
+
+import math
+
+from pyvista.examples import mapfile
+
+import amiwarp
+
+camera = amiwarp.Camera.from_fov(320, 240, math.radians(60))
+true, on_the_sheet = amiwarp.Prism(math.radians(2.0)), amiwarp.Prism(math.radians(2.3))
+recording = amiwarp.simulate(mapfile, camera, true, duration_s=0.2, motion=720.0, nominal_prism=on_the_sheet)
+
+calibration = amiwarp.calibrate(recording)
+print(f"apex {math.degrees(calibration.parameters['apex']):.3f} deg, true {math.degrees(true.apex):.3f} deg")
+print(f"sharpness {calibration.sharpness_before:.2f} -> {calibration.sharpness_after:.2f}")
+
+done = amiwarp.compensate(recording, calibration, "compensated.h5")
+print(f"{done.events} events at {done.mev_per_s:.1f} Mev/s into compensated.h5")

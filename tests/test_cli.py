@@ -1,0 +1,418 @@
+"""The command line: every command, its examples, its JSON, and how it fails."""
+
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+from amiwarp.calib import Calibration
+from amiwarp.cli import calibrate, compensate, convert, demo, info, simulate, translate
+from amiwarp.cli.app import app
+from amiwarp.cli.inputs import number
+from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
+
+COMMANDS = {
+    module.__name__.rpartition(".")[2]: module
+    for module in (demo, info, convert, simulate, translate, calibrate, compensate)
+}
+
+
+def run(*args: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(arg) for arg in args])
+
+
+def ok(*args: str | Path) -> dict[str, Any]:
+    """The command's JSON object; nothing else may be on stdout."""
+    result = run(*args, "--json")
+    assert result.exit_code == 0, result.stderr
+    data = json.loads(result.stdout)
+    assert isinstance(data, dict)
+    return data
+
+
+def fails(code: int, *args: str | Path) -> str:
+    """The one line on stderr of a command that fails with ``code``."""
+    result = run(*args)
+    assert (result.exit_code, result.stdout) == (code, ""), result.output
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    return str(result.stderr)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> Path:
+    """A picture, a recording of it and its calibration: 160 × 120, 0.2 s; read only."""
+    folder = tmp_path_factory.mktemp("cli")
+    Image.fromarray(texture).save(folder / "photo.jpg", quality=95)
+    ok(
+        "simulate", folder / "recording.h5", "--picture", folder / "photo.jpg", "--size", "160x120", "--fov-deg", "40",
+        "--duration", "0.2", "--apex-deg", "2", "--nominal-apex-deg", "2.4", "--phase-deg", "100", "--seed", "4",
+    )  # fmt: skip
+    ok("calibrate", folder / "recording.h5", folder / "calibration.json", "--events", "100000")
+    return folder
+
+
+@pytest.fixture
+def place(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in, with links to the files of ``folder``."""
+    for file in folder.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def left_behind(place: Path, *expected: str) -> set[str]:
+    """Files in ``place`` besides the fixture's and those expected."""
+    known = {"photo.jpg", "recording.h5", "calibration.json", *expected}
+    return {file.name for file in place.iterdir()} - known
+
+
+def test_help_of_everything_shows_an_example() -> None:
+    assert set(COMMANDS) == set(re.findall(r"^│ (\w+)  ", run("--help").stdout, re.M))
+    for name, module in COMMANDS.items():
+        result = run(name, "--help")
+        assert result.exit_code == 0
+        text = " ".join(result.stdout.split())
+        assert f"Example: {module.EXAMPLE}" in text
+        assert all(option in text for option in ("--json", "--device", "--seed"))
+
+
+def test_version() -> None:
+    import amiwarp
+
+    assert run("--version").stdout.strip() == amiwarp.__version__
+
+
+def test_examples_of_the_help_run(place: Path, texture: np.ndarray) -> None:
+    """Those that need the fixture's files only; the demo has a test of its own."""
+    for name in ("info", "compensate", "calibrate"):
+        words = shlex.split(COMMANDS[name].EXAMPLE)
+        if name == "calibrate":
+            (place / "calibration.json").unlink()
+        assert words[:2] == ["amiwarp", name]
+        ok(*words[1:])
+    assert left_behind(place) == {"compensated.h5", "iwe.png", "calibration.png"}
+    ok(*shlex.split(simulate.EXAMPLE)[1:], "--size", "64x48", "--duration", "0.05")
+    _own_recording(place)
+    ok(*shlex.split(convert.EXAMPLE.replace("events.raw", "events.npz").replace("recording.h5", "mine.h5"))[1:])
+    (place / "pictures").mkdir()
+    for k in range(3):
+        Image.fromarray(np.roll(texture, k)[:60, :80]).save(place / "pictures" / f"{k}.png")
+    words = shlex.split(translate.EXAMPLE.replace("video.mp4", "pictures").replace("recording.h5", "moved.h5"))
+    assert ok(*words[1:], "--fps", "50")["duration_s"] == pytest.approx(0.06, abs=1e-9)
+    assert open_recording(place / "moved.h5").events.size == (80, 60)
+
+
+def _own_recording(place: Path) -> None:
+    """``events.npz`` with 1,000 events over a second, and ``encoder.csv`` at one turn a second."""
+    rng = np.random.default_rng(5)
+    t = np.sort(rng.integers(0, 1_000_000, 1000))
+    np.savez(place / "events.npz", x=rng.integers(0, 64, 1000), y=rng.integers(0, 48, 1000), t=t, p=t % 2)
+    rows = [f"{t},{t * 4096 // 1_000_000}" for t in range(-1000, 1_002_000, 1000)]
+    (place / "encoder.csv").write_text("\n".join(["t_us,count", *rows]) + "\n")
+
+
+def test_simulate_tells_its_truth(place: Path) -> None:
+    data = ok("info", "recording.h5")
+    assert (data["width"], data["height"], data["compensated"]) == (160, 120, False)
+    assert data["truth"]["apex_deg"] == pytest.approx(2.0, abs=1e-9)
+    assert data["truth"]["phase_deg"] == pytest.approx(100.0, abs=1e-9)
+    assert data["prism"]["apex_deg"] == pytest.approx(2.4, abs=1e-9)
+    assert data["camera"]["fov_deg"] == pytest.approx(40.0, abs=1e-9)
+    assert data["encoder"]["rpm"] == pytest.approx(720.0, abs=1.0)
+    assert data["encoder"]["covers_events"] is True
+    assert data["encoder"]["gaps"] == []
+    assert data["truth_points"] is True
+    assert data["repairs"] == {}
+    assert data["duration_s"] == pytest.approx(0.2, abs=0.01)
+    assert 0.3 < data["on_share"] < 0.7
+
+
+def test_seed_decides_the_recording(place: Path) -> None:
+    def simulated(name: str, seed: str) -> bytes:
+        ok("simulate", name, "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.05", "--seed", seed)
+        return open_recording(name).events.slice(0, 10_000_000).t.tobytes()
+
+    assert simulated("a.h5", "1") == simulated("b.h5", "1")
+    assert simulated("c.h5", "2") != simulated("a.h5", "1")
+
+
+def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
+    (place / "speed.csv").write_text("# s, rpm\n0,700\n0.1,740\n")
+    ok(
+        "simulate", "faulty.h5", "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.1", "--ideal",
+        "--contrast-on", "0.3", "--shot-noise-hz", "2", "--counts-per-turn", "0", "--rate-hz", "500",
+        "--speed", "speed.csv", "--tilt-deg", "1,-0.5", "--rotate-deg-s", "0,5,0", "--flat-side", "camera",
+    )  # fmt: skip
+    data = ok("info", "faulty.h5")
+    truth = data["truth"]
+    assert (truth["contrast_on"], truth["contrast_off"], truth["shot_noise_hz"], truth["leak_hz"]) == (0.3, 0.25, 2, 0)
+    assert truth["tilt_y_deg"] == pytest.approx(-0.5, abs=1e-9)
+    assert truth["omega_y"] == pytest.approx(np.radians(5.0), abs=1e-9)
+    assert data["prism"]["flat_side"] == "camera"
+    assert data["encoder"]["rpm"] == pytest.approx(720.0, abs=3.0)
+    assert data["encoder"]["interval_us"] == pytest.approx(2000.0, abs=20.0)
+
+
+def test_calibrate_finds_the_truth(place: Path) -> None:
+    found = Calibration.load("calibration.json")
+    assert np.degrees(found.parameters["apex"]) == pytest.approx(2.0, abs=0.1)
+    # Events lag their edges, the more the higher the thresholds: the phase is not the mechanical one.
+    assert np.degrees(found.parameters["phase"]) == pytest.approx(100.0, abs=8.0)
+
+
+def test_calibrate_takes_every_setting(place: Path) -> None:
+    data = ok(
+        "calibrate", "recording.h5", "--model", "circle", "--sharpness", "gradient", "--global-algorithm", "none",
+        "--local-algorithm", "LN_SBPLX", "--free", "deflection,phase", "--start", "deflection=1deg", "--start",
+        "phase=1.6rad", "--bound", "deflection=0.5deg:1.5deg", "--bound", "phase=60deg:140deg", "--local-evaluations",
+        "40", "--tolerance-px", "0.01", "--smoothing-px", "1.5", "--per-polarity", "--events", "50000",
+        "--window", "0.05:0.18", "--nominal-apex-deg", "2.2", "--index", "1.52", "--flat-side", "scene",
+        "--fov-deg", "40", "--figure", "cost.png",
+    )  # fmt: skip
+    assert data["file"] == "recording.calibration.json"
+    assert [stage["algorithm"] for stage in data["stages"]] == ["LN_SBPLX"]
+    assert data["stages"][0]["evaluations"] <= 40
+    assert data["sharpness"]["kind"] == "gradient"
+    assert data["sharpness"]["after"] > data["sharpness"]["before"]
+    assert 0 < data["events"] <= 50_000
+    assert data["prism"]["index"] == 1.52
+    assert 60.0 <= data["parameters"]["phase"]["degrees"] <= 140.0
+    assert np.asarray(Image.open("cost.png")).shape[1] > 1000
+    assert left_behind(place) == {"recording.calibration.json", "cost.png"}
+
+
+def test_calibrate_prints_a_table(place: Path) -> None:
+    result = run("calibrate", "recording.h5", "again.json", "--events", "20000", "--global-evaluations", "60")
+    assert result.exit_code == 0, result.stderr
+    assert re.search(r"^apex +[12]\.\d+ +\S+ +deg$", result.stdout, re.M), result.stdout
+    assert re.search(r"^local +LN_\w+ +\d+ +[\d.]+ s", result.stdout, re.M), result.stdout
+    assert "sharpness (variance): " in result.stdout
+
+
+def test_compensate_keeps_every_event(place: Path) -> None:
+    data = ok("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json")
+    before, after = open_recording("recording.h5").events, open_recording("out.h5").events
+    assert data["events"] == len(before) == len(after)
+    a, b = before.slice(0, len(before)), after.slice(0, len(after))
+    assert np.array_equal(a.t, b.t)
+    assert np.array_equal(a.p, b.p)
+    assert b.x.dtype == np.float32
+    with h5py.File("out.h5") as file:
+        assert int((file["events/inside"][:] == 0).sum()) == data["outside"]
+    assert ok("info", "out.h5")["compensated"] is True
+
+
+@pytest.mark.parametrize(
+    ("layers", "shape"), [("merged", (120, 160)), ("signed", (120, 160)), ("polarity", (2, 120, 160))]
+)
+def test_iwe_whole(place: Path, layers: str, shape: tuple[int, ...]) -> None:
+    ok("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe", "iwe.npy", "--iwe",
+       "iwe.png", "--iwe-layers", layers)  # fmt: skip
+    image = np.load("iwe.npy")
+    with h5py.File("out.h5") as file:
+        inside = int(file["events/inside"][:].sum())
+    assert (image.shape, image.dtype) == (shape, np.float32)
+    if layers != "signed":
+        # an event at the border shares its vote with pixels beyond it
+        assert 0.98 * inside <= image.sum() <= inside * 1.001
+    picture = np.asarray(Image.open("iwe.png"))
+    assert picture.shape == ((120, 160, 3) if layers == "polarity" else (120, 160))
+    assert picture.max() == 255 or layers == "polarity"
+
+
+def test_iwe_by_windows_adds_up_to_the_whole(place: Path) -> None:
+    common = ("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe")
+    ok(*common, "whole.npy")
+    data = ok(*common, "parts.npy", "--iwe", "parts.png", "--iwe-window-ms", "30")
+    whole, parts = np.load("whole.npy"), np.load("parts.npy")
+    assert parts.shape == (7, 120, 160)
+    assert np.abs(parts.sum(axis=0) - whole).max() <= 1e-3 * whole.max()
+    assert len(data["iwe"]) == 8
+    assert left_behind(place) == {"out.h5", "whole.npy", "parts.npy", *(f"parts_{k:05d}.png" for k in range(7))}
+
+
+def test_convert_puts_encoder_camera_and_prism_in(place: Path) -> None:
+    _own_recording(place)
+    camera = {"width": 64, "height": 48, "fx": 80.0, "fy": 80.0, "cx": 31.5, "cy": 23.5}
+    (place / "camera.json").write_text(json.dumps(camera))
+    data = ok("convert", "events.npz", "mine.h5", "--encoder", "encoder.csv", "--counts-per-turn", "4096",
+              "--direction", "-1", "--camera", "camera.json", "--nominal-apex-deg", "1.5",
+              "--index", "1.6")  # fmt: skip
+    assert (data["events"], data["encoder_covers"], data["encoder_gaps"]) == (1000, True, [])
+    seen = ok("info", "mine.h5")
+    assert (seen["events"], seen["width"], seen["camera"]["fx"]) == (1000, 64, 80.0)
+    assert seen["encoder"]["rpm"] == pytest.approx(-60.0, abs=0.1)
+    assert seen["prism"] == {"apex_deg": pytest.approx(1.5), "index": 1.6, "flat_side": "scene"}
+
+
+def test_info_for_people(place: Path) -> None:
+    result = run("info", "recording.h5")
+    assert result.exit_code == 0
+    assert re.search(r"^size +160 x 120 px$", result.stdout, re.M)
+    assert re.search(r"^encoder +[\d,]+ samples, 7\d\d\.?\d* rpm, .*covers the events; no gaps$", result.stdout, re.M)
+
+
+def _bad_files(place: Path) -> None:
+    (place / "garbage.h5").write_bytes(bytes(range(256)) * 20)
+    (place / "empty.raw").write_bytes(b"")
+    (place / "cut.h5").write_bytes((place / "recording.h5").read_bytes()[:5000])
+    (place / "bad.json").write_text('{"format": "amiwarp-calibration", "version": 1, "model": "exact"}')
+    (place / "list.json").write_text("[1, 2]")
+    (place / "nocamera.json").write_text('{"width": 160}')
+    data = json.loads((place / "calibration.json").read_text())
+    data["camera"]["width"] = 99
+    (place / "narrow.json").write_text(json.dumps(data))
+    (place / "notes.txt").write_text("no picture")
+    _own_recording(place)
+
+
+BAD = [
+    (("info", "missing.h5"), "missing.h5"),
+    (("info", "garbage.h5"), "garbage.h5"),
+    (("info", "empty.raw"), "empty.raw"),
+    (("info", "cut.h5"), "cut.h5"),
+    (("info", "."), "folder"),
+    (("convert", "garbage.h5", "out.h5"), "garbage.h5"),
+    (("convert", "recording.h5", "recording.h5"), "recording.h5"),
+    (("convert", "recording.h5", "nowhere/out.h5"), "nowhere"),
+    (("convert", "recording.h5", "out.h5", "--encoder", "missing.csv"), "missing.csv"),
+    (("convert", "events.npz", "out.h5", "--encoder", "encoder.csv"), "counts_per_turn"),
+    (("convert", "events.npz", "out.h5", "--counts-per-turn", "5"), "--encoder"),
+    (("convert", "recording.h5", "out.h5", "--camera", "nocamera.json"), "height"),
+    (("convert", "recording.h5", "out.h5", "--camera", "narrow.json"), "99x120"),
+    (("convert", "recording.h5", "out.h5", "--camera", "narrow.json", "--fov-deg", "60"), "give one of them"),
+    (("simulate", "out.h5", "--picture", "notes.txt"), "notes.txt"),
+    (("simulate", "out.h5", "--picture", "missing.jpg"), "missing.jpg"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--size", "big"), "640x480"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--apex-deg", "45"), "apex"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--mismatch", "7"), "mismatch"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--tilt-deg", "1"), "--tilt-deg"),
+    (("simulate", "nowhere/out.h5", "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.01"), "nowhere"),
+    (("translate", "missing.mp4", "out.h5"), "missing.mp4"),
+    (("translate", "notes.txt", "out.h5"), "notes.txt"),
+    (("calibrate", "missing.h5"), "missing.h5"),
+    (("calibrate", "events.npz"), "camera"),
+    (("calibrate", "recording.h5", "--model", "spiral"), "spiral"),
+    (("calibrate", "recording.h5", "--global-algorithm", "GN_GUESS"), "GN_GUESS"),
+    (("calibrate", "recording.h5", "--local-algorithm", "LD_LBFGS"), "LD_LBFGS"),
+    (("calibrate", "recording.h5", "--free", "apex,colour"), "colour"),
+    (("calibrate", "recording.h5", "--start", "apex=1"), "1.2deg"),
+    (("calibrate", "recording.h5", "--start", "colour=1"), "colour"),
+    (("calibrate", "recording.h5", "--bound", "apex=1deg"), "LOW:HIGH"),
+    (("calibrate", "recording.h5", "--bound", "apex=2deg:1deg"), "apex"),
+    (("calibrate", "recording.h5", "--window", "5:6"), "5:6"),
+    (("calibrate", "recording.h5", "--window", "0.1"), "START:END"),
+    (("calibrate", "recording.h5", "--window", "0:0.001"), "events"),
+    (("calibrate", "recording.h5", "nowhere/c.json", "--events", "5000", "--global-evaluations", "20"), "nowhere"),
+    (("compensate", "recording.h5", "out.h5", "--calibration", "missing.json"), "missing.json"),
+    (("compensate", "recording.h5", "out.h5", "--calibration", "bad.json"), "bad.json"),
+    (("compensate", "recording.h5", "out.h5", "--calibration", "list.json"), "list.json"),
+    (("compensate", "recording.h5", "out.h5", "--calibration", "recording.h5"), "recording.h5"),
+    (("compensate", "recording.h5", "out.h5", "--calibration", "narrow.json"), "99x120"),
+    (("compensate", "recording.h5", "recording.h5", "--calibration", "calibration.json"), "recording.h5"),
+    (("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe", "iwe.bmp"), "iwe.bmp"),
+    (("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe-window-ms", "5"), "--iwe"),
+    (("compensate", "recording.h5", "no/o.h5", "--calibration", "calibration.json", "--iwe", "i.npy"), "no/o.h5"),
+    (("demo", "--picture", "notes.txt", "--out", "demo"), "notes.txt"),
+    (("demo", "--out", "notes.txt"), "notes.txt"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--device", "cuda:77"), "cuda:77"),
+]
+
+
+@pytest.mark.parametrize(("args", "named"), BAD, ids=lambda value: " ".join(value) if isinstance(value, tuple) else "")
+def test_bad_input_is_one_line_and_leaves_nothing(place: Path, args: tuple[str, ...], named: str) -> None:
+    _bad_files(place)
+    before = left_behind(place)
+    contents = (place / "recording.h5").read_bytes()
+    assert named in fails(1, *args)
+    assert left_behind(place, "demo") == before
+    assert (place / "recording.h5").read_bytes() == contents
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("explode",),
+        ("--explode",),
+        ("info",),
+        ("info", "recording.h5", "--explode"),
+        ("info", "recording.h5", "--seed", "-1"),
+        ("calibrate", "recording.h5", "--sharpness", "loud"),
+        ("compensate", "recording.h5", "out.h5"),
+        ("simulate", "out.h5"),
+    ],
+)
+def test_wrong_usage_is_exit_2_and_one_line(place: Path, args: tuple[str, ...]) -> None:
+    assert "--help" in fails(2, *args)
+    assert left_behind(place) == set()
+
+
+@pytest.mark.parametrize("command", ["simulate", "calibrate"])
+def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
+    args = {
+        "simulate": ["simulate", "long.h5", "--picture", "photo.jpg", "--duration", "60"],
+        "calibrate": ["calibrate", "recording.h5", "long.json", "--global-evaluations", "1000000"],
+    }[command]
+    script = "import sys; sys.argv[0] = 'amiwarp'; from amiwarp.cli.app import main; print('up', flush=True); main()"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, *args], cwd=place, env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "up\n"
+    if command == "simulate":
+        wait_until(lambda: any(file.name.endswith(".part") for file in place.iterdir()))
+    time.sleep(6.0 if command == "calibrate" else 0.5)
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, ""), error
+    assert error.count("\n") == 1, error
+    assert left_behind(place) == set()
+
+
+def wait_until(done: Any, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_stdout_of_a_process_is_json_alone(place: Path) -> None:
+    """Warp's banner and VTK's warnings go nowhere near it."""
+    args = ["compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--json", "--device", "cpu"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-m", "amiwarp", *args], cwd=place, env=environment, capture_output=True, text=True, check=True
+    )
+    assert json.loads(done.stdout)["events"] > 0
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [("90deg", "rad", np.pi / 2), ("1.5 rad", "rad", 1.5), ("-0.25ms", "us", -250.0), ("30", "us", 30.0),
+     ("720rpm", "1/min", 720.0), ("-720", "1/min", -720.0), ("1.5", "1", 1.5)],
+)  # fmt: skip
+def test_numbers_with_units(text: str, unit: str, value: float) -> None:
+    assert number(text, unit, "x") == pytest.approx(value, abs=1e-12)
+
+
+@pytest.mark.parametrize(("text", "unit"), [("1", "rad"), ("1rpm", "rad"), ("nan", "1"), ("", "us"), ("infdeg", "rad")])
+def test_numbers_without_sense(text: str, unit: str) -> None:
+    with pytest.raises(AmiwarpError, match="not a value"):
+        number(text, unit, "x")

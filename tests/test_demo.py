@@ -1,0 +1,63 @@
+"""The demo meets its bars, from the picture to the figure."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from amiwarp import clouds
+from amiwarp.calib import Calibration
+from amiwarp.cli.app import app
+from amiwarp.io import open_recording
+
+FILES = {"recording.h5", "calibration.json", "compensated.h5", "demo.png"}
+
+
+def check(data: dict[str, float], out: Path) -> None:
+    """The bars of the demo."""
+    assert data["blur_after_px"] <= 1.05 * data["blur_with_truth_px"]
+    assert data["blur_after_px"] <= data["blur_before_px"] / 3.0
+    assert data["model_error_px"] <= 0.5
+    assert data["apex_deg"] == pytest.approx(data["apex_true_deg"], abs=0.1)
+    assert {file.name for file in out.iterdir()} == FILES
+    assert len(open_recording(out / "recording.h5").events) == data["events"]
+    assert len(open_recording(out / "compensated.h5").events) == data["events"]
+    assert np.degrees(Calibration.load(out / "calibration.json").parameters["apex"]) == pytest.approx(data["apex_deg"])
+
+
+def test_demo_at_its_default_size(tmp_path: Path) -> None:
+    out = tmp_path / "made" / "demo"
+    result = CliRunner().invoke(app, ["demo", "--out", str(out), "--json", "--device", "cpu"])
+    assert result.exit_code == 0, result.stderr
+    data = json.loads(result.stdout)
+    check(data, out)
+    assert data["seconds"] < 300.0
+    assert data["events"] > 1_000_000
+    assert np.asarray(Image.open(out / "demo.png")).shape[1] > 1000
+    assert (out / "demo.png").stat().st_size < 1_000_000
+
+
+def test_demo_without_opengl_still_draws(tmp_path: Path, texture: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """VTK ends its process where there is no OpenGL; here every process ends."""
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    photo = tmp_path / "photo.png"
+    Image.fromarray(texture).save(photo)
+    args = ["demo", "--out", str(tmp_path / "out"), "--picture", str(photo), "--size", "200x150", "--duration", "0.2"]
+    result = CliRunner().invoke(app, [*args, "--seed", "3"])
+    assert result.exit_code == 0, result.stderr
+    assert clouds.MISSING in " ".join(result.stdout.split())
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES
+
+
+def test_clouds_are_drawn_or_said_not_to_be() -> None:
+    rng = np.random.default_rng(0)
+    cloud = clouds.Cloud(rng.uniform(-0.4, 0.4, (2000, 3)).astype(np.float32), rng.random(2000) < 0.5)
+    pictures = clouds.render([cloud, cloud])
+    if pictures is None:
+        pytest.skip(clouds.MISSING)
+    for picture in pictures:
+        assert picture.ndim == 3
+        assert (picture.reshape(-1, 3) < 200).any(axis=1).mean() > 0.02
