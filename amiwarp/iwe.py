@@ -46,6 +46,8 @@ class CanvasShape:
     per_polarity: bool = False
     """Two layers, OFF then ON, in place of one."""
     vote: Vote = Vote.BILINEAR
+    dither: bool = False
+    """Put each event somewhere in its pixel, not at the centre: then no sharpness is won by events on the pixel grid."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -60,6 +62,7 @@ class CanvasShape:
         c = Canvas()
         c.pad, c.scale = float(self.pad), self.scale
         c.per_polarity, c.nearest = int(self.per_polarity), int(self.vote is Vote.NEAREST)
+        c.dither = int(self.dither)
         return c
 
 

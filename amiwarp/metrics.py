@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics import ExactModel, ModelError, Prism, predicted_error
+from amiwarp.sharpness import Sharpness, sharpness
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -75,8 +76,8 @@ def edge_blur(
 ) -> float:
     """Standard deviation of events across edges [px], the paper's compensation error.
 
-    Edges are found in the IWE of ``sharp_xy`` (n, 2), and each event within :data:`ACROSS` px of one belongs to it, with
-    the probability that it is not of the even background that noise and neighbouring texture lay over the edge.
+    Edges are found in the IWE of ``sharp_xy`` (n, 2), and each event within :data:`ACROSS` px of one belongs to it,
+    with the probability that it is not of the even background that noise and neighbouring texture lay over the edge.
     Measured are the same events at ``of`` (n, 2), by default at ``sharp_xy`` itself: give the raw places there to
     learn the blur before compensation. Pixel quantisation alone leaves 0.29 px.
     Raises :class:`AmiwarpError` where there are no edges.
@@ -128,6 +129,16 @@ def _belonging(across: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(density > 0.0, np.maximum(0.0, 1.0 - background / density), 0.0)
     return np.asarray(share[bins])
+
+
+def contrast(image: NDArray[np.float32]) -> float:
+    """Variance over mean of an IWE (height, width): 1 for events strewn at random, more the sharper it is."""
+    return sharpness(image, Sharpness.VARIANCE)
+
+
+def entropy(image: NDArray[np.float32]) -> float:
+    """Entropy of the events' distribution over the pixels of an IWE (height, width) [nat]: less the sharper it is."""
+    return -sharpness(image, Sharpness.ENTROPY)
 
 
 def truth_model(camera: Camera, truth: Truth, flat_side: FlatSide) -> ExactModel:

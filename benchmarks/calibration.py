@@ -41,12 +41,14 @@ from amiwarp.simulate import Scene, Simulation
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.3  # nominal over true apex: no box is centred on the truth
-EVERY = 16  # events kept of each recording: calibration thins further, to a million
+EVERY = 16  # events kept of a picture's recording: calibration thins further, to a million
 GRID_PX = 0.75
 BLUR_EVENTS = 1_000_000
 
 
-def simulated(scene: Scene, camera: Camera, apex_deg: float, seed: int, seconds: float, device: str) -> Recording:
+def simulated(
+    scene: Scene, camera: Camera, apex_deg: float, seed: int, seconds: float, device: str, every: int = EVERY
+) -> Recording:
     """A recording thinned evenly while it is made; its phase differs from seed to seed."""
     prism = Prism(math.radians(apex_deg))
     phase = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
@@ -56,7 +58,7 @@ def simulated(scene: Scene, camera: Camera, apex_deg: float, seed: int, seconds:
     )  # fmt: skip
     kept, count = [], 0
     for events, _ in simulation.blocks():
-        part = events[slice((-count) % EVERY, None, EVERY)]
+        part = events[slice((-count) % every, None, every)]
         kept.append(Events(part.x.copy(), part.y.copy(), part.t.copy(), part.p.copy()))
         count += len(events)
     return Recording(
@@ -149,7 +151,7 @@ def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         seconds = min(args.seconds, frames.duration_us * 1e-6)
         for apex in args.apex:
             for seed in range(args.seeds):
-                recording = simulated(Scene(frames), camera, apex, seed, seconds, args.device)
+                recording = simulated(Scene(frames), camera, apex, seed, seconds, args.device, every=1)
                 yield {"clip": clip.name, "apex_true_deg": apex, "seed": seed, **row_of(recording, args.device)}
 
 
@@ -231,7 +233,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--limit-s", type=float, default=math.inf, help="start no new row after so many seconds")
     args = parser.parse_args()
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_ERROR
     began, rows, complete = time.perf_counter(), [], True
     for row in RUNS[args.what](args):
         rows.append(row)

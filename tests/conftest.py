@@ -14,7 +14,7 @@ from amiwarp.motion import PrismMotion
 from amiwarp.optics import Prism
 from amiwarp.simulate import simulate
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_ERROR
 wp.init()
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.io import open_recording
 from amiwarp.metrics import model_error, truth_model
 from amiwarp.motion import EncoderModel, PrismMotion
 from amiwarp.optics import MODELS, FlatSide, Prism, predicted_error
@@ -142,6 +144,13 @@ def test_tilt_is_found(texture: np.ndarray) -> None:
     assert c.parameters["tilt_y"] == pytest.approx(-0.03, abs=0.02)
 
 
+def test_index_can_be_free_and_is_hardly_determined(recording: Recording) -> None:
+    """At equal deflection another index moves events by hundredths of a pixel: apex and index trade."""
+    c = calibrate(recording, free=("apex", "phase", "index"), events=200_000, local_evaluations=300)
+    assert c.uncertainty["index"] > 5 * calibrate(recording, events=200_000).uncertainty["apex"]
+    assert error_px(recording, c.model) < 0.25
+
+
 @pytest.mark.parametrize("rpm", [720.0, -431.0])
 def test_speed_is_found_without_an_encoder(texture: np.ndarray, rpm: float) -> None:
     camera = Camera.from_fov(160, 120, math.radians(50))
@@ -209,6 +218,15 @@ def test_one_edge_direction(angle: float) -> None:
     recording = simulate(stripes, camera, TRUE_PRISM, duration_s=0.1)
     with pytest.raises(AmiwarpError, match="one direction"):
         calibrate(recording, events=100_000)
+
+
+def test_a_real_recording_without_a_prism(data_dir: Path) -> None:
+    recording = open_recording(data_dir / "aedat" / "aedat4_davis346_cars.aedat4")
+    camera = Camera.from_fov(346, 260, math.radians(60))
+    first, last = recording.events.t_first, recording.events.t_last
+    encoder = Encoder.constant_speed(600.0, first, last)
+    with pytest.raises(AmiwarpError, match="no motion"):
+        calibrate(replace(recording, camera=camera, encoder=encoder))
 
 
 def test_unknown_camera(recording: Recording) -> None:

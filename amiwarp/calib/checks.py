@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 FEWEST_EVENTS = 2000
 SMALLEST_TURN = math.pi / 2
 LEAST_SIGNIFICANCE = 5.0
-"""By how many standard deviations the optimum must be sharper than the same events with the phase turned round."""
-LARGEST_COHERENCE = 0.9
+"""By how many standard deviations the optimum must be sharper than with the phase turned round, and than still."""
+LARGEST_COHERENCE = 0.97
 """Of the edge directions: 0 where all are as frequent, 1 where all edges are parallel."""
 
 
@@ -48,20 +48,32 @@ def check_turn(theta: NDArray[np.float64], name: str) -> None:
         )
 
 
-def check_texture(best: NDArray[np.float64], turned: NDArray[np.float64], name: str) -> float:
+def significance(best: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """By how many standard deviations the sharpness of disjoint parts of the events is higher at one point."""
+    gain = best - other
+    spread = float(gain.std(ddof=1)) / math.sqrt(len(gain))
+    return float(gain.mean()) / max(spread, 1e-12)
+
+
+def check_texture(
+    best: NDArray[np.float64], turned: NDArray[np.float64], still: NDArray[np.float64], name: str
+) -> None:
     """The optimum must be sharper than chance: each array holds the sharpness of disjoint parts of the events.
 
-    ``turned`` is the same with half a turn added to the phase. Returns the significance in standard deviations.
+    ``turned`` is the same with half a turn added to the phase, ``still`` without any motion taken out.
     """
-    gain = best - turned
-    spread = float(gain.std(ddof=1)) / math.sqrt(len(gain))
-    significance = float(gain.mean()) / max(spread, 1e-12)
-    if not significance >= LEAST_SIGNIFICANCE:
+    sure = significance(best, turned)
+    if not sure >= LEAST_SIGNIFICANCE:
         raise AmiwarpError(
-            f"{name}: no motion of a prism makes the image sharper than chance does ({significance:.1f} standard "
+            f"{name}: no motion of a prism makes the image sharper than chance does ({sure:.1f} standard "
             "deviations): no texture, too few events, or a wrong encoder; show the camera a scene with edges"
         )
-    return significance
+    sure = significance(best, still)
+    if not sure >= LEAST_SIGNIFICANCE:
+        raise AmiwarpError(
+            f"{name}: the image is as sharp with no motion taken out ({sure:.1f} standard deviations between them): "
+            "no prism turned, its apex is too small for these events, or the encoder is wrong; record more events"
+        )
 
 
 def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.iwe import CanvasShape, Vote, Votes, upload_events
+from amiwarp.iwe import CanvasShape, Votes, upload_events
 from amiwarp.sharpness import Sharpness, SharpnessMeter
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ class Objective:
         smoothing: float,
         scale: float = 1.0,
         per_polarity: bool = False,
-        vote: Vote = Vote.BILINEAR,
         device: Any = "cpu",
     ) -> None:
         """``theta``: encoder's angle of each event [rad]; ``slope``: its change per unit of the drifting parameter.
@@ -43,7 +42,9 @@ class Objective:
         self._count = len(events)
         self._arrays = upload_events(events, theta, device, slope)
         camera = space.camera
-        canvas = CanvasShape(camera.width, camera.height, padding(space), scale, per_polarity, vote)
+        # the paper's J is left as it was written
+        dither = kind is not Sharpness.PAPER_J
+        canvas = CanvasShape(camera.width, camera.height, padding(space), scale, per_polarity, dither=dither)
         self._votes = Votes(canvas, device)
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from amiwarp.calib import checks
 from amiwarp.calib.objective import Objective
+from amiwarp.calib.parameters import UNITS
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
 from amiwarp.errors import AmiwarpError
@@ -46,7 +47,7 @@ class Settings:
     start: Mapping[str, float] = field(default_factory=dict)
     """Known values [rad, us, 1/min], by parameter name."""
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    global_evaluations: int = 300
+    global_evaluations: int = 120
     local_evaluations: int = 200
     tolerance_px: float = 0.002
     """The local search ends when its steps move events by less [px]."""
@@ -161,10 +162,8 @@ class Search:
         parts = self._parts(self.settings.sharpness)
         # by variance, whatever the cost: the paper's J may like an image without motion best
         plain = parts if self.settings.sharpness is Sharpness.VARIANCE else self._parts(Sharpness.VARIANCE)
-        turned = {**best, "phase": best["phase"] + math.pi}
-        checks.check_texture(
-            np.array([p.values(best) for p in plain]), np.array([p.values(turned) for p in plain]), name
-        )
+        points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
+        checks.check_texture(*(np.array([p.values(values) for p in plain]) for values in points), name)
         pad = (self.fine.image(best).shape[2] - self.space.camera.width) // 2
         checks.check_directions(self.fine.image(best).sum(axis=0)[pad:-pad, pad:-pad], name)
         v = self.space.to_vector(best)
@@ -176,7 +175,7 @@ class Search:
         stuck = [
             n for n in s.names if n != "phase" and min(best[n] - s.low[n], s.high[n] - best[n]) * s.pixels[n] < 0.05
         ]
-        return tuple(f"{n} = {best[n]:.6g} lies on its bound; widen it" for n in stuck)
+        return tuple(f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen it" for n in stuck)
 
     def _deviations(self, v: NDArray[np.float64], covariance: NDArray[np.float64]) -> dict[str, float]:
         """Standard deviations of the named parameters from the vector's covariance, by central differences."""
@@ -195,7 +194,7 @@ def _difference(name: str, a: float, b: float) -> float:
     return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
 
 
-def distinct_optima(stage: Stage, most: int, apart: float = 4.0) -> list[NDArray[np.float64]]:
+def distinct_optima(stage: Stage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
     """The best points of a stage that lie at least ``apart`` px from each better one."""
     chosen: list[NDArray[np.float64]] = []
     for k in np.argsort(-stage.scores, kind="stable"):

@@ -41,6 +41,7 @@ class Canvas:
     scale: float
     per_polarity: int
     nearest: int
+    dither: int
 
 
 @wp.func
@@ -71,6 +72,13 @@ def vote(canvas: Canvas, xy: wp.vec2, polarity: wp.uint8, image: wp.array3d(dtyp
     cast_vote(image, layer, row + 1, col + 1, both)
 
 
+@wp.func
+def somewhere_in_pixel(i: int) -> wp.vec2:
+    """A place in the pixel, even over it, the same for event ``i`` at every call."""
+    state = wp.rand_init(0, i)
+    return wp.vec2(wp.randf(state) - 0.5, wp.randf(state) - 0.5)
+
+
 @wp.kernel
 def vote_events(
     model: Any,
@@ -86,8 +94,10 @@ def vote_events(
     theta = events.theta[i]
     if events.slope.shape[0] > 0:
         theta += drift * events.slope[i]
-    xy = wp.vec2(float(events.x[i]), float(events.y[i]))
-    vote(canvas, compensate(model, camera, xy, azimuth(model, theta)), events.p[i], image)
+    xy = compensate(model, camera, wp.vec2(float(events.x[i]), float(events.y[i])), azimuth(model, theta))
+    if canvas.dither != 0:
+        xy += somewhere_in_pixel(i)
+    vote(canvas, xy, events.p[i], image)
 
 
 @wp.kernel
