@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.events import Events
 from amiwarp.kernels import launch as launching
+from amiwarp.kernels import sight
 from amiwarp.kernels import simulate as kernels
 from amiwarp.kernels.structs import camera_params
 from amiwarp.optics import ExactModel, axis_rotation, wrap_angle
@@ -33,6 +34,9 @@ CPU_RUN = 8192
 
 CUDA_SEGMENTS = 1024
 """Buffers of events on CUDA, each for every 1024th pixel."""
+
+CACHE_LINE = 64
+"""Bytes between the counters of CPU threads, which else would wait for each other."""
 
 EVENTS_PER_PIXEL = 128
 """Room for events in a chunk at first; it grows where it must."""
@@ -71,7 +75,7 @@ class Engine:
         turns = bool(simulation.camera_motion.largest_rates.any())
         self._orientation = simulation.camera_motion.orientation(simulation.duration_s) if turns else None
         self._sensor = sensor_params(simulation.sensor, self._step)
-        self._view = kernels.View()
+        self._view = sight.View()
         self._view.camera = camera_params(simulation.camera, str(self._device))
         self._view.prism = ExactModel(simulation.camera, simulation.prism, 0.0, simulation.motion.tilt).params(
             self._device
@@ -123,12 +127,14 @@ class Engine:
         to_texel = self._to_texel @ self._axis
         if self._orientation is not None:
             to_texel = self._to_texel @ self._orientation(np.maximum(t, 0.0) * 1e-6) @ self._axis
-        steps = kernels.Steps()
-        table: NDArray[Any] = np.zeros(len(t), cast("Any", kernels.Step).numpy_dtype())
+        steps = sight.Steps()
+        table: NDArray[Any] = np.zeros(len(t), cast("Any", sight.Step).numpy_dtype())
         table["azimuth"] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         table["to_texel"] = to_texel
         table["before"], table["after"], table["weight"] = slots[before], slots[after], weight
-        steps.at = wp.array(table, dtype=kernels.Step, device=self._device)
+        steps.at = wp.array(table, dtype=sight.Step, device=self._device)
+        if self._device.is_cpu:
+            steps.ahead = wp.array(instants_ahead(table[margin + 1 :]), dtype=sight.Instants, device=self._device)
         steps.angle = self._upload(wrap_angle(angle))
         steps.turn = self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
         steps.per_tick = 1.0 / (self._step * int(kernels.TICKS))
@@ -189,7 +195,8 @@ class KeyBuffer:
         self._segments = -(-pixels // CPU_RUN) if device.is_cpu else min(CUDA_SEGMENTS, pixels)
         self._sink = kernels.Sink()
         self._sink.run = CPU_RUN if device.is_cpu else 1
-        self._sink.count = wp.zeros(self._segments, dtype=int, device=device)
+        columns = CACHE_LINE // 4 if device.is_cpu else 1
+        self._sink.count = wp.zeros((self._segments, columns), dtype=int, device=device)
         self._reserve(EVENTS_PER_PIXEL * -(-pixels // self._segments))
 
     def _reserve(self, capacity: int) -> None:
@@ -206,7 +213,7 @@ class KeyBuffer:
         while True:
             self._sink.count.zero_()
             self._launch(inputs)
-            counts = self._sink.count.numpy()
+            counts = self._sink.count.numpy()[:, 0]
             if counts.max() <= self._capacity:
                 return self._pack(counts, carry)
             wp.copy(state, before)  # no room: once more from the start
@@ -229,14 +236,24 @@ class KeyBuffer:
         return keys
 
     def _launch(self, inputs: list[Any]) -> None:
+        kernel = kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
+
         def run(start: int, stop: int) -> None:
-            wp.launch(kernels.run_pixels, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)
+            wp.launch(kernel, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)
 
         if not self._device.is_cpu:
             run(0, self._pixels)
             return
         starts = range(0, self._pixels, CPU_RUN)
-        list(launching._pool().map(run, starts, [min(start + CPU_RUN, self._pixels) for start in starts]))
+        list(launching.pool().map(run, starts, [min(start + CPU_RUN, self._pixels) for start in starts]))
+
+
+def instants_ahead(table: NDArray[Any]) -> NDArray[np.float32]:
+    """Azimuths and matrices of a table of instants, in blocks, shape (n, 11, 16); the last is repeated to fill up."""
+    ahead = int(sight.AHEAD)
+    columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9)], axis=1)
+    filled = np.concatenate([columns, np.repeat(columns[-1:], -len(columns) % ahead, axis=0)])
+    return np.ascontiguousarray(filled.reshape(-1, ahead, 11).swapaxes(1, 2))
 
 
 def sensor_params(sensor: SensorModel, step: int) -> Any:

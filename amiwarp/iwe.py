@@ -47,7 +47,7 @@ class CanvasShape:
     """Two layers, OFF then ON, in place of one."""
     vote: Vote = Vote.BILINEAR
     dither: bool = False
-    """Put each event somewhere in its pixel, not at the centre: then no sharpness is won by events on the pixel grid."""
+    """Put each event somewhere in its pixel, not at its centre: nothing is won then by events on the pixel grid."""
 
     @property
     def shape(self) -> tuple[int, int, int]:

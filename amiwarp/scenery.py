@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import simulate as kernels
+from amiwarp.kernels import sight
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.structs import camera_params
 from amiwarp.optics import ExactModel
@@ -104,7 +104,7 @@ def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
     out = wp.empty(len(xy), dtype=wp.vec3, device=device)
     prism = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt).params(device)
     inputs = [camera_params(camera, str(wp.get_device(device))), prism, xy, angles]
-    launch(kernels.scene_bearings, len(xy), inputs, [out], device=device)
+    launch(sight.scene_bearings, len(xy), inputs, [out], device=device)
     bearings = out.numpy().astype(np.float64)
     return np.asarray(bearings[np.isfinite(bearings).all(axis=1)])
 
@@ -189,10 +189,10 @@ def log_view(simulation: Simulation) -> NDArray[np.float32]:
     placement = place_scene(simulation)
     ring = MapRing(simulation, placement)
     ring.cover(0, 0)
-    view = kernels.View()
+    view = sight.View()
     view.camera, view.maps = camera_params(camera, str(device)), ring.maps
     view.width, view.height = placement.width, placement.height
     out = wp.empty(camera.width * camera.height, dtype=float, device=device)
     inputs = [view, wp.mat33(*placement.to_texel().ravel().tolist())]
-    launch(kernels.see_without_prism, len(out), inputs, [out], device=device)
+    launch(sight.see_without_prism, len(out), inputs, [out], device=device)
     return np.asarray(out.numpy().reshape(camera.height, camera.width))

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from amiwarp.camera import Camera, RadialTangential
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, Recording
 from amiwarp.kernels import launch as launching
+from amiwarp.kernels import simulate as kernels
 from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.optics import ExactModel, FlatSide, Prism
 from amiwarp.pictures import DARK, Placement, linear_luminance, log_map, place, read_picture
@@ -168,6 +170,36 @@ def test_threads_and_room_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("amiwarp.engine.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
     monkeypatch.setattr(launching, "cpu_threads", lambda: 1)
     assert same(many, base().run())
+
+
+@pytest.mark.parametrize("flat_side", list(FlatSide))
+def test_looking_ahead_changes_nothing(monkeypatch: pytest.MonkeyPatch, flat_side: FlatSide) -> None:
+    """What a CPU does to be fast gives the events of the plain walk, past the picture's edges and in films, too."""
+    simulation = base(
+        scene=Scene(Film(texture(1), texture(2)), fov=math.radians(30.0)),
+        prism=replace(PRISM, flat_side=flat_side),
+        camera_motion=CameraMotion((0.3, 0.2, -0.4)),
+        motion=PrismMotion(-720.0, tilt=(0.02, 0.01)),
+        sensor=SensorModel(contrast_on=0.1, contrast_off=0.1, shot_noise_hz=30.0, leak_hz=5.0),
+    )
+    fast = simulation.run()
+    assert len(fast.events) > 20000
+    monkeypatch.setattr(kernels, "run_pixels_ahead", kernels.run_pixels)
+    assert same(fast, simulation.run())
+
+
+class Film:
+    """Two pictures, 25 ms apart, in turn."""
+
+    interval_us = 25_000.0
+
+    def __init__(self, *pictures: NDArray[np.float32]) -> None:
+        self._pictures = pictures
+        self.size = (pictures[0].shape[1], pictures[0].shape[0])
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        for i in range(4):
+            yield 25_000 * i, self._pictures[i % 2]
 
 
 def test_progress_rises_to_one() -> None:

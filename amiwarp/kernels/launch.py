@@ -13,7 +13,8 @@ SMALLEST_SLICE = 1 << 15  # below this many threads a slice costs more to launch
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
+def pool() -> ThreadPoolExecutor:
+    """Threads for launches on the CPU, one a core."""
     return ThreadPoolExecutor(cpu_threads(), thread_name_prefix="amiwarp")
 
 
@@ -55,7 +56,7 @@ def launch(
         inputs_ = [*inputs, span[0]]
         wp.launch(kernel, dim=span[1] - span[0], inputs=inputs_, outputs=list(outputs), device=device)
 
-    list(_pool().map(run, ranges)) if len(ranges) > 1 else run(ranges[0])
+    list(pool().map(run, ranges)) if len(ranges) > 1 else run(ranges[0])
 
 
 def launch_slices(kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
@@ -75,7 +76,7 @@ def launch_slices(kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[
         wp.launch(kernel, dim=stop - start, inputs=[*inputs, start], outputs=[out], device=device)
 
     jobs = list(zip(ranges, outputs, strict=False))
-    list(_pool().map(run, jobs)) if len(jobs) > 1 else run(jobs[0])
+    list(pool().map(run, jobs)) if len(jobs) > 1 else run(jobs[0])
 
 
 def slice_count(device: Any) -> int:
