@@ -106,6 +106,13 @@ class Votes:
         self._reserve(len(xy))
         launch_slices(vote_points, len(xy), [xy, p, self._params], self.images, device=self.device)
 
+    def add_as_they_are(self, events: Events) -> None:
+        """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""
+        import warp as wp
+
+        xy = wp.array(np.stack([events.x, events.y], axis=1).astype(np.float32), dtype=wp.vec2, device=self.device)
+        self.add_points(xy, wp.array(events.p, dtype=wp.uint8, device=self.device))
+
     def _reserve(self, count: int) -> None:
         """Makes room: no pixel of 32 bits can overflow, even if every event hit the same one."""
         if count >= MAX_PENDING:
@@ -166,12 +173,9 @@ def iwe(
 ) -> NDArray[np.float32]:
     """Image of warped events [events per pixel].
 
-    With ``model`` and ``encoder`` the events are compensated on the way; without, they are voted where they are
-    (raw or compensated before; NaN coordinates vote nowhere). Shape (height + 2 pad, width + 2 pad), or
-    (2, …) with OFF then ON where ``per_polarity``.
+    With ``model`` and ``encoder`` the events are compensated on the way; without, they are voted where they are.
+    Shape (height + 2 pad, width + 2 pad), or (2, …) with OFF then ON where ``per_polarity``.
     """
-    import warp as wp
-
     if (model is None) != (encoder is None):
         raise AmiwarpError("give both a model and an encoder to compensate the events, or neither")
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)
@@ -180,9 +184,6 @@ def iwe(
         if model is not None and encoder is not None:
             votes.add_events(model, upload_events(piece, encoder.angle_at(piece.t), device), len(piece))
         else:
-            xy = np.stack([piece.x, piece.y], axis=1).astype(np.float32)
-            votes.add_points(
-                wp.array(xy, dtype=wp.vec2, device=device), wp.array(piece.p, dtype=wp.uint8, device=device)
-            )
+            votes.add_as_they_are(piece)
     image = votes.take()
     return image if per_polarity else image[0]

@@ -121,16 +121,10 @@ class IweFiles:
 
     def add(self, events: Events) -> None:
         """Votes compensated events, which follow in time on those before."""
-        import warp as wp
-
         for window, piece in self._pieces(events):
             while self._at < window:
                 self._put()
-            device = self._votes.device
-            xy = np.stack([piece.x, piece.y], axis=1).astype(np.float32)
-            self._votes.add_points(
-                wp.array(xy, dtype=wp.vec2, device=device), wp.array(piece.p, dtype=wp.uint8, device=device)
-            )
+            self._votes.add_as_they_are(piece)
 
     def _pieces(self, events: Events) -> Iterator[tuple[int, Events]]:
         edges = {0, len(events), *range(0, len(events), PIECE)}

@@ -9,6 +9,8 @@ import numpy as np
 from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events
+from amiwarp.iwe import iwe
 from amiwarp.optics import ExactModel, ModelError, Prism, predicted_error
 from amiwarp.sharpness import Sharpness, sharpness
 
@@ -82,7 +84,8 @@ def edge_blur(
     learn the blur before compensation. Pixel quantisation alone leaves 0.29 px.
     Raises :class:`AmiwarpError` where there are no edges.
     """
-    edges = find_edges(_image(sharp_xy, width, height))
+    none = np.zeros(len(sharp_xy), np.uint8)
+    edges = find_edges(iwe(Events(sharp_xy[:, 0], sharp_xy[:, 1], none.astype(np.int64), none), width, height))
     with np.errstate(invalid="ignore"):
         pixel = np.rint(sharp_xy)
         inside = ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
@@ -101,20 +104,6 @@ def edge_blur(
         raise AmiwarpError("no event lies near an edge")
     mean = np.average(moved[near], weights=weight)
     return float(np.sqrt(np.average((moved[near] - mean) ** 2, weights=weight)))
-
-
-def _image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    import warp as wp
-
-    from amiwarp.iwe import PIECE, CanvasShape, Votes
-
-    votes = Votes(CanvasShape(width, height), "cpu")
-    for start in range(0, len(xy), PIECE):
-        piece = np.ascontiguousarray(xy[start : start + PIECE], dtype=np.float32)
-        votes.add_points(
-            wp.array(piece, dtype=wp.vec2, device="cpu"), wp.zeros(len(piece), dtype=wp.uint8, device="cpu")
-        )
-    return votes.take()[0]
 
 
 def _belonging(across: NDArray[np.float64]) -> NDArray[np.float64]:

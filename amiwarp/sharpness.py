@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.iwe import CanvasShape, Votes
+from amiwarp.iwe import CanvasShape
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class Sharpness(enum.Enum):
     LAPLACIAN = "laplacian"
     """Mean squared Laplacian over mean."""
     PAPER_J = "paper_j"
-    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)); see ``docs/calibration.md`` for where it fails."""
+    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)); ``docs/calibration.md`` says where it fails."""
     ENTROPY = "entropy"
     """Minus the entropy of the votes' distribution over pixels [nat]."""
 
@@ -111,6 +111,3 @@ def sharpness(
         raise AmiwarpError(f"image of shape {image.shape} is not a finite (height, width) or (2, height, width) image")
     votes = wp.array(np.rint(stack * 256.0).astype(np.int32).reshape(1, -1), dtype=wp.int32, device=device)
     return SharpnessMeter(canvas, kind, smoothing=smoothing, device=device).measure(votes)
-
-
-__all__ = ["PAPER_ETA", "CanvasShape", "Sharpness", "SharpnessMeter", "Votes", "gaussian", "sharpness"]

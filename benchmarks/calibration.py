@@ -1,9 +1,11 @@
 """Calibration without a guess, by the defaults, on simulated recordings of real pictures; JSON, one object.
 
-    python -m benchmarks.calibration pictures|videos|algorithms|costs FOLDER --out FILE.json [--device cuda:0] …
+    python -m benchmarks.calibration pictures|photometric|videos|algorithms|costs FOLDER --out FILE.json [--device cuda:0] …
 
 ``pictures``: every picture of FOLDER through three prisms, three seeds each. Each row carries the model error, the blur
 beside the truth's, and the best point of a dense grid of the very cost that was maximised.
+``photometric``: the same recordings with thresholds mismatched by 5 %, ON 0.22 and OFF 0.28, calibrated by both stages:
+model error of either, and the phase, the sensor's latency and refractory time being known.
 ``videos``: FOLDER's clips, translated, to the same bar.
 ``algorithms``: NLopt's algorithms, global at several budgets and local from 1 px away, on some of the recordings.
 ``costs``: sharpness costs, smoothing and polarity on the same.
@@ -26,8 +28,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from amiwarp.brightness import Sensor
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.calibrate import prepare
+from amiwarp.calib.photometric import PhotometricSettings
+from amiwarp.calib.search import STAGES
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.camera import Camera
 from amiwarp.compensate import compensate_events
@@ -37,7 +42,7 @@ from amiwarp.metrics import edge_blur, model_error, truth_model
 from amiwarp.motion import PrismMotion
 from amiwarp.optics import FlatSide, Prism
 from amiwarp.sharpness import Sharpness
-from amiwarp.simulate import Scene, Simulation
+from amiwarp.simulate import Scene, SensorModel, Simulation
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.3  # nominal over true apex: no box is centred on the truth
@@ -47,13 +52,22 @@ BLUR_EVENTS = 1_000_000
 
 
 def simulated(
-    scene: Scene, camera: Camera, apex_deg: float, seed: int, seconds: float, device: str, every: int = EVERY
+    scene: Scene,
+    camera: Camera,
+    apex_deg: float,
+    seed: int,
+    seconds: float,
+    device: str,
+    *,
+    every: int = EVERY,
+    sensor: SensorModel | None = None,
 ) -> Recording:
     """A recording thinned evenly while it is made; its phase differs from seed to seed."""
     prism = Prism(math.radians(apex_deg))
     phase = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
     simulation = Simulation(
-        scene, camera, prism, seconds, PrismMotion(720.0, phase=phase), seed=seed, device=device,
+        scene, camera, prism, seconds, PrismMotion(720.0, phase=phase),
+        sensor=sensor or SensorModel(), seed=seed, device=device,
         nominal_prism=replace(prism, apex=NOMINAL * prism.apex),
     )  # fmt: skip
     kept, count = [], 0
@@ -122,7 +136,7 @@ def judged(recording: Recording, c: Calibration, device: str) -> dict[str, Any]:
 def row_of(recording: Recording, device: str) -> dict[str, Any]:
     """One recording calibrated by the defaults, judged; a refusal is a row that misses its bar."""
     try:
-        c = calibrate(recording, device=device)
+        c = calibrate(recording, device=device, stages=STAGES[:1])
     except AmiwarpError as error:
         return {"refused": str(error), "ok": False}
     search = prepare(recording, Settings(), device=device)[0]
@@ -140,6 +154,52 @@ def run_pictures(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             for seed in range(args.seeds):
                 recording = simulated(scene, camera, apex, seed, args.seconds, args.device)
                 yield {"picture": picture.name, "apex_true_deg": apex, "seed": seed, **row_of(recording, args.device)}
+
+
+def run_photometric(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    camera = Camera.from_fov(640, 480, math.radians(60.0))
+    sensor = SensorModel(contrast_on=0.22, contrast_off=0.28, mismatch=0.05)
+    settings = PhotometricSettings(sensor=Sensor(sensor.latency_us, sensor.refractory_us))
+    for picture in pictures(args.folder):
+        scene = Scene.from_picture(picture)
+        for apex in args.apex:
+            for seed in range(args.seeds):
+                recording = simulated(scene, camera, apex, seed, args.seconds, args.device, every=1, sensor=sensor)
+                label = {"picture": picture.name, "apex_true_deg": apex, "seed": seed}
+                yield {**label, **photometric_row(recording, settings, args.device)}
+
+
+def photometric_row(recording: Recording, settings: PhotometricSettings, device: str) -> dict[str, Any]:
+    """Model error of both stages, phase, time and verdict."""
+    assert recording.camera is not None
+    assert recording.truth is not None
+    try:
+        c = calibrate(recording, device=device, photometric=settings)
+    except AmiwarpError as error:
+        return {"refused": str(error), "ok": False}
+    if c.photometric is None:
+        return {"warnings": list(c.warnings), "ok": False}
+    truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
+    first = replace(c, parameters=c.photometric.sharpness_parameters)
+    error, before = model_error(c.model, truth).rms, model_error(first.model, truth).rms
+    phase = math.degrees(math.remainder(c.parameters["phase"] - truth.phase, 2.0 * math.pi))
+    stage = c.stages[-1]
+    return {
+        "all_events": recording.metadata["all_events"],
+        "sharpness_model_error_px": before,
+        "model_error_px": error,
+        "phase_error_deg": phase,
+        "apex_error_deg": math.degrees(c.parameters["apex"] - truth.prism.apex),
+        "apex_std_deg": math.degrees(c.uncertainty["apex"]),
+        "pairs": c.photometric.pairs,
+        "off_over_on": c.photometric.off_over_on,
+        "cost": c.photometric.cost,
+        "verdict": c.photometric.verdict,
+        "evaluations": stage.evaluations,
+        "photometric_s": stage.seconds,
+        "calibrate_s": c.seconds,
+        "ok": c.photometric.accepted and error <= 0.02 and abs(phase) <= 0.3,
+    }
 
 
 def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -211,7 +271,13 @@ def run_costs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                     yield {**label, **what, **row, "ok": True}
 
 
-RUNS = {"pictures": run_pictures, "videos": run_videos, "algorithms": run_algorithms, "costs": run_costs}
+RUNS = {
+    "pictures": run_pictures,
+    "photometric": run_photometric,
+    "videos": run_videos,
+    "algorithms": run_algorithms,
+    "costs": run_costs,
+}
 
 
 def machine(device: str) -> dict[str, str]:

@@ -19,7 +19,7 @@ NEEDS_FILES = "test_file_keeps"  # writes HDF5 through a plug-in that a bare GPU
 
 def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
     """Every run by name."""
-    modules = ("camera", "optics", "iwe", "sharpness", "calibrate", "compensate", "simulate")
+    modules = ("camera", "optics", "iwe", "sharpness", "calibrate", "photometric", "compensate", "simulate")
     tests = [f"tests/test_{m}.py" for m in modules]
     module = [sys.executable, "-m"]
     calibration = [*module, "benchmarks.calibration"]
@@ -30,7 +30,7 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,
                    "--limit-s", str(limit)]
-            for what in ("videos", "algorithms", "costs", "pictures")
+            for what in ("videos", "algorithms", "costs", "pictures", "photometric")
         },
     }  # fmt: skip
 

@@ -1,5 +1,6 @@
-"""Calibration without a guess on simulated recordings, and the refusals."""
+"""Calibration by sharpness, without a guess, on simulated recordings; and the refusals."""
 
+import functools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 from conftest import TRUE_PRISM
 
-from amiwarp.calib import Settings, calibrate
+from amiwarp import calib
+from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.calibrate import prepare, thin
 from amiwarp.calib.checks import edge_coherence
 from amiwarp.calib.search import PARTS
@@ -20,9 +22,11 @@ from amiwarp.events import Events, MemoryEvents, Recording
 from amiwarp.io import open_recording
 from amiwarp.metrics import model_error, truth_model
 from amiwarp.motion import EncoderModel, PrismMotion
-from amiwarp.optics import MODELS, FlatSide, Prism, predicted_error
+from amiwarp.optics import MODELS, FlatSide, Prism, predicted_error, wrap_angle
 from amiwarp.sharpness import Sharpness
 from amiwarp.simulate import SensorModel, simulate
+
+calibrate = functools.partial(calib.calibrate, stages=("sharpness",))
 
 
 def error_px(recording: Recording, model: object) -> float:
@@ -164,6 +168,38 @@ def test_speed_is_found_without_an_encoder(texture: np.ndarray, rpm: float) -> N
     assert encoder.rpm == pytest.approx(c.parameters["rpm"])
 
 
+@pytest.mark.parametrize("given", [None, 717.0])
+def test_phase_without_an_encoder_belongs_to_the_speed_found(
+    texture: np.ndarray, tmp_path: Path, given: float | None
+) -> None:
+    camera = Camera.from_fov(160, 120, math.radians(50))
+    recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.5, motion=PrismMotion(720.0, phase=1.0))
+    assert recording.encoder is not None
+    blind = replace(recording, encoder=None)
+    first, last = recording.events.t_first, recording.events.t_last
+    c = calibrate(blind, events=200_000, start={} if given is None else {"rpm": given})
+    c.save(tmp_path / "c.json")
+    c = Calibration.load(tmp_path / "c.json")
+    # the angle of the tilt itself, against a calibration that knows the encoder
+    known = calibrate(recording, events=200_000)
+    t = np.array([first, (first + last) // 2, last])
+    azimuth = c.encoder_for(None, first, last).angle_at(t) + c.parameters["phase"]
+    expected = recording.encoder.angle_at(t) + known.parameters["phase"]
+    np.testing.assert_allclose(wrap_angle(azimuth - expected), 0.0, rtol=0, atol=math.radians(1.0))
+    # and so for part of the recording
+    part = c.encoder_for(None, first + 100_000, last).angle_at(t[1:]) + c.parameters["phase"]
+    np.testing.assert_allclose(part, azimuth[1:], rtol=0, atol=1e-9)
+
+
+def test_what_is_known_is_used(recording: Recording) -> None:
+    known = {"apex": TRUE_PRISM.apex, "phase": 0.0, "index": 1.6}
+    c = calibrate(recording, global_algorithm=None, start=known, events=50_000)
+    assert c.parameters["index"] == 1.6
+    assert "index" not in c.free
+    # (n - 1) apex is what the events tell
+    assert c.parameters["apex"] * 0.6 == pytest.approx(TRUE_PRISM.apex * (TRUE_PRISM.index - 1.0), rel=0.03)
+
+
 def test_thinning_is_even_and_complete(recording: Recording) -> None:
     n = len(recording.events)
     assert len(thin(recording, n)) == n
@@ -238,7 +274,10 @@ def test_unknown_camera(recording: Recording) -> None:
     ("changes", "text"),
     [
         ({"free": ("apex", "focal")}, "focal"),
-        ({"free": ("rpm", "apex")}, "encoder gives it"),
+        ({"free": ("rpm", "apex")}, "encoder gives the rpm"),
+        ({"start": {"rpm": 720.0}}, "encoder gives the rpm"),
+        ({"start": {"deflection": 0.01}}, "deflection, which the exact model has not"),
+        ({"bounds": {"index": (1.4, 1.6)}}, "index are given, which is not free"),
         ({"free": ()}, "no parameter is free"),
         ({"model": "circle", "free": ("deflection", "tilt_x")}, "tilt_x"),
         ({"model": "sphere"}, "sphere"),

@@ -75,6 +75,8 @@ DAMAGE = [
     put("other", "format"),
     put([{"name": "x"}], "stages"),
     put(None, "sharpness"),
+    put("noon", "zero_us"),
+    put(0.5, "zero_us"),
 ]
 
 

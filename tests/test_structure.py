@@ -20,12 +20,14 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 
 ORDER = (
     ("errors",),
-    ("kernels", "camera"),
+    ("kernels", "camera", "multilevel"),
     ("optics", "events", "encoder"),
     ("pictures", "motion", "clouds"),
     ("io", "iwe", "link"),
     ("compensate", "iwe_files", "sharpness", "metrics", "scenery"),
+    ("brightness",),
     ("calib", "engine", "reconstruct"),
+    ("picture_files",),
     ("simulate",),
     ("translate", "stability", "figures"),
     ("chart", "viewer", "demo"),

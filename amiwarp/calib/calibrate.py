@@ -11,7 +11,8 @@ import numpy as np
 
 from amiwarp.calib import checks
 from amiwarp.calib.parameters import Space, make_space, size_name
-from amiwarp.calib.result import Calibration
+from amiwarp.calib.photometric import refine
+from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.calib.search import Material, Progress, Search, Settings
 from amiwarp.calib.speed import estimate_rpm
 from amiwarp.encoder import Encoder
@@ -20,8 +21,6 @@ from amiwarp.events import Events
 from amiwarp.optics import Prism
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.camera import Camera
     from amiwarp.events import Recording
 
@@ -53,7 +52,7 @@ def calibrate(
     best = search.best
     warnings, uncertainty = search.judge(recording.name)
     before = search.fine.values({**best, search.space.size_name: 0.0})
-    return Calibration(
+    result = Calibration(
         model_name=settings.model,
         camera=search.space.camera,
         prism=search.space.prism,
@@ -64,10 +63,30 @@ def calibrate(
         sharpness_before=before,
         sharpness_after=search.fine.values(best),
         stages=tuple(search.stages),
+        zero_us=_middle(recording) if recording.encoder is None else None,
         events=len(search.material.events),
         seconds=time.perf_counter() - began,
         warnings=warnings,
     )
+    if "photometric" in settings.stages:
+        result = _second_stage(recording, search, result, progress)
+    return replace(result, seconds=time.perf_counter() - began)
+
+
+def _second_stage(recording: Recording, search: Search, result: Calibration, progress: Progress | None) -> Calibration:
+    """The answer of the photometric stage, or that of sharpness with a warning that says why."""
+    try:
+        found, summary = refine(
+            recording, search.space, search.material, result.parameters, search.settings.photometric,
+            device=search.device, progress=progress,
+        )  # fmt: skip
+    except AmiwarpError as error:
+        return replace(result, warnings=(*result.warnings, f"no photometric stage: {error}"))
+    result = replace(result, stages=(*result.stages, summary), photometric=found)
+    if not found.accepted:
+        return replace(result, warnings=(*result.warnings, f"photometric stage: {found.verdict}"))
+    after = search.fine.values(dict(found.parameters))
+    return replace(result, parameters=found.parameters, uncertainty=found.uncertainty, sharpness_after=after)
 
 
 def prepare(
@@ -82,7 +101,7 @@ def prepare(
     for encoder in encoders:
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
         space = _space(recording, camera, encoder, events, settings, free)
-        material = _material(events, encoder, space)
+        material = _material(events, encoder, space, _middle(recording))
         checks.check_turn(material.theta, name)
         searches.append(Search(space, material, settings, device, progress))
     return searches
@@ -98,15 +117,21 @@ def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], 
     """The recording's encoder; or constant speeds found in the events, both ways round. And what is to be free."""
     free = (size_name(settings.model), "phase") if settings.free is None else settings.free
     if recording.encoder is not None:
-        if "rpm" in free:
-            raise AmiwarpError(f"{recording.name}: rpm cannot be free, the encoder gives it; free clock_offset instead")
+        if "rpm" in free or "rpm" in settings.start:
+            raise AmiwarpError(f"{recording.name}: the encoder gives the rpm; leave it out, or free clock_offset")
         return [recording.encoder], free
-    if "clock_offset" in free:
-        raise AmiwarpError(f"{recording.name}: clock_offset cannot be free without an encoder; it is part of the phase")
+    if "clock_offset" in free or "clock_offset" in settings.start:
+        raise AmiwarpError(f"{recording.name}: has no encoder, so clock_offset is part of the phase; leave it out")
     rpm = settings.start.get("rpm")
     speeds = [rpm] if rpm is not None else [s * estimate_rpm(recording) for s in (1.0, -1.0)]
     first, last = recording.events.t_first, recording.events.t_last
-    return [Encoder.constant_speed(s, first, last) for s in speeds], free if "rpm" in free else (*free, "rpm")
+    encoders = [constant_speed(s, first, last, _middle(recording)) for s in speeds]
+    return encoders, free if "rpm" in free else (*free, "rpm")
+
+
+def _middle(recording: Recording) -> int:
+    """Where a change of speed changes the phase least [us]."""
+    return (recording.events.t_first + recording.events.t_last) // 2
 
 
 def thin(recording: Recording, most: int) -> Events:
@@ -142,12 +167,11 @@ def _space(
     )  # fmt: skip
 
 
-def _material(events: Events, encoder: Encoder, space: Space) -> Material:
-    slope: NDArray[np.float64] | None = None
-    if "clock_offset" in space.names:
-        slope = encoder.speed_at(events.t) * 1e-6
+def _material(events: Events, encoder: Encoder, space: Space, middle: int) -> Material:
+    if "clock_offset" in space.start:
         encoder = encoder.with_clock_offset(space.start["clock_offset"])
+    if "clock_offset" in space.names:
+        return Material.of(events, encoder, lambda t: encoder.speed_at(t) * 1e-6)
     if "rpm" in space.names:
-        middle = (int(events.t[0]) + int(events.t[-1])) // 2
-        slope = (events.t - middle).astype(np.float64) * (2.0 * math.pi / 60e6)
-    return Material(events, encoder.angle_at(events.t), slope)
+        return Material.of(events, encoder, lambda t: (t - middle).astype(np.float64) * (2.0 * math.pi / 60e6))
+    return Material.of(events, encoder, None)

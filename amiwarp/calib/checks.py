@@ -82,7 +82,7 @@ def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
     Noise has no direction of its own and lowers it, so gradients weaker than the median are left out.
     """
     smooth = ndimage.gaussian_filter(image.astype(np.float64), smoothing)
-    gy, gx = np.gradient(smooth)
+    gy, gx = (np.asarray(slope, np.float64) for slope in np.gradient(smooth))
     energy = gx**2 + gy**2
     strong = energy > 0.1 * energy.max()
     total = float(energy[strong].sum())

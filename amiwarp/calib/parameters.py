@@ -101,12 +101,27 @@ class Space:
             values[name] = min(max(values[name], self.low[name]), self.high[name])
         return values
 
+    def deviations(self, v: NDArray[np.float64], covariance: NDArray[np.float64]) -> dict[str, float]:
+        """Standard deviations of the free parameters at ``v`` from the vector's covariance [px²]."""
+        jacobian = np.empty((len(self.names), len(self.names)))
+        for k in range(len(self.names)):
+            h = np.zeros(len(self.names))
+            h[k] = 1e-3
+            up, down = self.to_values(v + h), self.to_values(v - h)
+            jacobian[:, k] = [_difference(n, up[n], down[n]) / 2e-3 for n in self.names]
+        variances = np.diag(jacobian @ covariance @ jacobian.T)
+        return {n: float(math.sqrt(max(s, 0.0))) for n, s in zip(self.names, variances, strict=True)}
+
     def build(self, values: Mapping[str, float]) -> Model:
         return build_model(self.model, self.camera, self.prism, values)
 
     def drift(self, values: Mapping[str, float]) -> float:
         """Distance of the drifting parameter, if one is free, from its start."""
         return float(sum(values[n] - self.start[n] for n in self.names if n in DRIFTS))
+
+
+def _difference(name: str, a: float, b: float) -> float:
+    return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
 
 
 def size_name(model: str) -> str:
@@ -144,8 +159,9 @@ def make_space(
     """
     size = size_name(model)
     names = _order(model, (size, "phase") if free is None else free)
+    _check_given(model, names, start, bounds)
     nominal = {"apex": prism.apex, "deflection": prism.deflection, "phase": 0.0, "index": prism.index}
-    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (size, "phase", *names)}
+    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (size, "phase", *names, *start)}
     low, high = {}, {}
     for name in names:
         low[name], high[name] = bounds.get(name) or _default_bounds(name, values[name], prism)
@@ -169,6 +185,19 @@ def _order(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
     if set(DRIFTS) <= wanted:
         raise AmiwarpError("clock_offset and rpm cannot both be free: rpm is for recordings without an encoder")
     return tuple(n for n in (size, "phase", *DRIFTS, *_EXACT_ONLY) if n in wanted)
+
+
+def _check_given(
+    model: str, names: tuple[str, ...], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> None:
+    """Nothing that is given is left out without a word."""
+    known = (size_name(model), "phase", *DRIFTS, *(() if model in ("circle", "radial") else _EXACT_ONLY))
+    for name in start:
+        if name not in known:
+            raise AmiwarpError(f"start gives {name}, which the {model} model has not; it has {', '.join(known)}")
+    for name in bounds:
+        if name not in names:
+            raise AmiwarpError(f"bounds of {name} are given, which is not free; name it in free too")
 
 
 def _default_bounds(name: str, value: float, prism: Prism) -> tuple[float, float]:

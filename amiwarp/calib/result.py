@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -48,6 +49,30 @@ class StageSummary:
 
 
 @dataclass(frozen=True)
+class Photometric:
+    """What the second stage found, and whether to believe it."""
+
+    accepted: bool
+    verdict: str
+    parameters: Mapping[str, float]
+    """Its answer, even where it is not accepted."""
+    uncertainty: Mapping[str, float]
+    sharpness_parameters: Mapping[str, float]
+    """The first stage's answer."""
+    moved_px: float
+    """Distance between the two answers [px rms]."""
+    cost: float
+    """Mean robust residual, as a share of that with no map at all."""
+    cost_at_sharpness: float
+    residual: float
+    """Median of the residuals' magnitudes [ON thresholds]."""
+    pairs: int
+    off_over_on: float
+    """Ratio of the OFF threshold to the ON threshold."""
+    leak_hz: float | None
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Parameters of one model of one camera and prism. Angles in rad; the JSON file gives degrees beside them."""
 
@@ -70,6 +95,10 @@ class Calibration:
     seconds: float
     """Whole time, reading included."""
     warnings: tuple[str, ...] = ()
+    zero_us: int | None = None
+    """Where there was no encoder: the time on the events' clock at which the prism's angle is taken as 0."""
+    photometric: Photometric | None = None
+    """What the second stage found; None where it did not run."""
 
     @property
     def model(self) -> Model:
@@ -83,9 +112,9 @@ class Calibration:
         """
         if encoder is not None:
             return encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
-        if "rpm" not in self.parameters:
+        if "rpm" not in self.parameters or self.zero_us is None:
             raise AmiwarpError("the recording has no encoder and the calibration no rpm; calibrate this recording")
-        return Encoder.constant_speed(self.parameters["rpm"], t_first, t_last)
+        return constant_speed(self.parameters["rpm"], t_first, t_last, self.zero_us)
 
     def to_json(self) -> dict[str, Any]:
         """The file's content as plain objects."""
@@ -101,6 +130,8 @@ class Calibration:
                 "before": self.sharpness_before,
                 "after": self.sharpness_after,
             },
+            "zero_us": self.zero_us,
+            "photometric": None if self.photometric is None else asdict(self.photometric),
             "events": self.events,
             "seconds": self.seconds,
             "warnings": list(self.warnings),
@@ -164,9 +195,17 @@ class Calibration:
             events=data["events"],
             seconds=data["seconds"],
             warnings=tuple(data["warnings"]),
+            zero_us=None if data["zero_us"] is None else operator.index(data["zero_us"]),
+            photometric=None if data["photometric"] is None else Photometric(**data["photometric"]),
         )
         _ = replace(result, model_name="exact" if result.model_name == "ellipse" else result.model_name).model
         return result
+
+
+def constant_speed(rpm: float, t_first: int, t_last: int, zero_us: int) -> Encoder:
+    """A prism without an encoder, turning at ``rpm`` and at angle 0 at ``zero_us``."""
+    encoder = Encoder.constant_speed(rpm, t_first, t_last)
+    return replace(encoder, angle=encoder.angle + (t_first - zero_us) * (rpm * 2.0 * math.pi / 60e6))
 
 
 def _finite(name: str, value: Any) -> float:
@@ -199,6 +238,7 @@ def cost_surface(stages: tuple[StageSummary, ...], size: str) -> NDArray[np.floa
         (point[size], point["phase"], point["score"], k)
         for k, stage in enumerate(stages)
         for point in stage.points
+        if stage.name != "photometric"  # its score is another
         if size in point and "phase" in point
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, 4)

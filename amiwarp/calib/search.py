@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from amiwarp.calib import checks
 from amiwarp.calib.objective import Objective
 from amiwarp.calib.parameters import UNITS
+from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
 from amiwarp.errors import AmiwarpError
@@ -22,12 +23,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import Space
+    from amiwarp.encoder import Encoder
     from amiwarp.events import Events
+
+    SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
 CANDIDATES = 3
 """Optima of the coarse image that are looked at on the fine one."""
 PARTS = 8
 """Disjoint parts of the events that tell chance from signal."""
+
+STAGES = ("sharpness", "photometric")
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage's name, evaluations done, and its budget."""
@@ -58,6 +64,9 @@ class Settings:
     events: int = 1_000_000
     """At most so many events, thinned evenly; the global search uses a fifth of them."""
     seed: int = 0
+    stages: tuple[str, ...] = STAGES
+    """Without "photometric" the answer of sharpness stands."""
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
 
     def check(self) -> None:
         if self.model not in MODELS:
@@ -65,6 +74,9 @@ class Settings:
         if self.global_algorithm is not None:
             check_algorithm(self.global_algorithm, GLOBAL_ALGORITHMS)
         check_algorithm(self.local_algorithm, LOCAL_ALGORITHMS)
+        check_algorithm(self.photometric.algorithm, LOCAL_ALGORITHMS)
+        if self.stages not in (STAGES, STAGES[:1]):
+            raise AmiwarpError(f"stages {self.stages} are not 'sharpness' or 'sharpness, photometric'")
         for name in ("global_evaluations", "local_evaluations", "events"):
             if getattr(self, name) < 1:
                 raise AmiwarpError(f"{name} = {getattr(self, name)}; give 1 or more")
@@ -75,12 +87,21 @@ class Material:
     """The events of a calibration with their angles."""
 
     events: Events
+    encoder: Encoder
     theta: NDArray[np.float64]
     slope: NDArray[np.float64] | None
+    slope_of: SlopeOf | None
+    """Where a parameter drifts the angle: change of the angle at times [us] per unit of it."""
+
+    @classmethod
+    def of(cls, events: Events, encoder: Encoder, slope_of: SlopeOf | None) -> Material:
+        slope = None if slope_of is None else slope_of(events.t)
+        return cls(events, encoder, encoder.angle_at(events.t), slope, slope_of)
 
     def every(self, step: int, first: int = 0) -> Material:
         cut = slice(first, None, step)
-        return Material(self.events[cut], self.theta[cut], None if self.slope is None else self.slope[cut])
+        slope = None if self.slope is None else self.slope[cut]
+        return replace(self, events=self.events[cut], theta=self.theta[cut], slope=slope)
 
 
 class Search:
@@ -163,12 +184,13 @@ class Search:
         # by variance, whatever the cost: the paper's J may like an image without motion best
         plain = parts if self.settings.sharpness is Sharpness.VARIANCE else self._parts(Sharpness.VARIANCE)
         points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
-        checks.check_texture(*(np.array([p.values(values) for p in plain]) for values in points), name)
+        sharp, turned, still = (np.array([part.values(values) for part in plain]) for values in points)
+        checks.check_texture(sharp, turned, still, name)
         pad = (self.fine.image(best).shape[2] - self.space.camera.width) // 2
         checks.check_directions(self.fine.image(best).sum(axis=0)[pad:-pad, pad:-pad], name)
         v = self.space.to_vector(best)
         covariance, warnings = scatter(parts, self.fine, v)
-        return self._at_bounds(best) + warnings, self._deviations(v, covariance)
+        return self._at_bounds(best) + warnings, self.space.deviations(v, covariance)
 
     def _at_bounds(self, best: dict[str, float]) -> tuple[str, ...]:
         s = self.space
@@ -176,22 +198,6 @@ class Search:
             n for n in s.names if n != "phase" and min(best[n] - s.low[n], s.high[n] - best[n]) * s.pixels[n] < 0.05
         ]
         return tuple(f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen it" for n in stuck)
-
-    def _deviations(self, v: NDArray[np.float64], covariance: NDArray[np.float64]) -> dict[str, float]:
-        """Standard deviations of the named parameters from the vector's covariance, by central differences."""
-        names = self.space.names
-        jacobian = np.empty((len(names), len(names)))
-        for k in range(len(names)):
-            h = np.zeros(len(names))
-            h[k] = 1e-3
-            up, down = self.space.to_values(v + h), self.space.to_values(v - h)
-            jacobian[:, k] = [_difference(n, up[n], down[n]) / 2e-3 for n in names]
-        variances = np.diag(jacobian @ covariance @ jacobian.T)
-        return {n: float(math.sqrt(max(s, 0.0))) for n, s in zip(names, variances, strict=True)}
-
-
-def _difference(name: str, a: float, b: float) -> float:
-    return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
 
 
 def distinct_optima(stage: Stage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:

@@ -94,31 +94,11 @@ def maximise(
 
     names = LOCAL_ALGORITHMS if algorithm.startswith("LN_") else GLOBAL_ALGORITHMS
     check_algorithm(algorithm, names)
-    points: list[NDArray[np.float64]] = []
-    scores: list[float] = []
-    failure: list[BaseException] = []
-
-    def cost(x: NDArray[np.float64], _gradient: Any) -> float:
-        # NLopt's C code may go on calling after an exception, so none is let through: it is kept, and NLopt stopped.
-        if failure or len(scores) >= evaluations:  # some algorithms overrun their budget
-            optimiser.force_stop()
-            return -min(scores, default=0.0)
-        try:
-            value = score(x)
-            if not math.isfinite(value):
-                raise AmiwarpError(f"sharpness is {value} at {x} px; check camera and prism")
-        except BaseException as error:
-            failure.append(error)
-            optimiser.force_stop()
-            return 0.0
-        points.append(x.copy())
-        scores.append(value)
-        return -value
-
     began = time.perf_counter()
     nlopt.srand(seed + 1)  # NLopt takes 0 for the clock
     optimiser = _optimiser(algorithm, low, high, evaluations, tolerance, step, inner)
-    optimiser.set_min_objective(cost)
+    samples = _Samples(score, evaluations, optimiser.force_stop)
+    optimiser.set_min_objective(samples.cost)
     try:
         optimiser.optimize(np.clip(start, low, high))
         ended = _ENDS.get(optimiser.last_optimize_result(), str(optimiser.last_optimize_result()))
@@ -128,11 +108,39 @@ def maximise(
         ended = "budget"
     except (RuntimeError, ValueError) as error:
         raise AmiwarpError(f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm") from error
-    if failure:
-        raise failure[0]
+    if samples.failure is not None:
+        raise samples.failure
+    points, scores = np.array(samples.points), np.array(samples.scores)
     best = int(np.argmax(scores))
-    return Stage(algorithm, points[best], scores[best], len(scores), time.perf_counter() - began, ended,
-                 np.array(points), np.array(scores))  # fmt: skip
+    seconds = time.perf_counter() - began
+    return Stage(algorithm, points[best], float(scores[best]), len(scores), seconds, ended, points, scores)
+
+
+class _Samples:
+    """What NLopt calls: keeps every sample, and stops NLopt at the budget and at a failure."""
+
+    def __init__(self, score: Callable[[NDArray[np.float64]], float], most: int, stop: Callable[[], None]) -> None:
+        self.points: list[NDArray[np.float64]] = []
+        self.scores: list[float] = []
+        self.failure: BaseException | None = None
+        self._score, self._most, self._stop = score, most, stop
+
+    def cost(self, x: NDArray[np.float64], _gradient: Any) -> float:
+        # NLopt's C code may go on calling after an exception, so none is let through: it is kept, and NLopt stopped.
+        if self.failure is not None or len(self.scores) >= self._most:  # some algorithms overrun their budget
+            self._stop()
+            return -min(self.scores, default=0.0)
+        try:
+            value = self._score(x)
+            if not math.isfinite(value):
+                raise AmiwarpError(f"sharpness is {value} at {x} px; check camera and prism")
+        except BaseException as error:
+            self.failure = error
+            self._stop()
+            return 0.0
+        self.points.append(x.copy())
+        self.scores.append(value)
+        return -value
 
 
 _ENDS = {1: "converged", 2: "score reached", 3: "tolerance of the score", 4: "tolerance", 5: "budget", 6: "time"}

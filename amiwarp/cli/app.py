@@ -8,7 +8,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from amiwarp.cli import calibrate, compensate, convert, demo, info, simulate, translate
+from amiwarp.cli import calibrate, compensate, convert, demo, info, reconstruct, simulate, translate
 from amiwarp.cli.options import command
 from amiwarp.errors import AmiwarpError
 
@@ -64,7 +64,7 @@ def _version(ctx: typer.Context, version: bool = typer.Option(False, "--version"
         print(ctx.get_help())
 
 
-for module in (demo, info, convert, simulate, translate, calibrate, compensate):
+for module in (demo, info, convert, simulate, translate, calibrate, compensate, reconstruct):
     command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 
 

@@ -84,7 +84,7 @@ class ParameterOptions:
     start: Annotated[
         list[str] | None,
         typer.Option(
-            help="Known value, as apex=1.1deg or clock_offset=-250us; can be given more than once.",
+            help="Known value, free or not, as apex=1.1deg or clock_offset=-250us; can be given more than once.",
             metavar="NAME=VALUE",
             rich_help_panel=_PARAMETERS,
         ),
@@ -100,7 +100,8 @@ class ParameterOptions:
     rpm: Annotated[
         float | None,
         typer.Option(
-            help="Speed where there is no encoder, negative backwards; it is refined. Default: found in the events.",
+            help="Speed (turns/min) where there is no encoder, negative backwards; it is refined. "
+            "Default: found in the events.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None
@@ -157,6 +158,7 @@ def run(
     opened = complete(open_recording(recording), camera, prism)
     opened = cut(opened, window) if window else opened
     out = out or recording.with_name(f"{recording.stem}.calibration.json")
+    check_outputs(out, figure)
     with progress("calibrating") as advance:
         found = calibrate(opened, settings, device=device, progress=staged(advance, settings))
     found.save(out)
@@ -166,6 +168,17 @@ def run(
         draw_calibration(figure, opened, found, device=device)
     data = summary(found) | {"file": str(out), "figure": None if figure is None else str(figure), "device": device}
     report(common, data, lines(found, data))
+
+
+def check_outputs(out: Path, figure: Path | None) -> None:
+    """Raises :class:`AmiwarpError` now, not after the search, where the files could not be written."""
+    from amiwarp.io.files import part_path
+
+    part_path(out)
+    if figure is not None:
+        part_path(figure)
+        if figure.suffix.lower() != ".png":
+            raise AmiwarpError(f"{figure}: figures are written as .png")
 
 
 def cut(recording: Recording, window: str) -> Recording:

@@ -29,6 +29,7 @@ class IweOptions:
         list[Path] | None,
         typer.Option(
             help="Image of the compensated events: .png to look at, .npy with the counts; can be given twice.",
+            metavar="<path>",
             rich_help_panel=_IWE,
         ),
     ] = None

@@ -78,6 +78,7 @@ def run(
         )  # fmt: skip
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
+    data |= {f"{name}_us": data.pop(name) for name in ("t_first", "t_last")}
     slip = data.pop("index_slip")
     data["slip_deg"] = None if slip is None else math.degrees(slip)
     report(common, data, _lines(data))

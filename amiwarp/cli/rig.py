@@ -124,7 +124,7 @@ class SensorOptions:
     leak_hz: Annotated[float | None, _sensor("Leak events per pixel and second.")] = None
     shot_noise_hz: Annotated[float | None, _sensor("Random events per pixel and second.")] = None
     hot_fraction: Annotated[float | None, _sensor("Share of hot pixels.")] = None
-    hot_hz: Annotated[float | None, _sensor("Their additional rate.")] = None
+    hot_hz: Annotated[float | None, _sensor("Additional events per hot pixel and second.")] = None
 
     def build(self) -> SensorModel:
         from amiwarp.simulate import SensorModel
@@ -144,7 +144,7 @@ class EncoderModelOptions:
     counts_per_turn: Annotated[int | None, _encoder("Resolution; 0 for none.")] = None
     rate_hz: Annotated[float | None, _encoder("Samples per second.")] = None
     jitter_us: Annotated[float | None, _encoder("Scatter of the samples' times.")] = None
-    clock_offset_us: Annotated[float | None, _encoder("Encoder's clock minus the camera's; not told.")] = None
+    clock_offset_us: Annotated[float | None, _encoder("Encoder's clock minus the camera's; kept secret.")] = None
     dropouts_hz: Annotated[float | None, _encoder("Drop-outs per second.")] = None
     dropout_us: Annotated[float | None, _encoder("How long each loses all samples.")] = None
 

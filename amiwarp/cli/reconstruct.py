@@ -1,0 +1,167 @@
+"""``amiwarp reconstruct``: a picture, or a video, of the scene from a recording and its calibration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli.console import Advance, choose_device, progress, report
+from amiwarp.cli.inputs import numbers
+from amiwarp.cli.options import Common
+from amiwarp.errors import AmiwarpError
+from amiwarp.picture_files import CONTRAST, VIDEO, Tone, check_path, save_mask, save_picture, save_video
+from amiwarp.reconstruct import Fill
+
+if TYPE_CHECKING:
+    from amiwarp.reconstruct import Picture, Reconstruction
+
+EXAMPLE = "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1"
+
+_WINDOW, _PICTURE = "Window", "Picture"
+
+
+@dataclass(frozen=True)
+class WindowOptions:
+    """Which events."""
+
+    start: Annotated[
+        float | None, typer.Option(help="Start, from the first event (s). Default: 0.", rich_help_panel=_WINDOW)
+    ] = None
+    length: Annotated[
+        float | None, typer.Option(min=1e-6, help="Length of the window (s).", rich_help_panel=_WINDOW)
+    ] = None
+    turns: Annotated[
+        float | None,
+        typer.Option(min=0.01, help="Length in turns of the prism, from 0.25. Default: 1.", rich_help_panel=_WINDOW),
+    ] = None
+    fps: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=100_000.0, help="Frames per second of an .mp4: 25.", rich_help_panel=_WINDOW),
+    ] = None
+    omega: Annotated[
+        str | None,
+        typer.Option(help="The camera's angular velocity about x, y, z (rad/s): 0,0.6,0.", rich_help_panel=_WINDOW),
+    ] = None
+
+    def span(self, work: Reconstruction) -> tuple[int, int]:
+        """Start and length [us]."""
+        start = work.recording.events.t_first + round((self.start or 0.0) * 1e6)
+        return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
+
+    def rotation(self) -> tuple[float, float, float]:
+        x, y, z = numbers(self.omega, 3, "--omega") if self.omega else (0.0, 0.0, 0.0)
+        return x, y, z
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """What the file shows."""
+
+    fill: Annotated[
+        Fill,
+        typer.Option(
+            help="Where events say nothing: none (black), smooth, or edge: flat with edges.", rich_help_panel=_PICTURE
+        ),
+    ] = Fill.SMOOTH
+    tone: Annotated[
+        Tone, typer.Option(help="mapped: for the eye; linear: proportional to intensity.", rich_help_panel=_PICTURE)
+    ] = Tone.MAPPED
+    bits: Annotated[int, typer.Option(help="8 or 16, of a .png; a .tif has 16.", rich_help_panel=_PICTURE)] = 8
+    contrast: Annotated[
+        float,
+        typer.Option(
+            min=0.01, max=10.0, rich_help_panel=_PICTURE,
+            help="The sensor's ON threshold (log intensity): events tell brightness in units of it.",
+        ),
+    ] = CONTRAST  # fmt: skip
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write where events determine the picture (.png).", metavar="<path>", rich_help_panel=_PICTURE
+        ),
+    ] = None
+
+
+def run(
+    recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    out: Annotated[Path, typer.Argument(help="To write: .png, .tif (16 bit), .npy (log intensity) or .mp4.")],
+    *,
+    calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
+    window: WindowOptions,
+    picture: PictureOptions,
+    common: Common,
+) -> None:
+    """Solve for the picture behind the events of a window; as a video, for windows that slide.
+
+    A picture needs a quarter turn or more. Intensity is relative: events tell no absolute brightness.
+    """
+    from amiwarp.calib import Calibration
+    from amiwarp.io import open_recording
+    from amiwarp.reconstruct import Reconstruction
+
+    check_path(out)
+    video = out.suffix.lower() == VIDEO
+    if video and (picture.mask is not None or picture.bits != 8):
+        raise AmiwarpError("--mask and --bits go with a single picture; a video has neither")
+    if not video and window.fps is not None:
+        raise AmiwarpError(f"{out}: --fps goes with a video; give a name that ends in {VIDEO}")
+    device = choose_device(common.device)
+    work = Reconstruction(
+        open_recording(recording), Calibration.load(calibration), omega=window.rotation(), fill=picture.fill,
+        device=device,
+    )  # fmt: skip
+    start, length = window.span(work)
+    began = time.perf_counter()
+    with progress("reconstructing") as advance:
+        if video:
+            data = _video(work, out, (start, length), window.fps or 25.0, picture, advance)
+        else:
+            data = _still(work.window(start, length), out, picture)
+    seconds = time.perf_counter() - began
+    data = {"file": str(out), "start_us": start, "length_us": length, **data, "seconds": seconds, "device": device}
+    report(common, data, [_line(data)])
+
+
+def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]:
+    save_picture(found, out, tone=options.tone, bits=options.bits, contrast=options.contrast)
+    if options.mask is not None:
+        save_mask(found, options.mask)
+    return {
+        "frames": 1,
+        "pairs": found.pairs,
+        "known": float(found.known.mean()),
+        "residual": found.residual,
+        "smoothness": found.smoothness,
+        "off_excess": found.off_excess,
+        "hot_pixels": found.hot,
+    }
+
+
+def _video(
+    work: Reconstruction, out: Path, span: tuple[int, int], fps: float, options: PictureOptions, advance: Advance
+) -> dict[str, Any]:
+    step = 1e6 / fps
+    count = work.count(*span, step_us=step)
+    pairs: list[int] = []
+
+    def pictures() -> Iterator[Picture]:
+        for found in work.windows(*span, step_us=step):
+            yield found
+            pairs.append(found.pairs)
+            advance(len(pairs) / count)
+
+    frames = save_video(pictures(), out, fps=fps, tone=options.tone, contrast=options.contrast)
+    return {"frames": frames, "fps": fps, "pairs": sum(pairs)}
+
+
+def _line(d: dict[str, Any]) -> str:
+    speed = f"{d['pairs'] / 1e6:.2f} million pairs of events in {d['seconds']:.2f} s on {d['device']}"
+    window = f"{d['length_us'] / 1e3:.1f} ms"
+    if "fps" in d:
+        return f"{d['file']}: {d['frames']} frames of {window} at {d['fps']:g}/s, {speed}"
+    return f"{d['file']}: {window}, {speed}; {100.0 * d['known']:.0f} % of the picture known from events"

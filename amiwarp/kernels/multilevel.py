@@ -1,0 +1,133 @@
+"""Device side of the preconditioner of large maps: corrections on ever coarser grids, added up.
+
+Bramble, Pasciak and Xu, "Parallel multilevel preconditioners", Math. Comp. 1990. Equations tell of differences between
+near nodes, so brightness travels across the map only slowly where each node is corrected alone.
+"""
+
+import warp as wp
+
+from amiwarp.kernels.photometric import Atlas, Geometry, Pairs, add_fixed, bilinear, fraction
+from amiwarp.kernels.prior import Prior, prior_diagonal
+
+wp.set_module_options({"enable_backward": False})
+
+SEGMENT = wp.constant(256)
+HAT = wp.constant(8.0 / 3.0)  # energy of a bilinear hat under links of weight 1, whatever its width
+
+
+@wp.func
+def coarse_place(atlas: Atlas, cell: int, f: wp.vec2, spacing: float) -> wp.vec2:
+    return wp.vec2(float(cell % atlas.columns) + f[0], float(cell / atlas.columns) + f[1]) / spacing
+
+
+@wp.func
+def upper_left(at: wp.vec2, columns: int) -> int:
+    return int(at[1]) * columns + int(at[0])
+
+
+@wp.func
+def share(a: int, wa: wp.vec4, node: int, columns: int) -> float:
+    """Weight of a node among the four of the cell ``a``."""
+    value = float(0.0)
+    for k in range(4):
+        if a + (k % 2) + (k / 2) * columns == node:
+            value = wa[k]
+    return value
+
+
+@wp.kernel
+def add_coarse_diagonal(
+    pairs: Pairs,
+    atlas: Atlas,
+    geometry: Geometry,
+    weight: wp.array(dtype=float),
+    spacing: float,
+    columns: int,
+    stride: int,
+    start: int,
+    sums: wp.array(dtype=wp.int64),
+):
+    """sums += diag(Pᵀ Aᵀ W A P) of the grid of that ``spacing``, from every ``stride``-th pair."""
+    i = (start + wp.tid()) * stride
+    cell = geometry.cell[i]
+    if cell[0] < 0:
+        return
+    a = coarse_place(atlas, cell[0], geometry.first[i], spacing)
+    b = coarse_place(atlas, cell[1], geometry.second[i], spacing)
+    wa = bilinear(fraction(a))
+    wb = bilinear(fraction(b))
+    na = upper_left(a, columns)
+    nb = upper_left(b, columns)
+    scale = weight[i] * float(stride)
+    for k in range(4):
+        step = (k % 2) + (k / 2) * columns
+        difference = wb[k] - share(na, wa, nb + step, columns)
+        add_fixed(sums, nb + step, scale * difference * difference)
+        if share(nb, wb, na + step, columns) == 0.0:
+            add_fixed(sums, na + step, scale * wa[k] * wa[k])
+
+
+@wp.kernel
+def divide(diagonal: wp.array(dtype=float), prior: Prior, residual: wp.array(dtype=float), start: int,
+           out: wp.array(dtype=float)):  # fmt: skip
+    """The finest grid's own correction."""
+    i = start + wp.tid()
+    out[i] = residual[i] / (diagonal[i] + prior_diagonal(prior, i))
+
+
+@wp.kernel
+def restrict(
+    fine: wp.array(dtype=float),
+    fine_rows: int,
+    fine_columns: int,
+    columns: int,
+    diagonal: wp.array(dtype=float),
+    floor: float,
+    start: int,
+    coarse: wp.array(dtype=float),
+    correction: wp.array(dtype=float),
+):
+    """The residual on the next coarser grid, and that grid's correction."""
+    i = start + wp.tid()
+    row = 2 * (i / columns)
+    column = 2 * (i % columns)
+    total = float(0.0)
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            y = row + dy
+            x = column + dx
+            if y >= 0 and y < fine_rows and x >= 0 and x < fine_columns:
+                total += fine[y * fine_columns + x] / float((1 + wp.abs(dy)) * (1 + wp.abs(dx)))
+    coarse[i] = total
+    correction[i] = total / (diagonal[i] + floor)
+
+
+@wp.kernel
+def prolong(coarse: wp.array(dtype=float), columns: int, fine_columns: int, start: int, fine: wp.array(dtype=float)):
+    """The coarser grid's correction, interpolated, is added to the finer one's."""
+    i = start + wp.tid()
+    row = i / fine_columns
+    column = i % fine_columns
+    at = (row / 2) * columns + column / 2
+    right = column % 2
+    down = (row % 2) * columns
+    fine[i] = fine[i] + 0.25 * (coarse[at] + coarse[at + right] + coarse[at + down] + coarse[at + right + down])
+
+
+@wp.kernel
+def dot(a: wp.array(dtype=float), b: wp.array(dtype=float), start: int, partial: wp.array(dtype=wp.float64)):
+    segment = start + wp.tid()
+    total = wp.float64(0.0)
+    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, a.shape[0])):
+        total += wp.float64(a[i]) * wp.float64(b[i])
+    partial[segment] = total
+
+
+@wp.kernel
+def turn_to(
+    scalars: wp.array(dtype=wp.float64), z: wp.array(dtype=float), start: int, direction: wp.array(dtype=float)
+):
+    """p = z + b p with b = new r·z / old r·z."""
+    i = start + wp.tid()
+    ratio = float(scalars[2] / wp.max(scalars[0], wp.float64(1.0e-30)))
+    direction[i] = z[i] + ratio * direction[i]

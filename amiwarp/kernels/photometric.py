@@ -1,0 +1,376 @@
+"""Device side of the photometric stage: pairs of events as equations in a log-brightness map, and their operator.
+
+The map is a set of rectangular tiles of equal shape, one behind the other, followed by two more unknowns: by how much
+the OFF threshold exceeds the ON threshold, and the leak. Sums are kept in fixed point, as votes are: they do not depend
+on the order of threads.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.optics import MODEL_STRUCTS, azimuth, compensate
+from amiwarp.kernels.prior import Prior, prior_diagonal, prior_product
+
+wp.set_module_options({"enable_backward": False})
+
+FIXED = wp.constant(wp.float64(4294967296.0))  # 2**32: unit of the sums
+SEGMENT = wp.constant(256)  # unknowns that one thread sums
+EXTRA = wp.constant(2)  # unknowns behind the map: OFF threshold, leak
+# What a pair's ``on`` may hold: bit 0, the polarity; bit 1, no event at the second time; bit 2, none at the first.
+ON = wp.constant(wp.uint8(1))
+QUIET = wp.constant(wp.uint8(2))
+
+
+@wp.struct
+class Pairs:
+    """Two consecutive events of a pixel each: the first sets the reference, the second is fired."""
+
+    x: wp.array(dtype=wp.uint16)
+    y: wp.array(dtype=wp.uint16)
+    tile: wp.array(dtype=wp.int32)
+    theta: wp.array(dtype=wp.vec2)  # encoder's angle at either [rad]
+    slope: wp.array(dtype=wp.vec2)  # its change per unit of the drifting parameter
+    time: wp.array(dtype=wp.vec2)  # of either, from the window's middle [s]
+    on: wp.array(dtype=wp.uint8)  # polarity of the second, and which of the two is no event
+    weak: float  # weight of pairs that are not of two events
+
+
+@wp.struct
+class Atlas:
+    """Tiles of the map: ``origin`` is the pixel of a tile's first node, nodes are ``1 / density`` px apart."""
+
+    origin: wp.array(dtype=wp.vec2)
+    rows: int
+    columns: int
+    density: float
+    with_off: float
+    with_leak: float
+
+
+@wp.struct
+class Geometry:
+    """Where either event of a pair falls on the map: index of the upper left node, and the way to the next."""
+
+    cell: wp.array(dtype=wp.vec2i)  # -1: not on its tile
+    first: wp.array(dtype=wp.vec2)
+    second: wp.array(dtype=wp.vec2)
+
+
+@wp.func
+def turn_back(camera: CameraParams, xy: wp.vec2, rotation: wp.vec3) -> wp.vec2:
+    """The pixel that the scene point at ``xy`` has once the camera's rotation since the middle is taken back."""
+    angle = wp.length(rotation)
+    if angle < 1.0e-9:
+        return xy
+    ray = pixel_to_ray(camera, xy)
+    return ray_to_pixel(camera, wp.quat_rotate(wp.quat_from_axis_angle(rotation / angle, angle), ray))
+
+
+@wp.func
+def node_of(atlas: Atlas, tile: int, xy: wp.vec2) -> wp.vec2:
+    return (xy - atlas.origin[tile]) * atlas.density
+
+
+@wp.func
+def cell_of(atlas: Atlas, tile: int, node: wp.vec2) -> int:
+    """Index of the node to the upper left; -1 off the tile."""
+    inside = node[0] >= 0.0 and node[1] >= 0.0
+    if not (inside and node[0] < float(atlas.columns - 1) and node[1] < float(atlas.rows - 1)):
+        return -1
+    return (tile * atlas.rows + int(node[1])) * atlas.columns + int(node[0])
+
+
+@wp.func
+def fraction(node: wp.vec2) -> wp.vec2:
+    return wp.vec2(node[0] - wp.floor(node[0]), node[1] - wp.floor(node[1]))
+
+
+@wp.kernel
+def place_pairs(
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    drift: float,
+    omega: wp.vec3,
+    start: int,
+    geometry: Geometry,
+):
+    """Compensated places of both events of a pair, on the map."""
+    i = start + wp.tid()
+    xy = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
+    theta = pairs.theta[i] + pairs.slope[i] * drift
+    a = compensate(model, camera, xy, azimuth(model, theta[0]))
+    b = compensate(model, camera, xy, azimuth(model, theta[1]))
+    a = node_of(atlas, pairs.tile[i], turn_back(camera, a, omega * pairs.time[i][0]))
+    b = node_of(atlas, pairs.tile[i], turn_back(camera, b, omega * pairs.time[i][1]))
+    cell = wp.vec2i(cell_of(atlas, pairs.tile[i], a), cell_of(atlas, pairs.tile[i], b))
+    if cell[0] < 0 or cell[1] < 0:
+        cell = wp.vec2i(-1, -1)
+    geometry.cell[i] = cell
+    geometry.first[i] = fraction(a)
+    geometry.second[i] = fraction(b)
+
+
+@wp.func
+def bilinear(f: wp.vec2) -> wp.vec4:
+    """Weights of the nodes: upper left, upper right, lower left, lower right."""
+    return wp.vec4((1.0 - f[0]) * (1.0 - f[1]), f[0] * (1.0 - f[1]), (1.0 - f[0]) * f[1], f[0] * f[1])
+
+
+@wp.func
+def look_up(image: wp.array(dtype=float), cell: int, columns: int, w: wp.vec4) -> float:
+    upper = image[cell] * w[0] + image[cell + 1] * w[1]
+    return upper + image[cell + columns] * w[2] + image[cell + columns + 1] * w[3]
+
+
+@wp.func
+def add_fixed(sums: wp.array(dtype=wp.int64), i: int, value: float):
+    wp.atomic_add(sums, i, wp.int64(wp.float64(value) * FIXED))
+
+
+@wp.func
+def spread(sums: wp.array(dtype=wp.int64), cell: int, columns: int, w: wp.vec4, value: float):
+    """The reverse of :func:`look_up`."""
+    add_fixed(sums, cell, w[0] * value)
+    add_fixed(sums, cell + 1, w[1] * value)
+    add_fixed(sums, cell + columns, w[2] * value)
+    add_fixed(sums, cell + columns + 1, w[3] * value)
+
+
+@wp.func
+def difference(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, g: Geometry, i: int) -> float:
+    """Left side of a pair's equation: L(second) - L(first) + [OFF] s + leak (t2 - t1)."""
+    cell = g.cell[i]
+    extra = image.shape[0] - EXTRA
+    value = look_up(image, cell[1], atlas.columns, bilinear(g.second[i]))
+    value -= look_up(image, cell[0], atlas.columns, bilinear(g.first[i]))
+    value += atlas.with_leak * image[extra + 1] * (pairs.time[i][1] - pairs.time[i][0])
+    if is_off(pairs, i):
+        value += atlas.with_off * image[extra]
+    return value
+
+
+@wp.func
+def right_side(pairs: Pairs, i: int) -> float:
+    """In units of the ON threshold: +1 for ON, -1 for OFF, 0 where the pixel kept quiet."""
+    if (pairs.on[i] & QUIET) != wp.uint8(0):
+        return 0.0
+    return wp.where((pairs.on[i] & ON) != wp.uint8(0), 1.0, -1.0)
+
+
+@wp.func
+def is_off(pairs: Pairs, i: int) -> bool:
+    return (pairs.on[i] & (ON | QUIET)) == wp.uint8(0)
+
+
+@wp.func
+def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g: Geometry, i: int, value: float):
+    """The transpose of :func:`difference`."""
+    cell = g.cell[i]
+    extra = sums.shape[0] - EXTRA
+    spread(sums, cell[1], atlas.columns, bilinear(g.second[i]), value)
+    spread(sums, cell[0], atlas.columns, bilinear(g.first[i]), -value)
+    if atlas.with_leak > 0.0:
+        add_fixed(sums, extra + 1, value * (pairs.time[i][1] - pairs.time[i][0]))
+    if atlas.with_off > 0.0 and is_off(pairs, i):
+        add_fixed(sums, extra, value)
+
+
+@wp.kernel
+def apply_normal(
+    pairs: Pairs,
+    atlas: Atlas,
+    geometry: Geometry,
+    weight: wp.array(dtype=float),
+    vector: wp.array(dtype=float),
+    start: int,
+    sums: wp.array(dtype=wp.int64),
+):
+    """sums += Aᵀ W A vector."""
+    i = start + wp.tid()
+    if geometry.cell[i][0] >= 0:
+        value = weight[i] * difference(vector, atlas, pairs, geometry, i)
+        transpose_add(sums, atlas, pairs, geometry, i, value)
+
+
+@wp.kernel
+def apply_residual(
+    pairs: Pairs,
+    atlas: Atlas,
+    geometry: Geometry,
+    weight: wp.array(dtype=float),
+    vector: wp.array(dtype=float),
+    start: int,
+    sums: wp.array(dtype=wp.int64),
+):
+    """sums += Aᵀ W (b - A vector)."""
+    i = start + wp.tid()
+    if geometry.cell[i][0] >= 0:
+        value = weight[i] * (right_side(pairs, i) - difference(vector, atlas, pairs, geometry, i))
+        transpose_add(sums, atlas, pairs, geometry, i, value)
+
+
+@wp.func
+def square(w: wp.vec4) -> wp.vec4:
+    return wp.cw_mul(w, w)
+
+
+@wp.kernel
+def add_diagonal(
+    pairs: Pairs,
+    atlas: Atlas,
+    geometry: Geometry,
+    weight: wp.array(dtype=float),
+    start: int,
+    sums: wp.array(dtype=wp.int64),
+):
+    """sums += diag(Aᵀ W A), as if the two places of a pair shared no node: the preconditioner."""
+    i = start + wp.tid()
+    cell = geometry.cell[i]
+    extra = sums.shape[0] - EXTRA
+    if cell[0] >= 0:
+        spread(sums, cell[1], atlas.columns, square(bilinear(geometry.second[i])), weight[i])
+        spread(sums, cell[0], atlas.columns, square(bilinear(geometry.first[i])), weight[i])
+        gap = pairs.time[i][1] - pairs.time[i][0]
+        add_fixed(sums, extra + 1, atlas.with_leak * weight[i] * gap * gap)
+        if is_off(pairs, i):
+            add_fixed(sums, extra, atlas.with_off * weight[i])
+
+
+@wp.kernel
+def weigh(
+    pairs: Pairs,
+    atlas: Atlas,
+    geometry: Geometry,
+    image: wp.array(dtype=float),
+    scale: float,
+    start: int,
+    weight: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+):
+    """Residual of each equation, and Cauchy's weight for it; NaN and 0 for a pair that is not on the map."""
+    i = start + wp.tid()
+    weight[i] = 0.0
+    residual[i] = wp.nan
+    if geometry.cell[i][0] >= 0:
+        r = right_side(pairs, i) - difference(image, atlas, pairs, geometry, i)
+        residual[i] = r
+        if pairs.on[i] > ON:
+            weight[i] = pairs.weak / (1.0 + r * r)  # right to within a threshold
+        else:
+            weight[i] = 1.0 / (1.0 + (r / scale) * (r / scale))
+
+
+# -- conjugate gradients over the unknowns; every thread sums SEGMENT of them, in order
+
+
+@wp.func
+def gathered(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
+    """Total over the slices, which are cleared for the next pass."""
+    total = wp.int64(0)
+    for k in range(sums.shape[0]):
+        total += sums[k, i]
+        sums[k, i] = wp.int64(0)
+    return float(wp.float64(total) / FIXED)
+
+
+@wp.kernel
+def gather(sums: wp.array2d(dtype=wp.int64), start: int, out: wp.array(dtype=float)):
+    i = start + wp.tid()
+    out[i] = gathered(sums, i)
+
+
+@wp.kernel
+def start_descent(
+    prior: Prior,
+    diagonal: wp.array(dtype=float),
+    image: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    direction: wp.array(dtype=float),
+    start: int,
+    partial: wp.array(dtype=wp.float64),
+):
+    """r = Aᵀ W (b - A x) - prior x; the first direction is r over the diagonal; partial sums of r·z."""
+    segment = start + wp.tid()
+    total = wp.float64(0.0)
+    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, image.shape[0])):
+        r = residual[i] - prior_product(prior, image, i)
+        z = r / (diagonal[i] + prior_diagonal(prior, i))
+        residual[i] = r
+        direction[i] = z
+        total += wp.float64(r) * wp.float64(z)
+    partial[segment] = total
+
+
+@wp.kernel
+def finish_product(
+    sums: wp.array2d(dtype=wp.int64),
+    prior: Prior,
+    direction: wp.array(dtype=float),
+    product: wp.array(dtype=float),
+    start: int,
+    partial: wp.array(dtype=wp.float64),
+):
+    """q = (Aᵀ W A + prior) p from the sums; partial sums of p·q."""
+    segment = start + wp.tid()
+    total = wp.float64(0.0)
+    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, direction.shape[0])):
+        q = gathered(sums, i) + prior_product(prior, direction, i)
+        product[i] = q
+        total += wp.float64(direction[i]) * wp.float64(q)
+    partial[segment] = total
+
+
+@wp.kernel
+def descend(
+    prior: Prior,
+    scalars: wp.array(dtype=wp.float64),
+    diagonal: wp.array(dtype=float),
+    direction: wp.array(dtype=float),
+    product: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    start: int,
+    image: wp.array(dtype=float),
+    partial: wp.array(dtype=wp.float64),
+):
+    """x += a p, r -= a q with a = (r·z)/(p·q); partial sums of the new r·z."""
+    segment = start + wp.tid()
+    step = float(scalars[0] / wp.max(scalars[1], wp.float64(1.0e-30)))
+    total = wp.float64(0.0)
+    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, image.shape[0])):
+        image[i] = image[i] + step * direction[i]
+        r = residual[i] - step * product[i]
+        residual[i] = r
+        total += wp.float64(r) * wp.float64(r / (diagonal[i] + prior_diagonal(prior, i)))
+    partial[segment] = total
+
+
+@wp.kernel
+def turn(
+    prior: Prior,
+    scalars: wp.array(dtype=wp.float64),
+    diagonal: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    start: int,
+    direction: wp.array(dtype=float),
+):
+    """p = z + b p with b = new r·z / old r·z."""
+    i = start + wp.tid()
+    ratio = float(scalars[2] / wp.max(scalars[0], wp.float64(1.0e-30)))
+    direction[i] = residual[i] / (diagonal[i] + prior_diagonal(prior, i)) + ratio * direction[i]
+
+
+@wp.kernel
+def sum_partial(partial: wp.array(dtype=wp.float64), at: int, scalars: wp.array(dtype=wp.float64)):
+    """Total of the partial sums, in order, into ``scalars[at]``; at 0 the last r·z moves up first."""
+    total = wp.float64(0.0)
+    for i in range(partial.shape[0]):
+        total += partial[i]
+    scalars[at] = total
+
+
+for _struct in MODEL_STRUCTS:
+    wp.overload(place_pairs, {"model": _struct})

@@ -1,0 +1,366 @@
+"""A picture of the scene from the events of a window: log intensity, solved for, with no network and no training.
+
+The pairs of consecutive events of each pixel are linear equations in the log-intensity map (see
+:mod:`amiwarp.brightness`). One tile, the image grown by the prism's orbit, is solved for; the picture is cut out of it.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import ndimage
+
+from amiwarp.brightness import BrightnessMap, PairSet, Smoothness, Tiles, open_ends, pair_events, quiet_pairs
+from amiwarp.compensate import check_size
+from amiwarp.encoder import TURN, Encoder
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib.result import Calibration
+    from amiwarp.camera import Camera
+    from amiwarp.events import Events, Recording
+    from amiwarp.optics import Model
+
+SCALES = (1.0, 0.5, 0.5)
+"""Of Cauchy's weights, round by round [thresholds]: an equation that is off by as much counts half."""
+STEPS = 15
+"""Of conjugate gradients in each round."""
+SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
+"""Weights of the prior among which held-out equations choose."""
+HELD_OUT = 8
+"""Every so many-th pair is held out."""
+PROBE = 96
+"""The choice is made on a square of so many pixels with the most events."""
+EDGE = 0.5
+"""Neighbours that differ by more [thresholds] are an edge to ``Fill.EDGE``."""
+DAMPING = 1e-6
+"""Holds the mean of the map, and nothing else."""
+SPANS = 8
+"""A turn in so many parts: a pixel silent throughout says in each that nothing changed."""
+COVERED = 0.5
+"""Of a node that the picture claims to know: the sum of its equations' weights."""
+HOLDS, AGREED = 0.25, 0.4
+"""An equation that is off by the one [thresholds] holds by half; of those about a node so much must hold: noise does not."""
+SPECK = 12
+"""Known regions of fewer pixels are noise."""
+NEAR = 2
+"""Pairs of events that are further from what is known are noise, and left out [px]."""
+STILL_US = 100_000
+"""Default window where no prism turns [us]."""
+LARGEST_MARGIN = 0.5
+"""Of the image's width: by no more is the map grown."""
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share of it that is."""
+
+
+class Fill(enum.Enum):
+    """What stands where the events say nothing."""
+
+    NONE = "none"
+    """Nothing: NaN."""
+    SMOOTH = "smooth"
+    """The membrane through what is known around it."""
+    EDGE = "edge"
+    """The same, but that it breaks rather than bends: flat parts with edges between them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """The scene over a window, without the prism."""
+
+    log: NDArray[np.float32]
+    """Log intensity in units of the ON threshold, median 0, shape (height, width); NaN where it is not filled.
+
+    It is determined up to one constant for each connected region of :attr:`known`; the fill joins them.
+    """
+    known: NDArray[np.bool_]
+    """Where events determine it."""
+    start_us: int
+    length_us: int
+    pairs: int
+    """Equations of two events each."""
+    off_excess: float
+    """The OFF threshold over the ON threshold, less 1, as it was taken to be."""
+    smoothness: float
+    """Weight of the prior that held-out equations chose."""
+    residual: float
+    """Median of the equations' absolute residuals [ON thresholds]."""
+    hot: int
+    """Pixels left out because they fire too much."""
+    seconds: float
+    unknowns: NDArray[np.float32] = field(repr=False)
+    """The whole map, to start the next window from."""
+
+    def intensity(self, contrast: float = 0.25) -> NDArray[np.float32]:
+        """Relative linear intensity for an ON threshold of ``contrast`` (log intensity), 1 at the median."""
+        return np.exp(np.float32(contrast) * self.log)
+
+
+class Reconstruction:
+    """Pictures of windows of one recording, with all that they share."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        calibration: Calibration | None = None,
+        *,
+        model: Model | None = None,
+        encoder: Encoder | None = None,
+        omega: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        fill: Fill = Fill.SMOOTH,
+        device: Any = "cpu",
+    ) -> None:
+        """Give a ``calibration``, or a ``model`` and, unless the recording has one, an ``encoder``.
+
+        ``omega``: the camera's angular velocity [rad/s]. Raises :class:`AmiwarpError` for a camera of another size, no
+        events, or no encoder.
+        """
+        if not len(recording.events):
+            raise AmiwarpError(f"{recording.name}: has no events to make a picture of")
+        first, last = recording.events.t_first, recording.events.t_last
+        if calibration is not None:
+            check_size(calibration, recording)
+            model, encoder = calibration.model, calibration.encoder_for(recording.encoder, first, last)
+        encoder = encoder or recording.encoder
+        if model is None or encoder is None:
+            raise AmiwarpError(f"{recording.name}: give a calibration, or a model and an encoder")
+        if (model.camera.width, model.camera.height) != recording.events.size:
+            width, height = recording.events.size
+            given = f"{model.camera.width}x{model.camera.height}"
+            raise AmiwarpError(
+                f"{recording.name}: is {width}x{height}, the model is for {given}; calibrate this camera"
+            )
+        self.recording, self.model, self.encoder = recording, model, encoder
+        self.omega, self.fill, self.device = omega, fill, device
+        self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
+        self._smoothness: float | None = None
+
+    def span(
+        self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
+    ) -> tuple[int, int]:
+        """Start and length of a window [us]: from the first event where not given, one turn or 0.1 s long."""
+        first, last = self.recording.events.t_first, self.recording.events.t_last
+        if turns is not None:
+            if length_us is not None or self.turn_us is None:
+                raise AmiwarpError("turns: the prism does not turn, or a length is given too; give a length alone")
+            length_us = round(turns * self.turn_us)
+        start = first if start_us is None else start_us
+        length = length_us or round(self.turn_us or STILL_US)
+        if length < 1 or start > last or start + length <= first:
+            where = f"{start} .. {start + length} us"
+            raise AmiwarpError(f"{self.recording.name}: no events in {where}; they are at {first} .. {last} us")
+        return start, length
+
+    def window(self, start_us: int, length_us: int, *, last: Picture | None = None) -> Picture:
+        """The picture of one window; it starts from that of the window before where that is given.
+
+        Raises :class:`AmiwarpError` where no pixel fires twice.
+        """
+        began = time.perf_counter()
+        recording = self.recording
+        width, height = recording.events.size
+        events = recording.events.between(start_us, start_us + length_us)
+        hot = hot_pixels(events, width, height)
+        pairs = self._pairs(events, np.where(hot, -1, 0).astype(np.int32), start_us, length_us)
+        if not (pairs.on < 2).any():
+            where = f"{start_us} .. {start_us + length_us} us"
+            raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
+        off = self._off_excess(start_us, length_us)
+        if self._smoothness is None:
+            self._smoothness = self._choose(events, pairs, length_us, off)
+        left, top, tiles = self._tile(length_us)
+        solver = self._solver(pairs, tiles, off, self._smoothness)
+        if last is not None:
+            unknowns = last.unknowns.copy()
+            unknowns[tiles.nodes :] = solver.unknowns[tiles.nodes :]
+            solver.unknowns = unknowns
+        for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
+            solver.solve(scale, steps=STEPS)
+        covered = known_nodes(solver)
+        solver.keep(ndimage.binary_dilation(covered, iterations=NEAR)[None])
+        residual = solver.solve(SCALES[-1], steps=STEPS)
+        cut = np.s_[top : top + height, left : left + width]
+        log, known = solver.maps()[0][cut], covered[cut]
+        log = log - np.median(log[known] if known.any() else log)
+        if self.fill is Fill.NONE:
+            log = np.where(known, log, np.float32(np.nan))
+        of_events = np.abs(residual[pairs.on < 2])
+        typical = float(np.nanmedian(of_events)) if np.isfinite(of_events).any() else math.nan
+        return Picture(
+            log.astype(np.float32), known, start_us, length_us, int((pairs.on < 2).sum()), off, self._smoothness,
+            typical, int(hot.sum()), time.perf_counter() - began, solver.unknowns,
+        )  # fmt: skip
+
+    def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
+        """Pictures of windows that slide by ``step_us``, each started from the one before, to the last that is whole.
+
+        A window without a pair of events repeats the picture before it.
+        """
+        last: Picture | None = None
+        for k in range(self.count(start_us, length_us, step_us=step_us)):
+            try:
+                last = self.window(start_us + round(k * step_us), length_us, last=last)
+            except AmiwarpError:
+                if last is None:
+                    raise
+            yield last
+
+    def count(self, start_us: int, length_us: int, *, step_us: float) -> int:
+        """How many pictures :meth:`windows` gives."""
+        room = self.recording.events.t_last + 1 - start_us - length_us
+        return max(1, math.floor(room / step_us) + 1)
+
+    def _pairs(self, events: Events, tile_of: NDArray[np.int32], start_us: int, length_us: int) -> PairSet:
+        """All equations of a window: pairs of events, open ends, and silence."""
+        turn = min(self.turn_us or length_us, length_us)
+        spans = max(2, round(SPANS * length_us / turn))
+        edges = np.round(np.linspace(start_us, start_us + length_us, spans + 1)).astype(np.int64)
+        parts = [
+            pair_events(events, tile_of, longest_gap_us=length_us, device=self.device),
+            open_ends(events, tile_of, start_us, start_us + length_us),
+            quiet_pairs(events, tile_of, edges, at_least=min(spans, SPANS)),
+        ]
+        return PairSet.concatenate(parts)
+
+    def _solver(self, pairs: PairSet, tiles: Tiles, off: float, smoothness: float) -> BrightnessMap:
+        prior = Smoothness(smoothness, EDGE if self.fill is Fill.EDGE else 0.0)
+        solver = BrightnessMap(
+            pairs, tiles, self.encoder, off_excess=off, damping=DAMPING, smoothness=prior, device=self.device
+        )
+        solver.place(self.model, omega=self.omega)
+        return solver
+
+    def _off_excess(self, start_us: int, length_us: int) -> float:
+        """Over whole turns a pixel comes back to where it was: ONs times their threshold equal OFFs times theirs."""
+        first, last = self.recording.events.t_first, self.recording.events.t_last
+        if self.turn_us is None or last - first < self.turn_us:
+            return 0.0
+        length = max(1, math.floor(length_us / self.turn_us)) * self.turn_us
+        start = min(max(start_us, first), last - length)
+        p = self.recording.events.between(round(start), round(start + length)).p
+        on = int(p.sum())
+        return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0
+
+    def _choose(self, events: Events, pairs: PairSet, length_us: int, off: float) -> float:
+        """The prior's weight under which held-out equations come out best, on the busiest part of the image."""
+        x0, y0 = busiest(events, *self.recording.events.size)
+        inside = (pairs.x >= x0) & (pairs.x < x0 + PROBE) & (pairs.y >= y0) & (pairs.y < y0 + PROBE)
+        part = pairs[np.flatnonzero(inside)]
+        real = np.flatnonzero(part.on < 2)
+        out = np.zeros(len(part), np.bool_)
+        out[real[::HELD_OUT]] = True
+        if out.sum() < 50:
+            return SMOOTHNESS[-1]
+        left, top, _ = self._tile(length_us)
+        shape = (PROBE + 2 * top, PROBE + 2 * left)
+        tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), *shape, 1.0)
+        judge = self._solver(part[out], tiles, off, SMOOTHNESS[0])
+        scores = []
+        for weight in SMOOTHNESS:
+            solver = self._solver(part[~out], tiles, off, weight)
+            for scale in SCALES[:2]:
+                solver.solve(scale, steps=STEPS)
+            judge.unknowns = solver.unknowns
+            residual = judge.solve(SCALES[0], steps=0, rounds=0)
+            scores.append(float(np.nanmean(np.log1p(residual**2))))
+        return SMOOTHNESS[int(np.nanargmin(scores))]
+
+    def _tile(self, length_us: int) -> tuple[int, int, Tiles]:
+        """Columns and rows of the map before the image's first, and the map: all that the window's pixels can see."""
+        camera = self.model.camera
+        margin = np.max(np.abs(orbit(self.model)), axis=0) + turned(camera, np.array(self.omega) * length_us * 0.5e-6)
+        limit = LARGEST_MARGIN * camera.width
+        left, top = (math.ceil(min(float(m), limit)) + 2 for m in margin)
+        origin = np.array([[-left, -top]], np.float32)
+        return left, top, Tiles(origin, camera.height + 2 * top, camera.width + 2 * left, 1.0)
+
+
+def reconstruct(
+    recording: Recording,
+    calibration: Calibration | None = None,
+    *,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    start_us: int | None = None,
+    length_us: int | None = None,
+    turns: float | None = None,
+    omega: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    fill: Fill = Fill.SMOOTH,
+    device: Any = "cpu",
+) -> Picture:
+    """The picture of a window, from a quarter turn up: of ``length_us`` or ``turns`` (default: one) from ``start_us``.
+
+    See :class:`Reconstruction` for the rest, and for several windows.
+    """
+    work = Reconstruction(recording, calibration, model=model, encoder=encoder, omega=omega, fill=fill, device=device)
+    return work.window(*work.span(start_us, length_us, turns))
+
+
+def hot_pixels(events: Events, width: int, height: int) -> NDArray[np.bool_]:
+    """Pixels that fire far more than the busiest of those around them, shape (height, width)."""
+    index = events.y.astype(np.int64) * width + events.x
+    count = np.bincount(index, minlength=width * height).reshape(height, width).astype(np.float32)
+    typical = ndimage.percentile_filter(count, 75, size=5, mode="mirror")
+    return np.asarray(count > 3.0 * typical + 5.0 * np.sqrt(typical) + 8.0)
+
+
+def known_nodes(solver: BrightnessMap) -> NDArray[np.bool_]:
+    """Nodes of the map that events determine: enough equations hold there, and most of those that there are."""
+    hold, everything = solver.coverage(HOLDS)[0], solver.coverage(1e6)[0]
+    return without_specks((hold >= COVERED) & (hold >= AGREED * everything))
+
+
+def without_specks(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask without regions under :data:`SPECK` pixels."""
+    label, count = ndimage.label(known)
+    size = np.bincount(label.ravel(), minlength=count + 1)
+    size[0] = 0
+    return np.asarray((size >= SPECK)[label])
+
+
+def busiest(events: Events, width: int, height: int) -> tuple[int, int]:
+    """First column and row of the :data:`PROBE` pixels' square with the most events."""
+    columns, rows = -(-width // PROBE), -(-height // PROBE)
+    cell = (events.y // PROBE).astype(np.int64) * columns + events.x // PROBE
+    best = int(np.argmax(np.bincount(cell, minlength=columns * rows)))
+    return best % columns * PROBE, best // columns * PROBE
+
+
+def orbit(model: Model) -> NDArray[np.float64]:
+    """How far the prism moves pixels of the image's border over a turn [px], shape (n, 2)."""
+    xy = border(model.camera)
+    theta = np.arange(24) * (TURN / 24)
+    at = np.repeat(xy, 24, axis=0)
+    moved = model.compensate_points(at.astype(np.float32), np.tile(theta, len(xy)))
+    away = np.asarray(moved, np.float64) - at
+    return away[np.isfinite(away).all(axis=1)]
+
+
+def turned(camera: Camera, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far pixels of the border move when the camera turns by ``rotation`` [rad], at most, along x and y [px]."""
+    if not rotation.any():
+        return np.zeros(2)
+    from scipy.spatial.transform import Rotation
+
+    xy = border(camera)
+    rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
+    both = [camera.rays_to_pixels(Rotation.from_rotvec(s * rotation).apply(rays).astype(np.float32)) for s in (1, -1)]
+    away = np.abs(np.concatenate([np.asarray(b) - xy for b in both]))
+    return np.asarray(np.nanmax(away, axis=0))
+
+
+def border(camera: Camera) -> NDArray[np.float64]:
+    """Pixels along the image's border, shape (n, 2)."""
+    x, y = np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9)
+    grid = np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
+    edge = np.isin(grid[:, 0], x[[0, -1]]) | np.isin(grid[:, 1], y[[0, -1]])
+    return np.asarray(grid[edge])

@@ -1,0 +1,309 @@
+"""Pictures from events: like the truth, honest where there is none, the same each time, whole on disk."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from typer.testing import CliRunner
+
+from amiwarp.calib.result import Calibration
+from amiwarp.camera import Camera
+from amiwarp.cli.app import app
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.io import open_recording, save_recording
+from amiwarp.io.text import read_calib
+from amiwarp.motion import CameraMotion, PrismMotion
+from amiwarp.optics import ExactModel, Prism
+from amiwarp.picture_files import Tone, save_picture, save_video, tones
+from amiwarp.reconstruct import Fill, Picture, Reconstruction, hot_pixels, reconstruct
+from amiwarp.simulate import Scene, SensorModel, Simulation
+
+CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
+PRISM, PHASE = Prism(math.radians(1.2)), 2.0
+MODEL = ExactModel(CAMERA, PRISM, PHASE)
+TURN_US = 83_333
+START = 20_000
+
+
+def simulation(picture: NDArray[np.uint8], **changes: object) -> Simulation:
+    start = Simulation(Scene.from_picture(picture), CAMERA, PRISM, 0.2, PrismMotion(720.0, PHASE), seed=4)
+    return replace(start, **changes)
+
+
+@pytest.fixture(scope="module")
+def sim(texture: NDArray[np.uint8]) -> Simulation:
+    return simulation(texture)
+
+
+@pytest.fixture(scope="module")
+def recording(sim: Simulation) -> Recording:
+    """Noise on: shot noise, leak, hot pixels, mismatch, latency, a refractory time."""
+    return sim.run()
+
+
+@pytest.fixture(scope="module")
+def truth(sim: Simulation) -> NDArray[np.float32]:
+    return sim.log_view()
+
+
+@pytest.fixture(scope="module")
+def picture(recording: Recording) -> Picture:
+    return reconstruct(recording, model=MODEL, start_us=START)
+
+
+def correlation(a: NDArray[np.float32], b: NDArray[np.float32], where: NDArray[np.bool_]) -> float:
+    return float(np.corrcoef(a[where], b[where])[0, 1])
+
+
+def everywhere(picture: Picture) -> NDArray[np.bool_]:
+    return np.ones_like(picture.known)
+
+
+def with_events(recording: Recording, events: Events) -> Recording:
+    order = np.argsort(events.t, kind="stable")
+    return replace(recording, events=MemoryEvents(events[order], *recording.events.size), truth=None)
+
+
+def calibration() -> Calibration:
+    parameters = {"apex": PRISM.apex, "phase": PHASE}
+    return Calibration("exact", CAMERA, PRISM, parameters, {}, (), "variance", 1.0, 2.0, (), 0, 0.0)
+
+
+def test_one_turn_looks_like_the_truth(picture: Picture, truth: NDArray[np.float32]) -> None:
+    assert correlation(picture.log, truth, picture.known) >= 0.96
+    assert correlation(picture.log, truth, everywhere(picture)) >= 0.95
+    assert picture.known.mean() > 0.2
+    assert abs(float(np.median(picture.log[picture.known]))) < 1e-4
+
+
+def test_its_contrast_is_the_threshold(picture: Picture, truth: NDArray[np.float32]) -> None:
+    """Log intensity per unit of the map is the simulated sensor's ON threshold, 0.25."""
+    found, true = picture.log[picture.known], truth[picture.known]
+    slope = float(np.cov(found, true)[0, 1] / np.var(found))
+    assert slope == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.parametrize(("turns", "bar"), [(0.25, 0.90), (2.0, 0.96)])
+def test_other_lengths(recording: Recording, truth: NDArray[np.float32], turns: float, bar: float) -> None:
+    found = reconstruct(recording, model=MODEL, start_us=START, turns=turns)
+    assert found.length_us == pytest.approx(turns * TURN_US, abs=5)
+    assert correlation(found.log, truth, found.known) >= bar
+
+
+def test_unequal_thresholds_are_found(texture: NDArray[np.uint8], truth: NDArray[np.float32]) -> None:
+    sensor = SensorModel(contrast_on=0.22, contrast_off=0.28)
+    found = reconstruct(simulation(texture, sensor=sensor).run(), model=MODEL, start_us=START)
+    assert found.off_excess == pytest.approx(0.28 / 0.22 - 1.0, abs=0.06)
+    assert correlation(found.log, truth, found.known) >= 0.95
+
+
+def test_nothing_is_claimed_where_nothing_fired() -> None:
+    """Half of the scene is blank; noise fires there all the same."""
+    picture = np.full((240, 320), 128, np.uint8)
+    picture[:, :150] = (np.indices((240, 150)).sum(axis=0) // 5 % 2 * 180 + 40).astype(np.uint8)
+    made = simulation(picture)
+    events = made.run()
+    found = reconstruct(events, model=MODEL, start_us=START, fill=Fill.NONE)
+    blank = np.zeros_like(found.known)
+    blank[:, 115:] = True
+    x = events.events.between(START, START + TURN_US).x
+    assert (x >= 115).sum() > 500
+    assert found.known[blank].mean() < 0.01
+    assert found.known[10:-10, 10:85].mean() > 0.9
+    assert np.array_equal(np.isnan(found.log), ~found.known)
+    filled = reconstruct(events, model=MODEL, start_us=START)
+    assert np.isfinite(filled.log).all()
+    assert np.std(filled.log[:, 130:]) < 0.5
+
+
+def test_edge_fill_breaks_rather_than_bends(recording: Recording, truth: NDArray[np.float32], picture: Picture) -> None:
+    found = reconstruct(recording, model=MODEL, start_us=START, fill=Fill.EDGE)
+    assert np.isfinite(found.log).all()
+    assert correlation(found.log, truth, everywhere(found)) >= 0.95
+    gap = ~found.known[:, 1:] & ~found.known[:, :-1]
+
+    def evenness(of: Picture) -> float:
+        """Of the steps between neighbours in the gaps: mean over rms."""
+        step = np.abs(np.diff(of.log, axis=1))[gap]
+        return float(step.mean() / np.sqrt(np.mean(step**2)))
+
+    assert evenness(found) < 0.95 * evenness(picture)
+
+
+def test_hot_pixels_leave_no_salt(recording: Recording, picture: Picture) -> None:
+    rng = np.random.default_rng(1)
+    n, each = 60, 400
+    x, y = np.repeat(rng.integers(0, 200, n), each), np.repeat(rng.integers(0, 150, n), each)
+    t = rng.integers(0, 200_000, n * each)
+    hot = Events.from_arrays(x.astype(np.uint16), y.astype(np.uint16), t, rng.integers(0, 2, n * each))
+    clean = recording.events.slice(0, len(recording.events))
+    found = reconstruct(with_events(recording, Events.concatenate([clean, hot])), model=MODEL, start_us=START)
+    assert found.hot >= 0.9 * n
+    away = np.abs(found.log - picture.log)[picture.known & found.known]
+    assert np.quantile(away, 0.999) < 1.0
+    assert float(away.max()) < 3.0
+
+
+def test_hot_pixels_are_told_from_texture() -> None:
+    count = np.full((20, 30), 12)
+    count[5, 7], count[6, 8] = 200, 14
+    y, x = (np.repeat(a.ravel(), count.ravel()) for a in np.indices(count.shape))
+    events = Events.from_arrays(x.astype(np.uint16), y.astype(np.uint16), np.arange(len(x)), np.ones(len(x)))
+    assert np.argwhere(hot_pixels(events, 30, 20)).tolist() == [[5, 7]]
+
+
+def test_bit_for_bit_the_same(recording: Recording, picture: Picture) -> None:
+    again = reconstruct(recording, model=MODEL, start_us=START)
+    assert np.array_equal(again.log, picture.log)
+    assert np.array_equal(again.known, picture.known)
+
+
+def test_devices_agree(recording: Recording, picture: Picture, device: str) -> None:
+    found = reconstruct(recording, model=MODEL, start_us=START, device=device)
+    both = found.known & picture.known
+    assert both.sum() > 0.99 * picture.known.sum()
+    assert np.quantile(np.abs(found.log - picture.log)[both], 0.99) < 0.05
+
+
+def test_while_the_camera_turns(texture: NDArray[np.uint8]) -> None:
+    rate = (0.0, math.radians(20.0), math.radians(-15.0))
+    turning = simulation(texture, camera_motion=CameraMotion(rate), duration_s=0.1).run()
+    still = reconstruct(turning, model=MODEL, start_us=0)
+    right = reconstruct(turning, model=MODEL, start_us=0, omega=rate)
+    wrong = reconstruct(turning, model=MODEL, start_us=0, omega=tuple(-r for r in rate))
+    assert right.residual < 0.7 * still.residual
+    assert right.residual < 0.7 * wrong.residual
+
+
+@pytest.mark.parametrize(("name", "expected"), [("shapes_rotation", 0.35), ("dynamic_rotation", 0.25)])
+def test_real_rotation_without_a_prism(data_dir: Path, name: str, expected: float) -> None:
+    """Residuals [thresholds]; the sign is that of the data's README."""
+    folder = data_dir / "text" / name
+    real = open_recording(folder / "events.txt")
+    width, height = real.events.size
+    camera = read_calib(folder / "calib.txt", width, height)
+    first, last = real.events.t_first, real.events.t_last
+    x, y, z = np.loadtxt(folder / "motion.txt").ravel()[-3:].tolist()
+    still = {
+        "model": ExactModel(camera, Prism(0.0)),
+        "encoder": Encoder.constant_speed(0.0, first, last),
+        "length_us": last - first + 1,
+    }
+    right = reconstruct(real, omega=(x, y, z), **still)
+    wrong = reconstruct(real, omega=(-x, -y, -z), **still)
+    assert right.residual < expected
+    assert wrong.residual > 2.0 * right.residual
+
+
+def test_tones(picture: Picture) -> None:
+    mapped, linear = tones(picture, Tone.MAPPED), tones(picture, Tone.LINEAR)
+    for value in (mapped, linear):
+        assert value.min() >= 0.0
+        assert value.max() == 1.0
+    assert np.median(mapped) > np.median(linear)
+    brightest = np.percentile(picture.intensity()[picture.known], 99.5)
+    inside = linear < 1.0
+    np.testing.assert_allclose(linear[inside] * brightest, picture.intensity()[inside], rtol=1e-4)
+
+
+def test_files_of_each_ending(picture: Picture, tmp_path: Path) -> None:
+    for name, kind in (("a.png", np.uint8), ("b.tif", np.uint16), ("c.tiff", np.uint16)):
+        save_picture(picture, tmp_path / name)
+        pixels = np.asarray(Image.open(tmp_path / name))
+        assert pixels.dtype == kind
+        assert pixels.shape == (150, 200)
+        assert np.ptp(pixels) == np.iinfo(kind).max
+    save_picture(picture, tmp_path / "d.png", bits=16, tone=Tone.LINEAR)
+    deep = np.asarray(Image.open(tmp_path / "d.png")).astype(np.float64) / 65535.0
+    np.testing.assert_allclose(deep, tones(picture, Tone.LINEAR), atol=1e-5)
+    save_picture(picture, tmp_path / "e.npy", contrast=0.2)
+    np.testing.assert_array_equal(np.load(tmp_path / "e.npy"), np.float32(0.2) * picture.log)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.tif", "c.tiff", "d.png", "e.npy"]
+
+
+def test_video(recording: Recording, truth: NDArray[np.float32], tmp_path: Path) -> None:
+    work = Reconstruction(recording, model=MODEL)
+    pictures = list(work.windows(START, TURN_US, step_us=20_000.0))
+    assert len(pictures) == work.count(START, TURN_US, step_us=20_000.0) == 5
+    assert all(correlation(p.log, truth, p.known) >= 0.96 for p in pictures)
+    assert save_video(pictures, tmp_path / "v.mp4", fps=50.0) == 5
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        stream = container.streams.video[0]
+        assert float(stream.average_rate) == 50.0
+        frames = [f.to_ndarray(format="gray") for f in container.decode(stream)]
+    assert len(frames) == 5
+    assert frames[0].shape == (150, 200)
+    assert np.abs(frames[0].astype(float) - 255.0 * tones(pictures[0], Tone.MAPPED)).mean() < 4.0
+
+
+def test_command(recording: Recording, tmp_path: Path) -> None:
+    save_recording(tmp_path / "r.h5", recording)
+    calibration().save(tmp_path / "c.json")
+    base = ["reconstruct", str(tmp_path / "r.h5")]
+    more = ["--calibration", str(tmp_path / "c.json"), "--device", "cpu"]
+    out = CliRunner().invoke(
+        app, [*base, str(tmp_path / "p.png"), *more, "--turns", "0.5", "--mask", str(tmp_path / "m.png"), "--json"]
+    )
+    assert out.exit_code == 0, out.stderr
+    data = json.loads(out.stdout)
+    mask = np.asarray(Image.open(tmp_path / "m.png"))
+    assert data["known"] == pytest.approx((mask == 255).mean(), abs=1e-9)
+    assert set(np.unique(mask)) == {0, 255}
+    film = CliRunner().invoke(app, [*base, str(tmp_path / "v.mp4"), *more, "--fps", "20", "--length", "0.05"])
+    assert film.exit_code == 0, film.stderr
+    assert "3 frames" in film.stdout
+    assert {p.name for p in tmp_path.iterdir()} == {"r.h5", "c.json", "p.png", "m.png", "v.mp4"}
+
+
+def test_command_refuses(recording: Recording, tmp_path: Path) -> None:
+    save_recording(tmp_path / "r.h5", recording)
+    calibration().save(tmp_path / "c.json")
+    before = {p.name for p in tmp_path.iterdir()}
+    for out, more, said in (
+        ("p.bmp", [], "ends in .bmp"),
+        ("none/p.png", [], "does not exist"),
+        ("p.png", ["--fps", "20"], "--fps goes with a video"),
+        ("v.mp4", ["--mask", "m.png"], "--mask"),
+        ("p.png", ["--start", "9"], "no events in"),
+        ("p.png", ["--bits", "12"], "12 bits"),
+        ("p.png", ["--turns", "1", "--length", "0.1"], "a length is given too"),
+    ):
+        args = ["reconstruct", str(tmp_path / "r.h5"), str(tmp_path / out), "--calibration", str(tmp_path / "c.json")]
+        result = CliRunner().invoke(app, [*args, "--device", "cpu", *more])
+        assert result.exit_code == 1
+        assert said in result.stderr
+        assert {p.name for p in tmp_path.iterdir()} == before
+
+
+def test_what_cannot_be(recording: Recording, picture: Picture, tmp_path: Path) -> None:
+    with pytest.raises(AmiwarpError, match="no events in"):
+        reconstruct(recording, model=MODEL, start_us=10_000_000)
+    with pytest.raises(AmiwarpError, match="no pixel fires twice"):
+        reconstruct(recording, model=MODEL, start_us=START, length_us=1)
+    with pytest.raises(AmiwarpError, match="200x150, the model is for 64x48"):
+        reconstruct(recording, model=ExactModel(Camera.from_fov(64, 48, 1.0), PRISM))
+    small = replace(calibration(), camera=Camera.from_fov(64, 48, 1.0))
+    with pytest.raises(AmiwarpError, match="the calibration is for 64x48"):
+        reconstruct(recording, small)
+    with pytest.raises(AmiwarpError, match="give a calibration, or a model"):
+        reconstruct(recording)
+    with pytest.raises(AmiwarpError, match="has no events"):
+        reconstruct(with_events(recording, Events.empty()), model=MODEL)
+    with pytest.raises(AmiwarpError, match="no picture to write"):
+        save_video([], tmp_path / "v.mp4", fps=25.0)
+    with pytest.raises(AmiwarpError, match="is a folder"):
+        save_picture(picture, _folder(tmp_path / "f.png"))
+    assert [p.name for p in tmp_path.iterdir()] == ["f.png"]
+
+
+def _folder(path: Path) -> Path:
+    path.mkdir()
+    return path
