@@ -246,7 +246,11 @@ class BrightnessMap:
             setattr(out, name, wp.array(getattr(pairs, name), dtype=dtype, device=self.device))
         times = [(t - self.middle_us) * 1e-6 for t in (pairs.first_t, pairs.second_t)]
         zeros = np.zeros((len(pairs), 2), dtype=np.float32)
-        columns = {"theta": np.stack(theta, 1), "slope": zeros if slope is None else slope, "time": np.stack(times, 1)}
+        columns: dict[str, Any] = {
+            "theta": np.stack(theta, 1),
+            "slope": zeros if slope is None else slope,
+            "time": np.stack(times, 1),
+        }
         for name, values in columns.items():
             setattr(out, name, wp.array(values.astype(np.float32), dtype=wp.vec2, device=self.device))
         return out
@@ -364,7 +368,7 @@ class BrightnessMap:
         shape = (len(self.tiles.origin), self.tiles.rows, self.tiles.columns)
         return self.unknowns[: self.tiles.nodes].reshape(shape)
 
-    def coverage(self, scale: float) -> NDArray[np.float32]:
+    def coverage(self, scale: float = 1.0) -> NDArray[np.float32]:
         """How much pairs of two events say of each node, with weights of ``scale``, shape (tiles, rows, columns)."""
         self._pairs.weak = 0.0
         self._weigh(scale)

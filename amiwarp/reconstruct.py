@@ -48,7 +48,7 @@ SPANS = 8
 COVERED = 0.5
 """Of a node that the picture claims to know: the sum of its equations' weights."""
 HOLDS, AGREED = 0.25, 0.4
-"""An equation that is off by the one [thresholds] holds by half; of those about a node so much must hold: noise does not."""
+"""An equation that is off by the one [thresholds] holds by half; so much of those about a node must hold."""
 SPECK = 12
 """Known regions of fewer pixels are noise."""
 NEAR = 2
@@ -93,7 +93,7 @@ class Picture:
     smoothness: float
     """Weight of the prior that held-out equations chose."""
     residual: float
-    """Median of the equations' absolute residuals [ON thresholds]."""
+    """Median of the equations' absolute residuals [ON thresholds]; near 1 where the optics or the motion is wrong."""
     hot: int
     """Pixels left out because they fire too much."""
     seconds: float
@@ -184,10 +184,11 @@ class Reconstruction:
             unknowns[tiles.nodes :] = solver.unknowns[tiles.nodes :]
             solver.unknowns = unknowns
         for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
-            solver.solve(scale, steps=STEPS)
+            residual = solver.solve(scale, steps=STEPS)
         covered = known_nodes(solver)
-        solver.keep(ndimage.binary_dilation(covered, iterations=NEAR)[None])
-        residual = solver.solve(SCALES[-1], steps=STEPS)
+        if covered.any():
+            solver.keep(ndimage.binary_dilation(covered, iterations=NEAR)[None])
+        solver.solve(SCALES[-1], steps=STEPS)
         cut = np.s_[top : top + height, left : left + width]
         log, known = solver.maps()[0][cut], covered[cut]
         log = log - np.median(log[known] if known.any() else log)

@@ -124,6 +124,14 @@ def test_nothing_is_claimed_where_nothing_fired() -> None:
     assert np.std(filled.log[:, 130:]) < 0.5
 
 
+def test_noise_makes_nothing_known(texture: NDArray[np.uint8], truth: NDArray[np.float32], picture: Picture) -> None:
+    """20 random events a second of every pixel, a third of all."""
+    noisy = simulation(texture, sensor=SensorModel(shot_noise_hz=20.0)).run()
+    found = reconstruct(noisy, model=MODEL, start_us=START)
+    assert found.known.mean() == pytest.approx(picture.known.mean(), abs=0.03)
+    assert correlation(found.log, truth, found.known) >= 0.94
+
+
 def test_edge_fill_breaks_rather_than_bends(recording: Recording, truth: NDArray[np.float32], picture: Picture) -> None:
     found = reconstruct(recording, model=MODEL, start_us=START, fill=Fill.EDGE)
     assert np.isfinite(found.log).all()

@@ -7,7 +7,7 @@ For given parameters the map is a linear least-squares problem; the parameters m
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from amiwarp.brightness import BrightnessMap, PairSet, Sensor, Tiles, pair_events
 from amiwarp.calib.objective import padding
 from amiwarp.calib.result import Photometric, StageSummary
-from amiwarp.calib.solve import maximise
+from amiwarp.calib.solve import Stage, maximise
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ GRID = (4, 3)
 """One tile, the busiest, from each of so many columns and rows of the image."""
 LONGEST_GAP_US = 60_000
 """Pairs further apart say little: noise has come between."""
+FEWEST_PAIRS = 10_000
 PAIRS_PER_NODE = 2.5
 """Fewer equations for each unknown of the map fit anything."""
 FEWEST_TURNS = 2
@@ -42,6 +43,8 @@ FIRST_SCALE = 1.0
 """Of Cauchy's weights while the map is cold [thresholds]."""
 FAR_PX = 2.0
 """The stage looks no further from the sharpness optimum than this, in any direction."""
+FIRST_STEP_PX = 0.2
+POLISH_STEP_PX = 0.05
 LARGEST_COST = 0.75
 """Of the cost with no map at all: above it the equations do not hold, and the scene or camera moved unmodelled."""
 
@@ -129,10 +132,10 @@ def guess_off_threshold(brightness: BrightnessMap, pairs: PairSet) -> None:
     brightness.unknowns = values
 
 
-def check_pairs(name: str, brightness: BrightnessMap, pairs: int) -> float:
+def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
     """Share of the equations that are left once the map is determined; raises where they are too few."""
-    touched = int((brightness.coverage() > 0.5).sum())
-    if pairs < PAIRS_PER_NODE * max(touched, 1000):
+    touched = int((coverage > 0.5).sum())
+    if pairs < max(FEWEST_PAIRS, PAIRS_PER_NODE * touched):
         raise AmiwarpError(
             f"{name}: {pairs} pairs of events are too few for {touched} places of a map; record for longer"
         )
@@ -196,7 +199,7 @@ def refine(
     cost = _Cost(space, brightness, settings.steps)
     v = space.to_vector(dict(start))
     cost.warm_up(v)
-    left = check_pairs(recording.name, brightness, len(pairs))
+    left = check_pairs(recording.name, brightness.coverage(cost.scale), len(pairs))
     at_start = -cost(v)
     low, high = (np.clip(edge, v - FAR_PX, v + FAR_PX) for edge in space.bounds())
 
@@ -205,16 +208,33 @@ def refine(
             progress("photometric", cost.evaluations, settings.evaluations)
         return cost(at)
 
-    stage = maximise(
-        score, settings.algorithm, low=low, high=high, start=v, evaluations=settings.evaluations,
-        tolerance=settings.tolerance_px, step=0.2,
-    )  # fmt: skip
+    def search(at: NDArray[np.float64], step: float) -> Stage:
+        return maximise(
+            score, settings.algorithm, low=low, high=high, start=at, evaluations=settings.evaluations,
+            tolerance=settings.tolerance_px, step=step,
+        )  # fmt: skip
+
+    stage = search(v, FIRST_STEP_PX)
+    # the map lags the parameters while they move far: once more from near, with a better map
+    cost.steps *= 2
+    stage = joined(stage, search(stage.x, POLISH_STEP_PX))
     result = _conclude(cost, stage.x, v, at_start, start, pairs, left)
     points = [
         {**{n: values[n] for n in space.names}, "score": float(s)}
         for values, s in ((space.to_values(x), s) for x, s in zip(stage.points, stage.scores, strict=True))
     ]
     return result, StageSummary.of("photometric", stage, points)
+
+
+def joined(first: Stage, second: Stage) -> Stage:
+    """Two runs as one; the answer is the second's, whose map was the better."""
+    return replace(
+        second,
+        evaluations=first.evaluations + second.evaluations,
+        seconds=first.seconds + second.seconds,
+        points=np.concatenate([first.points, second.points]),
+        scores=np.concatenate([first.scores, second.scores]),
+    )
 
 
 def _conclude(
@@ -228,7 +248,7 @@ def _conclude(
 ) -> Photometric:
     """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`."""
     space = cost.space
-    residuals = cost.residuals(best, rounds=2, steps=2 * cost.steps)
+    residuals = cost.residuals(best, rounds=2)
     final = float(cost.terms(residuals).mean())
     covariance = _covariance(cost, best, pairs.tile) / left**2
     off, leak = (float(x) for x in cost.brightness.unknowns[-2:])

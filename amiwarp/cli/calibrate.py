@@ -61,12 +61,29 @@ class SearchOptions:
         int | None, typer.Option(min=1, help="At most so many events, thinned evenly.", rich_help_panel=_SEARCH)
     ] = None
 
+    stages: Annotated[
+        str | None,
+        typer.Option(help="sharpness: without the photometric stage. Default: both.", rich_help_panel=_SEARCH),
+    ] = None
+    latency_us: Annotated[
+        float, typer.Option(min=0.0, help="Known delay of the sensor's time stamps.", rich_help_panel=_SEARCH)
+    ] = 0.0
+    refractory_us: Annotated[
+        float, typer.Option(min=0.0, help="Known refractory time of the sensor.", rich_help_panel=_SEARCH)
+    ] = 0.0
+
     def changes(self) -> dict[str, Any]:
         """Fields of the settings that were given."""
+        from amiwarp.brightness import Sensor
+        from amiwarp.calib.photometric import PhotometricSettings
+
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
         if (given.get("global_algorithm") or "").lower() == "none":
             given["global_algorithm"] = None
-        return given
+        if self.stages is not None:
+            given["stages"] = tuple(name.strip() for name in self.stages.split(","))
+        sensor = Sensor(given.pop("latency_us"), given.pop("refractory_us"))
+        return given | {"photometric": PhotometricSettings(sensor=sensor)}
 
 
 @dataclass(frozen=True)
@@ -205,12 +222,13 @@ def cut(recording: Recording, window: str) -> Recording:
 
 
 def staged(advance: Advance, settings: Settings) -> Any:
-    """A calibration's progress as one share: the global search is about half of the work."""
-    start = 0.0 if settings.global_algorithm is None else 0.5
+    """A calibration's progress as one share: each stage takes about as long as the others."""
+    names = [] if settings.global_algorithm is None else ["global"]
+    names += ["local", "photometric"][: len(settings.stages)]
 
     def update(stage: str, done: int, budget: int) -> None:
-        share = done / max(budget, 1)
-        advance(0.5 * share if stage == "global" else start + (1.0 - start) * share, f"calibrating, {stage}")
+        share = min(done / max(budget, 1), 1.0)
+        advance((names.index(stage) + share) / len(names), f"calibrating, {stage}")
 
     return update
 
@@ -236,9 +254,17 @@ def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
         table(stages, "stage", "algorithm", "evaluations", "time", "sharpness", "ended by"),
         "",
         f"sharpness ({sharp['kind']}): {sharp['before']:.5g} before, {sharp['after']:.5g} after",
+        *_photometric(c),
         *(f"warning: {text}" for text in c.warnings),
         f"{data['file']}: {data['model']} model, {c.events:,} events, {c.seconds:.2f} s on {data['device']}",
     ]
+
+
+def _photometric(c: Calibration) -> list[str]:
+    if c.photometric is None or not c.photometric.accepted:
+        return []
+    p = c.photometric
+    return [f"photometric: {p.verdict}; {p.pairs:,} pairs, {p.moved_px:.3f} px from the answer of sharpness"]
 
 
 def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:

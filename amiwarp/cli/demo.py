@@ -41,7 +41,9 @@ def lines(d: dict[str, Any]) -> list[Any]:
     """The outcome for people."""
     rows = [
         ("apex", f"{d['apex_deg']:.4f} deg found, {d['apex_true_deg']:.4f} deg true"),
-        ("model error", f"{d['model_error_px']:.3f} px rms over image and turn"),
+        ("model error", f"{d['model_error_px']:.4f} px rms over image and turn, "
+                        f"{d['sharpness_model_error_px']:.4f} px by sharpness alone"),
+        ("phase error", f"{d['phase_error_deg']:+.3f} deg"),
         ("blur", f"{d['blur_before_px']:.2f} px before, {d['blur_after_px']:.2f} px after, "
                  f"{d['blur_with_truth_px']:.2f} px with the true prism"),
         ("speed", f"simulated in {d['simulate_s']:.1f} s, calibrated in {d['calibrate_s']:.1f} s, "
