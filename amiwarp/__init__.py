@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from amiwarp.metrics import edge_blur, model_error, truth_model
     from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
     from amiwarp.optics import CircleModel, EllipseModel, ExactModel, FlatSide, Prism, RadialCircleModel
+    from amiwarp.reconstruct import Fill, Picture, Reconstruction, reconstruct
     from amiwarp.sharpness import Sharpness, sharpness
     from amiwarp.simulate import Scene, SensorModel, Simulation, simulate
     from amiwarp.translate import translate
@@ -37,6 +38,7 @@ _PUBLIC = {
     "metrics": ("edge_blur", "model_error", "truth_model"),
     "motion": ("CameraMotion", "EncoderModel", "PrismMotion"),
     "optics": ("CircleModel", "EllipseModel", "ExactModel", "FlatSide", "Prism", "RadialCircleModel"),
+    "reconstruct": ("Fill", "Picture", "Reconstruction", "reconstruct"),
     "sharpness": ("Sharpness", "sharpness"),
     "simulate": ("Scene", "SensorModel", "Simulation", "simulate"),
     "translate": ("translate",),

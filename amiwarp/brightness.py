@@ -194,7 +194,6 @@ class BrightnessMap:
         if not len(pairs):
             raise AmiwarpError("no pixel fired twice in time: there is no pair of events to learn the brightness from")
         self.device, self.tiles, self.count = wp.get_device(device), tiles, len(pairs)
-        self.with_leak = with_leak
         self.middle_us = (int(pairs.first_t.min()) + int(pairs.second_t.max())) // 2
         self._pairs = self._upload(pairs, encoder, sensor or Sensor(), slope)
         self._atlas = kernels.Atlas()

@@ -1,6 +1,6 @@
 """Calibration without a guess, by the defaults, on simulated recordings of real pictures; JSON, one object.
 
-    python -m benchmarks.calibration pictures|photometric|videos|algorithms|costs FOLDER --out FILE.json [--device cuda:0] …
+    python -m benchmarks.calibration WHAT FOLDER --out FILE.json [--device cuda:0] …
 
 ``pictures``: every picture of FOLDER through three prisms, three seeds each. Each row carries the model error, the blur
 beside the truth's, and the best point of a dense grid of the very cost that was maximised.
@@ -263,6 +263,7 @@ def run_costs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                             sharpness=kind,
                             smoothing_px=smoothing,
                             per_polarity=per_polarity,
+                            stages=STAGES[:1],
                             device=args.device,
                         )
                         row = judged(recording, c, args.device)

@@ -94,6 +94,15 @@ def test_too_few_pairs_fall_back_and_say_so(texture: np.ndarray) -> None:
     assert c.parameters == alone.parameters
 
 
+def test_missing_events_are_not_believed(recording: Recording) -> None:
+    """Of every seven events one: what is left is as sharp, but no pair of neighbours is a threshold apart."""
+    few = recording.events.slice(0, len(recording.events))[::7]
+    c = calibrate(replace(recording, events=MemoryEvents(few, *recording.events.size)), photometric=KNOWN)
+    assert c.photometric is None or not c.photometric.accepted
+    assert any("photometric" in warning for warning in c.warnings)
+    assert error_px(recording, c) < 0.15
+
+
 def test_an_unmodelled_motion_is_never_worse_than_sharpness_silently(texture: np.ndarray) -> None:
     """A camera that turns at 40 deg/s, unmodelled: accepted only if no worse, else kept and said."""
     camera = Camera.from_fov(200, 150, math.radians(50))

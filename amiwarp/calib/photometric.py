@@ -41,11 +41,11 @@ FEWEST_TURNS = 2
 FEWEST_TILES = 6
 FIRST_SCALE = 1.0
 """Of Cauchy's weights while the map is cold [thresholds]."""
-FAR_PX = 2.0
+FAR_PX = 1.0
 """The stage looks no further from the sharpness optimum than this, in any direction."""
 FIRST_STEP_PX = 0.2
 POLISH_STEP_PX = 0.05
-LARGEST_COST = 0.75
+LARGEST_COST = 0.35
 """Of the cost with no map at all: above it the equations do not hold, and the scene or camera moved unmodelled."""
 
 
@@ -64,8 +64,6 @@ class PhotometricSettings:
     """Nodes of the map per pixel."""
     sensor: Sensor = field(default_factory=Sensor)
     """Known latency and refractory time; what is not known of them stays in the phase."""
-    leak: bool = False
-    """Estimate the sensor's leak along with the map."""
 
 
 def choose_tiles(
@@ -124,12 +122,13 @@ def _spread(n: int) -> list[int]:
     return [k for k in order if k < n]
 
 
-def guess_off_threshold(brightness: BrightnessMap, pairs: PairSet) -> None:
-    """Over a whole turn brightness comes back to where it was, so ON steps and OFF steps add up to nothing."""
-    on = int(pairs.on.sum())
-    values = brightness.unknowns
-    values[-2] = on / max(1, len(pairs) - on) - 1.0
-    brightness.unknowns = values
+def off_excess(pairs: PairSet) -> float:
+    """Excess of the OFF threshold over the ON threshold, counted, not solved for: that would shrink it with the map.
+
+    Over a whole turn brightness comes back to where it was, so ON steps and OFF steps add up to nothing.
+    """
+    on = int((pairs.on == 1).sum())
+    return on / max(1, len(pairs) - on) - 1.0
 
 
 def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
@@ -193,9 +192,14 @@ def refine(
     if material.slope_of is not None:
         slope = np.stack([material.slope_of(t) for t in (pairs.first_t, pairs.second_t)], axis=1).astype(np.float32)
     brightness = BrightnessMap(
-        pairs, tiles, material.encoder, sensor=settings.sensor, slope=slope, with_leak=settings.leak, device=device
+        pairs,
+        tiles,
+        material.encoder,
+        sensor=settings.sensor,
+        slope=slope,
+        off_excess=off_excess(pairs),
+        device=device,
     )
-    guess_off_threshold(brightness, pairs)
     cost = _Cost(space, brightness, settings.steps)
     v = space.to_vector(dict(start))
     cost.warm_up(v)
@@ -251,7 +255,6 @@ def _conclude(
     residuals = cost.residuals(best, rounds=2)
     final = float(cost.terms(residuals).mean())
     covariance = _covariance(cost, best, pairs.tile) / left**2
-    off, leak = (float(x) for x in cost.brightness.unknowns[-2:])
     moved = float(np.linalg.norm(best - v))
     accepted, verdict = _verdict(final, at_start, moved)
     return Photometric(
@@ -265,8 +268,7 @@ def _conclude(
         cost_at_sharpness=at_start,
         residual=float(np.nanmedian(np.abs(residuals))),
         pairs=len(pairs),
-        off_over_on=1.0 + off,
-        leak_hz=leak if cost.brightness.with_leak else None,
+        off_over_on=1.0 + off_excess(pairs),
     )
 
 

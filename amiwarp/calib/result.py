@@ -68,8 +68,7 @@ class Photometric:
     """Median of the residuals' magnitudes [ON thresholds]."""
     pairs: int
     off_over_on: float
-    """Ratio of the OFF threshold to the ON threshold."""
-    leak_hz: float | None
+    """Ratio of the OFF threshold to the ON threshold, counted."""
 
 
 @dataclass(frozen=True)
