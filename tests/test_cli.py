@@ -181,7 +181,8 @@ def test_calibrate_takes_every_setting(place: Path) -> None:
         "phase=1.6rad", "--bound", "deflection=0.5deg:1.5deg", "--bound", "phase=60deg:140deg", "--local-evaluations",
         "40", "--tolerance-px", "0.01", "--smoothing-px", "1.5", "--per-polarity", "--events", "50000",
         "--window", "0.05:0.18", "--nominal-apex-deg", "2.2", "--index", "1.52", "--flat-side", "scene",
-        "--fov-deg", "40", "--figure", "cost.png", "--stages", "sharpness", "--latency-us", "100", "--refractory-us", "50",
+        "--fov-deg", "40", "--figure", "cost.png", "--stages", "sharpness", "--latency-us", "100",
+        "--refractory-us", "50",
     )  # fmt: skip
     assert data["file"] == "recording.calibration.json"
     assert [stage["algorithm"] for stage in data["stages"]] == ["LN_SBPLX"]
