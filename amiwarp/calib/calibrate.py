@@ -1,4 +1,4 @@
-"""Calibration by sharpness: reads the recording, searches, and refuses what the recording cannot determine."""
+"""Calibration: reads the recording, runs both stages, and refuses what the recording cannot determine."""
 
 from __future__ import annotations
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 NOMINAL_PRISM = Prism(math.radians(2.0))
 """What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
-
-
 LEAST_SHARPNESS_KEPT = 0.88
 """The truth is nearly as sharp as the sharpest (0.93 to 0.99 of the gain, measured); what keeps less is none."""
 
@@ -40,7 +38,8 @@ def calibrate(
     progress: Progress | None = None,
     **changes: Any,
 ) -> Calibration:
-    """Finds the prism's parameters in the recording itself: those that make the IWE sharpest.
+    """Finds the prism's parameters in the recording itself: those that make the IWE sharpest, and from there, unless
+    it cannot be believed, those that make one brightness map explain the events.
 
     ``changes`` are fields of :class:`Settings`, over ``settings``. Raises :class:`AmiwarpError` where the recording
     cannot determine the parameters: too few events, under a quarter turn, encoder not covering the events, no
@@ -65,7 +64,7 @@ def calibrate(
         free=search.space.names,
         sharpness_name=settings.sharpness.value,
         sharpness_before=before,
-        sharpness_after=search.fine.values(best),
+        sharpness_after=search.score,
         stages=tuple(search.stages),
         zero_us=_middle(recording) if recording.encoder is None else None,
         events=len(search.material.events),

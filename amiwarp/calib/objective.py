@@ -48,11 +48,14 @@ class Objective:
         self._votes = Votes(canvas, device)
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
 
+    def _vote(self, values: dict[str, float]) -> None:
+        self._votes.clear()
+        self._votes.add_events(self.space.build(values), self._arrays, self._count, self.space.drift(values))
+
     def values(self, values: dict[str, float]) -> float:
         """Sharpness at parameter values."""
         self.evaluations += 1
-        self._votes.clear()
-        self._votes.add_events(self.space.build(values), self._arrays, self._count, self.space.drift(values))
+        self._vote(values)
         return self._meter.measure(self._votes.flat)
 
     def __call__(self, v: NDArray[np.float64]) -> float:
@@ -61,8 +64,7 @@ class Objective:
 
     def image(self, values: dict[str, float]) -> NDArray[np.float32]:
         """The IWE at parameter values, shape (layers, rows, columns), padding included."""
-        self._votes.clear()
-        self._votes.add_events(self.space.build(values), self._arrays, self._count, self.space.drift(values))
+        self._vote(values)
         return self._votes.take()
 
 

@@ -223,11 +223,7 @@ def refine(
     cost.steps *= 2
     stage = joined(stage, search(stage.x, POLISH_STEP_PX))
     result = _conclude(cost, stage.x, v, at_start, start, pairs, left)
-    points = [
-        {**{n: values[n] for n in space.names}, "score": float(s)}
-        for values, s in ((space.to_values(x), s) for x, s in zip(stage.points, stage.scores, strict=True))
-    ]
-    return result, StageSummary.of("photometric", stage, points)
+    return result, StageSummary.of("photometric", stage, space)
 
 
 def joined(first: Stage, second: Stage) -> Stage:

@@ -22,6 +22,7 @@ from amiwarp.optics import MODELS, FlatSide, Prism
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.calib.parameters import Space
     from amiwarp.calib.solve import Stage
     from amiwarp.optics import Model
 
@@ -44,7 +45,11 @@ class StageSummary:
     """Parameters of every evaluation, each with its ``score``, in order."""
 
     @classmethod
-    def of(cls, name: str, stage: Stage, points: list[dict[str, float]]) -> StageSummary:
+    def of(cls, name: str, stage: Stage, space: Space) -> StageSummary:
+        points = []
+        for x, score in zip(stage.points, stage.scores, strict=True):
+            values = space.to_values(x)
+            points.append({**{n: values[n] for n in space.names}, "score": float(score)})
         return cls(name, stage.algorithm, stage.evaluations, stage.seconds, stage.score, stage.ended, points)
 
 

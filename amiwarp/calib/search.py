@@ -135,10 +135,10 @@ class Search:
         if self.settings.global_algorithm is not None:
             stage = self._run_global(self.settings.global_algorithm, starts[0])
             starts = distinct_optima(stage, CANDIDATES)
-            self.stages.append(self._summary("global", stage))
+            self.stages.append(StageSummary.of("global", stage, self.space))
         runs = [self._run_local(start) for start in starts]
         best = max(runs, key=lambda run: run.score)
-        self.stages.extend(self._summary("local", run) for run in runs)
+        self.stages.extend(StageSummary.of("local", run, self.space) for run in runs)
         self.best, self.score = self.space.to_values(best.x), best.score
 
     def _run_global(self, algorithm: str, start: NDArray[np.float64]) -> Stage:
@@ -170,13 +170,6 @@ class Search:
             inner=s.local_algorithm, seed=s.seed,
         )  # fmt: skip
 
-    def _summary(self, name: str, stage: Stage) -> StageSummary:
-        points = [
-            {**{n: values[n] for n in self.space.names}, "score": float(score)}
-            for values, score in ((self.space.to_values(x), v) for x, v in zip(stage.points, stage.scores, strict=True))
-        ]
-        return StageSummary.of(name, stage, points)
-
     def judge(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Refuses what chance could have made; returns warnings and standard deviations."""
         best = self.best
@@ -186,8 +179,9 @@ class Search:
         points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
         sharp, turned, still = (np.array([part.values(values) for part in plain]) for values in points)
         checks.check_texture(sharp, turned, still, name)
-        pad = (self.fine.image(best).shape[2] - self.space.camera.width) // 2
-        checks.check_directions(self.fine.image(best).sum(axis=0)[pad:-pad, pad:-pad], name)
+        image = self.fine.image(best).sum(axis=0)
+        pad = (image.shape[1] - self.space.camera.width) // 2
+        checks.check_directions(image[pad:-pad, pad:-pad], name)
         v = self.space.to_vector(best)
         covariance, warnings = scatter(parts, self.fine, v)
         return self._at_bounds(best) + warnings, self.space.deviations(v, covariance)
