@@ -377,16 +377,50 @@ def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
         [sys.executable, "-c", script, *args], cwd=place, env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "up\n"
-    if command == "simulate":
-        wait_until(lambda: any(file.name.endswith(".part") for file in place.iterdir()))
-    time.sleep(6.0 if command == "calibrate" else 0.5)
-    process.send_signal(signal.SIGINT)
-    out, error = process.communicate(timeout=60)
+    with process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "up\n"
+            if command == "simulate":
+                wait_until(lambda: any(file.name.endswith(".part") for file in place.iterdir()))
+            time.sleep(6.0 if command == "calibrate" else 0.5)
+            process.send_signal(signal.SIGINT)
+            out, error = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert (process.returncode, out) == (130, ""), error
     assert error.count("\n") == 1, error
     assert left_behind(place) == set()
+
+
+def test_interrupt_inside_a_finaliser_is_not_lost(place: Path) -> None:
+    """Python drops an exception there; the command must end all the same."""
+    script = """
+import signal, sys, time
+import amiwarp.io
+from amiwarp.cli import app
+
+class Dropping:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+        for _ in range(10):
+            pass
+
+def slow(*args, **extra):
+    thing = Dropping()
+    del thing
+    time.sleep(30)
+
+amiwarp.io.open_recording = slow
+app.main()
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", script, "info", "recording.h5"],
+        cwd=place, env=environment, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr.count("\n") == 1, done.stderr
 
 
 def wait_until(done: Any, seconds: float = 60.0) -> None:

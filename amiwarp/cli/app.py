@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import _thread
 import sys
+import threading
 from typing import Any
 
 import typer
@@ -70,4 +72,15 @@ for module in (demo, info, convert, simulate, translate, calibrate, compensate, 
 
 def main() -> None:
     """Run the command line; ends the process."""
+    sys.unraisablehook = _interrupt_again
     app(prog_name="amiwarp")
+
+
+def _interrupt_again(dropped: Any) -> None:
+    """Ctrl-C that reaches Python inside a finaliser is dropped there; it is given once more, a moment later."""
+    if not issubclass(dropped.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(dropped)
+        return
+    again = threading.Timer(0.05, _thread.interrupt_main)
+    again.daemon = True
+    again.start()
