@@ -14,13 +14,14 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.multilevel import Levels
-from amiwarp.optics import model_camera, wrap_angle
+from amiwarp.optics import model_camera
+from amiwarp.pairs import PairSet, Sensor, upload_pairs
+from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.encoder import Encoder
-    from amiwarp.events import Events
     from amiwarp.optics import Model
 
 WEAK_WEIGHT = 0.05
@@ -28,16 +29,6 @@ WEAK_WEIGHT = 0.05
 
 DAMPING = 0.02
 """Weight of the map's own square beside the equations: it holds unknowns that none determines."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sensor:
-    """What is known of the sensor's timing [us]; zero where nothing is."""
-
-    latency_us: float = 0.0
-    """Time from a change of brightness to its stamp."""
-    refractory_us: float = 0.0
-    """Time after an event at whose end a pixel takes its new reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,104 +56,6 @@ class Tiles:
         return len(self.origin) * self.rows * self.columns
 
 
-@dataclass(frozen=True)
-class PairSet:
-    """Pairs of consecutive events of a pixel, on the host."""
-
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    first_t: NDArray[np.int64]
-    """Time of the event that sets the reference [us]."""
-    second_t: NDArray[np.int64]
-    on: NDArray[np.uint8]
-    """Polarity of the second event; plus 2 where there is none at the second time, 4 where none at the first."""
-    tile: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        return len(self.x)
-
-    def __getitem__(self, which: slice | NDArray[Any]) -> PairSet:
-        names = ("x", "y", "first_t", "second_t", "on", "tile")
-        return PairSet(*(getattr(self, name)[which] for name in names))
-
-    @classmethod
-    def concatenate(cls, parts: list[PairSet]) -> PairSet:
-        names = ("x", "y", "first_t", "second_t", "on", "tile")
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
-
-
-def pair_events(
-    events: Events,
-    tile_of: NDArray[np.int32],
-    *,
-    longest_gap_us: int,
-    shortest_gap_us: float = 0.0,
-    device: Any = "cpu",
-) -> PairSet:
-    """Consecutive events of each pixel of a tile (``tile_of`` (height, width) >= 0), sorted on ``device``.
-
-    Left out are pairs further apart than ``longest_gap_us``, or closer than ``shortest_gap_us``.
-    """
-    import warp as wp
-
-    tile = tile_of[events.y, events.x]
-    events, tile = events[tile >= 0], tile[tile >= 0]
-    n, width = len(events), tile_of.shape[1]
-    if n < 2:
-        return PairSet(events.x[:0], events.y[:0], events.t[:0], events.t[:0], events.p[:0], tile[:0])
-    keys = np.zeros(2 * n, dtype=np.int32)
-    keys[:n] = events.y.astype(np.int32) * width + events.x
-    keys_d = wp.array(keys, dtype=wp.int32, device=device)
-    order_d = wp.array(np.arange(2 * n, dtype=np.int32), dtype=wp.int32, device=device)
-    wp.utils.radix_sort_pairs(keys_d, order_d, n)
-    pixel, order = keys_d.numpy()[:n], order_d.numpy()[:n]
-    gap = np.diff(events.t[order])
-    pair = np.flatnonzero((pixel[1:] == pixel[:-1]) & (gap <= longest_gap_us) & (gap > shortest_gap_us))
-    first, second = order[pair], order[pair + 1]
-    return PairSet(events.x[first], events.y[first], events.t[first], events.t[second], events.p[second], tile[first])
-
-
-def open_ends(events: Events, tile_of: NDArray[np.int32], start: int, stop: int) -> PairSet:
-    """From the window's ``start`` to each pixel's first event, and from its last to ``stop`` [us].
-
-    At the start the brightness is anywhere within a threshold of the reference, so that the first event finds it one
-    threshold further in the mean; after the last it stays within one. Without the former, every edge that enters would
-    look lower than it looks when it leaves, and the map would slope.
-    """
-    events = events[tile_of[events.y, events.x] >= 0]
-    pixel = events.y.astype(np.int64) * tile_of.shape[1] + events.x
-    first = np.unique(pixel, return_index=True)[1]
-    last = len(pixel) - 1 - np.unique(pixel[::-1], return_index=True)[1]
-    e, z = events[first], events[last]
-    return PairSet(
-        np.concatenate([e.x, z.x]),
-        np.concatenate([e.y, z.y]),
-        np.concatenate([np.full(len(e), start, np.int64), z.t]),
-        np.concatenate([e.t, np.full(len(z), stop, np.int64)]),
-        np.concatenate([e.p | 4, np.full(len(z), 2, np.uint8)]).astype(np.uint8),
-        np.concatenate([tile_of[e.y, e.x], tile_of[z.y, z.x]]),
-    )
-
-
-def quiet_pairs(events: Events, tile_of: NDArray[np.int32], edges: NDArray[np.int64], *, at_least: int) -> PairSet:
-    """Spans between two of ``edges`` (rising times [us]) of pixels that fire in none of ``at_least`` spans about them.
-
-    Silence is information: the log brightness along the pixel's way changed by no more than about a threshold.
-    """
-    spans = len(edges) - 1
-    span = np.searchsorted(edges, events.t, side="right") - 1
-    inside = (span >= 0) & (span < spans)
-    run = np.ones((spans, *tile_of.shape), np.int32)
-    run[span[inside], events.y[inside], events.x[inside]] = 0
-    for k in range(1, spans):
-        run[k] *= 1 + run[k - 1]
-    for k in range(spans - 2, -1, -1):
-        run[k] = np.where((run[k] > 0) & (run[k + 1] > 0), run[k + 1], run[k])
-    at, y, x = np.nonzero((run >= at_least) & (tile_of >= 0))
-    on = np.full(len(at), 2, np.uint8)
-    return PairSet(x.astype(np.uint16), y.astype(np.uint16), edges[at], edges[at + 1], on, tile_of[y, x])
-
-
 class BrightnessMap:
     """The map of a set of pairs and its solver; owns its buffers. Solves warm-start from the last map."""
 
@@ -179,14 +72,18 @@ class BrightnessMap:
         off_excess: float | None = None,
         damping: float = DAMPING,
         smoothness: Smoothness | None = None,
+        weak: float = WEAK_WEIGHT,
+        middle_us: int = 0,
         device: Any = "cpu",
     ) -> None:
         """``slope`` (n, 2): change of the encoder's angle at either event per unit of a drifting parameter.
 
         ``off_excess``: the OFF threshold's excess over the ON threshold where it is known: held, not solved for.
+        ``middle_us``: the time to which a turning camera is turned back.
         """
         import warp as wp
 
+        from amiwarp.kernels import descent
         from amiwarp.kernels import photometric as kernels
         from amiwarp.kernels.launch import slice_count
         from amiwarp.kernels.prior import Prior
@@ -194,20 +91,22 @@ class BrightnessMap:
         if not len(pairs):
             raise AmiwarpError("no pixel fired twice in time: there is no pair of events to learn the brightness from")
         self.device, self.tiles, self.count = wp.get_device(device), tiles, len(pairs)
-        self.middle_us = (int(pairs.first_t.min()) + int(pairs.second_t.max())) // 2
-        self._pairs = self._upload(pairs, encoder, sensor or Sensor(), slope)
+        self.middle_us = middle_us
+        self._pairs = upload_pairs(
+            pairs, encoder, sensor or Sensor(), slope, middle_us=self.middle_us, weak=weak, device=self.device
+        )
         self._atlas = kernels.Atlas()
         self._atlas.origin = wp.array(tiles.origin, dtype=wp.vec2, device=device)
         self._atlas.rows, self._atlas.columns, self._atlas.density = tiles.rows, tiles.columns, tiles.density
         self._atlas.with_off, self._atlas.with_leak = float(with_off), float(with_leak)
         unknowns = tiles.nodes + int(kernels.EXTRA)
-        names = ("image", "residual", "direction", "product", "diagonal")
-        self._image, self._r, self._p, self._q, self._diagonal = (
+        names = ("image", "change", "residual", "direction", "product", "diagonal")
+        self._image, self._change, self._r, self._p, self._q, self._diagonal = (
             wp.zeros(unknowns, dtype=float, device=device) for _ in names
         )
         self._sums = wp.zeros((slice_count(device), unknowns), dtype=wp.int64, device=device)
         self._slices = [self._sums[k] for k in range(len(self._sums))]
-        self._partial = wp.zeros(-(-unknowns // int(kernels.SEGMENT)), dtype=wp.float64, device=device)
+        self._partial = wp.zeros(-(-unknowns // int(descent.SEGMENT)), dtype=wp.float64, device=device)
         self._scalars = wp.zeros(3, dtype=wp.float64, device=device)
         self.smoothness = smoothness
         self._prior = Prior()
@@ -219,50 +118,24 @@ class BrightnessMap:
         self._levels = Levels(tiles.rows, tiles.columns, self.device) if one else None
         self._z = wp.zeros(unknowns if one else 0, dtype=float, device=device)
         if off_excess is not None:
-            self._prior.held = tiles.nodes
-            self._image.assign(np.concatenate([np.zeros(tiles.nodes), [off_excess, 0.0]]).astype(np.float32))
-        self._weight = wp.zeros(self.count, dtype=float, device=device)
-        self._residual = wp.zeros(self.count, dtype=float, device=device)
+            self._prior.held = tiles.nodes + 1  # the leak comes first
+            self._image.assign(np.concatenate([np.zeros(tiles.nodes + 1), [off_excess]]).astype(np.float32))
+        self._weight, self._residual, self._scratch, self._other = (
+            wp.zeros(self.count, dtype=float, device=device) for _ in range(4)
+        )
         self._geometry = kernels.Geometry()
         self._geometry.cell = wp.zeros(self.count, dtype=wp.vec2i, device=device)
         self._geometry.first = wp.zeros(self.count, dtype=wp.vec2, device=device)
         self._geometry.second = wp.zeros(self.count, dtype=wp.vec2, device=device)
 
-    def _upload(self, pairs: PairSet, encoder: Encoder, sensor: Sensor, slope: NDArray[np.float32] | None) -> Any:
-        import warp as wp
-
-        from amiwarp.kernels.photometric import Pairs
-
-        speed = [encoder.speed_at(t) for t in (pairs.first_t, pairs.second_t)]
-        late = (sensor.refractory_us - sensor.latency_us, -sensor.latency_us)
-        theta = [
-            wrap_angle(encoder.angle_at(t) + s * shift * 1e-6)
-            for t, s, shift in zip((pairs.first_t, pairs.second_t), speed, late, strict=True)
-        ]
-        out = Pairs()
-        out.weak = WEAK_WEIGHT
-        for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("tile", wp.int32), ("on", wp.uint8)):
-            setattr(out, name, wp.array(getattr(pairs, name), dtype=dtype, device=self.device))
-        times = [(t - self.middle_us) * 1e-6 for t in (pairs.first_t, pairs.second_t)]
-        zeros = np.zeros((len(pairs), 2), dtype=np.float32)
-        columns: dict[str, Any] = {
-            "theta": np.stack(theta, 1),
-            "slope": zeros if slope is None else slope,
-            "time": np.stack(times, 1),
-        }
-        for name, values in columns.items():
-            setattr(out, name, wp.array(values.astype(np.float32), dtype=wp.vec2, device=self.device))
-        return out
-
-    def place(self, model: Model, *, drift: float = 0.0, omega: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        """Where the pairs fall for these parameters; ``omega``: the camera's angular velocity [rad/s]."""
-        import warp as wp
-
+    def place(self, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:
+        """Where the pairs fall for these parameters, the camera's ``turning`` taken back to ``middle_us``."""
         from amiwarp.kernels.launch import launch
         from amiwarp.kernels.photometric import place_pairs
 
         inputs = [model.params(self.device), model_camera(model, self.device), self._pairs, self._atlas, drift]
-        launch(place_pairs, self.count, [*inputs, wp.vec3(*omega)], [self._geometry], device=self.device)
+        turning = (turning or Turning()).about(self.middle_us)
+        launch(place_pairs, self.count, [*inputs, turning.params()], [self._geometry], device=self.device)
 
     def solve(self, scale: float, *, steps: int, rounds: int = 1) -> NDArray[np.float32]:
         """``rounds`` of Cauchy weights of ``scale`` [thresholds] and ``steps`` of conjugate gradients each.
@@ -271,42 +144,69 @@ class BrightnessMap:
         """
         for _ in range(rounds):
             self._weigh(scale)
-            self._descend(steps)
+            self._descend(self._image, self._residual, steps)
         self._weigh(scale)
         residual: NDArray[np.float32] = self._residual.numpy()
         return residual.copy()
 
-    def _weigh(self, scale: float) -> None:
+    def residual(self) -> NDArray[np.float32]:
+        """Residual of every pair [thresholds] for the map as it is, where :meth:`place` has put them last."""
+        self._weigh(1.0, self._scratch)
+        residual: NDArray[np.float32] = self._other.numpy()
+        return residual.copy()
+
+    def unexplained(self, target: NDArray[np.float32], *, steps: int) -> NDArray[np.float32]:
+        """What of ``target`` (pairs) no change of the map explains, under the weights of the last :meth:`solve`.
+
+        The projection of variable projection (Golub and Pereyra 1973), by conjugate gradients from no change.
+        """
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.photometric import subtract
+
+        self._other.assign(np.nan_to_num(target).astype(np.float32))
+        self._change.zero_()
+        self._descend(self._change, self._other, steps)
+        inputs = [self._pairs, self._atlas, self._geometry, self._change]
+        launch(subtract, self.count, inputs, [self._other], device=self.device)
+        rest: NDArray[np.float32] = self._other.numpy()
+        return rest.copy()
+
+    def _weigh(self, scale: float, weight: Any = None) -> None:
         from amiwarp.kernels.launch import launch
         from amiwarp.kernels.photometric import weigh
 
         inputs = [self._pairs, self._atlas, self._geometry, self._image, scale]
-        launch(weigh, self.count, inputs, [self._weight, self._residual], device=self.device)
+        outputs = [self._weight, self._residual] if weight is None else [weight, self._other]
+        launch(weigh, self.count, inputs, outputs, device=self.device)
 
-    def _descend(self, steps: int) -> None:
-        """Conjugate gradients on the normal equations, preconditioned by the diagonal or by :class:`Levels`."""
+    def _descend(self, image: Any, residual: Any, steps: int) -> None:
+        """Conjugate gradients on the normal equations, preconditioned by the diagonal or by :class:`Levels`.
+
+        ``image`` moves so that less is left of ``residual``, which is that of ``image`` as it comes in.
+        """
         import warp as wp
 
+        from amiwarp.kernels import descent as cg
         from amiwarp.kernels import photometric as k
         from amiwarp.kernels.launch import launch, launch_slices
 
         equations = [self._pairs, self._atlas, self._geometry, self._weight]
-        unknowns = len(self._image)
+        unknowns = len(image)
         self._link()
         self._find_diagonal()
         if self._levels is not None:
             self._levels.prepare(equations, self.count, self._sums, self._slices)
-        launch_slices(k.apply_residual, self.count, [*equations, self._image], self._slices, device=self.device)
-        launch(k.gather, unknowns, [self._sums], [self._r], device=self.device)
-        self._by_segment(k.start_descent, [self._prior, self._diagonal, self._image, self._r, self._p], [], 0)
+        launch_slices(k.apply_transpose, self.count, [*equations, residual], self._slices, device=self.device)
+        launch(cg.gather, unknowns, [self._sums], [self._r], device=self.device)
+        self._by_segment(cg.start_descent, [self._prior, self._diagonal, image, self._r, self._p], [], 0)
         if self._levels is not None:
             self._correct(0)
             wp.copy(self._p, self._z)
         for _ in range(steps):
             launch_slices(k.apply_normal, self.count, [*equations, self._p], self._slices, device=self.device)
-            self._by_segment(k.finish_product, [self._sums, self._prior, self._p, self._q], [], 1)
+            self._by_segment(cg.finish_product, [self._sums, self._prior, self._p, self._q], [], 1)
             inputs = [self._prior, self._scalars, self._diagonal, self._p, self._q, self._r]
-            self._by_segment(k.descend, inputs, [self._image], 2)
+            self._by_segment(cg.descend, inputs, [image], 2)
             self._turn()
             wp.copy(self._scalars, self._scalars, 0, 2, 1)
 
@@ -314,8 +214,8 @@ class BrightnessMap:
         """Run a kernel that leaves partial sums, and put their total into the scalar ``at``."""
         import warp as wp
 
+        from amiwarp.kernels.descent import sum_partial
         from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import sum_partial
 
         launch(kernel, len(self._partial), inputs, [*outputs, self._partial], device=self.device, smallest=64)
         wp.launch(sum_partial, dim=1, inputs=[self._partial, at, self._scalars], device=self.device)
@@ -332,8 +232,8 @@ class BrightnessMap:
     def _turn(self) -> None:
         """The next direction."""
         from amiwarp.kernels import multilevel
+        from amiwarp.kernels.descent import turn
         from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import turn
 
         if self._levels is None:
             inputs = [self._prior, self._scalars, self._diagonal, self._r]
@@ -369,13 +269,18 @@ class BrightnessMap:
 
     def coverage(self, scale: float = 1.0) -> NDArray[np.float32]:
         """How much pairs of two events say of each node, with weights of ``scale``, shape (tiles, rows, columns)."""
-        self._pairs.weak = 0.0
+        weak, self._pairs.weak = self._pairs.weak, 0.0
         self._weigh(scale)
         self._find_diagonal()
-        self._pairs.weak = WEAK_WEIGHT
+        self._pairs.weak = weak
         shape = (len(self.tiles.origin), self.tiles.rows, self.tiles.columns)
         diagonal: NDArray[np.float32] = self._diagonal.numpy()[: self.tiles.nodes].reshape(shape)
         return diagonal.copy()
+
+    @property
+    def extra(self) -> NDArray[np.float32]:
+        """The unknowns behind the map: the leak [thresholds/s], and the OFF threshold's excess."""
+        return self.unknowns[self.tiles.nodes :]
 
     def keep(self, nodes: NDArray[np.bool_]) -> None:
         """Pairs of two events that lie off ``nodes`` (tiles, rows, columns), either of them, are left out: noise."""
@@ -390,9 +295,10 @@ class BrightnessMap:
         self._geometry.cell = wp.array(cell, dtype=wp.vec2i, device=self.device)
 
     def _find_diagonal(self) -> None:
+        from amiwarp.kernels import descent as cg
         from amiwarp.kernels import photometric as k
         from amiwarp.kernels.launch import launch, launch_slices
 
         equations = [self._pairs, self._atlas, self._geometry, self._weight]
         launch_slices(k.add_diagonal, self.count, equations, self._slices, device=self.device)
-        launch(k.gather, len(self._image), [self._sums], [self._diagonal], device=self.device)
+        launch(cg.gather, len(self._image), [self._sums], [self._diagonal], device=self.device)

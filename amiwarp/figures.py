@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,12 +16,15 @@ from amiwarp.calib.parameters import size_name
 from amiwarp.calib.result import cost_surface
 from amiwarp.iwe import iwe
 from amiwarp.iwe_files import PERCENTILE, save_png
+from amiwarp.picture_files import Tone, limits, tones
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib import Calibration
     from amiwarp.events import Events, Recording
+    from amiwarp.metrics import PictureQuality
+    from amiwarp.reconstruct import Picture
 
 EVENTS = 2_000_000
 """At most so many events, thinned evenly, make an image of a figure."""
@@ -29,6 +32,10 @@ POINTS = 60_000
 """At most so many points make a cloud."""
 REGION = (64, 80)
 """Part of the image that is shown enlarged and as clouds [px]."""
+WIDTH, TITLE = 15.0, 14.0
+"""Of the demo's figure [inch], and of its titles' letters [point]."""
+GREYS, FAINT = 128, 8
+"""Of a figure's 256 colours so many are grey; a colour whose channels differ by no more counts as grey."""
 FOUND, TRUTH, LOCAL = "#d55e00", "#000000", "#e69f00"
 
 
@@ -61,14 +68,10 @@ def images(events: Events, recording: Recording, calibration: Calibration, *, de
     return Images(iwe(events, *size, device=device), after)
 
 
-def draw_images(axes: Any, pair: Images, box: tuple[int, int] | None = None) -> None:
-    """Both images on the same scale; ``box`` marks the region whose left top pixel it is."""
-    from matplotlib.patches import Rectangle
-
+def draw_images(axes: Any, pair: Images) -> None:
+    """Both images on the same scale."""
     for ax, image, title in zip(axes, (pair.before, pair.after), ("before", "after"), strict=True):
         show(ax, image, pair.top, f"events {title} compensation")
-        if box is not None:
-            ax.add_patch(Rectangle(box, *REGION, fill=False, edgecolor=LOCAL, linewidth=1.6))
 
 
 def show(ax: Any, image: NDArray[np.float32], top: float, title: str) -> None:
@@ -110,29 +113,123 @@ def _polar(size: float, phase: float) -> tuple[float, float]:
     return math.degrees(size) * math.cos(phase), math.degrees(size) * math.sin(phase)
 
 
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """A reconstructed picture beside the truth."""
+
+    picture: Picture
+    original: NDArray[np.float32]
+    """What the camera would see without the prism: log intensity, shape (height, width)."""
+    quality: PictureQuality
+
+    def tones(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Both for the eye, 0 .. 1, with the original's black and white: gain and offset are those of the fit."""
+        log = np.float32(self.quality.gain) * self.picture.log + np.float32(self.quality.offset)
+        original = replace(self.picture, log=self.original, known=np.ones(self.original.shape, np.bool_))
+        between = limits(original, 1.0)
+        found = tones(replace(self.picture, log=log), Tone.MAPPED, contrast=1.0, between=between)
+        return found, tones(original, Tone.MAPPED, contrast=1.0, between=between)
+
+
 def draw_demo(
     path: Path,
     recording: Recording,
     calibration: Calibration,
+    reconstructed: Reconstructed,
     *,
     headline: str,
     truth: tuple[float, float],
     device: Any,
 ) -> tuple[str, ...]:
-    """Clouds, images and cost surface in one figure; returns notes on what could not be drawn as it should."""
+    """What came in and what came of it, the marked region enlarged, clouds and cost surface in one figure.
+
+    Returns notes on what could not be drawn as it should.
+    """
     pair = images(thin(recording, EVENTS), recording, calibration, device=device)
-    left, top = busiest(pair.after)
-    figure, axes = _figure((15.0, 9.2), 2, 3, (1.0, 1.0, 1.0))
-    figure.suptitle(headline, fontsize=15)
-    notes = _draw_clouds(figure, axes[0, :2], recording, calibration, (left, top), device)
-    draw_cost(figure, axes[0, 2], calibration, truth)
-    draw_images(axes[1, :2], pair, (left, top))
-    part = (slice(top, top + REGION[1]), slice(left, left + REGION[0]))
-    seam = np.full((REGION[1], 2), pair.top, np.float32)
-    both = np.concatenate([pair.before[part], seam, pair.after[part]], axis=1)
-    show(axes[1, 2], both, pair.top, "the marked region before and after")
+    corner = busiest(pair.after)
+    found, original = reconstructed.tones()
+    grid = Grid.make(*recording.events.size)
+    figure, ax = grid.figure, grid.axes
+    figure.text(0.5, 1.0 - 0.34 / grid.height, headline, ha="center", va="center", fontsize=18)
+    show(ax["raw"], pair.before, pair.top, "events as they come")
+    show_grey(ax["picture"], found, f"reconstructed from one turn, correlation {reconstructed.quality.correlation:.3f}")
+    show_grey(ax["original"], original, "the original, as seen without the prism")
+    show(ax["compensated"], pair.after, pair.top, "events, compensated")
+    for name in ("raw", "picture", "original", "compensated"):
+        mark(ax[name], corner)
+    part = (slice(corner[1], corner[1] + REGION[1]), slice(corner[0], corner[0] + REGION[0]))
+    show(ax["part raw"], pair.before[part], pair.top, "marked region: as it comes")
+    show(ax["part compensated"], pair.after[part], pair.top, "compensated")
+    show_grey(ax["part picture"], found[part], "reconstructed")
+    notes = _draw_clouds(figure, (ax["cloud before"], ax["cloud after"]), recording, calibration, corner, device)
+    draw_cost(figure, ax["cost"], calibration, truth)
+    enlarge(figure, ax["cost"])
     save(figure, path)
     return notes
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The demo's figure: axes by name at places that follow from the image's proportions, so that nothing overlaps."""
+
+    figure: Any
+    axes: dict[str, Any]
+    height: float
+    """Of the figure [inch]."""
+
+    @classmethod
+    def make(cls, columns: int, rows: int) -> Grid:
+        """For images of ``columns`` x ``rows`` pixels: three in the first row, one and its region in the second."""
+        gap, title = 0.12, 0.42
+        width = (WIDTH - 4 * gap) / 3.0
+        tall = width * rows / columns
+        part = min(tall * REGION[0] / REGION[1], (WIDTH - 5 * gap - width) / 3.0)
+        third = 4.1
+        height = 0.6 + 2 * (title + tall + gap) + title + third + 0.65
+        figure = _blank((WIDTH, height))
+
+        def place(left: float, top: float, wide: float, high: float) -> Any:
+            return figure.add_axes((left / WIDTH, 1.0 - (top + high) / height, wide / WIDTH, high / height))
+
+        axes = {}
+        top = 0.6 + title
+        for k, name in enumerate(("raw", "picture", "original")):
+            axes[name] = place(gap + k * (width + gap), top, width, tall)
+        top += tall + gap + title
+        axes["compensated"] = place(gap, top, width, tall)
+        spare = (WIDTH - 2 * gap - width - 3 * part) / 3.0
+        for k, name in enumerate(("part raw", "part compensated", "part picture")):
+            axes[name] = place(gap + width + spare + k * (part + spare), top, part, tall)
+        top += tall + gap + title
+        for k, name in enumerate(("cloud before", "cloud after")):
+            axes[name] = place(gap + k * (width + gap), top, width, third)
+        axes["cost"] = place(2 * (width + gap) + 0.75, top, width - 0.65, third)
+        return cls(figure, axes, height)
+
+
+def enlarge(figure: Any, cost: Any) -> None:
+    """Letters that can still be read where the figure is shown at half its size."""
+    for each in figure.axes:
+        each.title.set_fontsize(TITLE)
+        each.tick_params(labelsize=TITLE - 2.0)
+        each.xaxis.label.set_fontsize(TITLE - 2.0)
+        each.yaxis.label.set_fontsize(TITLE - 2.0)
+    for text in cost.get_legend().get_texts():
+        text.set_fontsize(TITLE - 3.0)
+
+
+def mark(ax: Any, corner: tuple[int, int]) -> None:
+    """Marks the region whose left top pixel is ``corner``."""
+    from matplotlib.patches import Rectangle
+
+    ax.add_patch(Rectangle(corner, *REGION, fill=False, edgecolor=LOCAL, linewidth=2.0))
+
+
+def show_grey(ax: Any, image: NDArray[np.float32], title: str) -> None:
+    """A picture of values 0 .. 1."""
+    ax.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
+    ax.set(xticks=(), yticks=())
+    ax.set_title(title)
 
 
 def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
@@ -164,7 +261,7 @@ def _draw_clouds(
             ax.imshow(pictures[k])
             continue
         ax.set_visible(False)
-        plain = figure.add_subplot(ax.get_subplotspec(), projection="3d")
+        plain = figure.add_axes(ax.get_position(), projection="3d")
         plain.set_title(ax.get_title())
         clouds.draw_plain(plain, pair[k])
     return () if pictures is not None else (clouds.MISSING,)
@@ -199,13 +296,18 @@ def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int
 
 
 def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[float, ...]) -> tuple[Any, Any]:
+    figure = _blank(size, layout="compressed")
+    return figure, figure.subplots(rows, columns, width_ratios=widths)
+
+
+def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
     # Not through pyplot: nothing global is touched, and no display is looked for.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=110, layout="compressed")
+    figure = Figure(figsize=size, dpi=110, layout=layout)
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, width_ratios=widths)
+    return figure
 
 
 def save(figure: Any, path: Path) -> None:
@@ -214,8 +316,26 @@ def save(figure: Any, path: Path) -> None:
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
-    picture = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE)
-    save_png(path, picture)
+    save_png(path, indexed(np.asarray(Image.open(buffer).convert("RGB"))))
+
+
+def indexed(rgb: NDArray[np.uint8]) -> Any:
+    """The picture (height, width, 3) with a palette of :data:`GREYS` even greys, and the rest for what has colour.
+
+    A palette chosen for all at once has too few greys, and smooth areas show steps, or too few colours.
+    """
+    from PIL import Image
+
+    coloured = np.ptp(rgb.astype(np.int16), axis=2) > FAINT
+    index = np.rint(rgb.mean(axis=2) * ((GREYS - 1) / 255.0)).astype(np.uint8)
+    palette = np.repeat(np.rint(np.linspace(0.0, 255.0, GREYS)), 3).astype(np.uint8).tolist()
+    if coloured.any():
+        colours = Image.fromarray(rgb[coloured][None]).quantize(256 - GREYS, Image.Quantize.MEDIANCUT)
+        index[coloured] = GREYS + np.asarray(colours)[0]
+        palette += colours.getpalette() or []
+    picture = Image.fromarray(index)
+    picture.putpalette(palette[: 3 * 256])
+    return picture
 
 
 __all__ = ["draw_calibration", "draw_cost", "draw_demo", "draw_images", "images"]

@@ -10,6 +10,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics import wrap_angle
+from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -88,13 +89,19 @@ class Votes:
         self._buffer.zero_()
         self.pending = 0
 
-    def add_events(self, model: Model, events: Any, count: int, drift: float = 0.0) -> None:
-        """Votes ``count`` events (an ``EventArrays`` on the same device) after compensation by ``model``."""
+    def add_events(
+        self, model: Model, events: Any, count: int, *, drift: float = 0.0, turning: Turning | None = None
+    ) -> None:
+        """Votes ``count`` events (an ``EventArrays`` on the same device) after compensation by ``model``.
+
+        ``turning`` is taken back where the events were given their times.
+        """
         from amiwarp.kernels.iwe import vote_events
         from amiwarp.kernels.launch import launch_slices
         from amiwarp.optics import model_camera
 
-        inputs = [model.params(self.device), model_camera(model, self.device), events, drift, self._params]
+        inputs = [model.params(self.device), model_camera(model, self.device), events, drift]
+        inputs += [(turning or Turning()).params(), self._params]
         self._reserve(count)
         launch_slices(vote_events, count, inputs, self.images, device=self.device)
 
@@ -139,9 +146,17 @@ class Votes:
 
 
 def upload_events(
-    events: Events, theta: NDArray[np.float64], device: Any, slope: NDArray[np.float64] | None = None
+    events: Events,
+    theta: NDArray[np.float64],
+    device: Any,
+    *,
+    slope: NDArray[np.float64] | None = None,
+    middle_us: int | None = None,
 ) -> Any:
-    """Events and their angles [rad] as an ``EventArrays`` on ``device``; pixels must be whole (uint16)."""
+    """Events and their angles [rad] as an ``EventArrays`` on ``device``; pixels must be whole (uint16).
+
+    ``middle_us``: where given, the events get their times from it, so that the camera's turning can be taken back.
+    """
     import warp as wp
 
     from amiwarp.kernels.iwe import EventArrays
@@ -156,6 +171,8 @@ def upload_events(
     e.p = wp.array(events.p, dtype=wp.uint8, device=device)
     e.theta = wp.array(wrap_angle(theta).astype(np.float32), dtype=float, device=device)
     e.slope = wp.array([] if slope is None else slope.astype(np.float32), dtype=float, device=device)
+    time = np.zeros(0, np.float32) if middle_us is None else ((events.t - middle_us) * 1e-6).astype(np.float32)
+    e.time = wp.array(time, dtype=float, device=device)
     return e
 
 
@@ -166,6 +183,7 @@ def iwe(
     *,
     model: Model | None = None,
     encoder: Encoder | None = None,
+    turning: Turning | None = None,
     pad: int = 0,
     per_polarity: bool = False,
     vote: Vote = Vote.BILINEAR,
@@ -173,7 +191,8 @@ def iwe(
 ) -> NDArray[np.float32]:
     """Image of warped events [events per pixel].
 
-    With ``model`` and ``encoder`` the events are compensated on the way; without, they are voted where they are.
+    With ``model`` and ``encoder`` the events are compensated on the way, and the camera's ``turning`` is taken back if
+    it is given; without, they are voted where they are.
     Shape (height + 2 pad, width + 2 pad), or (2, …) with OFF then ON where ``per_polarity``.
     """
     if (model is None) != (encoder is None):
@@ -182,7 +201,9 @@ def iwe(
     for start in range(0, len(events), PIECE):
         piece = events[start : start + PIECE]
         if model is not None and encoder is not None:
-            votes.add_events(model, upload_events(piece, encoder.angle_at(piece.t), device), len(piece))
+            middle = None if turning is None else turning.middle_us
+            arrays = upload_events(piece, encoder.angle_at(piece.t), device, middle_us=middle)
+            votes.add_events(model, arrays, len(piece), turning=turning)
         else:
             votes.add_as_they_are(piece)
     image = votes.take()

@@ -1,9 +1,10 @@
-"""How good a compensation is: blur across edges, contrast and entropy of the IWE, error against the truth."""
+"""How good a compensation or a picture is: blur across edges, contrast, entropy, error against the truth."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
@@ -27,6 +28,8 @@ RIDGE_SCALE = 1.0
 """Standard deviation of the derivatives that find edges [px]."""
 WEAKEST = 0.3
 """Edges weaker than this share of the strong ones (the 95th percentile) are left out: noise has ridges too."""
+RANGE = (0.5, 99.5)
+"""Percentiles of a true picture between which its range lies, to which PSNR is relative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,3 +146,50 @@ def model_error(model: Model, truth: ExactModel) -> ModelError:
     The constant lag is removed first: events lag their edge, which no model can know.
     """
     return predicted_error(model, truth, remove_lag=True)
+
+
+@dataclass(frozen=True, slots=True)
+class PictureQuality:
+    """How near a picture comes to the truth once the gain and the offset that events do not tell are fitted."""
+
+    correlation: float
+    """Pearson's, of log intensity: -1 .. 1; negative for an inverted picture."""
+    psnr_db: float
+    """Of log intensity after the fit [dB], relative to the truth's range over :data:`RANGE`; inf without any error."""
+    gain: float
+    """Log intensity of the truth per unit of the picture: the ON threshold, where it is in units of that."""
+    offset: float
+    """Log intensity of the truth where the picture is 0."""
+
+
+def picture_quality(
+    log: NDArray[np.floating[Any]], truth: NDArray[np.floating[Any]], where: NDArray[np.bool_] | None = None
+) -> PictureQuality:
+    """Correlation and PSNR of a picture of log intensity, gain and offset fitted first by least squares.
+
+    ``log``: the picture in any unit, shape (height, width), may be NaN where it is not judged; ``truth``: the true
+    natural log intensity, same shape; ``where``: the pixels that are fitted and judged, same shape, all by default.
+    The truth's range is that of all its pixels, so that PSNRs over different pixels can be compared.
+    Raises :class:`AmiwarpError` for shapes that differ, values that are not finite, and where the pixels judged, or
+    the truth's range, are constant.
+    """
+    if where is None:
+        where = np.ones(np.shape(truth), np.bool_)
+    if not np.shape(log) == np.shape(truth) == where.shape:
+        shapes = f"{np.shape(log)}, {np.shape(truth)} and {where.shape}"
+        raise AmiwarpError(f"picture, truth and pixels to judge are of shapes {shapes}; give all of one shape")
+    a, b = log[where].astype(np.float64), truth[where].astype(np.float64)
+    span = float(np.ptp(np.percentile(truth, RANGE)))
+    if not (np.isfinite(a).all() and np.isfinite(b).all() and math.isfinite(span)):
+        raise AmiwarpError("picture or truth: not finite in some pixels; leave these out with `where`")
+    if not (a.size and np.ptp(a) > 0.0 and np.ptp(b) > 0.0 and span > 0.0):
+        raise AmiwarpError(f"picture or truth: constant over the {a.size} pixels judged; there is no gain to fit")
+    da, db = a - a.mean(), b - b.mean()
+    gain = float(da @ db / (da @ da))
+    error = float(np.mean((db - gain * da) ** 2))
+    return PictureQuality(
+        correlation=float(da @ db / math.sqrt((da @ da) * (db @ db))),
+        psnr_db=10.0 * math.log10(span**2 / error) if error > 0.0 else math.inf,
+        gain=gain,
+        offset=float(b.mean() - gain * a.mean()),
+    )

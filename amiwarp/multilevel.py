@@ -27,8 +27,8 @@ class Levels:
     def prepare(self, equations: list[Any], count: int, sums: Any, slices: list[Any]) -> None:
         """The grids' diagonals, for the equations' weights as they are."""
         from amiwarp.kernels import multilevel as k
+        from amiwarp.kernels.descent import gather
         from amiwarp.kernels.launch import launch, launch_slices
-        from amiwarp.kernels.photometric import gather
 
         for level, diagonal in enumerate(self._diagonal, start=1):
             inputs = [*equations, float(2**level), self.shapes[level][1], STRIDE]

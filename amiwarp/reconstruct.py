@@ -16,33 +16,36 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import ndimage
 
-from amiwarp.brightness import BrightnessMap, PairSet, Smoothness, Tiles, open_ends, pair_events, quiet_pairs
+from amiwarp.brightness import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensate import check_size
 from amiwarp.encoder import TURN, Encoder
 from amiwarp.errors import AmiwarpError
+from amiwarp.pairs import PairSet, open_ends, pair_events, quiet_pairs
+from amiwarp.turning import Turning, border
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.result import Calibration
-    from amiwarp.camera import Camera
     from amiwarp.events import Events, Recording
     from amiwarp.optics import Model
 
 SCALES = (1.0, 0.5, 0.5)
 """Of Cauchy's weights, round by round [thresholds]: an equation that is off by as much counts half."""
-STEPS = 15
+STEPS = 30
 """Of conjugate gradients in each round."""
 SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
 """Weights of the prior among which held-out equations choose."""
+WEAK = 0.03
+"""Weight of silence and open ends: the one that held-out equations like best, or near it (see the docs)."""
 HELD_OUT = 8
 """Every so many-th pair is held out."""
 PROBE = 96
 """The choice is made on a square of so many pixels with the most events."""
 EDGE = 0.5
 """Neighbours that differ by more [thresholds] are an edge to ``Fill.EDGE``."""
-DAMPING = 1e-6
-"""Holds the mean of the map, and nothing else."""
+MEAN_HOLD = 1e-6
+"""Of the map's square: holds its mean, of which no equation tells."""
 SPANS = 8
 """A turn in so many parts: a pixel silent throughout says in each that nothing changed."""
 COVERED = 0.5
@@ -51,6 +54,8 @@ HOLDS, AGREED = 0.25, 0.4
 """An equation that is off by the one [thresholds] holds by half; so much of those about a node must hold."""
 SPECK = 12
 """Known regions of fewer pixels are noise."""
+PINHOLE = 4
+"""Unknown places of up to so many pixels within a known region are known: equations on all sides of them are."""
 NEAR = 2
 """Pairs of events that are further from what is known are noise, and left out [px]."""
 STILL_US = 100_000
@@ -115,13 +120,15 @@ class Reconstruction:
         *,
         model: Model | None = None,
         encoder: Encoder | None = None,
-        omega: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        turning: Turning | None = None,
         fill: Fill = Fill.SMOOTH,
         device: Any = "cpu",
     ) -> None:
         """Give a ``calibration``, or a ``model`` and, unless the recording has one, an ``encoder``.
 
-        ``omega``: the camera's angular velocity [rad/s]. Raises :class:`AmiwarpError` for a camera of another size, no
+        ``turning``: how the camera turns, unless the calibration found it.
+
+        Raises :class:`AmiwarpError` for a camera of another size, no
         events, or no encoder.
         """
         if not len(recording.events):
@@ -140,7 +147,9 @@ class Reconstruction:
                 f"{recording.name}: is {width}x{height}, the model is for {given}; calibrate this camera"
             )
         self.recording, self.model, self.encoder = recording, model, encoder
-        self.omega, self.fill, self.device = omega, fill, device
+        if turning is None and calibration is not None:
+            turning = calibration.turning
+        self.turning, self.fill, self.device = turning or Turning(), fill, device
         self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
         self._smoothness: float | None = None
 
@@ -176,9 +185,9 @@ class Reconstruction:
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
         off = self._off_excess(start_us, length_us)
         if self._smoothness is None:
-            self._smoothness = self._choose(events, pairs, length_us, off)
-        left, top, tiles = self._tile(length_us)
-        solver = self._solver(pairs, tiles, off, self._smoothness)
+            self._smoothness = self._choose(events, pairs, start_us, length_us, off)
+        left, top, tiles = self._tile(start_us, length_us)
+        solver = self._solver(pairs, tiles, off, self._smoothness, start_us + length_us // 2)
         if last is not None:
             unknowns = last.unknowns.copy()
             unknowns[tiles.nodes :] = solver.unknowns[tiles.nodes :]
@@ -232,12 +241,13 @@ class Reconstruction:
         ]
         return PairSet.concatenate(parts)
 
-    def _solver(self, pairs: PairSet, tiles: Tiles, off: float, smoothness: float) -> BrightnessMap:
+    def _solver(self, pairs: PairSet, tiles: Tiles, off: float, smoothness: float, middle_us: int) -> BrightnessMap:
         prior = Smoothness(smoothness, EDGE if self.fill is Fill.EDGE else 0.0)
         solver = BrightnessMap(
-            pairs, tiles, self.encoder, off_excess=off, damping=DAMPING, smoothness=prior, device=self.device
-        )
-        solver.place(self.model, omega=self.omega)
+            pairs, tiles, self.encoder, off_excess=off, damping=MEAN_HOLD, smoothness=prior, weak=WEAK,
+            middle_us=middle_us, device=self.device,
+        )  # fmt: skip
+        solver.place(self.model, turning=self.turning)
         return solver
 
     def _off_excess(self, start_us: int, length_us: int) -> float:
@@ -251,7 +261,7 @@ class Reconstruction:
         on = int(p.sum())
         return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0
 
-    def _choose(self, events: Events, pairs: PairSet, length_us: int, off: float) -> float:
+    def _choose(self, events: Events, pairs: PairSet, start_us: int, length_us: int, off: float) -> float:
         """The prior's weight under which held-out equations come out best, on the busiest part of the image."""
         x0, y0 = busiest(events, *self.recording.events.size)
         inside = (pairs.x >= x0) & (pairs.x < x0 + PROBE) & (pairs.y >= y0) & (pairs.y < y0 + PROBE)
@@ -261,13 +271,14 @@ class Reconstruction:
         out[real[::HELD_OUT]] = True
         if out.sum() < 50:
             return SMOOTHNESS[-1]
-        left, top, _ = self._tile(length_us)
+        left, top, _ = self._tile(start_us, length_us)
+        middle = start_us + length_us // 2
         shape = (PROBE + 2 * top, PROBE + 2 * left)
         tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), *shape, 1.0)
-        judge = self._solver(part[out], tiles, off, SMOOTHNESS[0])
+        judge = self._solver(part[out], tiles, off, SMOOTHNESS[0], middle)
         scores = []
         for weight in SMOOTHNESS:
-            solver = self._solver(part[~out], tiles, off, weight)
+            solver = self._solver(part[~out], tiles, off, weight, middle)
             for scale in SCALES[:2]:
                 solver.solve(scale, steps=STEPS)
             judge.unknowns = solver.unknowns
@@ -275,10 +286,11 @@ class Reconstruction:
             scores.append(float(np.nanmean(np.log1p(residual**2))))
         return SMOOTHNESS[int(np.nanargmin(scores))]
 
-    def _tile(self, length_us: int) -> tuple[int, int, Tiles]:
+    def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
         """Columns and rows of the map before the image's first, and the map: all that the window's pixels can see."""
         camera = self.model.camera
-        margin = np.max(np.abs(orbit(self.model)), axis=0) + turned(camera, np.array(self.omega) * length_us * 0.5e-6)
+        turning = self.turning.about(start_us + length_us // 2)
+        margin = np.max(np.abs(orbit(self.model)), axis=0) + turning.reach(camera, length_us * 0.5e-6)
         limit = LARGEST_MARGIN * camera.width
         left, top = (math.ceil(min(float(m), limit)) + 2 for m in margin)
         origin = np.array([[-left, -top]], np.float32)
@@ -294,7 +306,7 @@ def reconstruct(
     start_us: int | None = None,
     length_us: int | None = None,
     turns: float | None = None,
-    omega: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    turning: Turning | None = None,
     fill: Fill = Fill.SMOOTH,
     device: Any = "cpu",
 ) -> Picture:
@@ -302,7 +314,9 @@ def reconstruct(
 
     See :class:`Reconstruction` for the rest, and for several windows.
     """
-    work = Reconstruction(recording, calibration, model=model, encoder=encoder, omega=omega, fill=fill, device=device)
+    work = Reconstruction(
+        recording, calibration, model=model, encoder=encoder, turning=turning, fill=fill, device=device
+    )
     return work.window(*work.span(start_us, length_us, turns))
 
 
@@ -317,7 +331,7 @@ def hot_pixels(events: Events, width: int, height: int) -> NDArray[np.bool_]:
 def known_nodes(solver: BrightnessMap) -> NDArray[np.bool_]:
     """Nodes of the map that events determine: enough equations hold there, and most of those that there are."""
     hold, everything = solver.coverage(HOLDS)[0], solver.coverage(1e6)[0]
-    return without_specks((hold >= COVERED) & (hold >= AGREED * everything))
+    return without_pinholes(without_specks((hold >= COVERED) & (hold >= AGREED * everything)))
 
 
 def without_specks(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -326,6 +340,13 @@ def without_specks(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     size = np.bincount(label.ravel(), minlength=count + 1)
     size[0] = 0
     return np.asarray((size >= SPECK)[label])
+
+
+def without_pinholes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask with the holes of up to :data:`PINHOLE` pixels closed."""
+    label, count = ndimage.label(~known)
+    size = np.bincount(label.ravel(), minlength=count + 1)
+    return np.asarray(known | (size[label] <= PINHOLE))
 
 
 def busiest(events: Events, width: int, height: int) -> tuple[int, int]:
@@ -344,24 +365,3 @@ def orbit(model: Model) -> NDArray[np.float64]:
     moved = model.compensate_points(at.astype(np.float32), np.tile(theta, len(xy)))
     away = np.asarray(moved, np.float64) - at
     return away[np.isfinite(away).all(axis=1)]
-
-
-def turned(camera: Camera, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far pixels of the border move when the camera turns by ``rotation`` [rad], at most, along x and y [px]."""
-    if not rotation.any():
-        return np.zeros(2)
-    from scipy.spatial.transform import Rotation
-
-    xy = border(camera)
-    rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
-    both = [camera.rays_to_pixels(Rotation.from_rotvec(s * rotation).apply(rays).astype(np.float32)) for s in (1, -1)]
-    away = np.abs(np.concatenate([np.asarray(b) - xy for b in both]))
-    return np.asarray(np.nanmax(away, axis=0))
-
-
-def border(camera: Camera) -> NDArray[np.float64]:
-    """Pixels along the image's border, shape (n, 2)."""
-    x, y = np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9)
-    grid = np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
-    edge = np.isin(grid[:, 0], x[[0, -1]]) | np.isin(grid[:, 1], y[[0, -1]])
-    return np.asarray(grid[edge])

@@ -6,6 +6,9 @@
 beside the truth's, and the best point of a dense grid of the very cost that was maximised.
 ``photometric``: the same recordings with thresholds mismatched by 5 %, ON 0.22 and OFF 0.28, calibrated by both stages:
 model error of either, and the phase, the sensor's latency and refractory time being known.
+``moving``: the camera turns at 2 to 60 degrees a second about each axis; its angular velocity is free.
+``refiners``: the photometric stage by Gauss-Newton and by NLopt's local algorithms, from the same start.
+``shares``: the same with ever fewer pairs of events.
 ``videos``: FOLDER's clips, translated, to the same bar.
 ``algorithms``: NLopt's algorithms, global at several budgets and local from 1 px away, on some of the recordings.
 ``costs``: sharpness costs, smoothing and polarity on the same.
@@ -28,9 +31,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.brightness import Sensor
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.calibrate import prepare
+from amiwarp.calib.gauss_newton import GAUSS_NEWTON
+from amiwarp.calib.parameters import RATES
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.calib.search import STAGES
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
@@ -39,8 +43,9 @@ from amiwarp.compensate import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, Recording, Truth
 from amiwarp.metrics import edge_blur, model_error, truth_model
-from amiwarp.motion import PrismMotion
+from amiwarp.motion import CameraMotion, PrismMotion
 from amiwarp.optics import FlatSide, Prism
+from amiwarp.pairs import Sensor
 from amiwarp.sharpness import Sharpness
 from amiwarp.simulate import Scene, SensorModel, Simulation
 
@@ -61,13 +66,14 @@ def simulated(
     *,
     every: int = EVERY,
     sensor: SensorModel | None = None,
+    turning: CameraMotion | None = None,
 ) -> Recording:
     """A recording thinned evenly while it is made; its phase differs from seed to seed."""
     prism = Prism(math.radians(apex_deg))
     phase = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
     simulation = Simulation(
         scene, camera, prism, seconds, PrismMotion(720.0, phase=phase),
-        sensor=sensor or SensorModel(), seed=seed, device=device,
+        camera_motion=turning or CameraMotion(), sensor=sensor or SensorModel(), seed=seed, device=device,
         nominal_prism=replace(prism, apex=NOMINAL * prism.apex),
     )  # fmt: skip
     kept, count = [], 0
@@ -158,15 +164,13 @@ def run_pictures(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def run_photometric(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     camera = Camera.from_fov(640, 480, math.radians(60.0))
-    sensor = SensorModel(contrast_on=0.22, contrast_off=0.28, mismatch=0.05)
-    settings = PhotometricSettings(sensor=Sensor(sensor.latency_us, sensor.refractory_us))
     for picture in pictures(args.folder):
         scene = Scene.from_picture(picture)
         for apex in args.apex:
             for seed in range(args.seeds):
-                recording = simulated(scene, camera, apex, seed, args.seconds, args.device, every=1, sensor=sensor)
+                recording = simulated(scene, camera, apex, seed, args.seconds, args.device, every=1, sensor=MISMATCHED)
                 label = {"picture": picture.name, "apex_true_deg": apex, "seed": seed}
-                yield {**label, **photometric_row(recording, settings, args.device)}
+                yield {**label, **photometric_row(recording, KNOWN, args.device)}
 
 
 def photometric_row(recording: Recording, settings: PhotometricSettings, device: str) -> dict[str, Any]:
@@ -202,6 +206,66 @@ def photometric_row(recording: Recording, settings: PhotometricSettings, device:
     }
 
 
+MISMATCHED = SensorModel(contrast_on=0.22, contrast_off=0.28, mismatch=0.05)
+KNOWN = PhotometricSettings(sensor=Sensor(MISMATCHED.latency_us, MISMATCHED.refractory_us))
+
+
+def run_moving(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    camera = Camera.from_fov(640, 480, math.radians(60.0))
+    for name in ("china.jpg", "brick.png", "astronaut.png"):
+        scene = Scene.from_picture(args.folder / name)
+        for axis in range(3):
+            for speed in (2.0, 10.0, 30.0, 60.0):
+                rate = np.eye(3)[axis] * math.radians(speed)
+                recording = simulated(
+                    scene, camera, 1.0, axis, 0.18, args.device, every=1, sensor=MISMATCHED,
+                    turning=CameraMotion(tuple(rate)),
+                )  # fmt: skip
+                label = {"picture": name, "axis": "xyz"[axis], "deg_per_s": speed}
+                yield {**label, **moving_row(recording, rate, args.device)}
+
+
+def moving_row(recording: Recording, rate: np.ndarray, device: str) -> dict[str, Any]:
+    """Errors of the velocity and of the model by either stage."""
+    assert recording.camera is not None
+    assert recording.truth is not None
+    try:
+        c = calibrate(recording, free=("apex", "phase", "motion"), device=device, photometric=KNOWN)
+    except AmiwarpError as error:
+        return {"refused": str(error), "ok": False}
+    if c.photometric is None:
+        return {"warnings": list(c.warnings), "ok": False}
+    truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
+    row: dict[str, Any] = {"all_events": recording.metadata["all_events"]}
+    for name, values in (("sharpness_", c.photometric.sharpness_parameters), ("", c.parameters)):
+        found = np.array([values[n] for n in RATES])
+        row[f"{name}velocity_error"] = float(np.linalg.norm(found - rate) / np.linalg.norm(rate))
+        row[f"{name}model_error_px"] = model_error(replace(c, parameters=values).model, truth).rms
+    return {
+        **row,
+        "pairs": c.photometric.pairs,
+        "cost": c.photometric.cost,
+        "verdict": c.photometric.verdict,
+        "calibrate_s": c.seconds,
+        "photometric_s": c.stages[-1].seconds,
+        "ok": c.photometric.accepted and row["velocity_error"] <= 0.02 and row["model_error_px"] <= 0.05,
+    }
+
+
+def run_refiners(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    for label, recording in some(args, every=1, sensor=MISMATCHED):
+        for algorithm in (GAUSS_NEWTON, *LOCAL_ALGORITHMS):
+            row = photometric_row(recording, replace(KNOWN, algorithm=algorithm), args.device)
+            yield {**label, "algorithm": algorithm, **row}
+
+
+def run_shares(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    for label, recording in some(args, every=1, sensor=MISMATCHED):
+        for pairs in (2_400_000, 1_200_000, 600_000, 300_000, 150_000, 75_000):
+            row = photometric_row(recording, replace(KNOWN, pairs=pairs), args.device)
+            yield {**label, "asked_pairs": pairs, **row, "ok": True}
+
+
 def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     from amiwarp.translate import open_pictures
 
@@ -215,12 +279,15 @@ def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 yield {"clip": clip.name, "apex_true_deg": apex, "seed": seed, **row_of(recording, args.device)}
 
 
-def some(args: argparse.Namespace) -> Iterator[tuple[dict[str, Any], Recording]]:
+def some(
+    args: argparse.Namespace, *, every: int = EVERY, sensor: SensorModel | None = None
+) -> Iterator[tuple[dict[str, Any], Recording]]:
     """A third of the table: every picture with one prism, in turn."""
     camera = Camera.from_fov(640, 480, math.radians(60.0))
     for k, picture in enumerate(pictures(args.folder)):
         apex = APEXES_DEG[k % len(APEXES_DEG)]
-        recording = simulated(Scene.from_picture(picture), camera, apex, k, args.seconds, args.device)
+        scene = Scene.from_picture(picture)
+        recording = simulated(scene, camera, apex, k, args.seconds, args.device, every=every, sensor=sensor)
         yield {"picture": picture.name, "apex_true_deg": apex}, recording
 
 
@@ -275,6 +342,9 @@ def run_costs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 RUNS = {
     "pictures": run_pictures,
     "photometric": run_photometric,
+    "moving": run_moving,
+    "refiners": run_refiners,
+    "shares": run_shares,
     "videos": run_videos,
     "algorithms": run_algorithms,
     "costs": run_costs,

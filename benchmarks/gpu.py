@@ -30,7 +30,7 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,
                    "--limit-s", str(limit)]
-            for what in ("videos", "algorithms", "costs", "pictures", "photometric")
+            for what in ("moving", "photometric", "refiners", "shares", "costs", "videos", "algorithms", "pictures")
         },
     }  # fmt: skip
 

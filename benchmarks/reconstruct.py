@@ -1,11 +1,13 @@
 """Pictures from events beside the truth of simulated recordings, and beside peers that need no trained weights; JSON.
 
-    python -m benchmarks.reconstruct FOLDER --out FILE.json [--figure FILE.png] [--turns 0.25 1 4] [--noise 1 10] …
+    python -m benchmarks.reconstruct FOLDER --out FILE.json [--figure FILE.png] [--pictures china.jpg] …
 
-Every picture of FOLDER is seen by a 346 × 260 camera (60°) through a prism (apex 1°, 720 rpm). ``--noise`` is the rate
-of shot noise of a pixel [1/s]; the share of noise among the events is in each row. The peers get the true optics too:
-``integration`` adds up ±threshold at each event's place without the prism; ``leaky`` does so with a high-pass filter of
-100 ms, as a complementary filter without frames (Scheerlinck, Barnes and Mahony, ACCV 2018).
+Every picture of FOLDER is seen by a 346 × 260 camera (60°) through a prism (apex 1°, 720 rpm), at noise of about 0, 10,
+25 and 50 % of all events. Windows start after a whole turn: until then the references of a simulated pixel are as it
+was switched on. The peers get the true optics too: ``integration`` adds up ±threshold at each event's place without
+the prism; ``leaky`` does so with a high-pass filter of 100 ms, as a complementary filter without frames (Scheerlinck,
+Barnes and Mahony, ACCV 2018); ``panning`` is the same solver on the same camera without a prism, which turns about a
+diagonal axis as fast as the prism moves the image. Rows that FILE already holds for other pictures are kept.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ import argparse
 import io
 import json
 import math
+import os
 import platform
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +28,8 @@ import warp as wp
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from scipy.spatial.transform import Rotation
+from skimage.metrics import structural_similarity
 
 from amiwarp.camera import Camera
 from amiwarp.compensate import compensate_events
@@ -33,25 +38,89 @@ from amiwarp.events import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
 from amiwarp.iwe_files import save_png
-from amiwarp.motion import PrismMotion
+from amiwarp.metrics import RANGE, picture_quality
+from amiwarp.motion import CameraMotion, PrismMotion
 from amiwarp.optics import ExactModel, Prism
 from amiwarp.reconstruct import Reconstruction, reconstruct
+from amiwarp.scenery import place_scene
 from amiwarp.simulate import Scene, SensorModel, Simulation
+from amiwarp.turning import Turning
 
 CAMERA = Camera.from_fov(346, 260, math.radians(60.0))
 PRISM, PHASE = Prism(math.radians(1.0)), 1.0
-START_US, TURN_US = 30_000, 250_000.0 / 3.0
+START_US, TURN_US = 100_000, 250_000.0 / 3.0
+ALL, SOME, ONE = (0.25, 0.5, 1.0, 2.0, 4.0), (0.25, 1.0), (1.0,)
+SETTINGS = (
+    (0.25, 0.0, ALL), (0.25, 0.25, ALL), (0.25, 0.1, SOME), (0.25, 0.5, SOME),
+    (0.1, 0.0, ONE), (0.1, 0.25, ONE), (0.5, 0.0, ONE), (0.5, 0.25, ONE),
+)  # fmt: skip
+"""Threshold, share of shot noise among the events, windows [turns]."""
 TEXTURED = 0.05
 """Areas where log intensity varies by more (standard deviation over 9 × 9 px) are textured."""
 DECAY_S = 0.1
+SHOWN = 0.25
+"""Share of noise of the pictures in the figure, at a threshold of 0.25."""
+PEERS = {"panning": "panning, no prism", "integration": "integrated events", "leaky": "high-pass filter"}
+"""In the figure, over one turn."""
+METHODS = ("amiwarp", *PEERS)
+PROBE_S = 0.06
+"""Length of the noiseless recording that tells how many events the scene makes."""
+MARGIN = 64
+"""A wider view of the scene, to cut that of a turned camera out of [px]."""
 
 
-def simulated(picture: Path, noise: float, contrast: float, seconds: float, device: str) -> tuple[Recording, Any]:
+def simulation(picture: Path, contrast: float, seconds: float, noise: float, device: str) -> Simulation:
     sensor = SensorModel(contrast_on=contrast, contrast_off=contrast, shot_noise_hz=noise)
-    simulation = Simulation(
+    return Simulation(
         Scene.from_picture(picture), CAMERA, PRISM, seconds, PrismMotion(720.0, PHASE), sensor=sensor, device=device
     )
-    return simulation.run(), simulation.log_view()
+
+
+def noise_rate(picture: Path, contrast: float, share: float, device: str) -> float:
+    """Rate of a pixel's shot noise [1/s] that makes about ``share`` of all events."""
+    quiet = simulation(picture, contrast, PROBE_S, 0.0, device).run()
+    return share / (1.0 - share) * len(quiet.events) / PROBE_S / (CAMERA.width * CAMERA.height)
+
+
+def speed() -> float:
+    """At which the prism moves the middle of the image [px/s]."""
+    theta = np.linspace(0.0, 2.0 * np.pi, 65)
+    xy = np.tile(np.array([[CAMERA.cx, CAMERA.cy]], np.float32), (65, 1))
+    path = np.asarray(ExactModel(CAMERA, PRISM).compensate_points(xy, theta))
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / (TURN_US * 1e-6))
+
+
+def scene_fov(through: Simulation) -> float:
+    """Horizontal extent of the whole picture behind the prism [rad]."""
+    place = place_scene(through)
+    left, _, right, _ = place.box
+    plane = place.width / place.pitch[0] / (right - left)  # per pixel of the picture
+    return 2.0 * math.atan(0.5 * plane * through.scene.frames.size[0])
+
+
+def panning(through: Simulation, fov: float) -> tuple[Recording, Turning]:
+    """The same scene, at the same scale, from a camera that turns instead of a prism; and how it turns."""
+    rate = speed() / CAMERA.fx / math.sqrt(2.0)
+    turn = Turning((rate, rate, 0.0))
+    still = replace(
+        through, prism=Prism(0.0), motion=PrismMotion(0.0), camera_motion=CameraMotion(turn.rate),
+        scene=replace(through.scene, fov=fov),
+    )  # fmt: skip
+    return still.run(), turn
+
+
+def seen_at(through: Simulation, rotation: NDArray[np.float64], fov: float) -> NDArray[np.float32]:
+    """The true log intensity for a camera turned by ``rotation`` [rad] from where it faces the picture."""
+    wide = Camera(
+        CAMERA.width + 2 * MARGIN, CAMERA.height + 2 * MARGIN, CAMERA.fx, CAMERA.fy, CAMERA.cx + MARGIN,
+        CAMERA.cy + MARGIN,
+    )  # fmt: skip
+    view = replace(through, camera=wide, prism=Prism(0.0), scene=replace(through.scene, fov=fov)).log_view()
+    rows, columns = np.indices((CAMERA.height, CAMERA.width), np.float32)
+    rays = np.asarray(CAMERA.pixels_to_rays(np.stack([columns.ravel(), rows.ravel()], axis=1)))
+    xy = np.asarray(wide.rays_to_pixels(Rotation.from_rotvec(rotation).apply(rays).astype(np.float32)))
+    seen = ndimage.map_coordinates(view, xy[:, ::-1].T, order=1, mode="nearest")
+    return np.asarray(seen, np.float32).reshape(CAMERA.height, CAMERA.width)
 
 
 def integrate(recording: Recording, model: ExactModel, length_us: int, *, decay_s: float | None) -> NDArray[np.float32]:
@@ -74,50 +143,88 @@ def integrate(recording: Recording, model: ExactModel, length_us: int, *, decay_
     return image[: CAMERA.height, : CAMERA.width].astype(np.float32)
 
 
-def judged(log: NDArray[np.float32], truth: NDArray[np.float32], where: NDArray[np.bool_]) -> dict[str, float]:
-    """Correlation, PSNR and SSIM of log intensity; gain and offset fitted first, as neither is told by events."""
-    a, b = log[where].astype(np.float64), truth[where].astype(np.float64)
-    gain, offset = np.polyfit(a, b, 1)
-    span = float(np.ptp(np.percentile(truth, [0.5, 99.5])))
-    fitted = (gain * log + offset).astype(np.float64)
-    _, similar = structural_similarity(truth.astype(np.float64), fitted, data_range=span, full=True)
-    return {
-        "correlation": float(np.corrcoef(a, b)[0, 1]),
-        "psnr_db": float(peak_signal_noise_ratio(b, gain * a + offset, data_range=span)),
-        "ssim": float(similar[where].mean()),
-        "gain": float(gain),
-    }
+def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, dict[str, float]]:
+    """Quality over textured areas and over all; SSIM after the gain and offset that fit there."""
+    spread = ndimage.uniform_filter(truth**2, 9) - ndimage.uniform_filter(truth, 9) ** 2
+    out = {}
+    for area, where in (("textured", spread > TEXTURED**2), ("all", np.ones(truth.shape, np.bool_))):
+        quality = picture_quality(log, truth, where)
+        fitted = (quality.gain * log + quality.offset).astype(np.float64)
+        span = float(np.ptp(np.percentile(truth, RANGE)))
+        _, similar = structural_similarity(truth.astype(np.float64), fitted, data_range=span, full=True)
+        out[area] = {
+            "correlation": quality.correlation, "psnr_db": quality.psnr_db, "ssim": float(similar[where].mean()),
+            "gain": quality.gain,
+        }  # fmt: skip
+    return out
 
 
-def rows(args: argparse.Namespace) -> Iterator[tuple[dict[str, Any], tuple[Any, dict[str, Any]]]]:
-    model = ExactModel(CAMERA, PRISM, PHASE)
-    seconds = START_US * 1e-6 + max(args.turns) * TURN_US * 1e-6 + 0.02
-    for picture in args.pictures or sorted(p.name for p in args.folder.iterdir() if p.suffix in (".jpg", ".png")):
-        for noise in args.noise:
-            for contrast in args.contrast:
-                recording, truth = simulated(args.folder / picture, noise, contrast, seconds, args.device)
-                spread = ndimage.uniform_filter(truth**2, 9) - ndimage.uniform_filter(truth, 9) ** 2
-                areas = {"textured": spread > TEXTURED**2, "all": np.ones(truth.shape, np.bool_)}
-                work = Reconstruction(recording, model=model, device=args.device)
-                events = len(recording.events) / seconds
-                share = noise * CAMERA.width * CAMERA.height / events
-                for turns in args.turns:
-                    length = round(turns * TURN_US)
-                    found = work.window(START_US, length)
-                    pictures = {
-                        "amiwarp": found.log,
-                        "integration": integrate(recording, model, length, decay_s=None),
-                        "leaky": integrate(recording, model, length, decay_s=DECAY_S),
-                    }
-                    row = {
-                        "picture": picture, "noise_hz": noise, "noise_share": share, "contrast": contrast,
-                        "turns": turns, "pairs": found.pairs, "known": float(found.known.mean()),
-                        "smoothness": found.smoothness, "off_excess": found.off_excess, "seconds": found.seconds,
-                        "known_area": judged(found.log, truth, found.known),
-                    }  # fmt: skip
-                    for name, log in pictures.items():
-                        row[name] = {area: judged(log, truth, where) for area, where in areas.items()}
-                    yield row, (truth, pictures)
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One simulated scene: through the prism, and by a camera that turns instead."""
+
+    through: Simulation
+    fov: float
+    recording: Recording
+    truth: NDArray[np.float32]
+    turning: Recording
+    turn: Turning
+    noise: float
+
+    @classmethod
+    def make(cls, picture: Path, contrast: float, share: float, turns: tuple[float, ...], device: str) -> Seen:
+        seconds = (START_US + max(turns) * TURN_US) * 1e-6 + 0.02
+        noise = noise_rate(picture, contrast, share, device)
+        through = simulation(picture, contrast, seconds, noise, device)
+        fov = scene_fov(through)
+        return cls(through, fov, through.run(), through.log_view(), *panning(through, fov), noise)
+
+    def row(self, turns: float) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
+        """What is measured in a window, and the pictures."""
+        length = round(turns * TURN_US)
+        model = ExactModel(CAMERA, PRISM, PHASE)
+        found = Reconstruction(self.recording, model=model, device=self.through.device).window(START_US, length)
+        pictures = {
+            "amiwarp": found.log,
+            "integration": integrate(self.recording, model, length, decay_s=None),
+            "leaky": integrate(self.recording, model, length, decay_s=DECAY_S),
+        }
+        row = {
+            "turns": turns, "pairs": found.pairs, "hot": found.hot,
+            "smoothness": found.smoothness, "off_excess": found.off_excess, "residual": found.residual,
+            "seconds": found.seconds,
+        } | {name: judged(log, self.truth) for name, log in pictures.items()}  # fmt: skip
+        if turns in SOME and self.through.sensor.contrast_on == 0.25:
+            pictures["panning"], row["panning_pairs"], row["panning"] = self.panned(length)
+        return row, {"truth": self.truth} | pictures
+
+    def panned(self, length: int) -> tuple[NDArray[np.float32], int, dict[str, dict[str, float]]]:
+        """The picture of the camera that turns, its equations, and its quality."""
+        found = Reconstruction(
+            self.turning, model=ExactModel(CAMERA, Prism(0.0)), turning=self.turn, device=self.through.device,
+            encoder=Encoder.constant_speed(0.0, 0, self.turning.events.t_last),
+        ).window(START_US, length)  # fmt: skip
+        middle = (START_US + length / 2.0) * 1e-6
+        truth = seen_at(self.through, np.array(self.turn.rate) * middle, self.fov)
+        return found.log, found.pairs, judged(found.log, truth)
+
+
+def rows(picture: Path, device: str, shown: dict[str, dict[str, NDArray[np.float32]]]) -> Iterator[dict[str, Any]]:
+    """All windows of a picture; pictures of the share :data:`SHOWN` go into ``shown``."""
+    for contrast, share, windows in SETTINGS:
+        seen = Seen.make(picture, contrast, share, windows, device)
+        rate = len(seen.recording.events) / seen.through.duration_s
+        noise_share = seen.noise * CAMERA.width * CAMERA.height / rate
+        what = {"picture": picture.name, "contrast": contrast, "share": share, "noise_hz": seen.noise,
+                "noise_share": noise_share}  # fmt: skip
+        for turns in windows:
+            row, pictures = seen.row(turns)
+            if contrast == 0.25 and share == SHOWN:
+                line = shown.setdefault(picture.stem, {"truth": pictures["truth"]})
+                line[f"{turns:g} turn{'s' * (turns > 1)}"] = pictures["amiwarp"]
+                if turns == 1.0:
+                    line |= {title: pictures[name] for name, title in PEERS.items()}
+            yield what | row
 
 
 def grid(shown: dict[str, dict[str, NDArray[np.float32]]], path: Path) -> None:
@@ -143,20 +250,20 @@ def grid(shown: dict[str, dict[str, NDArray[np.float32]]], path: Path) -> None:
 
 
 def real(folder: Path, device: str) -> dict[str, dict[str, NDArray[np.float32]]]:
-    """Recordings of a turning camera without a prism: the camera's own frame, and the map with either sign."""
+    """Recordings of a turning camera without a prism: the map with either sign, and what is known."""
     out = {}
     for name in ("shapes_rotation", "dynamic_rotation"):
         recording = open_recording(folder / name / "events.txt")
         width, height = recording.events.size
         first, last = recording.events.t_first, recording.events.t_last
         model = ExactModel(read_calib(folder / name / "calib.txt", width, height), Prism(0.0))
-        sheet = np.asarray(Image.open(folder / name / "000000000.png").convert("L"), np.float32)
-        row = {"camera's frame": sheet[height + 1 : 2 * height - 1, 1 : width - 1]}
+        row = {}
         omega = np.loadtxt(folder / name / "motion.txt").ravel()[-3:]
         for title, sign in (("motion.txt", 1.0), ("the wrong sign", -1.0)):
             x, y, z = (sign * omega).tolist()
             found = reconstruct(
-                recording, model=model, encoder=Encoder.constant_speed(0.0, first, last), omega=(x, y, z),
+                recording, model=model, encoder=Encoder.constant_speed(0.0, first, last), 
+                turning=Turning((x, y, z), middle_us=(first + last) // 2),
                 length_us=last - first + 1, device=device,
             )  # fmt: skip
             print(json.dumps({"recording": name, "omega": title, "pairs": found.pairs, "residual": found.residual}))
@@ -173,9 +280,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--figure", type=Path)
     parser.add_argument("--pictures", nargs="+", help="names in FOLDER; all where left out")
-    parser.add_argument("--turns", type=float, nargs="+", default=[0.25, 0.5, 1.0, 2.0, 4.0])
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 1.0, 10.0])
-    parser.add_argument("--contrast", type=float, nargs="+", default=[0.25])
     parser.add_argument("--real", type=Path, help="folder of shapes_rotation and dynamic_rotation")
     parser.add_argument("--real-figure", type=Path)
     parser.add_argument("--device", default="cpu")
@@ -183,20 +287,55 @@ def main() -> None:
     wp.config.log_level = wp.LOG_ERROR
     if args.real is not None:
         grid(real(args.real, args.device), args.real_figure)
-    found, shown, peers = [], {}, {}
-    for row, (truth, pictures) in rows(args):
-        found.append(row)
-        print(json.dumps({k: v for k, v in row.items() if not isinstance(v, dict)}), flush=True)
-        if row["noise_hz"] == args.noise[0] and row["contrast"] == args.contrast[0]:
-            line = shown.setdefault(row["picture"].split(".")[0], {"truth": truth})
-            line[f"{row['turns']:g} turn{'s' * (row['turns'] > 1)}"] = pictures["amiwarp"]
-            if row["turns"] == max(t for t in args.turns if t <= 1.0):
-                titles = {"integration": "integrated events", "leaky": "high-pass filter"}
-                peers[row["picture"].split(".")[0]] = {text: pictures[name] for name, text in titles.items()}
-    machine = {"device": args.device, "machine": platform.processor(), "python": platform.python_version()}
-    args.out.write_text(json.dumps({"settings": machine, "rows": found}, indent=1) + "\n")
+    shown: dict[str, dict[str, NDArray[np.float32]]] = {}
+    names = args.pictures or sorted(p.name for p in args.folder.iterdir() if p.suffix in (".jpg", ".png"))
+    for name in names:
+        found = []
+        for row in rows(args.folder / name, args.device, shown):
+            found.append(row)
+            print(json.dumps({k: v for k, v in row.items() if not isinstance(v, dict)}), flush=True)
+        merge(args.out, name, found, args.device)
+    every = json.loads(args.out.read_text())["rows"]
+    print("\n".join(line for contrast in (0.25, 0.1, 0.5) for line in table(every, contrast, METHODS)))
     if args.figure is not None:
-        grid({name: line | peers[name] for name, line in shown.items()}, args.figure)
+        grid({name: ordered(line) for name, line in shown.items()}, args.figure)
+
+
+def table(found: list[dict[str, Any]], contrast: float, methods: tuple[str, ...]) -> Iterator[str]:
+    """Lines of Markdown: means over the pictures, and the worst correlation with its picture."""
+    chosen = [row for row in found if row["contrast"] == contrast]
+    for turns, share in sorted({(row["turns"], row["share"]) for row in chosen}, key=lambda key: (key[1], key[0])):
+        group = [row for row in chosen if (row["turns"], row["share"]) == (turns, share)]
+        cells = [
+            f"{turns:g}",
+            f"{min(r['noise_share'] for r in group):.0%} to {max(r['noise_share'] for r in group):.0%}",
+        ]
+        for method in methods:
+            for area in ("textured", "all") if method == "amiwarp" else ("textured",):
+                values = [row[method][area] for row in group if method in row]
+                mean = [sum(v[key] for v in values) / max(len(values), 1) for key in ("correlation", "psnr_db", "ssim")]
+                cells.append(f"{mean[0]:.3f} / {mean[1]:.1f} / {mean[2]:.2f}" if values else "–")
+        worst = min(group, key=lambda row: float(row["amiwarp"]["all"]["correlation"]))
+        cells.append(f"{worst['amiwarp']['all']['correlation']:.3f} ({worst['picture'].split('.')[0]})")
+        yield f"| {contrast:g} | " + " | ".join(cells) + f" | {len(group)} |"
+
+
+def ordered(line: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    """The columns of the figure: not all windows, and the peers last."""
+    last = list(PEERS.values())
+    kept = [name for name in line if name not in (*last, "0.5 turn", "2 turns")]
+    return {name: line[name] for name in (*kept, *last)}
+
+
+def merge(path: Path, picture: str, found: list[dict[str, Any]], device: str) -> None:
+    """Put a picture's rows into the file, in place of older ones."""
+    old = json.loads(path.read_text())["rows"] if path.exists() else []
+    kept = [row for row in old if row["picture"] != picture] + found
+    machine = {"device": device, "machine": platform.processor(), "python": platform.python_version()}
+    text = json.dumps({"settings": machine, "rows": sorted(kept, key=lambda row: str(row["picture"]))}, indent=1)
+    beside = path.with_suffix(".tmp")
+    beside.write_text(text + "\n")
+    os.replace(beside, path)
 
 
 if __name__ == "__main__":

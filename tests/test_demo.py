@@ -15,7 +15,7 @@ from amiwarp.calib import Calibration
 from amiwarp.cli.app import app
 from amiwarp.io import open_recording
 
-FILES = {"recording.h5", "calibration.json", "compensated.h5", "demo.png"}
+FILES = {"recording.h5", "calibration.json", "compensated.h5", "picture.png", "demo.png"}
 
 
 def check(data: dict[str, float], out: Path) -> None:
@@ -37,6 +37,9 @@ def test_demo_at_its_default_size(tmp_path: Path) -> None:
     data = json.loads(result.stdout)
     check(data, out)
     assert data["seconds"] < 300.0
+    assert data["picture_correlation"] >= 0.9
+    assert data["picture_psnr_db"] >= 20.0
+    assert np.asarray(Image.open(out / "picture.png")).shape == (480, 640)
     assert data["events"] > 1_000_000
     assert np.asarray(Image.open(out / "demo.png")).shape[1] > 1000
     assert (out / "demo.png").stat().st_size < 1_000_000

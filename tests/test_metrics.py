@@ -7,7 +7,7 @@ import pytest
 
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.metrics import contrast, edge_blur, entropy, find_edges, model_error
+from amiwarp.metrics import contrast, edge_blur, entropy, find_edges, model_error, picture_quality
 from amiwarp.optics import ExactModel, Prism
 
 
@@ -85,3 +85,61 @@ def test_contrast_and_entropy_of_known_images() -> None:
     assert contrast(image) == pytest.approx(image.var() / image.mean(), rel=1e-5)
     assert entropy(image) == pytest.approx(math.log(20), rel=1e-5)
     assert entropy(np.ones((20, 30), dtype=np.float32)) == pytest.approx(math.log(600), rel=1e-5)
+
+
+RAMP = np.linspace(-1.0, 1.0, 1001).reshape(7, 143)
+"""Range from the 0.5th to the 99.5th percentile: 1.98."""
+
+
+def test_gain_and_offset_do_not_count() -> None:
+    quality = picture_quality((RAMP - 0.3) / 0.25, RAMP)
+    assert quality.gain == pytest.approx(0.25, abs=1e-12)
+    assert quality.offset == pytest.approx(0.3, abs=1e-12)
+    assert quality.correlation == pytest.approx(1.0, abs=1e-12)
+    assert quality.psnr_db > 200.0
+
+
+def test_an_exact_picture_has_no_error() -> None:
+    ends = np.array([[0.0, 1.0], [1.0, 0.0]])
+    quality = picture_quality(ends, ends)
+    assert (quality.correlation, quality.psnr_db, quality.gain, quality.offset) == (1.0, math.inf, 1.0, 0.0)
+
+
+def test_psnr_of_a_known_error() -> None:
+    """Error 0.1 that is uncorrelated with the picture, so the fit leaves it: variance 1, error 0.01, range 2.2."""
+    picture = np.array([[-1.0, -1.0, 1.0, 1.0]] * 100)
+    truth = picture + np.array([[-0.1, 0.1, -0.1, 0.1]] * 100)
+    quality = picture_quality(picture, truth)
+    assert quality.psnr_db == pytest.approx(20.0 * math.log10(2.2 / 0.1), abs=1e-9)
+    assert quality.correlation == pytest.approx(1.0 / math.sqrt(1.01), abs=1e-12)
+    assert quality.gain == pytest.approx(1.0, abs=1e-12)
+
+
+def test_an_inverted_picture_is_told_by_its_signs() -> None:
+    quality = picture_quality(-2.0 * RAMP, RAMP)
+    assert quality.correlation == pytest.approx(-1.0, abs=1e-12)
+    assert quality.gain == pytest.approx(-0.5, abs=1e-12)
+
+
+def test_only_the_pixels_asked_for_are_judged() -> None:
+    """The range stays that of the whole truth; what is wrong elsewhere, or NaN, is not looked at."""
+    where = np.zeros(RAMP.shape, np.bool_)
+    where[0, :4] = True
+    truth, picture = RAMP.copy(), np.full(RAMP.shape, np.nan)
+    truth[0, :4], picture[0, :4] = (-0.6, -0.4, 0.4, 0.6), (-0.5, -0.5, 0.5, 0.5)
+    span = float(np.ptp(np.percentile(truth, [0.5, 99.5])))
+    assert picture_quality(picture, truth, where).psnr_db == pytest.approx(20.0 * math.log10(span / 0.1), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("log", "truth", "says"),
+    [
+        (RAMP[:3], RAMP, "shapes"),
+        (np.zeros_like(RAMP), RAMP, "constant"),
+        (RAMP, np.ones_like(RAMP), "constant"),
+        (np.where(RAMP > 0.9, np.nan, RAMP), RAMP, "not finite"),
+    ],
+)
+def test_pictures_that_cannot_be_judged(log: np.ndarray, truth: np.ndarray, says: str) -> None:
+    with pytest.raises(AmiwarpError, match=says):
+        picture_quality(log, truth)

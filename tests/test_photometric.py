@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import TRUE_PHASE, TRUE_PRISM
 
-from amiwarp.brightness import BrightnessMap, Sensor, Tiles, pair_events
+from amiwarp.brightness import BrightnessMap, Tiles
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric import PhotometricSettings, _spread
 from amiwarp.camera import Camera
@@ -18,6 +18,7 @@ from amiwarp.events import Events, MemoryEvents, Recording
 from amiwarp.metrics import model_error, truth_model
 from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.optics import ExactModel, FlatSide, Prism
+from amiwarp.pairs import Sensor, pair_events
 from amiwarp.simulate import SensorModel, simulate
 
 KNOWN = PhotometricSettings(sensor=Sensor(latency_us=100.0, refractory_us=100.0))
@@ -86,7 +87,7 @@ def test_without_it_sharpness_stands(recording: Recording) -> None:
 def test_too_few_pairs_fall_back_and_say_so(texture: np.ndarray) -> None:
     camera = Camera.from_fov(160, 120, math.radians(50))
     dull = SensorModel(contrast_on=0.9, contrast_off=0.9)
-    recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.05, sensor=dull, seed=2)
+    recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.03, sensor=dull, seed=2)
     c = calibrate(recording)
     assert c.photometric is None or not c.photometric.accepted
     assert any("photometric" in warning for warning in c.warnings)

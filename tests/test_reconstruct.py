@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from scipy import ndimage
 from typer.testing import CliRunner
 
 from amiwarp.calib.result import Calibration
@@ -23,8 +24,9 @@ from amiwarp.io.text import read_calib
 from amiwarp.motion import CameraMotion, PrismMotion
 from amiwarp.optics import ExactModel, Prism
 from amiwarp.picture_files import Tone, save_picture, save_video, tones
-from amiwarp.reconstruct import Fill, Picture, Reconstruction, hot_pixels, reconstruct
+from amiwarp.reconstruct import Fill, Picture, Reconstruction, hot_pixels, reconstruct, without_pinholes
 from amiwarp.simulate import Scene, SensorModel, Simulation
+from amiwarp.turning import Turning
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 PRISM, PHASE = Prism(math.radians(1.2)), 2.0
@@ -168,6 +170,18 @@ def test_hot_pixels_are_told_from_texture() -> None:
     assert np.argwhere(hot_pixels(events, 30, 20)).tolist() == [[5, 7]]
 
 
+def test_the_mask_has_no_pinholes(picture: Picture) -> None:
+    known = np.ones((20, 30), np.bool_)
+    known[5, 7] = known[9, 12:16] = known[14, 20:25] = False
+    expected = np.ones((20, 30), np.bool_)
+    expected[14, 20:25] = False
+    assert np.array_equal(without_pinholes(known), expected)
+    label, count = ndimage.label(~picture.known)
+    inside = [np.argwhere(label == k + 1) for k in range(count) if (label == k + 1).sum() <= 4]
+    size = np.array(picture.known.shape) - 1
+    assert all(((where == 0) | (where == size)).any() for where in inside)
+
+
 def test_bit_for_bit_the_same(recording: Recording, picture: Picture) -> None:
     again = reconstruct(recording, model=MODEL, start_us=START)
     assert np.array_equal(again.log, picture.log)
@@ -185,8 +199,8 @@ def test_while_the_camera_turns(texture: NDArray[np.uint8]) -> None:
     rate = (0.0, math.radians(20.0), math.radians(-15.0))
     turning = simulation(texture, camera_motion=CameraMotion(rate), duration_s=0.1).run()
     still = reconstruct(turning, model=MODEL, start_us=0)
-    right = reconstruct(turning, model=MODEL, start_us=0, omega=rate)
-    wrong = reconstruct(turning, model=MODEL, start_us=0, omega=tuple(-r for r in rate))
+    right = reconstruct(turning, model=MODEL, start_us=0, turning=Turning(rate))
+    wrong = reconstruct(turning, model=MODEL, start_us=0, turning=Turning(tuple(-r for r in rate)))
     assert right.residual < 0.7 * still.residual
     assert right.residual < 0.7 * wrong.residual
 
@@ -205,8 +219,8 @@ def test_real_rotation_without_a_prism(data_dir: Path, name: str, expected: floa
         "encoder": Encoder.constant_speed(0.0, first, last),
         "length_us": last - first + 1,
     }
-    right = reconstruct(real, omega=(x, y, z), **still)
-    wrong = reconstruct(real, omega=(-x, -y, -z), **still)
+    right = reconstruct(real, turning=Turning((x, y, z)), **still)
+    wrong = reconstruct(real, turning=Turning((-x, -y, -z)), **still)
     assert right.residual < expected
     assert wrong.residual > 2.0 * right.residual
 

@@ -21,10 +21,11 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 ORDER = (
     ("errors",),
     ("kernels", "camera", "multilevel"),
-    ("optics", "events", "encoder"),
+    ("optics", "events", "encoder", "turning"),
     ("pictures", "motion", "clouds"),
     ("io", "iwe", "link"),
     ("compensate", "iwe_files", "sharpness", "metrics", "scenery"),
+    ("pairs",),
     ("brightness",),
     ("calib", "engine", "reconstruct"),
     ("picture_files",),

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib import checks
-from amiwarp.calib.parameters import Space, make_space, size_name
+from amiwarp.calib.panning import estimate_rates
+from amiwarp.calib.parameters import MOTION, RATES, Space, make_space, size_name
 from amiwarp.calib.photometric import refine
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.calib.search import Material, Progress, Search, Settings
 from amiwarp.calib.speed import estimate_rpm
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
+from amiwarp.events import Events, MemoryEvents
 from amiwarp.optics import Prism
 
 if TYPE_CHECKING:
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 
 NOMINAL_PRISM = Prism(math.radians(2.0))
 """What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
+LINEAR = ("off_ratio", "leak")
+"""Names that are free in the photometric stage alone: unknowns of its linear equations."""
+MOVING_TURNS, MOVING_US = 2.1, 100_000.0
+"""Length of the window where the camera's motion is free: in turns, or without a prism."""
 LEAST_SHARPNESS_KEPT = 0.88
 """The truth is nearly as sharp as the sharpest (0.93 to 0.99 of the gain, measured); what keeps less is none."""
 
@@ -48,13 +53,15 @@ def calibrate(
     began = time.perf_counter()
     settings = replace(settings or Settings(), **changes)
     settings.check()
+    recording = moving_window(recording, settings)
     searches = prepare(recording, settings, device=device, progress=progress)
     for search in searches:
         search.run()
     search = max(searches, key=lambda s: s.score)
     best = search.best
     warnings, uncertainty = search.judge(recording.name)
-    before = search.fine.values({**best, search.space.size_name: 0.0})
+    still = {n: 0.0 for n in (search.space.size_name, *MOTION) if n in best}
+    before = search.fine.values({**best, **still})
     result = Calibration(
         model_name=settings.model,
         camera=search.space.camera,
@@ -66,7 +73,8 @@ def calibrate(
         sharpness_before=before,
         sharpness_after=search.score,
         stages=tuple(search.stages),
-        zero_us=_middle(recording) if recording.encoder is None else None,
+        zero_us=_middle(recording) if recording.encoder is None and search.space.sized else None,
+        middle_us=search.space.middle_us if search.space.moving else None,
         events=len(search.material.events),
         seconds=time.perf_counter() - began,
         warnings=warnings,
@@ -79,10 +87,7 @@ def calibrate(
 def _second_stage(recording: Recording, search: Search, result: Calibration, progress: Progress | None) -> Calibration:
     """The answer of the photometric stage, or that of sharpness with a warning that says why."""
     try:
-        found, summary = refine(
-            recording, search.space, search.material, result.parameters, search.settings.photometric,
-            device=search.device, progress=progress,
-        )  # fmt: skip
+        found, summary = refine(recording, search, linear(search.settings), progress=progress)
     except AmiwarpError as error:
         return replace(result, warnings=(*result.warnings, f"no photometric stage: {error}"))
     after = search.fine.values(dict(found.parameters))
@@ -90,6 +95,9 @@ def _second_stage(recording: Recording, search: Search, result: Calibration, pro
     if found.accepted and kept < LEAST_SHARPNESS_KEPT:
         verdict = f"keeps only {100 * kept:.0f} % of what sharpness gained: events are missing, or the scene moved"
         found = replace(found, accepted=False, verdict=f"{verdict}; kept the answer of sharpness")
+    if found.held:
+        vain = f"the events do not determine {', '.join(found.held)}: not moved by the photometric stage"
+        result = replace(result, warnings=(*result.warnings, vain))
     result = replace(result, stages=(*result.stages, summary), photometric=found)
     if not found.accepted:
         return replace(result, warnings=(*result.warnings, f"photometric stage: {found.verdict}"))
@@ -109,9 +117,27 @@ def prepare(
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
         space = _space(recording, camera, encoder, events, settings, free)
         material = _material(events, encoder, space, _middle(recording))
-        checks.check_turn(material.theta, name)
+        if space.sized:
+            checks.check_turn(material.theta, name)
         searches.append(Search(space, material, settings, device, progress))
     return searches
+
+
+def moving_window(recording: Recording, settings: Settings) -> Recording:
+    """The two turns in the recording's middle where the camera's motion is free: for longer it moves otherwise."""
+    if not settings.free or not {"motion", *MOTION} & set(settings.free):
+        return recording
+    encoder, events = recording.encoder, recording.events
+    rpm = settings.start.get("rpm", 0.0) if encoder is None else encoder.rpm
+    length = MOVING_TURNS * 60e6 / abs(rpm) if abs(rpm) > 1e-3 else MOVING_US
+    middle = _middle(recording)
+    cut = events.between(round(middle - length / 2), round(middle + length / 2))
+    return replace(recording, events=MemoryEvents(cut, *events.size))
+
+
+def linear(settings: Settings) -> tuple[str, ...]:
+    """What is free in the equations of the photometric stage themselves."""
+    return tuple(n for n in settings.free or () if n in LINEAR)
 
 
 def _camera(recording: Recording) -> Camera:
@@ -123,6 +149,9 @@ def _camera(recording: Recording) -> Camera:
 def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], tuple[str, ...]]:
     """The recording's encoder; or constant speeds found in the events, both ways round. And what is to be free."""
     free = (size_name(settings.model), "phase") if settings.free is None else settings.free
+    free = tuple(n for n in free if n not in LINEAR)
+    if not {"apex", "deflection", "phase"} & set(free) and settings.start.get(size_name(settings.model)) == 0.0:
+        return [constant_speed(0.0, recording.events.t_first, recording.events.t_last, _middle(recording))], free
     if recording.encoder is not None:
         if "rpm" in free or "rpm" in settings.start:
             raise AmiwarpError(f"{recording.name}: the encoder gives the rpm; leave it out, or free clock_offset")
@@ -168,9 +197,12 @@ def _space(
         start["rpm"] = encoder.rpm
     if "clock_offset" in free:
         start.setdefault("clock_offset", encoder.clock_offset_us)
+    if ("motion" in free or set(RATES) & set(free)) and turned > 0.0 and not set(RATES) & set(start):
+        found = dict(zip(RATES, estimate_rates(events, encoder, camera), strict=True))
+        start |= {n: rate for n, rate in found.items() if "motion" in free or n in free}
     return make_space(
         settings.model, camera, recording.prism or NOMINAL_PRISM, free=free, start=start, bounds=settings.bounds,
-        rad_per_us=turned / max(duration, 1), duration_us=float(duration),
+        rad_per_us=turned / max(duration, 1), duration_us=float(duration), middle_us=_middle(recording),
     )  # fmt: skip
 
 

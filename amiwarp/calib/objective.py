@@ -7,14 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.parameters import MOTION, build_model
 from amiwarp.iwe import CanvasShape, Votes, upload_events
 from amiwarp.sharpness import Sharpness, SharpnessMeter
+from amiwarp.turning import border
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import Space
     from amiwarp.events import Events
+
+MOTION_ROOM_PX = 16.0
 
 
 class Objective:
@@ -40,7 +46,8 @@ class Objective:
         self.space = space
         self.evaluations = 0
         self._count = len(events)
-        self._arrays = upload_events(events, theta, device, slope)
+        middle = space.middle_us if space.moving else None
+        self._arrays = upload_events(events, theta, device, slope=slope, middle_us=middle)
         camera = space.camera
         # the paper's J is left as it was written
         dither = kind is not Sharpness.PAPER_J
@@ -50,7 +57,8 @@ class Objective:
 
     def _vote(self, values: dict[str, float]) -> None:
         self._votes.clear()
-        self._votes.add_events(self.space.build(values), self._arrays, self._count, self.space.drift(values))
+        drift, turning = self.space.drift(values), self.space.turning(values)
+        self._votes.add_events(self.space.build(values), self._arrays, self._count, drift=drift, turning=turning)
 
     def values(self, values: dict[str, float]) -> float:
         """Sharpness at parameter values."""
@@ -69,17 +77,22 @@ class Objective:
 
 
 def padding(space: Space) -> int:
-    """Border [px] that no event of the image can cross, at the largest size and any phase."""
-    camera = space.camera
-    largest = {**space.start, **{n: space.high[n] for n in space.names if n == space.size_name}}
-    kind = "exact" if space.model == "ellipse" else space.model
-    border = np.array(
-        [(x, y) for x in np.linspace(0, camera.width - 1, 9) for y in np.linspace(0, camera.height - 1, 9)]
-    )
-    theta = np.repeat(np.arange(16) * (np.pi / 8), len(border))
-    xy = np.tile(border, (16, 1))
-    from amiwarp.calib.parameters import build_model
+    """Border [px] that no event of the image can cross, at the largest size and any phase, or as far as it turns."""
+    largest = {n: space.high[n] for n in space.names if n == space.size_name}
+    # a search that goes as far as its bounds is lost anyway: twice the start's motion, and a little, is room enough
+    faster = {n: 2.0 * abs(space.start.get(n, 0.0)) for n in MOTION if n in space.start}
+    room = MOTION_ROOM_PX if space.moving else 0.0
+    return math.ceil(reach(space, {**space.start, **largest, **faster}) + room) + 2
 
-    moved = build_model(kind, camera, space.prism, largest).compensate_points(xy, theta) - xy
-    reach = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
-    return math.ceil(float(reach.max())) + 2 if len(reach) else 2
+
+def reach(space: Space, values: Mapping[str, float]) -> float:
+    """How far events are moved at ``values``, at most [px], by the prism and by the camera's turning."""
+    camera = space.camera
+    kind = "exact" if space.model == "ellipse" else space.model
+    at = border(camera)
+    theta = np.repeat(np.arange(16) * (np.pi / 8), len(at))
+    xy = np.tile(at, (16, 1))
+    moved = build_model(kind, camera, space.prism, values).compensate_points(xy, theta) - xy
+    radius = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
+    turned = space.turning(values).reach(camera, space.duration_us * 0.5e-6)
+    return float(radius.max(initial=0.0)) + float(np.linalg.norm(turned))

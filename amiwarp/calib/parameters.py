@@ -23,6 +23,7 @@ from amiwarp.optics import (
     RadialCircleModel,
     deflection_from_apex,
 )
+from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,12 +40,28 @@ UNITS = {
     "tilt_x": "rad",
     "tilt_y": "rad",
     "index": "1",
+    "focal_length": "px",
+    "rate_x": "rad/s",
+    "rate_y": "rad/s",
+    "rate_z": "rad/s",
+    "change_x": "rad/s2",
+    "change_y": "rad/s2",
+    "change_z": "rad/s2",
 }
-"""Every parameter that can be free, with its unit. ``clock_offset`` is added to the encoder's (see Encoder)."""
+"""Every parameter that can be free, with its unit. ``clock_offset`` is added to the encoder's (see Encoder);
+``focal_length`` is the camera's fx, fy keeping its ratio; ``rate`` and ``change`` are the camera's :class:`Turning`."""
 
 DRIFTS = ("clock_offset", "rpm")
+RATES = ("rate_x", "rate_y", "rate_z")
+CHANGES = ("change_x", "change_y", "change_z")
+MOTION = (*RATES, *CHANGES)
+LATE = ("index", "focal_length")
+"""They and the apex make nearly the same motion: sharpness is not asked where the photometric stage can be."""
 _EXACT_ONLY = ("tilt_x", "tilt_y", "index")
-_DEFAULT_RANGE = {"tilt_x": math.radians(5.0), "tilt_y": math.radians(5.0), "clock_offset": 5000.0, "index": 0.2}
+_DEFAULT_RANGE = {
+    "tilt_x": math.radians(5.0), "tilt_y": math.radians(5.0), "clock_offset": 5000.0, "index": 0.2,
+    **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0),
+}  # fmt: skip
 """Half width of the default bounds about the start."""
 TURN = (-math.pi, math.pi)
 
@@ -63,6 +80,9 @@ class Space:
     """All parameters of the model, the free ones' start included."""
     pixels: Mapping[str, float]
     """Motion of events [px rms] per unit of each free parameter."""
+    middle_us: int
+    """Time to which a turning camera is turned back."""
+    duration_us: float
 
     @property
     def size_name(self) -> str:
@@ -73,6 +93,24 @@ class Space:
         """Whether the first two entries are (size·cos phase, size·sin phase)."""
         full = self.high.get("phase", 0.0) - self.low.get("phase", 0.0) >= 2.0 * math.pi - 1e-9
         return self.names[:2] == (self.size_name, "phase") and full
+
+    @property
+    def sized(self) -> bool:
+        """Whether a prism is sought, and not only the camera's motion."""
+        return self.size_name in self.names
+
+    @property
+    def moving(self) -> bool:
+        """Whether the camera's motion is sought or given."""
+        return any(self.start.get(n) or n in self.names for n in MOTION)
+
+    def without(self, names: tuple[str, ...]) -> Space:
+        """The space in which ``names`` are held at their start."""
+        return replace(self, names=tuple(n for n in self.names if n not in names))
+
+    def holding(self, values: Mapping[str, float]) -> Space:
+        """The same with another start."""
+        return replace(self, start={**self.start, **values})
 
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper corner of the box in which the vector moves [px]."""
@@ -115,6 +153,9 @@ class Space:
     def build(self, values: Mapping[str, float]) -> Model:
         return build_model(self.model, self.camera, self.prism, values)
 
+    def turning(self, values: Mapping[str, float]) -> Turning:
+        return turning_of(values, self.middle_us)
+
     def drift(self, values: Mapping[str, float]) -> float:
         """Distance of the drifting parameter, if one is free, from its start."""
         return float(sum(values[n] - self.start[n] for n in self.names if n in DRIFTS))
@@ -129,8 +170,18 @@ def size_name(model: str) -> str:
     return "apex" if model in ("exact", "ellipse") else "deflection"
 
 
+def turning_of(values: Mapping[str, float], middle_us: int) -> Turning:
+    """The camera's motion among parameter values; none where they do not name it."""
+    x, y, z = (values.get(n, 0.0) for n in RATES)
+    a, b, c = (values.get(n, 0.0) for n in CHANGES)
+    return Turning((x, y, z), (a, b, c), middle_us)
+
+
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
-    """A model of the ladder from parameter values; what they do not name comes from ``prism``."""
+    """A model of the ladder from parameter values; what they do not name comes from ``camera`` and ``prism``."""
+    if "focal_length" in values:
+        scale = values["focal_length"] / camera.fx
+        camera = replace(camera, fx=values["focal_length"], fy=camera.fy * scale)
     if model == "circle":
         return CircleModel(camera, values["deflection"], values["phase"], prism.flat_side)
     if model == "radial":
@@ -150,17 +201,23 @@ def make_space(
     bounds: Mapping[str, tuple[float, float]],
     rad_per_us: float,
     duration_us: float,
+    middle_us: int = 0,
 ) -> Space:
     """Checks names and bounds and measures how far each parameter moves events.
 
     ``prism`` is the nominal one: the size may go from 0 to twice its apex unless ``bounds`` say otherwise.
-    ``rad_per_us``: mean speed of the prism; ``duration_us``: of the events. Raises :class:`AmiwarpError` for unknown,
+    ``rad_per_us``: mean speed of the prism; ``duration_us``: of the events, about ``middle_us``.
+
+    Raises :class:`AmiwarpError` for unknown,
     unfit or contradicting names.
     """
     size = size_name(model)
     names = _order(model, (size, "phase") if free is None else free)
     _check_given(model, names, start, bounds)
-    nominal = {"apex": prism.apex, "deflection": prism.deflection, "phase": 0.0, "index": prism.index}
+    nominal = {
+        "apex": prism.apex, "deflection": prism.deflection, "phase": 0.0, "index": prism.index,
+        "focal_length": camera.fx,
+    }  # fmt: skip
     values = {n: start.get(n, nominal.get(n, 0.0)) for n in (size, "phase", *names, *start)}
     low, high = {}, {}
     for name in names:
@@ -168,13 +225,14 @@ def make_space(
         if not low[name] < high[name]:
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower first")
         values[name] = min(max(values[name], low[name]), high[name])
-    shifts = _pixels_per_unit(model, camera, prism, values, rad_per_us, duration_us)
-    return Space(model, camera, prism, names, low, high, values, {n: shifts[n] for n in names})
+    shifts = _pixels_per_unit(model, camera, prism, names, values, rad_per_us, duration_us)
+    return Space(model, camera, prism, names, low, high, values, shifts, middle_us, duration_us)
 
 
 def _order(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
     size = size_name(model)
-    wanted = {size if n in ("apex", "deflection") else n for n in free}
+    wanted = {size if n in ("apex", "deflection") else n for n in free if n != "motion"}
+    wanted |= set(RATES if "motion" in free else ())
     unknown = wanted - set(UNITS)
     if unknown:
         raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {', '.join(UNITS)}")
@@ -184,14 +242,15 @@ def _order(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
         raise AmiwarpError(f"the {model} model has no {sorted(wanted & set(_EXACT_ONLY))[0]}; use model 'exact'")
     if set(DRIFTS) <= wanted:
         raise AmiwarpError("clock_offset and rpm cannot both be free: rpm is for recordings without an encoder")
-    return tuple(n for n in (size, "phase", *DRIFTS, *_EXACT_ONLY) if n in wanted)
+    return tuple(n for n in (size, "phase", *DRIFTS, *_EXACT_ONLY, "focal_length", *MOTION) if n in wanted)
 
 
 def _check_given(
     model: str, names: tuple[str, ...], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> None:
     """Nothing that is given is left out without a word."""
-    known = (size_name(model), "phase", *DRIFTS, *(() if model in ("circle", "radial") else _EXACT_ONLY))
+    exact = () if model in ("circle", "radial") else _EXACT_ONLY
+    known = (size_name(model), "phase", *DRIFTS, *exact, "focal_length", *MOTION)
     for name in start:
         if name not in known:
             raise AmiwarpError(f"start gives {name}, which the {model} model has not; it has {', '.join(known)}")
@@ -207,12 +266,19 @@ def _default_bounds(name: str, value: float, prism: Prism) -> tuple[float, float
         return 0.0, deflection_from_apex(2.0 * prism.apex, prism.index, prism.flat_side)
     if name == "phase":
         return TURN
-    half = 0.02 * abs(value) if name == "rpm" else _DEFAULT_RANGE[name]
+    share = {"rpm": 0.02, "focal_length": 0.2}
+    half = share[name] * abs(value) if name in share else _DEFAULT_RANGE[name]
     return value - half, value + half
 
 
 def _pixels_per_unit(
-    model: str, camera: Camera, prism: Prism, values: Mapping[str, float], rad_per_us: float, duration_us: float
+    model: str,
+    camera: Camera,
+    prism: Prism,
+    names: tuple[str, ...],
+    values: Mapping[str, float],
+    rad_per_us: float,
+    duration_us: float,
 ) -> dict[str, float]:
     """Finite differences of the displacement over a grid of pixels and angles, at the nominal size."""
     nominal = {**values, "apex": prism.apex, "deflection": prism.deflection}
@@ -235,11 +301,23 @@ def _pixels_per_unit(
         moved = moved[np.isfinite(moved).all(axis=1)]
         return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
-    steps = {size_name(model): 0.25 * nominal[size_name(model)], "phase": 0.05}
-    steps |= {n: 0.02 for n in _EXACT_ONLY if n in values}
-    shifts = {name: rms(name, step) for name, step in steps.items()}
-    shifts["clock_offset"] = shifts["phase"] * abs(rad_per_us)
-    shifts["rpm"] = shifts["phase"] * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
-    if not all(math.isfinite(s) and s > 0.0 for s in shifts.values()):
+    size = size_name(model)
+    steps = {size: 0.25 * nominal[size], "phase": 0.05, **dict.fromkeys(_EXACT_ONLY, 0.02)}
+    shifts = {name: rms(name, step) for name, step in steps.items() if name in names}
+    if set(DRIFTS) & set(names):
+        phase = rms("phase", 0.05)
+        shifts["clock_offset"] = phase * abs(rad_per_us)
+        shifts["rpm"] = phase * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
+    seconds = duration_us * 1e-6
+    radius = math.sqrt((camera.width**2 + camera.height**2) / 12.0)
+    for name, lever in zip(MOTION, (camera.fy, camera.fx, radius) * 2, strict=True):
+        # standard deviation of τ, and of τ²/2, over a window
+        shifts[name] = (
+            lever * seconds * (seconds * math.sqrt(1.0 / 720.0) if name in CHANGES else math.sqrt(1.0 / 12.0))
+        )
+    # what a camera that turns at half a radian a second would show of it
+    if "focal_length" in names:
+        shifts["focal_length"] = max(rms("focal_length", 0.01 * camera.fx), 0.5 * seconds / math.sqrt(12.0))
+    if not all(math.isfinite(shifts[n]) and shifts[n] > 0.0 for n in names):
         raise AmiwarpError("the nominal prism moves no event; give its nominal apex (above 0) and the encoder's speed")
-    return shifts
+    return {n: shifts[n] for n in names}

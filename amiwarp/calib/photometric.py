@@ -8,43 +8,48 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.brightness import BrightnessMap, PairSet, Sensor, Tiles, pair_events
-from amiwarp.calib.objective import padding
+from amiwarp.brightness import BrightnessMap, Tiles
+from amiwarp.calib.gauss_newton import GAUSS_NEWTON, Slopes, determined, iterate
+from amiwarp.calib.objective import reach
+from amiwarp.calib.parameters import LATE, MOTION
 from amiwarp.calib.result import Photometric, StageSummary
 from amiwarp.calib.solve import Stage, maximise
 from amiwarp.errors import AmiwarpError
+from amiwarp.pairs import PairSet, Sensor, off_excess, pair_events, places_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import Space
-    from amiwarp.calib.search import Material, Progress
+    from amiwarp.calib.search import Progress, Search
     from amiwarp.encoder import Encoder
-    from amiwarp.events import Events, Recording
+    from amiwarp.events import Recording
 
 TILE = 32
-"""Side of a tile's pixels [px]."""
+"""Side of a tile of the scene [px]."""
 GRID = (4, 3)
 """One tile, the busiest, from each of so many columns and rows of the image."""
+MARGIN_PX, MOVING_MARGIN_PX = 3, 8
+"""By which the map of a tile is grown: the parameters may move events so far."""
 LONGEST_GAP_US = 60_000
 """Pairs further apart say little: noise has come between."""
-FEWEST_PAIRS = 10_000
-PAIRS_PER_NODE = 2.5
+FEWEST_PAIRS = 5_000
+PAIRS_PER_NODE = 1.5
 """Fewer equations for each unknown of the map fit anything."""
 FEWEST_TURNS = 2
 FEWEST_TILES = 6
 FIRST_SCALE = 1.0
 """Of Cauchy's weights while the map is cold [thresholds]."""
-FAR_PX = 1.0
-"""The stage looks no further from the sharpness optimum than this, in any direction."""
+FAR_PX, FAR_MOVING_PX = 1.0, 4.0
+"""The stage looks no further from the sharpness optimum than this; than the latter in the camera's motion."""
 FIRST_STEP_PX = 0.2
 POLISH_STEP_PX = 0.05
+SLOPE_PX = 0.05
+"""Of the differences that give the residuals' slopes [px]."""
 LARGEST_COST = 0.35
 """Of the cost with no map at all: above it the equations do not hold, and the scene or camera moved unmodelled."""
 
@@ -55,8 +60,10 @@ class PhotometricSettings:
 
     pairs: int = 600_000
     """At most about so many pairs of events, in whole turns spread over the recording."""
-    algorithm: str = "LN_BOBYQA"
+    algorithm: str = GAUSS_NEWTON
+    """That, or one of NLopt's derivative-free local algorithms by name."""
     evaluations: int = 80
+    """Budget of each of an NLopt algorithm's two runs."""
     tolerance_px: float = 0.002
     steps: int = 20
     """Conjugate gradients per evaluation; each starts from the last map."""
@@ -66,16 +73,15 @@ class PhotometricSettings:
     """Known latency and refractory time; what is not known of them stays in the phase."""
 
 
-def choose_tiles(
-    events: Events, width: int, height: int, reach: int, density: float
-) -> tuple[NDArray[np.int32], Tiles]:
-    """The busiest cell of :data:`TILE` px from each part of the image: tile of each pixel (or -1), and the tiles.
+def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
+    """The busiest cell of :data:`TILE` px from each part of the scene: tile of each pixel (or -1), and the tiles.
 
-    ``events``: a sample. ``reach`` [px]: how far a pixel's events can be moved.
+    ``image``: of events at the first stage's answer, shape (height, width).
     """
+    height, width = image.shape
     columns, rows = max(1, width // TILE), max(1, height // TILE)
-    counts = np.zeros((rows, columns), dtype=np.int64)
-    np.add.at(counts, (np.minimum(events.y // TILE, rows - 1), np.minimum(events.x // TILE, columns - 1)), 1)
+    cells = image[: rows * TILE, : columns * TILE]
+    counts = cells.reshape(rows, cells.shape[0] // rows, columns, cells.shape[1] // columns).sum(axis=(1, 3))
     tile_of = np.full((height, width), -1, dtype=np.int32)
     corners: list[tuple[int, int]] = []
     for part_rows in np.array_split(np.arange(rows), min(GRID[1], rows)):
@@ -84,35 +90,92 @@ def choose_tiles(
             row, column = np.unravel_index(int(part.argmax()), part.shape)
             x, y = int(part_columns[column]) * TILE, int(part_rows[row]) * TILE
             tile_of[y : y + TILE, x : x + TILE] = len(corners)
-            corners.append((x - reach, y - reach))
-    side = math.ceil((TILE + 2 * reach) * density) + 2
+            corners.append((x - margin, y - margin))
+    side = math.ceil((TILE + 2 * margin) * density) + 2
     return tile_of, Tiles(np.array(corners, dtype=np.float32), side, side, density)
 
 
-def gather_pairs(
-    recording: Recording, encoder: Encoder, tile_of: NDArray[np.int32], most: int, sensor: Sensor, device: Any
-) -> PairSet:
-    """Pairs of whole turns, two or more where there are, spread evenly over the recording, until ``most`` are found.
+def one_tile(width: int, height: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
+    """The whole image as one tile: where there are few events none is left out."""
+    origin = np.array([[-margin, -margin]], dtype=np.float32)
+    rows, columns = (math.ceil((n + 2 * margin) * density) + 2 for n in (height, width))
+    return np.zeros((height, width), dtype=np.int32), Tiles(origin, rows, columns, density)
+
+
+class _Gatherer:
+    """Pairs whose two events both fall on one tile of the scene, at the first stage's answer."""
+
+    def __init__(self, recording: Recording, search: Search, tile_of: NDArray[np.int32], sensor: Sensor) -> None:
+        from scipy import ndimage
+
+        self.recording, self.search, self.sensor, self.tile_of = recording, search, sensor, tile_of
+        far = math.ceil(reach(search.space, search.best)) + 1
+        near = ndimage.maximum_filter((tile_of >= 0).astype(np.uint8), size=2 * far + 1) > 0
+        self.near = np.where(near, 0, -1).astype(np.int32)
+
+    def between(self, start: int, stop: int) -> PairSet:
+        pairs = pair_events(
+            self.recording.events.between(start, stop), self.near, longest_gap_us=LONGEST_GAP_US,
+            shortest_gap_us=2.0 * self.sensor.refractory_us, device=self.search.device,
+        )  # fmt: skip
+        if not len(pairs):
+            return pairs
+        space, best = self.search.space, self.search.best
+        places = places_of(
+            pairs, space.build(best), self.search.material.encoder, self.sensor, space.turning(best),
+            drift=space.drift(best), slope=slopes_of(self.search, pairs), device=self.search.device,
+        )  # fmt: skip
+        tiles = self._tile(places[:, :2])
+        pairs = replace(pairs, tile=tiles)
+        return pairs[np.flatnonzero((tiles >= 0) & (tiles == self._tile(places[:, 2:])))]
+
+    def _tile(self, xy: NDArray[np.float32]) -> NDArray[np.int32]:
+        height, width = self.tile_of.shape
+        at = np.floor(np.nan_to_num(xy, nan=-1.0) + 0.5).astype(np.int64)
+        inside = (at[:, 0] >= 0) & (at[:, 1] >= 0) & (at[:, 0] < width) & (at[:, 1] < height)
+        tiles = np.full(len(xy), -1, np.int32)
+        tiles[inside] = self.tile_of[at[inside, 1], at[inside, 0]]
+        return tiles
+
+
+def slopes_of(search: Search, pairs: PairSet) -> NDArray[np.float32] | None:
+    """Change of the encoder's angle at either event per unit of the drifting parameter, where one is free."""
+    of = search.material.slope_of
+    return None if of is None else np.stack([of(t) for t in (pairs.first_t, pairs.second_t)], axis=1).astype(np.float32)
+
+
+def turn_length(recording: Recording, encoder: Encoder) -> float:
+    """Length of a turn [us], or of the whole recording where it is shorter."""
+    whole = float(recording.events.t_last - recording.events.t_first + 1)
+    return min(60e6 / max(abs(encoder.rpm), 1e-6), whole)
+
+
+def gather_pairs(recording: Recording, search: Search, settings: PhotometricSettings) -> tuple[PairSet, Tiles]:
+    """Pairs of whole turns, two or more where there are, spread evenly over the recording, until there are enough.
 
     Where two turns hold many more, whole tiles are left out: fewer pairs on the same map would leave it undetermined.
     """
     first, last = recording.events.t_first, recording.events.t_last
-    turn = min(60e6 / max(abs(encoder.rpm), 1e-6), float(last - first + 1))
+    turn = turn_length(recording, search.material.encoder)
     turns = max(1, int((last - first + 1) / turn))
+    margin = MOVING_MARGIN_PX if search.whole.moving else MARGIN_PX
+    if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= settings.pairs:
+        tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
+    else:
+        tile_of, tiles = choose_tiles(search.image(), settings.density, margin)
+    gatherer = _Gatherer(recording, search, tile_of, settings.sensor)
+    if search.whole.moving:
+        return gatherer.between(first, last + 1), tiles
     parts: list[PairSet] = []
     for k in _spread(turns):
         start = first + int(k * turn)
-        events = recording.events.between(start, start + int(turn))
-        part = pair_events(
-            events, tile_of, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * sensor.refractory_us, device=device
-        )
-        parts.append(part)
-        if len(parts) >= FEWEST_TURNS and sum(map(len, parts)) >= most:
+        parts.append(gatherer.between(start, start + int(turn)))
+        if len(parts) >= FEWEST_TURNS and sum(map(len, parts)) >= settings.pairs:
             break
     pairs = PairSet.concatenate(parts)
-    tiles = int(tile_of.max()) + 1
-    keep = max(FEWEST_TILES, round(tiles * most / max(len(pairs), 1)))
-    return pairs if keep >= tiles else pairs[np.isin(pairs.tile, np.array(_spread(tiles)[:keep]))]
+    count = len(tiles.origin)
+    keep = max(FEWEST_TILES, round(count * settings.pairs / max(len(pairs), 1)))
+    return (pairs if keep >= count else pairs[np.isin(pairs.tile, np.array(_spread(count)[:keep]))]), tiles
 
 
 def _spread(n: int) -> list[int]:
@@ -120,15 +183,6 @@ def _spread(n: int) -> list[int]:
     bits = max(1, (n - 1).bit_length())
     order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
     return [k for k in order if k < n]
-
-
-def off_excess(pairs: PairSet) -> float:
-    """Excess of the OFF threshold over the ON threshold, counted, not solved for: that would shrink it with the map.
-
-    Over a whole turn brightness comes back to where it was, so ON steps and OFF steps add up to nothing.
-    """
-    on = int((pairs.on == 1).sum())
-    return on / max(1, len(pairs) - on) - 1.0
 
 
 def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
@@ -155,9 +209,14 @@ class _Cost:
         self.scale = max(0.1, 1.5 * float(np.nanmedian(np.abs(self.last))))
         self.residuals(v)
 
-    def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> NDArray[np.float32]:
+    def place(self, v: NDArray[np.float64]) -> None:
         values = self.space.to_values(v)
-        self.brightness.place(self.space.build(values), drift=self.space.drift(values))
+        self.brightness.place(
+            self.space.build(values), drift=self.space.drift(values), turning=self.space.turning(values)
+        )
+
+    def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> NDArray[np.float32]:
+        self.place(v)
         self.last = self.brightness.solve(self.scale, steps=steps or self.steps, rounds=rounds)
         return self.last
 
@@ -166,64 +225,105 @@ class _Cost:
         known = np.where(np.isfinite(residuals), residuals, 1.0).astype(np.float64)
         return np.asarray(np.log1p((known / self.scale) ** 2) / math.log1p(1.0 / self.scale**2))
 
+    def weights(self, residuals: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Cauchy's weights; 0 for a pair off the map."""
+        known = np.isfinite(residuals)
+        return np.where(known, 1.0 / (1.0 + (np.nan_to_num(residuals).astype(np.float64) / self.scale) ** 2), 0.0)
+
     def __call__(self, v: NDArray[np.float64]) -> float:
         self.evaluations += 1
         return -float(self.terms(self.residuals(v)).mean())
 
+    def settled(self, v: NDArray[np.float64]) -> float:
+        """The same with twice the steps: a map that lags a long step of the parameters would speak against it."""
+        self.evaluations += 1
+        return -float(self.terms(self.residuals(v, steps=2 * self.steps)).mean())
+
+    def slopes(self, v: NDArray[np.float64]) -> Slopes:
+        """The residuals at ``v`` and their slopes, less what a change of the map would make of them."""
+        here = self.residuals(v)
+        rows = []
+        for step in np.eye(len(v)) * SLOPE_PX:
+            sides = []
+            for sign in (1.0, -1.0):
+                self.place(v + sign * step)
+                sides.append(self.brightness.residual())
+            rows.append((sides[0] - sides[1]) / np.float32(2.0 * SLOPE_PX))
+        self.place(v)
+        left = [self.brightness.unexplained(row, steps=self.steps) for row in rows]
+        return Slopes(np.nan_to_num(here), np.array(left), np.nan_to_num(np.array(rows)), self.weights(here))
+
 
 def refine(
-    recording: Recording,
-    space: Space,
-    material: Material,
-    start: Mapping[str, float],
-    settings: PhotometricSettings,
-    *,
-    device: Any = "cpu",
-    progress: Progress | None = None,
+    recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
 ) -> tuple[Photometric, StageSummary]:
-    """Runs the stage from the first stage's answer ``start``; ``material``: its events, which tell where texture is.
+    """Runs the stage from the first stage's answer; ``linear``: which of ``off_ratio`` and ``leak`` are free.
 
     Raises :class:`AmiwarpError` where there are too few pairs.
     """
-    width, height = recording.events.size
-    tile_of, tiles = choose_tiles(material.events, width, height, padding(space) + 2, settings.density)
-    pairs = gather_pairs(recording, material.encoder, tile_of, settings.pairs, settings.sensor, device)
-    slope = None
-    if material.slope_of is not None:
-        slope = np.stack([material.slope_of(t) for t in (pairs.first_t, pairs.second_t)], axis=1).astype(np.float32)
+    settings: PhotometricSettings = search.settings.photometric
+    pairs, tiles = gather_pairs(recording, search, settings)
+    space = search.whole.holding({n: x for n, x in search.best.items() if n not in search.whole.names})
+    # without a whole turn brightness need not come back to where it was
+    whole = abs(search.material.encoder.rpm) * (recording.events.t_last - recording.events.t_first) >= 60e6
+    excess = off_excess(pairs, with_leak="leak" in linear) if whole else 0.0
     brightness = BrightnessMap(
-        pairs,
-        tiles,
-        material.encoder,
-        sensor=settings.sensor,
-        slope=slope,
-        off_excess=off_excess(pairs),
-        device=device,
-    )
+        pairs, tiles, search.material.encoder, sensor=settings.sensor, slope=slopes_of(search, pairs),
+        off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
+        middle_us=space.middle_us, device=search.device,
+    )  # fmt: skip
     cost = _Cost(space, brightness, settings.steps)
-    v = space.to_vector(dict(start))
+    v = space.to_vector({**space.start, **search.best})
     cost.warm_up(v)
     left = check_pairs(recording.name, brightness.coverage(cost.scale), len(pairs))
-    at_start = -cost(v)
-    low, high = (np.clip(edge, v - FAR_PX, v + FAR_PX) for edge in space.bounds())
+    clusters = pairs.tile if len(tiles.origin) > 1 else pairs.x // 64 * 64 + pairs.y // 64
+    keep = determined(cost.slopes(v), clusters.astype(np.int64), space, left)
+    held = tuple(n for n in space.names if n not in keep)
+    # sharpness was free to move the others along with them, so they stay where it left them
+    cost.space = space = space.without(held).holding({n: x for n, x in search.best.items() if n in held})
+    v = space.to_vector({**space.start, **search.best})
+    if held:
+        cost.warm_up(v)
+    stage = _search(cost, v, settings, progress)
+    result = _conclude(cost, stage.x, v, clusters.astype(np.int64), left)
+    found = replace(
+        result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held,
+        off_over_on=1.0 + float(brightness.extra[1]), leak=float(brightness.extra[0]),
+    )  # fmt: skip
+    return found, StageSummary.of("photometric", stage, space)
+
+
+def limits(space: Space, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The box about the first stage's answer."""
+    far = np.array([math.inf if n in LATE else FAR_MOVING_PX if n in MOTION else FAR_PX for n in space.names])
+    low, high = space.bounds()
+    return np.clip(low, v - far, v + far), np.clip(high, v - far, v + far)
+
+
+def _search(cost: _Cost, v: NDArray[np.float64], settings: PhotometricSettings, progress: Progress | None) -> Stage:
+    low, high = limits(cost.space, v)
+
+    def tell(done: int, budget: int) -> None:
+        if progress is not None:
+            progress("photometric", done, budget)
 
     def score(at: NDArray[np.float64]) -> float:
-        if progress is not None:
-            progress("photometric", cost.evaluations, settings.evaluations)
+        tell(cost.evaluations, 2 * settings.evaluations)
         return cost(at)
 
-    def search(at: NDArray[np.float64], step: float) -> Stage:
+    if settings.algorithm == GAUSS_NEWTON:
+        return iterate(cost.settled, cost.slopes, v, low, high, settings.tolerance_px, tell)
+
+    def run(at: NDArray[np.float64], step: float) -> Stage:
         return maximise(
             score, settings.algorithm, low=low, high=high, start=at, evaluations=settings.evaluations,
             tolerance=settings.tolerance_px, step=step,
         )  # fmt: skip
 
-    stage = search(v, FIRST_STEP_PX)
+    stage = run(v, FIRST_STEP_PX)
     # the map lags the parameters while they move far: once more from near, with a better map
     cost.steps *= 2
-    stage = joined(stage, search(stage.x, POLISH_STEP_PX))
-    result = _conclude(cost, stage.x, v, at_start, start, pairs, left)
-    return result, StageSummary.of("photometric", stage, space)
+    return joined(stage, run(stage.x, POLISH_STEP_PX))
 
 
 def joined(first: Stage, second: Stage) -> Stage:
@@ -241,30 +341,31 @@ def _conclude(
     cost: _Cost,
     best: NDArray[np.float64],
     v: NDArray[np.float64],
-    at_start: float,
-    start: Mapping[str, float],
-    pairs: PairSet,
+    clusters: NDArray[np.int64],
     left: float,
 ) -> Photometric:
     """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`."""
     space = cost.space
+    # like with like: the map had longer by now than when the search began
+    at_start = float(cost.terms(cost.residuals(v, rounds=2)).mean())
     residuals = cost.residuals(best, rounds=2)
     final = float(cost.terms(residuals).mean())
-    covariance = _covariance(cost, best, pairs.tile) / left**2
-    moved = float(np.linalg.norm(best - v))
+    covariance = cost.slopes(best).covariance(clusters) / left**2
+    near = np.array([n not in (*LATE, *MOTION) for n in space.names])
+    moved = float(np.linalg.norm((best - v)[near]))
     accepted, verdict = _verdict(final, at_start, moved)
     return Photometric(
         accepted=accepted,
         verdict=verdict,
         parameters=space.to_values(best),
         uncertainty=space.deviations(best, covariance),
-        sharpness_parameters=dict(start),
+        sharpness_parameters={},
         moved_px=moved,
         cost=final,
         cost_at_sharpness=at_start,
         residual=float(np.nanmedian(np.abs(residuals))),
-        pairs=len(pairs),
-        off_over_on=1.0 + off_excess(pairs),
+        pairs=0,
+        off_over_on=1.0,
     )
 
 
@@ -279,33 +380,3 @@ def _verdict(cost: float, at_start: float, moved: float) -> tuple[bool, str]:
     if cost > at_start:
         return False, "no better than the answer of sharpness, which was kept"
     return True, f"one map explains the events ({100 * cost:.0f} % of the residual remains)"
-
-
-def _covariance(cost: _Cost, best: NDArray[np.float64], tile: NDArray[np.int32], h: float = 0.1) -> NDArray[np.float64]:
-    """Sandwich estimate [px²]: curvature of the cost, and the scatter of its slope from tile to tile.
-
-    Tiles have maps of their own, so their slopes are independent.
-    """
-    n = len(best)
-    tiles = np.unique(tile)
-    share = np.array([(tile == k).mean() for k in tiles])
-
-    def by_tile(v: NDArray[np.float64]) -> NDArray[np.float64]:
-        terms = cost.terms(cost.residuals(v))
-        return np.bincount(tile, weights=terms)[tiles] / np.bincount(tile)[tiles]
-
-    centre = by_tile(best)
-    up = [by_tile(best + step) for step in np.eye(n) * h]
-    down = [by_tile(best - step) for step in np.eye(n) * h]
-    slopes = np.array([(u - d) / (2.0 * h) for u, d in zip(up, down, strict=True)])
-    hessian = np.diag([float(share @ (u + d - 2.0 * centre)) / h**2 for u, d in zip(up, down, strict=True)])
-    for i in range(n):
-        for j in range(i):
-            both = np.eye(n)[i] * h + np.eye(n)[j] * h
-            value = by_tile(best + both) + by_tile(best - both) - up[i] - down[i] - up[j] - down[j] + 2.0 * centre
-            hessian[i, j] = hessian[j, i] = float(share @ value) / (2.0 * h**2)
-    weighted = slopes * share
-    scatter = (weighted - weighted.mean(axis=1, keepdims=True)) @ weighted.T * len(tiles) / max(1, len(tiles) - 1)
-    values, vectors = np.linalg.eigh(hessian)
-    inverse = vectors @ np.diag(1.0 / np.maximum(values, 1e-3 * max(float(values.max()), 1e-12))) @ vectors.T
-    return np.asarray(inverse @ scatter @ inverse)

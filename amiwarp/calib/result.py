@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.parameters import UNITS, build_model
+from amiwarp.calib.parameters import MOTION, UNITS, build_model, turning_of
 from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics import MODELS, FlatSide, Prism
+from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,7 +74,11 @@ class Photometric:
     """Median of the residuals' magnitudes [ON thresholds]."""
     pairs: int
     off_over_on: float
-    """Ratio of the OFF threshold to the ON threshold, counted."""
+    """Ratio of the OFF threshold to the ON threshold, counted, or solved for if it was freed."""
+    leak: float = 0.0
+    """Thresholds a second by which a pixel's reference drifts, where it was freed."""
+    held: tuple[str, ...] = ()
+    """Freed in vain: the events do not determine them, and they kept their start."""
 
 
 @dataclass(frozen=True)
@@ -103,17 +108,29 @@ class Calibration:
     """Where there was no encoder: the time on the events' clock at which the prism's angle is taken as 0."""
     photometric: Photometric | None = None
     """What the second stage found; None where it did not run."""
+    middle_us: int | None = None
+    """Where the camera's motion was free: the time for which its rates hold, on the events' clock."""
 
     @property
     def model(self) -> Model:
         """The calibrated model."""
         return build_model(self.model_name, self.camera, self.prism, self.parameters)
 
+    @property
+    def turning(self) -> Turning | None:
+        """The camera's own motion, about ``middle_us``; None where it was neither free nor given."""
+        if not any(n in self.parameters for n in MOTION):
+            return None
+        return turning_of(self.parameters, self.middle_us or 0)
+
     def encoder_for(self, encoder: Encoder | None, t_first: int, t_last: int) -> Encoder:
         """The recording's encoder with the clock offset that was found, or a constant speed where it has none.
 
-        Raises :class:`AmiwarpError` where there is neither an encoder nor a calibrated rpm.
+        Without a prism any angle will do. Raises :class:`AmiwarpError` where there is neither an encoder nor a
+        calibrated rpm.
         """
+        if self.parameters.get("apex", self.parameters.get("deflection")) == 0.0:
+            return constant_speed(0.0, t_first, t_last, t_first)
         if encoder is not None:
             return encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
         if "rpm" not in self.parameters or self.zero_us is None:
@@ -135,6 +152,7 @@ class Calibration:
                 "after": self.sharpness_after,
             },
             "zero_us": self.zero_us,
+            "middle_us": self.middle_us,
             "photometric": None if self.photometric is None else asdict(self.photometric),
             "events": self.events,
             "seconds": self.seconds,
@@ -200,10 +218,15 @@ class Calibration:
             seconds=data["seconds"],
             warnings=tuple(data["warnings"]),
             zero_us=None if data["zero_us"] is None else operator.index(data["zero_us"]),
-            photometric=None if data["photometric"] is None else Photometric(**data["photometric"]),
+            photometric=_photometric(data["photometric"]),
+            middle_us=None if data.get("middle_us") is None else operator.index(data["middle_us"]),
         )
         _ = replace(result, model_name="exact" if result.model_name == "ellipse" else result.model_name).model
         return result
+
+
+def _photometric(data: dict[str, Any] | None) -> Photometric | None:
+    return None if data is None else Photometric(**{**data, "held": tuple(data.get("held", ()))})
 
 
 def constant_speed(rpm: float, t_first: int, t_last: int, zero_us: int) -> Encoder:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib import checks
+from amiwarp.calib.gauss_newton import GAUSS_NEWTON
 from amiwarp.calib.objective import Objective
-from amiwarp.calib.parameters import UNITS
+from amiwarp.calib.parameters import LATE, MOTION, UNITS
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
@@ -74,7 +75,7 @@ class Settings:
         if self.global_algorithm is not None:
             check_algorithm(self.global_algorithm, GLOBAL_ALGORITHMS)
         check_algorithm(self.local_algorithm, LOCAL_ALGORITHMS)
-        check_algorithm(self.photometric.algorithm, LOCAL_ALGORITHMS)
+        check_algorithm(self.photometric.algorithm, (GAUSS_NEWTON, *LOCAL_ALGORITHMS))
         if self.stages not in (STAGES, STAGES[:1]):
             raise AmiwarpError(f"stages {self.stages} are not 'sharpness' or 'sharpness, photometric'")
         for name in ("global_evaluations", "local_evaluations", "events"):
@@ -99,7 +100,16 @@ class Material:
         return cls(events, encoder, encoder.angle_at(events.t), slope, slope_of)
 
     def every(self, step: int, first: int = 0) -> Material:
-        cut = slice(first, None, step)
+        return self._cut(slice(first, None, step))
+
+    def central(self, share: float) -> Material:
+        """The events within ``share`` of the time about its middle."""
+        t = self.events.t
+        middle, half = (int(t[0]) + int(t[-1])) / 2.0, share * (int(t[-1]) - int(t[0])) / 2.0
+        first, last = np.searchsorted(t, [middle - half, middle + half])
+        return self._cut(slice(int(first), int(last) + 1))
+
+    def _cut(self, cut: slice) -> Material:
         slope = None if self.slope is None else self.slope[cut]
         return replace(self, events=self.events[cut], theta=self.theta[cut], slope=slope)
 
@@ -110,7 +120,10 @@ class Search:
     def __init__(
         self, space: Space, material: Material, settings: Settings, device: Any, progress: Progress | None
     ) -> None:
-        self.space, self.material, self.settings, self.device = space, material, settings, device
+        # the whole space is the photometric stage's
+        self.whole = space
+        self.space = space.without(LATE) if "photometric" in settings.stages else space
+        self.material, self.settings, self.device = material, settings, device
         self.progress = progress
         self.stages: list[StageSummary] = []
         self.fine = self._objective(material, 1.0, settings.smoothing_px)
@@ -119,13 +132,15 @@ class Search:
         smoothing = max(1.0, self.settings.smoothing_px)
         return [self._objective(self.material.every(PARTS, k), 1.0, smoothing, kind) for k in range(PARTS)]
 
-    def _objective(self, m: Material, scale: float, smoothing: float, kind: Sharpness | None = None) -> Objective:
+    def _objective(
+        self, m: Material, scale: float, smoothing: float, kind: Sharpness | None = None, space: Space | None = None
+    ) -> Objective:
         s = self.settings
         kind = kind or s.sharpness
         if kind is Sharpness.PAPER_J:
             smoothing = 0.0  # the tails of a Gaussian are pixels with h > 0, each of which J would count
         return Objective(
-            self.space, m.events, m.theta, m.slope, kind=kind, smoothing=smoothing, scale=scale,
+            space or self.space, m.events, m.theta, m.slope, kind=kind, smoothing=smoothing, scale=scale,
             per_polarity=s.per_polarity, device=self.device,
         )  # fmt: skip
 
@@ -133,20 +148,40 @@ class Search:
         """Finds ``best``, its ``score``, and keeps the ``stages`` that led there."""
         starts = [self.space.to_vector(self.space.start)]
         if self.settings.global_algorithm is not None:
-            stage = self._run_global(self.settings.global_algorithm, starts[0])
-            starts = distinct_optima(stage, CANDIDATES)
-            self.stages.append(StageSummary.of("global", stage, self.space))
+            starts = self._run_global(self.settings.global_algorithm)
+        if self.space.moving:
+            starts = [self._follow(start) for start in starts]
         runs = [self._run_local(start) for start in starts]
         best = max(runs, key=lambda run: run.score)
         self.stages.extend(StageSummary.of("local", run, self.space) for run in runs)
         self.best, self.score = self.space.to_values(best.x), best.score
 
-    def _run_global(self, algorithm: str, start: NDArray[np.float64]) -> Stage:
-        s = self.settings
-        coarse = self._objective(
-            self.material.every(max(1, len(self.material.events) // (s.events // 5 + 1))), 0.5, 4.0
-        )
-        return self._maximise(coarse, algorithm, start, s.global_evaluations, step=1.0)
+    def _coarse(self, material: Material, space: Space) -> Objective:
+        step = max(1, len(material.events) // (self.settings.events // 5 + 1))
+        return self._objective(material.every(step), 0.5, 4.0, space=space)
+
+    def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
+        """Starts for the local search. The camera's motion stays at its start, unless it is all that is sought."""
+        space = self.space.without(MOTION)
+        if not space.names:
+            return [self.space.to_vector(self.space.start)]
+        start = space.to_vector(space.start)
+        objective = self._coarse(self.material, space)
+        stage = self._maximise(objective, algorithm, start, self.settings.global_evaluations, step=1.0)
+        self.stages.append(StageSummary.of("global", stage, space))
+        return [self.space.to_vector(space.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
+
+    def _follow(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A turning camera followed on the coarse image, through windows that grow about the middle where no prism
+        tells how it turns: a short window blurs less than the smoothing, whatever the speed."""
+        for share in (1.0,) if self.space.sized else (0.125, 0.25, 0.5, 1.0):
+            objective = self._coarse(self.material.central(share), self.space)
+            stage = self._maximise(
+                objective, self.settings.local_algorithm, start, self.settings.local_evaluations, step=2.0
+            )
+            start = stage.x
+            self.stages.append(StageSummary.of("local", stage, self.space))
+        return start
 
     def _run_local(self, start: NDArray[np.float64]) -> Stage:
         return self._maximise(
@@ -156,7 +191,7 @@ class Search:
     def _maximise(
         self, objective: Objective, algorithm: str, start: NDArray[np.float64], budget: int, step: float
     ) -> Stage:
-        low, high = self.space.bounds()
+        low, high = objective.space.bounds()
         name = "global" if algorithm.startswith("G") else "local"
 
         def score(v: NDArray[np.float64]) -> float:
@@ -174,17 +209,25 @@ class Search:
         """Refuses what chance could have made; returns warnings and standard deviations."""
         best = self.best
         parts = self._parts(self.settings.sharpness)
+        if self.space.sized:
+            self._check(best, parts, name)
+        v = self.space.to_vector(best)
+        covariance, warnings = scatter(parts, self.fine, v)
+        return self._at_bounds(best) + warnings, self.space.deviations(v, covariance)
+
+    def _check(self, best: dict[str, float], parts: list[Objective], name: str) -> None:
         # by variance, whatever the cost: the paper's J may like an image without motion best
         plain = parts if self.settings.sharpness is Sharpness.VARIANCE else self._parts(Sharpness.VARIANCE)
         points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
         sharp, turned, still = (np.array([part.values(values) for part in plain]) for values in points)
         checks.check_texture(sharp, turned, still, name)
-        image = self.fine.image(best).sum(axis=0)
+        checks.check_directions(self.image(), name)
+
+    def image(self) -> NDArray[np.float32]:
+        """The IWE at the answer, of the sensor's size, all polarities."""
+        image = self.fine.image(self.best).sum(axis=0)
         pad = (image.shape[1] - self.space.camera.width) // 2
-        checks.check_directions(image[pad:-pad, pad:-pad], name)
-        v = self.space.to_vector(best)
-        covariance, warnings = scatter(parts, self.fine, v)
-        return self._at_bounds(best) + warnings, self.space.deviations(v, covariance)
+        return np.asarray(image[pad:-pad, pad:-pad])
 
     def _at_bounds(self, best: dict[str, float]) -> tuple[str, ...]:
         s = self.space

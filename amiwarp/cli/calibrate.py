@@ -65,6 +65,10 @@ class SearchOptions:
         str | None,
         typer.Option(help="sharpness: without the photometric stage. Default: both.", rich_help_panel=_SEARCH),
     ] = None
+    photometric_algorithm: Annotated[
+        str | None,
+        typer.Option(help="gauss-newton (default), or NLopt's name, as LN_BOBYQA.", rich_help_panel=_SEARCH),
+    ] = None
     latency_us: Annotated[
         float, typer.Option(min=0.0, help="Known delay of the sensor's time stamps.", rich_help_panel=_SEARCH)
     ] = 0.0
@@ -74,8 +78,8 @@ class SearchOptions:
 
     def changes(self) -> dict[str, Any]:
         """Fields of the settings that were given."""
-        from amiwarp.brightness import Sensor
         from amiwarp.calib.photometric import PhotometricSettings
+        from amiwarp.pairs import Sensor
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
         if (given.get("global_algorithm") or "").lower() == "none":
@@ -83,7 +87,9 @@ class SearchOptions:
         if self.stages is not None:
             given["stages"] = tuple(name.strip() for name in self.stages.split(","))
         sensor = Sensor(given.pop("latency_us"), given.pop("refractory_us"))
-        return given | {"photometric": PhotometricSettings(sensor=sensor)}
+        algorithm = given.pop("photometric_algorithm", None)
+        photometric = PhotometricSettings(sensor=sensor)
+        return given | {"photometric": replace(photometric, algorithm=algorithm) if algorithm else photometric}
 
 
 @dataclass(frozen=True)
@@ -93,8 +99,9 @@ class ParameterOptions:
     free: Annotated[
         str | None,
         typer.Option(
-            help="Names separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, tilt_y, index. "
-            "Default: apex,phase, and rpm without an encoder.",
+            help="Names separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, tilt_y, index, "
+            "focal_length; motion (or rate_x, rate_y, rate_z) and change_x, change_y, change_z for a camera that "
+            "turns; off_ratio and leak of the sensor. Default: apex,phase, and rpm without an encoder.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None

@@ -17,13 +17,15 @@ EXAMPLE = "amiwarp demo --out amiwarp-demo"
 
 def run(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for recording, calibration and figure.")] = Path("amiwarp-demo"),
+    out: Annotated[Path, typer.Option(help="Folder for recording, calibration, picture and figure.")] = Path(
+        "amiwarp-demo"
+    ),
     picture: Annotated[Path | None, typer.Option(help="Your own picture. Default: a map of the earth.")] = None,
     size: Annotated[str, typer.Option(help="Pixels of the camera.", metavar="WIDTHxHEIGHT")] = "640x480",
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.5,
     common: Common,
 ) -> None:
-    """Simulate a recording of a picture, calibrate it without a guess, compensate it, draw it. Under a minute."""
+    """Simulate a recording, calibrate it without a guess, compensate it, reconstruct the picture. Under a minute."""
     began = time.perf_counter()
     device = choose_device(common.device)
     with progress("starting") as advance:
@@ -46,9 +48,11 @@ def lines(d: dict[str, Any]) -> list[Any]:
         ("phase error", f"{d['phase_error_deg']:+.3f} deg"),
         ("blur", f"{d['blur_before_px']:.2f} px before, {d['blur_after_px']:.2f} px after, "
                  f"{d['blur_with_truth_px']:.2f} px with the true prism"),
+        ("picture", f"correlation {d['picture_correlation']:.3f} with the original, "
+                    f"PSNR {d['picture_psnr_db']:.1f} dB, from one turn"),
         ("speed", f"simulated in {d['simulate_s']:.1f} s, calibrated in {d['calibrate_s']:.1f} s, "
-                  f"compensated at {d['compensate_mev_per_s']:.1f} Mev/s"),
-        *((name, path) for name, path in d["files"].items()),
+                  f"reconstructed in {d['reconstruct_s']:.1f} s, compensated at {d['compensate_mev_per_s']:.1f} Mev/s"),
+        *((f"{name} file", path) for name, path in d["files"].items()),
     ]  # fmt: skip
     notes = [f"note: {note}" for note in d["notes"]]
     return [table(rows), *notes, f"{d['events']:,} events, {d['seconds']:.1f} s in all on {d['device']}"]

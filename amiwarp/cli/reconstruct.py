@@ -16,6 +16,7 @@ from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.picture_files import CONTRAST, VIDEO, Tone, check_path, save_mask, save_picture, save_video
 from amiwarp.reconstruct import Fill
+from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
     from amiwarp.reconstruct import Picture, Reconstruction
@@ -45,7 +46,10 @@ class WindowOptions:
     ] = None
     omega: Annotated[
         str | None,
-        typer.Option(help="The camera's angular velocity about x, y, z (rad/s): 0,0.6,0.", rich_help_panel=_WINDOW),
+        typer.Option(
+            help="The camera's angular velocity about x, y, z (rad/s): 0,0.6,0. Default: what the calibration found.",
+            rich_help_panel=_WINDOW,
+        ),
     ] = None
 
     def span(self, work: Reconstruction) -> tuple[int, int]:
@@ -53,9 +57,12 @@ class WindowOptions:
         start = work.recording.events.t_first + round((self.start or 0.0) * 1e6)
         return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
 
-    def rotation(self) -> tuple[float, float, float]:
-        x, y, z = numbers(self.omega, 3, "--omega") if self.omega else (0.0, 0.0, 0.0)
-        return x, y, z
+    def turning(self) -> Turning | None:
+        """The camera's rotation where it was given."""
+        if self.omega is None:
+            return None
+        x, y, z = numbers(self.omega, 3, "--omega")
+        return Turning((x, y, z))
 
 
 @dataclass(frozen=True)
@@ -112,7 +119,7 @@ def run(
         raise AmiwarpError(f"{out}: --fps goes with a video; give a name that ends in {VIDEO}")
     device = choose_device(common.device)
     work = Reconstruction(
-        open_recording(recording), Calibration.load(calibration), omega=window.rotation(), fill=picture.fill,
+        open_recording(recording), Calibration.load(calibration), turning=window.turning(), fill=picture.fill,
         device=device,
     )  # fmt: skip
     start, length = window.span(work)

@@ -167,3 +167,25 @@ def pixels_to_rays(c: CameraParams, xy: wp.array(dtype=wp.vec2), start: int, ray
 def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), start: int, xy: wp.array(dtype=wp.vec2)):
     i = start + wp.tid()
     xy[i] = ray_to_pixel(c, rays[i])
+
+
+# -- the camera's own rotation
+
+
+@wp.struct
+class TurningParams:
+    """Angular velocity at time 0 [rad/s], and its change [rad/s²]."""
+
+    rate: wp.vec3
+    change: wp.vec3
+
+
+@wp.func
+def turn_back(camera: CameraParams, xy: wp.vec2, turning: TurningParams, time: float) -> wp.vec2:
+    """The pixel at time 0 of the scene point that is at ``xy`` at ``time`` [s]."""
+    rotation = turning.rate * time + turning.change * (0.5 * time * time)
+    angle = wp.length(rotation)
+    if angle < 1.0e-9:
+        return xy
+    ray = pixel_to_ray(camera, xy)
+    return ray_to_pixel(camera, wp.quat_rotate(wp.quat_from_axis_angle(rotation / angle, angle), ray))

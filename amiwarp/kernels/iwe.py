@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams
+from amiwarp.kernels.camera import CameraParams, TurningParams, turn_back
 from amiwarp.kernels.optics import MODEL_STRUCTS, azimuth, compensate
 
 wp.set_module_options({"enable_backward": False})
@@ -24,13 +24,15 @@ ENTROPY = wp.constant(4)
 
 @wp.struct
 class EventArrays:
-    """Events on a device. ``theta``: the encoder's angle [rad]; ``slope``: its change per unit of drift, or empty."""
+    """Events on a device. ``theta``: the encoder's angle [rad]; ``slope``: its change per unit of drift, or empty;
+    ``time``: from the window's middle [s], or empty where the camera does not turn."""
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
     p: wp.array(dtype=wp.uint8)
     theta: wp.array(dtype=float)
     slope: wp.array(dtype=float)
+    time: wp.array(dtype=float)
 
 
 @wp.struct
@@ -85,6 +87,7 @@ def vote_events(
     camera: CameraParams,
     events: EventArrays,
     drift: float,
+    turning: TurningParams,
     canvas: Canvas,
     start: int,
     image: wp.array3d(dtype=wp.int32),
@@ -95,6 +98,8 @@ def vote_events(
     if events.slope.shape[0] > 0:
         theta += drift * events.slope[i]
     xy = compensate(model, camera, wp.vec2(float(events.x[i]), float(events.y[i])), azimuth(model, theta))
+    if events.time.shape[0] > 0:
+        xy = turn_back(camera, xy, turning, events.time[i])
     if canvas.dither != 0:
         xy += somewhere_in_pixel(i)
     vote(canvas, xy, events.p[i], image)

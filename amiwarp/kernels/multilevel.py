@@ -6,7 +6,8 @@ near nodes, so brightness travels across the map only slowly where each node is 
 
 import warp as wp
 
-from amiwarp.kernels.photometric import Atlas, Geometry, Pairs, add_fixed, bilinear, fraction
+from amiwarp.kernels.descent import add_fixed
+from amiwarp.kernels.photometric import Atlas, Geometry, Pairs, bilinear, fraction
 from amiwarp.kernels.prior import Prior, prior_diagonal
 
 wp.set_module_options({"enable_backward": False})

@@ -9,15 +9,13 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.camera import CameraParams, TurningParams, turn_back
+from amiwarp.kernels.descent import add_fixed
 from amiwarp.kernels.optics import MODEL_STRUCTS, azimuth, compensate
-from amiwarp.kernels.prior import Prior, prior_diagonal, prior_product
 
 wp.set_module_options({"enable_backward": False})
 
-FIXED = wp.constant(wp.float64(4294967296.0))  # 2**32: unit of the sums
-SEGMENT = wp.constant(256)  # unknowns that one thread sums
-EXTRA = wp.constant(2)  # unknowns behind the map: OFF threshold, leak
+EXTRA = wp.constant(2)  # unknowns behind the map: leak, OFF threshold
 # What a pair's ``on`` may hold: bit 0, the polarity; bit 1, no event at the second time; bit 2, none at the first.
 ON = wp.constant(wp.uint8(1))
 QUIET = wp.constant(wp.uint8(2))
@@ -59,16 +57,6 @@ class Geometry:
 
 
 @wp.func
-def turn_back(camera: CameraParams, xy: wp.vec2, rotation: wp.vec3) -> wp.vec2:
-    """The pixel that the scene point at ``xy`` has once the camera's rotation since the middle is taken back."""
-    angle = wp.length(rotation)
-    if angle < 1.0e-9:
-        return xy
-    ray = pixel_to_ray(camera, xy)
-    return ray_to_pixel(camera, wp.quat_rotate(wp.quat_from_axis_angle(rotation / angle, angle), ray))
-
-
-@wp.func
 def node_of(atlas: Atlas, tile: int, xy: wp.vec2) -> wp.vec2:
     return (xy - atlas.origin[tile]) * atlas.density
 
@@ -87,6 +75,33 @@ def fraction(node: wp.vec2) -> wp.vec2:
     return wp.vec2(node[0] - wp.floor(node[0]), node[1] - wp.floor(node[1]))
 
 
+@wp.func
+def place_of(
+    model: Any, camera: CameraParams, turning: TurningParams, pairs: Pairs, drift: float, i: int, k: int
+) -> wp.vec2:
+    """Compensated place of the first (k = 0) or second event of a pair [px]."""
+    theta = pairs.theta[i][k] + pairs.slope[i][k] * drift
+    xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), azimuth(model, theta))
+    return turn_back(camera, xy, turning, pairs.time[i][k])
+
+
+@wp.kernel
+def find_places(
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    drift: float,
+    turning: TurningParams,
+    start: int,
+    places: wp.array(dtype=wp.vec4),
+):
+    """Compensated places of both events of a pair [px]."""
+    i = start + wp.tid()
+    a = place_of(model, camera, turning, pairs, drift, i, 0)
+    b = place_of(model, camera, turning, pairs, drift, i, 1)
+    places[i] = wp.vec4(a[0], a[1], b[0], b[1])
+
+
 @wp.kernel
 def place_pairs(
     model: Any,
@@ -94,18 +109,14 @@ def place_pairs(
     pairs: Pairs,
     atlas: Atlas,
     drift: float,
-    omega: wp.vec3,
+    turning: TurningParams,
     start: int,
     geometry: Geometry,
 ):
     """Compensated places of both events of a pair, on the map."""
     i = start + wp.tid()
-    xy = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
-    theta = pairs.theta[i] + pairs.slope[i] * drift
-    a = compensate(model, camera, xy, azimuth(model, theta[0]))
-    b = compensate(model, camera, xy, azimuth(model, theta[1]))
-    a = node_of(atlas, pairs.tile[i], turn_back(camera, a, omega * pairs.time[i][0]))
-    b = node_of(atlas, pairs.tile[i], turn_back(camera, b, omega * pairs.time[i][1]))
+    a = node_of(atlas, pairs.tile[i], place_of(model, camera, turning, pairs, drift, i, 0))
+    b = node_of(atlas, pairs.tile[i], place_of(model, camera, turning, pairs, drift, i, 1))
     cell = wp.vec2i(cell_of(atlas, pairs.tile[i], a), cell_of(atlas, pairs.tile[i], b))
     if cell[0] < 0 or cell[1] < 0:
         cell = wp.vec2i(-1, -1)
@@ -127,11 +138,6 @@ def look_up(image: wp.array(dtype=float), cell: int, columns: int, w: wp.vec4) -
 
 
 @wp.func
-def add_fixed(sums: wp.array(dtype=wp.int64), i: int, value: float):
-    wp.atomic_add(sums, i, wp.int64(wp.float64(value) * FIXED))
-
-
-@wp.func
 def spread(sums: wp.array(dtype=wp.int64), cell: int, columns: int, w: wp.vec4, value: float):
     """The reverse of :func:`look_up`."""
     add_fixed(sums, cell, w[0] * value)
@@ -147,9 +153,9 @@ def difference(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, g: Geom
     extra = image.shape[0] - EXTRA
     value = look_up(image, cell[1], atlas.columns, bilinear(g.second[i]))
     value -= look_up(image, cell[0], atlas.columns, bilinear(g.first[i]))
-    value += atlas.with_leak * image[extra + 1] * (pairs.time[i][1] - pairs.time[i][0])
+    value += atlas.with_leak * image[extra] * (pairs.time[i][1] - pairs.time[i][0])
     if is_off(pairs, i):
-        value += atlas.with_off * image[extra]
+        value += atlas.with_off * image[extra + 1]
     return value
 
 
@@ -174,9 +180,9 @@ def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g:
     spread(sums, cell[1], atlas.columns, bilinear(g.second[i]), value)
     spread(sums, cell[0], atlas.columns, bilinear(g.first[i]), -value)
     if atlas.with_leak > 0.0:
-        add_fixed(sums, extra + 1, value * (pairs.time[i][1] - pairs.time[i][0]))
+        add_fixed(sums, extra, value * (pairs.time[i][1] - pairs.time[i][0]))
     if atlas.with_off > 0.0 and is_off(pairs, i):
-        add_fixed(sums, extra, value)
+        add_fixed(sums, extra + 1, value)
 
 
 @wp.kernel
@@ -197,20 +203,36 @@ def apply_normal(
 
 
 @wp.kernel
-def apply_residual(
+def apply_transpose(
     pairs: Pairs,
     atlas: Atlas,
     geometry: Geometry,
     weight: wp.array(dtype=float),
-    vector: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """sums += Aᵀ W (b - A vector)."""
+    """sums += Aᵀ W residual."""
     i = start + wp.tid()
     if geometry.cell[i][0] >= 0:
-        value = weight[i] * (right_side(pairs, i) - difference(vector, atlas, pairs, geometry, i))
-        transpose_add(sums, atlas, pairs, geometry, i, value)
+        transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
+
+
+@wp.kernel
+def subtract(
+    pairs: Pairs,
+    atlas: Atlas,
+    geometry: Geometry,
+    vector: wp.array(dtype=float),
+    start: int,
+    residual: wp.array(dtype=float),
+):
+    """residual -= A vector; 0 for a pair that is not on the map."""
+    i = start + wp.tid()
+    if geometry.cell[i][0] >= 0:
+        residual[i] = residual[i] - difference(vector, atlas, pairs, geometry, i)
+    else:
+        residual[i] = 0.0
 
 
 @wp.func
@@ -235,9 +257,9 @@ def add_diagonal(
         spread(sums, cell[1], atlas.columns, square(bilinear(geometry.second[i])), weight[i])
         spread(sums, cell[0], atlas.columns, square(bilinear(geometry.first[i])), weight[i])
         gap = pairs.time[i][1] - pairs.time[i][0]
-        add_fixed(sums, extra + 1, atlas.with_leak * weight[i] * gap * gap)
+        add_fixed(sums, extra, atlas.with_leak * weight[i] * gap * gap)
         if is_off(pairs, i):
-            add_fixed(sums, extra, atlas.with_off * weight[i])
+            add_fixed(sums, extra + 1, atlas.with_off * weight[i])
 
 
 @wp.kernel
@@ -264,113 +286,6 @@ def weigh(
             weight[i] = 1.0 / (1.0 + (r / scale) * (r / scale))
 
 
-# -- conjugate gradients over the unknowns; every thread sums SEGMENT of them, in order
-
-
-@wp.func
-def gathered(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
-    """Total over the slices, which are cleared for the next pass."""
-    total = wp.int64(0)
-    for k in range(sums.shape[0]):
-        total += sums[k, i]
-        sums[k, i] = wp.int64(0)
-    return float(wp.float64(total) / FIXED)
-
-
-@wp.kernel
-def gather(sums: wp.array2d(dtype=wp.int64), start: int, out: wp.array(dtype=float)):
-    i = start + wp.tid()
-    out[i] = gathered(sums, i)
-
-
-@wp.kernel
-def start_descent(
-    prior: Prior,
-    diagonal: wp.array(dtype=float),
-    image: wp.array(dtype=float),
-    residual: wp.array(dtype=float),
-    direction: wp.array(dtype=float),
-    start: int,
-    partial: wp.array(dtype=wp.float64),
-):
-    """r = Aᵀ W (b - A x) - prior x; the first direction is r over the diagonal; partial sums of r·z."""
-    segment = start + wp.tid()
-    total = wp.float64(0.0)
-    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, image.shape[0])):
-        r = residual[i] - prior_product(prior, image, i)
-        z = r / (diagonal[i] + prior_diagonal(prior, i))
-        residual[i] = r
-        direction[i] = z
-        total += wp.float64(r) * wp.float64(z)
-    partial[segment] = total
-
-
-@wp.kernel
-def finish_product(
-    sums: wp.array2d(dtype=wp.int64),
-    prior: Prior,
-    direction: wp.array(dtype=float),
-    product: wp.array(dtype=float),
-    start: int,
-    partial: wp.array(dtype=wp.float64),
-):
-    """q = (Aᵀ W A + prior) p from the sums; partial sums of p·q."""
-    segment = start + wp.tid()
-    total = wp.float64(0.0)
-    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, direction.shape[0])):
-        q = gathered(sums, i) + prior_product(prior, direction, i)
-        product[i] = q
-        total += wp.float64(direction[i]) * wp.float64(q)
-    partial[segment] = total
-
-
-@wp.kernel
-def descend(
-    prior: Prior,
-    scalars: wp.array(dtype=wp.float64),
-    diagonal: wp.array(dtype=float),
-    direction: wp.array(dtype=float),
-    product: wp.array(dtype=float),
-    residual: wp.array(dtype=float),
-    start: int,
-    image: wp.array(dtype=float),
-    partial: wp.array(dtype=wp.float64),
-):
-    """x += a p, r -= a q with a = (r·z)/(p·q); partial sums of the new r·z."""
-    segment = start + wp.tid()
-    step = float(scalars[0] / wp.max(scalars[1], wp.float64(1.0e-30)))
-    total = wp.float64(0.0)
-    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, image.shape[0])):
-        image[i] = image[i] + step * direction[i]
-        r = residual[i] - step * product[i]
-        residual[i] = r
-        total += wp.float64(r) * wp.float64(r / (diagonal[i] + prior_diagonal(prior, i)))
-    partial[segment] = total
-
-
-@wp.kernel
-def turn(
-    prior: Prior,
-    scalars: wp.array(dtype=wp.float64),
-    diagonal: wp.array(dtype=float),
-    residual: wp.array(dtype=float),
-    start: int,
-    direction: wp.array(dtype=float),
-):
-    """p = z + b p with b = new r·z / old r·z."""
-    i = start + wp.tid()
-    ratio = float(scalars[2] / wp.max(scalars[0], wp.float64(1.0e-30)))
-    direction[i] = residual[i] / (diagonal[i] + prior_diagonal(prior, i)) + ratio * direction[i]
-
-
-@wp.kernel
-def sum_partial(partial: wp.array(dtype=wp.float64), at: int, scalars: wp.array(dtype=wp.float64)):
-    """Total of the partial sums, in order, into ``scalars[at]``; at 0 the last r·z moves up first."""
-    total = wp.float64(0.0)
-    for i in range(partial.shape[0]):
-        total += partial[i]
-    scalars[at] = total
-
-
 for _struct in MODEL_STRUCTS:
     wp.overload(place_pairs, {"model": _struct})
+    wp.overload(find_places, {"model": _struct})

@@ -1,0 +1,239 @@
+"""Calibration while the camera turns, and the scenes that it must not be fooled by."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import TRUE_PRISM
+from numpy.typing import NDArray
+
+from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.calibrate import thin
+from amiwarp.calib.panning import estimate_rates
+from amiwarp.calib.parameters import RATES
+from amiwarp.calib.photometric import PhotometricSettings
+from amiwarp.camera import Camera
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Recording
+from amiwarp.io import open_recording
+from amiwarp.io.text import read_calib
+from amiwarp.iwe import iwe
+from amiwarp.metrics import model_error, truth_model
+from amiwarp.motion import CameraMotion
+from amiwarp.optics import FlatSide
+from amiwarp.pairs import Sensor
+from amiwarp.pictures import linear_luminance
+from amiwarp.reconstruct import reconstruct
+from amiwarp.simulate import Scene, SensorModel, Simulation, simulate
+from amiwarp.turning import Turning
+
+CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
+KNOWN = PhotometricSettings(sensor=Sensor(latency_us=100.0, refractory_us=100.0))
+FREE = ("apex", "phase", "motion")
+
+
+def turned(texture: NDArray[np.uint8], rates: Any, **extra: Any) -> Recording:
+    """A little over two turns of the prism in front of the texture, the camera turning."""
+    return simulate(
+        texture, CAMERA, TRUE_PRISM, duration_s=0.18, camera_motion=CameraMotion(rates), seed=4,
+        nominal_prism=replace(TRUE_PRISM, apex=1.2 * TRUE_PRISM.apex), **extra,
+    )  # fmt: skip
+
+
+def error_px(c: Calibration, recording: Recording) -> float:
+    assert recording.camera is not None
+    assert recording.truth is not None
+    return model_error(c.model, truth_model(recording.camera, recording.truth, FlatSide.SCENE)).rms
+
+
+def rates_of(c: Calibration) -> NDArray[np.float64]:
+    return np.array([c.parameters[n] for n in RATES])
+
+
+@pytest.mark.parametrize(("axis", "speed"), [(0, 60.0), (1, 10.0), (2, 30.0)])
+def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -> None:
+    rate = np.eye(3)[axis] * math.radians(speed)
+    recording = turned(texture, tuple(rate))
+    c = calibrate(recording, free=FREE, photometric=KNOWN)
+    assert c.photometric is not None
+    assert c.photometric.accepted
+    assert np.linalg.norm(rates_of(c) - rate) <= 0.02 * np.linalg.norm(rate)
+    assert error_px(c, recording) <= 0.05
+    assert c.turning == Turning(tuple(rates_of(c).tolist()), middle_us=c.middle_us or 0)
+
+
+def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8], tmp_path: Path) -> None:
+    """Rates linear in time: the change is found, survives the file, and the reconstruction turns with it."""
+    simulation = Simulation(
+        Scene.from_picture(texture), CAMERA, TRUE_PRISM, 0.18, seed=4,
+        camera_motion=CameraMotion([[0.0, 0.0, 0.2, 0.0], [0.2, 0.0, 1.2, 0.0]]),
+    )  # fmt: skip
+    recording = simulation.run()
+    c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN)
+    assert c.parameters["change_y"] == pytest.approx(5.0, rel=0.05)
+    assert c.turning is not None
+    assert c.turning.about(0).rate[1] == pytest.approx(0.2, abs=0.02)
+    assert error_px(c, recording) <= 0.05
+    c.save(tmp_path / "c.json")
+    loaded = Calibration.load(tmp_path / "c.json")
+    assert loaded == c
+    following, still = (
+        reconstruct(recording, loaded, start_us=0, turns=1.0, turning=turning) for turning in (None, Turning())
+    )
+    assert following.residual < 0.3 * still.residual
+
+
+def test_a_still_camera_is_found_to_be_still(recording: Recording) -> None:
+    assert recording.encoder is not None
+    assert recording.camera is not None
+    rates = estimate_rates(thin(recording, 400_000), recording.encoder, recording.camera)
+    assert np.abs(rates).max() < math.radians(1.0)
+
+
+def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording) -> None:
+    """At constant speed a clock offset is a phase."""
+    c = calibrate(recording, free=("apex", "phase", "clock_offset"), photometric=KNOWN)
+    assert c.photometric is not None
+    assert c.photometric.held == ("clock_offset",)
+    assert "clock_offset" not in c.photometric.uncertainty
+    assert any("clock_offset" in warning for warning in c.warnings)
+    assert error_px(c, recording) < 0.02
+
+
+def test_index_and_focal_length(recording: Recording) -> None:
+    """They and the apex make nearly the same motion, but not quite."""
+    c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN)
+    assert c.photometric is not None
+    assert c.photometric.accepted
+    assert error_px(c, recording) < 0.02
+    assert recording.camera is not None
+    for name, true in (("index", TRUE_PRISM.index), ("focal_length", recording.camera.fx)):
+        if name not in c.photometric.held:
+            assert c.parameters[name] == pytest.approx(true, abs=6.0 * c.uncertainty[name])
+
+
+def test_linear_unknowns(texture: NDArray[np.uint8]) -> None:
+    """A strong leak is found, and freeing it or the thresholds' ratio costs no accuracy to speak of."""
+    sensor = SensorModel(contrast_on=0.22, contrast_off=0.28, leak_hz=20.0)
+    recording = simulate(texture, CAMERA, TRUE_PRISM, duration_s=0.25, sensor=sensor, seed=5)
+    for free in (("leak",), ("off_ratio", "leak")):
+        c = calibrate(recording, free=("apex", "phase", *free), photometric=KNOWN, events=200_000)
+        assert c.photometric is not None
+        assert c.photometric.accepted
+        assert c.photometric.leak == pytest.approx(20.0, abs=5.0)
+        assert 1.0 < c.photometric.off_over_on < 1.4  # 1.27
+        assert error_px(c, recording) < 0.03
+
+
+@pytest.mark.parametrize(("name", "gain"), [("shapes_rotation", 2.99), ("dynamic_rotation", 2.06)])
+def test_real_recordings_from_zero(data_dir: Path, name: str, gain: float) -> None:
+    """No prism: both stages find the camera's rotation, and their images are at least as sharp as motion.txt's."""
+    folder = data_dir / "text" / name
+    recording = open_recording(folder / "events.txt")
+    width, height = recording.events.size
+    recording = replace(recording, camera=read_calib(folder / "calib.txt", width, height))
+    c = calibrate(recording, free=("motion",), start={"apex": 0.0})
+    assert c.photometric is not None
+    assert c.photometric.accepted
+    assert c.middle_us is not None
+    sharp, photometric = (
+        np.array([values[n] for n in RATES]) for values in (c.photometric.sharpness_parameters, c.parameters)
+    )
+    assert np.linalg.norm(photometric) == pytest.approx(np.linalg.norm(sharp), rel=0.05)
+    given = np.loadtxt(folder / "motion.txt").ravel()[-3:]
+    assert np.linalg.norm(photometric) == pytest.approx(np.linalg.norm(given), rel=0.2)
+    events = recording.events.slice(0, len(recording.events))
+    encoder = c.encoder_for(None, recording.events.t_first, recording.events.t_last)
+
+    def variance(rates: NDArray[np.float64]) -> float:
+        x, y, z = rates.tolist()
+        turning = Turning((x, y, z), middle_us=c.middle_us or 0)
+        return float(iwe(events, width, height, model=c.model, encoder=encoder, turning=turning).var())
+
+    still = variance(np.zeros(3))
+    for rates in (sharp, photometric):
+        assert variance(rates) / still >= gain
+        assert variance(rates) > variance(given)
+    assert reconstruct(recording, c, length_us=recording.events.t_last - recording.events.t_first).residual < 0.3
+
+
+# -- scenes that break the equations: the answer is refused, or that of sharpness with a reason, never worse in silence
+
+
+@dataclass(frozen=True)
+class Film:
+    """A picture a millisecond, made when it is read."""
+
+    picture: Callable[[float], NDArray[Any]]
+    seconds: float
+
+    @property
+    def size(self) -> tuple[int, int]:
+        height, width = self.picture(0.0).shape
+        return width, height
+
+    @property
+    def interval_us(self) -> float:
+        return 1000.0
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        for k in range(round(self.seconds * 1e3) + 1):
+            yield 1000 * k, linear_luminance(self.picture(k * 1e-3))
+
+
+def outcome(film: Film) -> tuple[Recording, Calibration | None]:
+    recording = Simulation(Scene(film), CAMERA, TRUE_PRISM, film.seconds, seed=6).run()
+    try:
+        return recording, calibrate(recording, photometric=KNOWN)
+    except AmiwarpError:
+        return recording, None
+
+
+def check_honest(recording: Recording, c: Calibration | None) -> None:
+    """Refused; or the answer of sharpness, said to be so; or better than it."""
+    if c is None:
+        return
+    if c.photometric is None or not c.photometric.accepted:
+        assert any("photometric" in warning for warning in c.warnings)
+        return
+    before = replace(c, parameters=c.photometric.sharpness_parameters)
+    assert error_px(c, recording) <= error_px(before, recording)
+
+
+def test_flickering_light(texture: NDArray[np.uint8]) -> None:
+    """A lamp on the mains: all of the scene to 40 % and back, 100 times a second."""
+
+    def picture(t: float) -> NDArray[np.float32]:
+        light = np.float32(0.7 + 0.3 * math.cos(math.tau * 100.0 * t))
+        return linear_luminance(texture) * light
+
+    recording, c = outcome(Film(picture, 0.25))
+    assert c is None or c.photometric is None or not c.photometric.accepted
+    check_honest(recording, c)
+
+
+def test_an_object_moves_through(texture: NDArray[np.uint8]) -> None:
+    """A third of the image moves on its own, 400 px a second."""
+
+    def picture(t: float) -> NDArray[np.uint8]:
+        out = texture.copy()
+        rows = slice(60, 180)
+        out[rows] = np.roll(texture[rows][:, ::-1], round(400.0 * t), axis=1)
+        return out
+
+    recording, c = outcome(Film(picture, 0.25))
+    check_honest(recording, c)
+
+
+def test_blank_scene() -> None:
+    grey = np.full((60, 80), 128, np.uint8)
+    recording = simulate(grey, CAMERA, TRUE_PRISM, duration_s=0.25, seed=6)
+    with pytest.raises(AmiwarpError, match=r"events are too few|sharper than chance"):
+        calibrate(recording)
+    noisy = simulate(grey, CAMERA, TRUE_PRISM, duration_s=0.25, seed=6, sensor=SensorModel(shot_noise_hz=50.0))
+    with pytest.raises(AmiwarpError, match="sharper than chance"):
+        calibrate(noisy)
