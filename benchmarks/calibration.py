@@ -212,10 +212,10 @@ KNOWN = PhotometricSettings(sensor=Sensor(MISMATCHED.latency_us, MISMATCHED.refr
 
 def run_moving(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     camera = Camera.from_fov(640, 480, math.radians(60.0))
-    for name in ("china.jpg", "brick.png", "astronaut.png"):
+    for name in args.pictures:
         scene = Scene.from_picture(args.folder / name)
         for axis in range(3):
-            for speed in (2.0, 10.0, 30.0, 60.0):
+            for speed in args.speeds:
                 rate = np.eye(3)[axis] * math.radians(speed)
                 recording = simulated(
                     scene, camera, 1.0, axis, 0.18, args.device, every=1, sensor=MISMATCHED,
@@ -367,6 +367,8 @@ def main() -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--apex", type=float, nargs="+", default=list(APEXES_DEG))
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--pictures", nargs="+", default=["china.jpg", "brick.png", "astronaut.png"], help="moving")
+    parser.add_argument("--speeds", type=float, nargs="+", default=[2.0, 10.0, 30.0, 60.0], help="moving [deg/s]")
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--limit-s", type=float, default=math.inf, help="start no new row after so many seconds")
     args = parser.parse_args()

@@ -17,6 +17,7 @@ from amiwarp.calib.panning import estimate_rates
 from amiwarp.calib.parameters import RATES
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.camera import Camera
+from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io import open_recording
@@ -95,7 +96,9 @@ def test_a_still_camera_is_found_to_be_still(recording: Recording) -> None:
 
 
 def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording) -> None:
-    """At constant speed a clock offset is a phase."""
+    """At constant speed a clock offset is a phase; this encoder has no counts whose steps would tell them apart."""
+    even = Encoder.constant_speed(720.0, recording.events.t_first, recording.events.t_last)
+    recording = replace(recording, encoder=even)
     c = calibrate(recording, free=("apex", "phase", "clock_offset"), photometric=KNOWN)
     assert c.photometric is not None
     assert c.photometric.held == ("clock_offset",)

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 ANGLES = 24
 """Ranges of prism angles in a turn."""
-PARTS = (4, 3)
+PARTS = (6, 5)
 """Of the image, along x and y."""
 SMOOTHING_PX = 2.0
-PEAKS, BEST = 3, 4
+PEAKS, BEST = 3, 12
 """Looked at in each part; followed to the top."""
-ROLLS = (-24.0, -12.0, 0.0, 12.0, 24.0)
+ROLLS = tuple(range(-60, 61, 12))
 """Turning about the optical axis that is tried with each [1/f in a turn]."""
 
 

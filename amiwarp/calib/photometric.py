@@ -48,7 +48,7 @@ FAR_PX, FAR_MOVING_PX = 1.0, 4.0
 """The stage looks no further from the sharpness optimum than this; than the latter in the camera's motion."""
 FIRST_STEP_PX = 0.2
 POLISH_STEP_PX = 0.05
-SLOPE_PX = 0.05
+SLOPE_PX = 0.02
 """Of the differences that give the residuals' slopes [px]."""
 LARGEST_COST = 0.35
 """Of the cost with no map at all: above it the equations do not hold, and the scene or camera moved unmodelled."""
@@ -164,10 +164,9 @@ def gather_pairs(recording: Recording, search: Search, settings: PhotometricSett
     else:
         tile_of, tiles = choose_tiles(search.image(), settings.density, margin)
     gatherer = _Gatherer(recording, search, tile_of, settings.sensor)
-    if search.whole.moving:
-        return gatherer.between(first, last + 1), tiles
-    parts: list[PairSet] = []
-    for k in _spread(turns):
+    # the two turns of a camera that moves belong together
+    parts = [gatherer.between(first, last + 1)] if search.whole.moving else []
+    for k in () if search.whole.moving else _spread(turns):
         start = first + int(k * turn)
         parts.append(gatherer.between(start, start + int(turn)))
         if len(parts) >= FEWEST_TURNS and sum(map(len, parts)) >= settings.pairs:
