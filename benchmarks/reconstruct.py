@@ -220,7 +220,7 @@ def rows(picture: Path, device: str, shown: dict[str, dict[str, NDArray[np.float
         for turns in windows:
             row, pictures = seen.row(turns)
             if contrast == 0.25 and share == SHOWN:
-                line = shown.setdefault(picture.stem, {"truth": pictures["truth"]})
+                line = shown.setdefault(picture.stem, {})
                 line[f"{turns:g} turn{'s' * (turns > 1)}"] = pictures["amiwarp"]
                 if turns == 1.0:
                     line |= {title: pictures[name] for name, title in PEERS.items()}

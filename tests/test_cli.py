@@ -365,6 +365,17 @@ def test_wrong_usage_is_exit_2_and_one_line(place: Path, args: tuple[str, ...]) 
     assert left_behind(place) == set()
 
 
+def test_a_turning_camera_without_a_prism(place: Path, data_dir: Path) -> None:
+    """From an ordinary event recording to its picture, the camera's motion found on the way."""
+    events = str(data_dir / "text" / "dynamic_rotation" / "events.txt")
+    args = ["--free", "motion", "--start", "apex=0deg", "--start", "rate_y=20deg/s", "--bound", "rate_z=-1rad/s:1rad/s"]
+    found = ok("calibrate", events, "moving.json", *args, "--photometric-algorithm", "LN_BOBYQA")
+    assert found["parameters"]["rate_y"]["value"] == pytest.approx(2.0, rel=0.05)
+    assert found["parameters"]["rate_y"]["unit"] == "rad/s"
+    picture = ok("reconstruct", events, "moving.png", "--calibration", "moving.json", "--length", "0.02")
+    assert picture["residual"] < 0.3
+
+
 @pytest.mark.parametrize("command", ["simulate", "calibrate"])
 def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
     args = {
@@ -444,13 +455,16 @@ def test_stdout_of_a_process_is_json_alone(place: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "unit", "value"),
     [("90deg", "rad", np.pi / 2), ("1.5 rad", "rad", 1.5), ("-0.25ms", "us", -250.0), ("30", "us", 30.0),
-     ("720rpm", "1/min", 720.0), ("-720", "1/min", -720.0), ("1.5", "1", 1.5)],
+     ("720rpm", "1/min", 720.0), ("90deg/s", "rad/s", np.pi / 2),
+     ("2rad/s2", "rad/s2", 2.0), ("554", "px", 554.0), ("-720", "1/min", -720.0), ("1.5", "1", 1.5)],
 )  # fmt: skip
 def test_numbers_with_units(text: str, unit: str, value: float) -> None:
     assert number(text, unit, "x") == pytest.approx(value, abs=1e-12)
 
 
-@pytest.mark.parametrize(("text", "unit"), [("1", "rad"), ("1rpm", "rad"), ("nan", "1"), ("", "us"), ("infdeg", "rad")])
+@pytest.mark.parametrize(
+    ("text", "unit"), [("1", "rad"), ("1", "rad/s"), ("1rpm", "rad"), ("nan", "1"), ("", "us"), ("infdeg", "rad")]
+)
 def test_numbers_without_sense(text: str, unit: str) -> None:
     with pytest.raises(AmiwarpError, match="not a value"):
         number(text, unit, "x")

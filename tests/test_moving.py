@@ -59,7 +59,7 @@ def rates_of(c: Calibration) -> NDArray[np.float64]:
 def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -> None:
     rate = np.eye(3)[axis] * math.radians(speed)
     recording = turned(texture, tuple(rate))
-    c = calibrate(recording, free=FREE, photometric=KNOWN)
+    c = calibrate(recording, free=FREE, photometric=KNOWN, events=200_000)
     assert c.photometric is not None
     assert c.photometric.accepted
     assert np.linalg.norm(rates_of(c) - rate) <= 0.02 * np.linalg.norm(rate)
@@ -74,7 +74,7 @@ def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8]
         camera_motion=CameraMotion([[0.0, 0.0, 0.2, 0.0], [0.2, 0.0, 1.2, 0.0]]),
     )  # fmt: skip
     recording = simulation.run()
-    c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN)
+    c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN, events=200_000)
     assert c.parameters["change_y"] == pytest.approx(5.0, rel=0.05)
     assert c.turning is not None
     assert c.turning.about(0).rate[1] == pytest.approx(0.2, abs=0.02)
@@ -99,7 +99,7 @@ def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording
     """At constant speed a clock offset is a phase; this encoder has no counts whose steps would tell them apart."""
     even = Encoder.constant_speed(720.0, recording.events.t_first, recording.events.t_last)
     recording = replace(recording, encoder=even)
-    c = calibrate(recording, free=("apex", "phase", "clock_offset"), photometric=KNOWN)
+    c = calibrate(recording, free=("apex", "phase", "clock_offset"), photometric=KNOWN, events=200_000)
     assert c.photometric is not None
     assert c.photometric.held == ("clock_offset",)
     assert "clock_offset" not in c.photometric.uncertainty
@@ -109,7 +109,7 @@ def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording
 
 def test_index_and_focal_length(recording: Recording) -> None:
     """They and the apex make nearly the same motion, but not quite."""
-    c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN)
+    c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN, events=200_000)
     assert c.photometric is not None
     assert c.photometric.accepted
     assert error_px(c, recording) < 0.02
@@ -191,7 +191,7 @@ class Film:
 def outcome(film: Film) -> tuple[Recording, Calibration | None]:
     recording = Simulation(Scene(film), CAMERA, TRUE_PRISM, film.seconds, seed=6).run()
     try:
-        return recording, calibrate(recording, photometric=KNOWN)
+        return recording, calibrate(recording, photometric=KNOWN, events=200_000)
     except AmiwarpError:
         return recording, None
 

@@ -350,16 +350,16 @@ def _conclude(
     residuals = cost.residuals(best, rounds=2)
     final = float(cost.terms(residuals).mean())
     covariance = cost.slopes(best).covariance(clusters) / left**2
+    asked = np.array([n not in LATE for n in space.names])
     near = np.array([n not in (*LATE, *MOTION) for n in space.names])
-    moved = float(np.linalg.norm((best - v)[near]))
-    accepted, verdict = _verdict(final, at_start, moved)
+    accepted, verdict = _verdict(final, at_start, float(np.linalg.norm((best - v)[near])))
     return Photometric(
         accepted=accepted,
         verdict=verdict,
         parameters=space.to_values(best),
         uncertainty=space.deviations(best, covariance),
         sharpness_parameters={},
-        moved_px=moved,
+        moved_px=float(np.linalg.norm((best - v)[asked])),
         cost=final,
         cost_at_sharpness=at_start,
         residual=float(np.nanmedian(np.abs(residuals))),

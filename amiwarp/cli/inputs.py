@@ -117,8 +117,23 @@ SCALES = {
     "us": 1.0,
     "ms": 1e3,
     "rpm": 1.0,
+    "deg/s": math.pi / 180.0,
+    "rad/s": 1.0,
+    "deg/s2": math.pi / 180.0,
+    "rad/s2": 1.0,
+    "px": 1.0,
 }
 """Suffixes of values on the command line; what they come to [rad, us, 1/min]."""
+FORMS = {
+    "rad": (("deg", "rad"), "1.2deg or 0.02rad"),
+    "us": (("us", "ms"), "250us or 0.25ms"),
+    "1/min": (("rpm",), "720rpm"),
+    "rad/s": (("deg/s", "rad/s"), "30deg/s or 0.5rad/s"),
+    "rad/s2": (("deg/s2", "rad/s2"), "30deg/s2 or 0.5rad/s2"),
+    "px": (("px",), "554px"),
+    "1": ((), "1.5168"),
+}
+"""Of each unit the suffixes that fit, and an example."""
 
 
 def number(text: str, unit: str, name: str) -> float:
@@ -126,14 +141,13 @@ def number(text: str, unit: str, name: str) -> float:
 
     ``unit``: the parameter's own, as in ``amiwarp.calib.parameters.UNITS``.
     """
-    kinds = {"rad": ("deg", "rad"), "us": ("us", "ms"), "1/min": ("rpm",), "1": ()}[unit]
+    kinds, form = FORMS[unit]
     suffix = next((k for k in kinds if text.strip().endswith(k)), "")
     try:
         value = float(text.strip().removesuffix(suffix))
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or (unit == "rad" and not suffix):
-        form = {"rad": "1.2deg or 0.02rad", "us": "250us or 0.25ms", "1/min": "720rpm", "1": "1.5168"}[unit]
+    if not math.isfinite(value) or (unit.startswith("rad") and not suffix):
         raise AmiwarpError(f"{name}: {text!r} is not a value; write it like {form}")
     return value * SCALES.get(suffix, 1.0)
 

@@ -1,0 +1,83 @@
+"""Draws what the two stages of calibration see: their costs about the true apex, and the errors of many recordings.
+
+python -m benchmarks.stages_figure benchmarks/results/calibration_photometric_cuda.json docs/images/stages.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from amiwarp.brightness import BrightnessMap
+from amiwarp.calib import Settings
+from amiwarp.calib.calibrate import prepare
+from amiwarp.calib.photometric import _Cost, gather_pairs, off_excess
+from amiwarp.camera import Camera
+from amiwarp.demo import earth
+from amiwarp.iwe_files import save_png
+from amiwarp.optics import Prism
+from amiwarp.simulate import simulate
+
+APEX = math.radians(0.5)
+BLUE, ORANGE = "#0072b2", "#d55e00"
+
+
+def costs(offsets_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sharpness, and the share of the residual that one map leaves, at apexes about the truth [px]."""
+    recording = simulate(earth(), Camera.from_fov(346, 260, math.radians(60.0)), Prism(APEX), duration_s=0.34, seed=1)
+    search = prepare(recording, Settings())[0]
+    search.run()
+    unit = search.space.pixels["apex"]
+    points = [{**search.best, "apex": APEX + x / unit, "phase": 0.0} for x in offsets_px]
+    sharp = np.array([search.fine.values(values) for values in points])
+    pairs, tiles = gather_pairs(recording, search, search.settings.photometric)
+    brightness = BrightnessMap(pairs, tiles, search.material.encoder, off_excess=off_excess(pairs))
+    cost = _Cost(search.space, brightness, 40)
+    cost.warm_up(search.space.to_vector(points[len(points) // 2]))
+    rest = np.array([-cost(search.space.to_vector(values)) for values in points])
+    return sharp, rest
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("out", type=Path)
+    args = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    x = np.linspace(-0.8, 0.8, 33)
+    sharp, rest = costs(x)
+    figure = Figure(figsize=(11.0, 3.6), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    left, middle, right = figure.subplots(1, 3)
+    for ax, values, colour, best, title in (
+        (left, sharp, BLUE, int(sharp.argmax()), "sharpness (higher is better)"),
+        (middle, 100.0 * rest, ORANGE, int(rest.argmin()), "residual of one map, % (lower is better)"),
+    ):
+        ax.plot(x, values, color=colour)
+        ax.plot(x[best], values[best], "o", color=colour)
+        ax.axvline(0.0, color="0.5", lw=1, ls="--")
+        ax.set(xlabel="apex, away from the truth [px]", title=title)
+    rows = json.loads(args.results.read_text())["rows"]
+    for name, colour, label in (
+        ("sharpness_model_error_px", BLUE, "sharpness"), ("model_error_px", ORANGE, "photometric"),
+    ):  # fmt: skip
+        values = np.sort([row[name] for row in rows])
+        right.step(values, np.arange(1, len(values) + 1), where="post", color=colour, label=label)
+    right.set(xscale="log", xlabel="model error [px]", title=f"of {len(rows)} recordings, so many have less")
+    right.legend(frameon=False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    save_png(args.out, Image.open(buffer).convert("RGB"))
+
+
+if __name__ == "__main__":
+    main()
