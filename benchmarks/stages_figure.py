@@ -20,7 +20,7 @@ from PIL import Image
 from amiwarp.brightness import BrightnessMap
 from amiwarp.calib import Settings
 from amiwarp.calib.calibrate import prepare
-from amiwarp.calib.photometric import _Cost, gather_pairs, off_excess
+from amiwarp.calib.photometric import Cost, gather_pairs, off_excess
 from amiwarp.camera import Camera
 from amiwarp.demo import earth
 from amiwarp.iwe_files import save_png
@@ -41,7 +41,7 @@ def costs(offsets_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sharp = np.array([search.fine.values(values) for values in points])
     pairs, tiles = gather_pairs(recording, search, search.settings.photometric)
     brightness = BrightnessMap(pairs, tiles, search.material.encoder, off_excess=off_excess(pairs))
-    cost = _Cost(search.space, brightness, 40)
+    cost = Cost(search.space, brightness, 40)
     cost.warm_up(search.space.to_vector(points[len(points) // 2]))
     rest = np.array([-cost(search.space.to_vector(values)) for values in points])
     return sharp, rest

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import TRUE_PHASE, TRUE_PRISM
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.linalg import spsolve
 
 from amiwarp.brightness import BrightnessMap, Tiles
 from amiwarp.calib import Calibration, calibrate
@@ -155,6 +157,37 @@ def test_the_map_is_the_scene(device: str) -> None:
     inner = brightness.maps()[0, 12:24, 14:30]
     np.testing.assert_allclose(np.diff(inner, axis=1), slope, rtol=0, atol=0.15)
     np.testing.assert_allclose(np.diff(inner, axis=0), 0.0, rtol=0, atol=0.15)
+
+
+def test_single_precision_is_enough(recording: Recording, device: str) -> None:
+    """The map and its residuals beside a float64 solution of the same equations by SciPy."""
+    events = recording.events.slice(0, 200_000)
+    width, height = recording.events.size
+    tile_of = np.full((height, width), -1, dtype=np.int32)
+    tile_of[50:90, 60:110] = 0
+    pairs = pair_events(events, tile_of, longest_gap_us=60_000, device=device)
+    tiles = Tiles(np.array([[44.0, 34.0]], dtype=np.float32), 72, 82, 1.0)
+    assert recording.camera is not None
+    assert recording.encoder is not None
+    brightness = BrightnessMap(pairs, tiles, recording.encoder, off_excess=0.0, damping=0.02, device=device)
+    brightness.place(ExactModel(recording.camera, TRUE_PRISM, TRUE_PHASE))
+    residual = brightness.solve(1e6, steps=300)  # all weights are 1
+    geometry = brightness._geometry
+    cell = geometry.cell.numpy()
+    on = np.flatnonzero(cell[:, 0] >= 0)
+    rows, columns, values = [], [], []
+    for side, sign, fraction in ((1, 1.0, geometry.second.numpy()), (0, -1.0, geometry.first.numpy())):
+        fx, fy = fraction[on].astype(np.float64).T
+        for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            rows.append(np.arange(len(on)))
+            columns.append(cell[on, side] + dx + dy * tiles.columns)
+            values.append(sign * np.abs(1 - dx - fx) * np.abs(1 - dy - fy))
+    shape = (len(on), tiles.nodes)
+    matrix = csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+    right = np.where(pairs.on[on] == 1, 1.0, -1.0)
+    solved = spsolve((matrix.T @ matrix + 0.02 * eye_array(tiles.nodes)).tocsc(), matrix.T @ right)
+    np.testing.assert_allclose(brightness.maps()[0].ravel(), solved, rtol=0, atol=0.01)
+    np.testing.assert_allclose(residual[on], right - matrix @ solved, rtol=0, atol=2e-3)
 
 
 def test_pairs_are_neighbours_in_time_of_one_pixel(recording: Recording, device: str) -> None:

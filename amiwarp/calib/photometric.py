@@ -194,7 +194,7 @@ def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
     return 1.0 - touched / pairs
 
 
-class _Cost:
+class Cost:
     """Robust residual as a function of the space's vector; the map is warm from call to call."""
 
     def __init__(self, space: Space, brightness: BrightnessMap, steps: int) -> None:
@@ -271,7 +271,7 @@ def refine(
         off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
         middle_us=space.middle_us, device=search.device,
     )  # fmt: skip
-    cost = _Cost(space, brightness, settings.steps)
+    cost = Cost(space, brightness, settings.steps)
     v = space.to_vector({**space.start, **search.best})
     cost.warm_up(v)
     left = check_pairs(recording.name, brightness.coverage(cost.scale), len(pairs))
@@ -299,7 +299,7 @@ def limits(space: Space, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
     return np.clip(low, v - far, v + far), np.clip(high, v - far, v + far)
 
 
-def _search(cost: _Cost, v: NDArray[np.float64], settings: PhotometricSettings, progress: Progress | None) -> Stage:
+def _search(cost: Cost, v: NDArray[np.float64], settings: PhotometricSettings, progress: Progress | None) -> Stage:
     low, high = limits(cost.space, v)
 
     def tell(done: int, budget: int) -> None:
@@ -337,7 +337,7 @@ def joined(first: Stage, second: Stage) -> Stage:
 
 
 def _conclude(
-    cost: _Cost,
+    cost: Cost,
     best: NDArray[np.float64],
     v: NDArray[np.float64],
     clusters: NDArray[np.int64],
