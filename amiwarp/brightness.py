@@ -67,7 +67,6 @@ class BrightnessMap:
         *,
         sensor: Sensor | None = None,
         slope: NDArray[np.float32] | None = None,
-        with_off: bool = True,
         with_leak: bool = False,
         off_excess: float | None = None,
         damping: float = DAMPING,
@@ -98,7 +97,7 @@ class BrightnessMap:
         self._atlas = kernels.Atlas()
         self._atlas.origin = wp.array(tiles.origin, dtype=wp.vec2, device=device)
         self._atlas.rows, self._atlas.columns, self._atlas.density = tiles.rows, tiles.columns, tiles.density
-        self._atlas.with_off, self._atlas.with_leak = float(with_off), float(with_leak)
+        self._atlas.with_leak = float(with_leak)
         unknowns = tiles.nodes + int(kernels.EXTRA)
         names = ("image", "change", "residual", "direction", "product", "diagonal")
         self._image, self._change, self._r, self._p, self._q, self._diagonal = (

@@ -165,10 +165,10 @@ def gather_pairs(recording: Recording, search: Search, settings: PhotometricSett
         tile_of, tiles = choose_tiles(search.image(), settings.density, margin)
     gatherer = _Gatherer(recording, search, tile_of, settings.sensor)
     # the two turns of a camera that moves belong together
-    parts = [gatherer.between(first, last + 1)] if search.whole.moving else []
-    for k in () if search.whole.moving else _spread(turns):
-        start = first + int(k * turn)
-        parts.append(gatherer.between(start, start + int(turn)))
+    spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in _spread(turns)]
+    parts: list[PairSet] = []
+    for start, stop in [(first, last + 1)] if search.whole.moving else spans:
+        parts.append(gatherer.between(start, stop))
         if len(parts) >= FEWEST_TURNS and sum(map(len, parts)) >= settings.pairs:
             break
     pairs = PairSet.concatenate(parts)
@@ -229,14 +229,13 @@ class Cost:
         known = np.isfinite(residuals)
         return np.where(known, 1.0 / (1.0 + (np.nan_to_num(residuals).astype(np.float64) / self.scale) ** 2), 0.0)
 
-    def __call__(self, v: NDArray[np.float64]) -> float:
+    def __call__(self, v: NDArray[np.float64], *, steps: int | None = None) -> float:
         self.evaluations += 1
-        return -float(self.terms(self.residuals(v)).mean())
+        return -float(self.terms(self.residuals(v, steps=steps)).mean())
 
     def settled(self, v: NDArray[np.float64]) -> float:
         """The same with twice the steps: a map that lags a long step of the parameters would speak against it."""
-        self.evaluations += 1
-        return -float(self.terms(self.residuals(v, steps=2 * self.steps)).mean())
+        return self(v, steps=2 * self.steps)
 
     def slopes(self, v: NDArray[np.float64]) -> Slopes:
         """The residuals at ``v`` and their slopes, less what a change of the map would make of them."""

@@ -43,7 +43,6 @@ class Atlas:
     rows: int
     columns: int
     density: float
-    with_off: float
     with_leak: float
 
 
@@ -155,7 +154,7 @@ def difference(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, g: Geom
     value -= look_up(image, cell[0], atlas.columns, bilinear(g.first[i]))
     value += atlas.with_leak * image[extra] * (pairs.time[i][1] - pairs.time[i][0])
     if is_off(pairs, i):
-        value += atlas.with_off * image[extra + 1]
+        value += image[extra + 1]
     return value
 
 
@@ -181,7 +180,7 @@ def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g:
     spread(sums, cell[0], atlas.columns, bilinear(g.first[i]), -value)
     if atlas.with_leak > 0.0:
         add_fixed(sums, extra, value * (pairs.time[i][1] - pairs.time[i][0]))
-    if atlas.with_off > 0.0 and is_off(pairs, i):
+    if is_off(pairs, i):
         add_fixed(sums, extra + 1, value)
 
 
@@ -259,7 +258,7 @@ def add_diagonal(
         gap = pairs.time[i][1] - pairs.time[i][0]
         add_fixed(sums, extra, atlas.with_leak * weight[i] * gap * gap)
         if is_off(pairs, i):
-            add_fixed(sums, extra + 1, atlas.with_off * weight[i])
+            add_fixed(sums, extra + 1, weight[i])
 
 
 @wp.kernel
