@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics import wrap_angle
 from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
@@ -19,10 +18,14 @@ if TYPE_CHECKING:
     from amiwarp.events import Events
     from amiwarp.optics import Model
 
-MAX_PENDING = 1 << 23
-"""Full votes that fit a 32-bit pixel: 2**31 / 256. Before more events than this came, votes are moved on."""
 PIECE = 1 << 22
 """Events that are put on the device at a time."""
+BATCH = 1 << 24
+"""Events that are voted at a time without a look at what their words held: on CUDA the words are emptied between."""
+TURNS = 1 << 16
+"""Angles of the prism that are told apart: 0.0055 deg, 0.0005 px on an orbit of 10 px."""
+PROBE = 1 << 21
+"""Events of the first such batch. Where some were lost, and fewer at once, every event looks."""
 
 
 class Vote(enum.Enum):
@@ -58,60 +61,108 @@ class CanvasShape:
         return (2 if self.per_polarity else 1, rows, columns)
 
     def params(self) -> Any:
-        from amiwarp.kernels.iwe import Canvas
+        from amiwarp.kernels.votes import Canvas
 
         c = Canvas()
         c.pad, c.scale = float(self.pad), self.scale
-        c.per_polarity, c.nearest = int(self.per_polarity), int(self.vote is Vote.NEAREST)
-        c.dither = int(self.dither)
+        c.nearest, c.dither = int(self.vote is Vote.NEAREST), float(self.dither)
+        c.rows, c.columns = self.shape[1] + 2, self.shape[2] + 2
+        c.layer = c.rows * c.columns if self.per_polarity else 0
         return c
 
 
+@dataclass(frozen=True, slots=True)
+class DeviceEvents:
+    """Events with their angles on a device; see :func:`upload_events`."""
+
+    arrays: Any
+    """``amiwarp.kernels.votes.EventArrays``."""
+    count: int
+    base: Any
+    """Angles without drift, where there is a slope."""
+    slope: Any
+    """Change of the angles [1/65536 turn] per unit of the drifting parameter, or None."""
+
+    def drift(self, value: float) -> None:
+        """Sets the angles to what they are where the drifting parameter has ``value``."""
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.votes import drift_turns
+
+        launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
+
+
 class Votes:
-    """Vote buffers of a canvas on a device, allocated once: one image per CPU slice, one on CUDA."""
+    """Vote buffers of a canvas on a device, allocated once: one image per CPU slice, one on CUDA.
+
+    No vote is lost, however many events meet in a pixel. On CUDA events must stay as they are until :meth:`take`.
+    """
 
     def __init__(self, canvas: CanvasShape, device: Any) -> None:
         import warp as wp
 
         from amiwarp.kernels.launch import slice_count
+        from amiwarp.kernels.votes import TRASH, Cells
 
         self.canvas = canvas
         self.device = wp.get_device(device)
-        self._count = slice_count(self.device)
-        self._buffer = wp.zeros((self._count, *canvas.shape), dtype=wp.int32, device=self.device)
-        self.images = [self._buffer[k] for k in range(self._count)]
-        self.flat = self._buffer.reshape((self._count, int(np.prod(canvas.shape))))
-        self._total = wp.zeros(self.flat.shape[1], dtype=wp.int64, device=self.device)
         self._params = canvas.params()
-        self.pending = 0
+        n, slices = canvas.shape[0] * self._params.rows * self._params.columns, slice_count(self.device)
+        self._trash = n
+        self._words = wp.zeros((slices, n + int(TRASH)), dtype=wp.uint64, device=self.device)
+        self._totals = wp.zeros((slices, n), dtype=wp.int64, device=self.device)
+        self._spilled = wp.zeros((slices, 1), dtype=wp.int32, device=self.device)
+        self._cells = []
+        for k in range(slices):
+            cells = Cells()
+            cells.words, cells.totals, cells.spilled = self._words[k], self._totals[k], self._spilled[k]
+            self._cells.append(cells)
+        self._counts = wp.zeros(64, dtype=wp.int64, device=self.device)
+        self._batches: list[tuple[list[Any], int, int]] = []
+        self._quick: bool | None = None if self.device.is_cuda else False
 
     def clear(self) -> None:
-        self._buffer.zero_()
-        self.pending = 0
+        self._batches.clear()
+        self._words.zero_()
+        if self._any_total:
+            self._totals.zero_()
+            self._spilled.zero_()
+
+    @property
+    def _any_total(self) -> bool:
+        return bool(self.device.is_cuda or self._spilled.numpy().any())
 
     def add_events(
-        self, model: Model, events: Any, count: int, *, drift: float = 0.0, turning: Turning | None = None
+        self, model: Model, events: DeviceEvents, *, drift: float = 0.0, turning: Turning | None = None
     ) -> None:
-        """Votes ``count`` events (an ``EventArrays`` on the same device) after compensation by ``model``.
+        """Votes events on the same device after compensation by ``model``.
 
         ``turning`` is taken back where the events were given their times.
         """
-        from amiwarp.kernels.iwe import vote_events
         from amiwarp.kernels.launch import launch_slices
+        from amiwarp.kernels.structs import pinhole_params
+        from amiwarp.kernels.votes import BLOCK, vote_blocks, vote_events, vote_turning
         from amiwarp.optics import model_camera
 
-        inputs = [model.params(self.device), model_camera(model, self.device), events, drift]
-        inputs += [(turning or Turning()).params(), self._params]
-        self._reserve(count)
-        launch_slices(vote_events, count, inputs, self.images, device=self.device)
+        if events.slope is not None:
+            events.drift(drift)
+        params, camera = model.params(self.device), pinhole_params(model.camera)
+        inputs = [params, camera or model_camera(model, self.device), events.arrays, self._params]
+        if turning is not None and events.arrays.time.shape[0]:
+            inputs = [params, model_camera(model, self.device), *inputs[2:], turning.params()]
+            self._exactly(vote_turning, inputs, events.count)
+        elif self.device.is_cuda:
+            self._in_batches(inputs, events.count)
+        elif camera is not None:
+            blocks = -(-events.count // int(BLOCK))
+            launch_slices(vote_blocks, blocks, [*inputs, events.count], self._cells, device=self.device, smallest=512)
+        else:
+            self._exactly(vote_events, inputs, events.count)
 
     def add_points(self, xy: Any, p: Any) -> None:
         """Votes points as they are: ``xy`` a Warp array of vec2 [px], ``p`` of uint8."""
-        from amiwarp.kernels.iwe import vote_points
-        from amiwarp.kernels.launch import launch_slices
+        from amiwarp.kernels.votes import vote_points
 
-        self._reserve(len(xy))
-        launch_slices(vote_points, len(xy), [xy, p, self._params], self.images, device=self.device)
+        self._exactly(vote_points, [xy, p, self._params], len(xy))
 
     def add_as_they_are(self, events: Events) -> None:
         """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""
@@ -120,29 +171,79 @@ class Votes:
         xy = wp.array(np.stack([events.x, events.y], axis=1).astype(np.float32), dtype=wp.vec2, device=self.device)
         self.add_points(xy, wp.array(events.p, dtype=wp.uint8, device=self.device))
 
-    def _reserve(self, count: int) -> None:
-        """Makes room: no pixel of 32 bits can overflow, even if every event hit the same one."""
-        if count >= MAX_PENDING:
-            raise AmiwarpError(
-                f"{count} events at once could overflow a pixel of the image; vote at most {MAX_PENDING - 1}"
-            )
-        if self.pending + count >= MAX_PENDING:
-            self._flush()
-        self.pending += count
+    def _exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
+        """Every event looks at what its word held."""
+        from amiwarp.kernels.launch import launch_slices
 
-    def _flush(self) -> None:
-        from amiwarp.kernels.iwe import gather_votes
+        launch_slices(kernel, count, inputs, self._cells, device=self.device, first=first)
+
+    def _in_batches(self, inputs: list[Any], count: int) -> None:
+        """On CUDA: fast, then checked; where words overflow, and for few events, exactly at once."""
+        from amiwarp.kernels.votes import vote_events
+
+        start = 0
+        while start < count:
+            batch = min(count - start, PROBE if self._quick is None else BATCH)
+            if self._quick is False or batch < PROBE:
+                self._exactly(vote_events, inputs, count - start, start)
+                return
+            self._quickly(inputs, batch, start)
+            if self._quick is None or len(self._batches) == len(self._counts):
+                self._settle()
+            start += batch
+
+    def _quickly(self, inputs: list[Any], count: int, first: int) -> None:
+        import warp as wp
+
+        from amiwarp.kernels import votes as kernels
+
+        slot, cells = len(self._batches), self._cells[0]
+        self._counts[slot : slot + 1].zero_()
+        if not self._batches:
+            self._empty(slot, 0)  # of what was voted exactly
+        wp.launch(kernels.vote_quickly, count, [*inputs, self._trash, first], [cells], device=self.device)
+        wp.launch(kernels.count_votes, 16384, [cells.words, slot], [self._counts], device=self.device)
+        self._empty(slot, count)
+        self._batches.append((inputs, count, first))
+
+    def _empty(self, slot: int, count: int) -> None:
+        import warp as wp
+
+        from amiwarp.kernels.votes import empty_words
+
+        n = int(np.prod(self.canvas.shape))
+        wp.launch(empty_words, n, [self._counts, slot, count, self._params], [self._cells[0]], device=self.device)
+        self._words.zero_()
+
+    def _settle(self) -> None:
+        """Votes again, exactly, the batches in which a word overflowed."""
+        from amiwarp.kernels.votes import vote_events
+
+        batches, self._batches = self._batches, []
+        counts = self._counts.numpy()[: len(batches)] if batches else []
+        lost = [batch for batch, count in zip(batches, counts, strict=True) if count != batch[1]]
+        for inputs, count, first in lost:
+            self._exactly(vote_events, inputs, count, first)
+        if batches:
+            self._quick = not lost
+
+    def read(self, image: Any) -> None:
+        """Writes the image so far [events] to a flat float32 Warp array; the votes stay."""
         from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.votes import read_votes
 
-        launch(gather_votes, self.flat.shape[1], [self.flat], [self._total], device=self.device)
-        self.clear()
+        self._settle()
+        inputs = [self._words, self._totals, self._params, int(self._any_total)]
+        launch(read_votes, len(image), inputs, [image], device=self.device)
 
     def take(self) -> NDArray[np.float32]:
         """The image so far [events], shape (layers, rows, columns); the canvas is empty afterwards."""
-        self._flush()
-        image = self._total.numpy().reshape(self.canvas.shape) / 256.0
-        self._total.zero_()
-        return image.astype(np.float32)
+        import warp as wp
+
+        image = wp.empty(int(np.prod(self.canvas.shape)), dtype=float, device=self.device)
+        self.read(image)
+        self.clear()
+        return np.asarray(image.numpy().reshape(self.canvas.shape))
 
 
 def upload_events(
@@ -152,28 +253,39 @@ def upload_events(
     *,
     slope: NDArray[np.float64] | None = None,
     middle_us: int | None = None,
-) -> Any:
-    """Events and their angles [rad] as an ``EventArrays`` on ``device``; pixels must be whole (uint16).
+) -> DeviceEvents:
+    """Events and their angles [rad] on ``device``; pixels must be whole (uint16).
 
-    ``middle_us``: where given, the events get their times from it, so that the camera's turning can be taken back.
+    ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events get
+    their times from it, so that the camera's turning can be taken back.
     """
     import warp as wp
 
-    from amiwarp.kernels.iwe import EventArrays
+    from amiwarp.kernels.structs import azimuths
+    from amiwarp.kernels.votes import BLOCK, EventArrays
 
     if events.x.dtype != np.uint16:
         raise AmiwarpError(
             f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
         )
+    n = len(events)
+    padded = -(-n // int(BLOCK)) * int(BLOCK)
+
+    def put(values: NDArray[Any], dtype: Any) -> Any:
+        array = wp.zeros(padded, dtype=dtype, device=device)
+        wp.copy(array, wp.array(values, dtype=dtype, device=device), count=n)
+        return array
+
     e = EventArrays()
-    e.x = wp.array(events.x, dtype=wp.uint16, device=device)
-    e.y = wp.array(events.y, dtype=wp.uint16, device=device)
-    e.p = wp.array(events.p, dtype=wp.uint8, device=device)
-    e.theta = wp.array(wrap_angle(theta).astype(np.float32), dtype=float, device=device)
-    e.slope = wp.array([] if slope is None else slope.astype(np.float32), dtype=float, device=device)
-    time = np.zeros(0, np.float32) if middle_us is None else ((events.t - middle_us) * 1e-6).astype(np.float32)
-    e.time = wp.array(time, dtype=float, device=device)
-    return e
+    e.x, e.y, e.p = put(events.x, wp.uint16), put(events.y, wp.uint16), put(events.p, wp.uint8)
+    e.turn = put(np.rint(theta * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
+    e.azimuths = azimuths(str(wp.get_device(device)))
+    e.time = wp.empty(0, dtype=float, device=device)
+    if middle_us is not None:
+        e.time = put(((events.t - middle_us) * 1e-6).astype(np.float32), float)
+    if slope is None:
+        return DeviceEvents(e, n, None, None)
+    return DeviceEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
 
 
 def iwe(
@@ -203,7 +315,7 @@ def iwe(
         if model is not None and encoder is not None:
             middle = None if turning is None else turning.middle_us
             arrays = upload_events(piece, encoder.angle_at(piece.t), device, middle_us=middle)
-            votes.add_events(model, arrays, len(piece), turning=turning)
+            votes.add_events(model, arrays, turning=turning)
         else:
             votes.add_as_they_are(piece)
     image = votes.take()

@@ -136,6 +136,10 @@ def model_camera(model: _Model, device: Any) -> Any:
     return camera_params(model.camera, str(device))
 
 
+def _set_phase(params: Any, phase: float) -> None:
+    params.phase, params.phase_cos, params.phase_sin = phase, math.cos(phase), math.sin(phase)
+
+
 @dataclass(frozen=True)
 class CircleModel(_OnDevice):
     """A rotation of the bearing by one constant angle about z × w(θ): two numbers for the whole image."""
@@ -157,8 +161,9 @@ class CircleModel(_OnDevice):
         from amiwarp.kernels.optics import CircleParams
 
         p = CircleParams()
-        p.deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
-        p.phase = self.phase
+        p.sine = math.sin(self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection)
+        p.versine = 2.0 * math.sin(self.deflection / 2.0) ** 2
+        _set_phase(p, self.phase)
         return p
 
 
@@ -194,7 +199,7 @@ class RadialCircleModel(_OnDevice):
 
         p = RadialCircleParams()
         p.deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
-        p.phase = self.phase
+        _set_phase(p, self.phase)
         p.index = self.index
         return p
 
@@ -224,8 +229,9 @@ class ExactModel(_OnDevice):
         p.sin_apex = math.sin(self.prism.apex)
         p.cos_apex = math.cos(self.prism.apex)
         p.index2 = self.prism.index**2
-        p.phase = self.phase
+        _set_phase(p, self.phase)
         p.flat_to_scene = int(self.prism.flat_side is FlatSide.SCENE)
+        p.tilted = int(any(self.tilt))
         p.axis = wp.mat33(*axis_rotation(*self.tilt).ravel().tolist())
         return p
 
@@ -265,10 +271,10 @@ class EllipseModel(_OnDevice):
         from amiwarp.kernels.optics import fit_harmonics
 
         shape = (model.camera.height, model.camera.width)
-        tables = [wp.empty(shape, dtype=wp.vec2, device=device) for _ in range(3)]
+        table = wp.empty((*shape, 6), dtype=float, device=device)
         inputs = [replace(model, phase=0.0).params(device), model_camera(model, device)]
-        wp.launch(fit_harmonics, dim=shape, inputs=inputs, outputs=tables, device=device)
-        offset, cosine, sine = (table.numpy() for table in tables)
+        wp.launch(fit_harmonics, dim=shape, inputs=inputs, outputs=[table], device=device)
+        offset, cosine, sine = np.split(table.numpy(), 3, axis=2)
         return cls(model.camera, offset, cosine, sine, model.phase)
 
     @classmethod
@@ -317,9 +323,9 @@ class EllipseModel(_OnDevice):
 
         if str(device) not in self._tables:
             p = EllipseParams()
-            for name in ("offset", "cosine", "sine"):
-                setattr(p, name, wp.array(getattr(self, name), dtype=wp.vec2, device=device))
-            p.phase = self.phase
+            table = np.concatenate([self.offset, self.cosine, self.sine], axis=2)
+            p.table = wp.array(table, dtype=float, device=device)
+            _set_phase(p, self.phase)
             self._tables[str(device)] = p
         return self._tables[str(device)]
 

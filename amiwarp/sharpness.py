@@ -48,20 +48,22 @@ class SharpnessMeter:
         self._n = self._layers * self._height * self._width
         self._device = device
         self._weights = wp.array(gaussian(smoothing), dtype=float, device=device)
-        self._image = wp.empty(self._n, dtype=float, device=device)
-        self._smooth = wp.empty(self._n, dtype=float, device=device) if smoothing > 0 else self._image
+        self.image = wp.empty(self._n, dtype=float, device=device)
+        """Where the image to measure is put [events], flat."""
+        self._half = wp.empty(self._n, dtype=float, device=device)
+        self._smooth = wp.empty(self._n, dtype=float, device=device) if smoothing > 0 else self.image
         segments = -(-self._n // int(kernels.SEGMENT))
         self._sums = wp.empty(segments, dtype=wp.vec2d, device=device)
 
-    def measure(self, flat_votes: Any) -> float:
-        """Sharpness of the votes in ``flat_votes``, an int32 Warp array of shape (slices, pixels)."""
+    def measure(self) -> float:
+        """Sharpness of :attr:`image`."""
         from amiwarp.kernels import iwe as kernels
         from amiwarp.kernels.launch import launch
 
-        launch(kernels.smooth_along_x, self._n, [flat_votes, self._weights, self._width], [self._image],
-               device=self._device)  # fmt: skip
         if self.smoothing > 0:
-            launch(kernels.smooth_along_y, self._n, [self._image, self._weights, self._width, self._height],
+            launch(kernels.smooth_along_x, self._n, [self.image, self._weights, self._width], [self._half],
+                   device=self._device)  # fmt: skip
+            launch(kernels.smooth_along_y, self._n, [self._half, self._weights, self._width, self._height],
                    [self._smooth], device=self._device)  # fmt: skip
         kind = list(Sharpness).index(self.kind)
         launch(kernels.sum_terms, len(self._sums), [kind, self._smooth, self._width, self._height, PAPER_ETA],
@@ -101,7 +103,7 @@ def sharpness(
 ) -> float:
     """Sharpness of an image [events per pixel] of shape (height, width) or (layers, height, width).
 
-    ``smoothing``: standard deviation [px]. The image is rounded to 1/256 event, as votes are.
+    ``smoothing``: standard deviation [px].
     """
     import warp as wp
 
@@ -109,5 +111,6 @@ def sharpness(
     canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
     if len(stack) > 2 or not np.all(np.isfinite(image)):
         raise AmiwarpError(f"image of shape {image.shape} is not a finite (height, width) or (2, height, width) image")
-    votes = wp.array(np.rint(stack * 256.0).astype(np.int32).reshape(1, -1), dtype=wp.int32, device=device)
-    return SharpnessMeter(canvas, kind, smoothing=smoothing, device=device).measure(votes)
+    meter = SharpnessMeter(canvas, kind, smoothing=smoothing, device=device)
+    wp.copy(meter.image, wp.array(stack.astype(np.float32).ravel(), dtype=float, device=device))
+    return meter.measure()

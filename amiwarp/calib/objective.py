@@ -45,7 +45,6 @@ class Objective:
         """
         self.space = space
         self.evaluations = 0
-        self._count = len(events)
         middle = space.middle_us if space.moving else None
         self._arrays = upload_events(events, theta, device, slope=slope, middle_us=middle)
         camera = space.camera
@@ -58,13 +57,14 @@ class Objective:
     def _vote(self, values: dict[str, float]) -> None:
         self._votes.clear()
         drift, turning = self.space.drift(values), self.space.turning(values)
-        self._votes.add_events(self.space.build(values), self._arrays, self._count, drift=drift, turning=turning)
+        self._votes.add_events(self.space.build(values), self._arrays, drift=drift, turning=turning)
 
     def values(self, values: dict[str, float]) -> float:
         """Sharpness at parameter values."""
         self.evaluations += 1
         self._vote(values)
-        return self._meter.measure(self._votes.flat)
+        self._votes.read(self._meter.image)
+        return self._meter.measure()
 
     def __call__(self, v: NDArray[np.float64]) -> float:
         """Sharpness at a vector of the space [px]."""

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 PINHOLE = wp.constant(0)
 RADIAL_TANGENTIAL = wp.constant(1)
@@ -27,6 +27,18 @@ class CameraParams:
     k: wp.types.vector(length=5, dtype=float)
     limit: float  # largest tan (radial-tangential) or angle (fisheye) up to which the distortion is one-to-one
     rays: wp.array2d(dtype=wp.vec3)  # bearing of each pixel centre; NaN where there is none; empty for a pinhole
+
+
+@wp.struct
+class PinholeParams:
+    """A camera without distortion, for kernels without branches."""
+
+    fx: float
+    fy: float
+    inverse_fx: float
+    inverse_fy: float
+    cx: float
+    cy: float
 
 
 @wp.func

@@ -59,21 +59,30 @@ def launch(
     list(pool().map(run, ranges)) if len(ranges) > 1 else run(ranges[0])
 
 
-def launch_slices(kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
+def launch_slices(
+    kernel: Any,
+    n: int,
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    *,
+    device: Any,
+    first: int = 0,
+    smallest: int = SMALLEST_SLICE,
+) -> None:
     """As :func:`launch`, but slice k writes into ``outputs[k]`` alone: for threads that add to shared places.
 
-    On CUDA one launch adds into ``outputs[0]`` with atomics.
+    Over ``range(first, first + n)``. On CUDA one launch adds into ``outputs[0]`` with atomics.
     """
     device = wp.get_device(device)
     if n == 0:
         return
-    ranges = slices(n, len(outputs)) if device.is_cpu else [(0, n)]
+    ranges = slices(n, len(outputs), smallest) if device.is_cpu else [(0, n)]
     if device.is_cpu:
         kernel.module.load(device, block_dim=1)
 
     def run(job: tuple[tuple[int, int], Any]) -> None:
         (start, stop), out = job
-        wp.launch(kernel, dim=stop - start, inputs=[*inputs, start], outputs=[out], device=device)
+        wp.launch(kernel, dim=stop - start, inputs=[*inputs, first + start], outputs=[out], device=device)
 
     jobs = list(zip(ranges, outputs, strict=False))
     list(pool().map(run, jobs)) if len(jobs) > 1 else run(jobs[0])

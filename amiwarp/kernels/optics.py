@@ -1,16 +1,26 @@
 """Device side of the models: observed pixel to the pixel without the prism (compensate), and back (deflect).
 
 Every model struct has the two functions ``compensate(model, camera, xy, w)`` and ``deflect(model, camera, xy, w)``,
-``w`` being the azimuth (cos, sin) of the prism's tilt, and ``azimuth(model, theta)`` that gives it.
+``w`` being the azimuth (cos, sin) of the prism's tilt, and ``azimuth(model, theta)`` that gives it; ``place`` is
+``compensate`` for an event's pixel, in plain floats. ``moved`` compensates a direction.
 """
 
 from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, invalid_pixel, invalid_ray, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.camera import (
+    NAN,
+    CameraParams,
+    PinholeParams,
+    invalid_pixel,
+    invalid_ray,
+    pixel_to_ray,
+    ray_to_pixel,
+)
 
-wp.set_module_options({"enable_backward": False})
+# without fused multiply-add, which CPUs and GPUs place differently: both give the same bits
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 HARMONIC_ANGLES = wp.constant(16)
 INVERSION_STEPS = wp.constant(8)
@@ -18,14 +28,19 @@ INVERSION_STEPS = wp.constant(8)
 
 @wp.struct
 class CircleParams:
-    deflection: float  # signed: positive with the flat face to the scene
+    sine: float  # of the deflection, signed: positive with the flat face to the scene
+    versine: float  # 1 - cosine
     phase: float
+    phase_cos: float
+    phase_sin: float
 
 
 @wp.struct
 class RadialCircleParams:
     deflection: float  # on the axis; negative with the flat face to the camera: the sign also says which side
     phase: float
+    phase_cos: float
+    phase_sin: float
     index: float
 
 
@@ -35,16 +50,19 @@ class ExactParams:
     cos_apex: float
     index2: float  # n squared
     phase: float
+    phase_cos: float
+    phase_sin: float
     flat_to_scene: int
+    tilted: int
     axis: wp.mat33  # columns: the prism's frame in the camera's
 
 
 @wp.struct
 class EllipseParams:
     phase: float
-    offset: wp.array2d(dtype=wp.vec2)
-    cosine: wp.array2d(dtype=wp.vec2)
-    sine: wp.array2d(dtype=wp.vec2)
+    phase_cos: float
+    phase_sin: float
+    table: wp.array3d(dtype=float)  # per pixel: offset x, y, then the factors of cos, x, y, then of sin, x, y
 
 
 @wp.func
@@ -53,29 +71,49 @@ def azimuth(model: Any, theta: float) -> wp.vec2:
     return wp.vec2(wp.cos(phi), wp.sin(phi))
 
 
+# Directions are three floats, not a vec3, wherever CPUs shall run eight events at a time: LLVM does not vectorise calls
+# that return small structs. They may have any length but zero.
+
 # -- circle: a rotation of the bearing by a constant angle about z x w
 
 
 @wp.func
-def rotate_towards(ray: wp.vec3, w: wp.vec2, angle: float) -> wp.vec3:
-    """Rodrigues' rotation about z x w = (-w_y, w_x, 0): turns the optical axis towards w."""
-    axis = wp.vec3(-w[1], w[0], 0.0)
-    s = wp.sin(angle)
-    c = wp.cos(angle)
-    return ray * c + wp.cross(axis, ray) * s + axis * (wp.dot(axis, ray) * (1.0 - c))
+def turned(x: float, y: float, z: float, w0: float, w1: float, sine: float, versine: float):
+    """Rodrigues' rotation of a direction about z x w = (-w1, w0, 0): turns the optical axis towards w."""
+    d = w0 * x + w1 * y
+    g = z * sine - d * versine
+    return x + g * w0, y + g * w1, z - z * versine - d * sine
 
 
 @wp.func
-def compensate(model: CircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    return ray_to_pixel(camera, rotate_towards(pixel_to_ray(camera, xy), w, model.deflection))
+def moved(model: CircleParams, x: float, y: float, z: float, w0: float, w1: float):
+    return turned(x, y, z, w0, w1, model.sine, model.versine)
 
 
 @wp.func
 def deflect(model: CircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    return ray_to_pixel(camera, rotate_towards(pixel_to_ray(camera, xy), w, -model.deflection))
+    ray = pixel_to_ray(camera, xy)
+    x, y, z = turned(ray[0], ray[1], ray[2], w[0], w[1], -model.sine, model.versine)
+    return ray_to_pixel(camera, wp.vec3(x, y, z))
 
 
 # -- radial circle: the same, the angle growing off the axis
+
+
+@wp.func
+def sine_versine(a: float):
+    """Sine and 1 - cosine of an angle up to pi/2, by their series: the same bits on every device."""
+    b = a * a
+    s = 1.0 / 120.0 + b * (-1.0 / 5040.0 + b * (1.0 / 362880.0 - b / 39916800.0))
+    v = 1.0 / 720.0 + b * (-1.0 / 40320.0 + b * (1.0 / 3628800.0 - b / 479001600.0))
+    return a * (1.0 + b * (-1.0 / 6.0 + b * s)), b * (0.5 + b * (-1.0 / 24.0 + b * v))
+
+
+@wp.func
+def rotate_towards(ray: wp.vec3, w: wp.vec2, angle: float) -> wp.vec3:
+    sine, versine = sine_versine(angle)
+    x, y, z = turned(ray[0], ray[1], ray[2], w[0], w[1], sine, versine)
+    return wp.vec3(x, y, z)
 
 
 @wp.func
@@ -109,11 +147,14 @@ def turn_from_flat_side(model: RadialCircleParams, ray: wp.vec3, w: wp.vec2) -> 
 
 
 @wp.func
-def compensate(model: RadialCircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    ray = pixel_to_ray(camera, xy)
+def moved(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
+    ray = wp.vec3(x, y, z)
+    ray = ray / wp.length(ray)
     if model.deflection < 0.0:
-        return ray_to_pixel(camera, turn_from_flat_side(model, ray, w))
-    return ray_to_pixel(camera, turn_from_tilted_side(model, ray, w))
+        found = turn_from_flat_side(model, ray, wp.vec2(w0, w1))
+        return found[0], found[1], found[2]
+    ahead = turn_from_tilted_side(model, ray, wp.vec2(w0, w1))
+    return ahead[0], ahead[1], ahead[2]
 
 
 @wp.func
@@ -128,51 +169,50 @@ def deflect(model: RadialCircleParams, camera: CameraParams, xy: wp.vec2, w: wp.
 
 
 @wp.func
-def shift_bearing(ray: wp.vec3, w: wp.vec2, shift: float) -> wp.vec3:
-    """Unit bearing moved by ``shift`` along w; invalid past total internal reflection.
+def rotated(r: wp.mat33, x: float, y: float, z: float):
+    a = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
+    b = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
+    return a, b, r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
 
-    z² by its change, not as 1 - x² - y²: far off the axis that would cancel in float32.
+
+@wp.func
+def refracted(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float, entering: int):
+    """A direction through both faces in the prism's frame: Gamma sin(alpha) along w; NaN where no light passes.
+
+    In at the tilted face (``entering`` 1): q is its cosine there. Out at it (0): the same behind the flat face, and the
+    other sign of n^2 - 1. z^2 by its change, not from x^2 + y^2: far off the axis that would cancel in float32.
     """
-    z2 = ray[2] * ray[2] - shift * (2.0 * (w[0] * ray[0] + w[1] * ray[1]) + shift)
-    if not (z2 > 0.0):
-        return invalid_ray()
-    return wp.vec3(ray[0] + shift * w[0], ray[1] + shift * w[1], wp.sqrt(z2))
+    inside = float(entering)
+    length2 = x * x + y * y + z * z
+    bent = (m.index2 - 1.0) * length2
+    d = w0 * x + w1 * y
+    q = m.sin_apex * d + m.cos_apex * wp.sqrt(z * z + (1.0 - inside) * bent)
+    shift = (wp.sqrt(q * q + (2.0 * inside - 1.0) * bent) - q) * m.sin_apex
+    z2 = z * z - shift * (2.0 * d + shift)
+    passes = wp.min(wp.min(z, q), z2) > 0.0  # z2, which may be NaN, last: min(a, NaN) is NaN here
+    return x + shift * w0, y + shift * w1, wp.where(passes, wp.sqrt(z2), NAN)
 
 
 @wp.func
-def enter_tilted_face(m: ExactParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
-    """In through the tilted face, out through the flat one: shift Gamma sin(alpha) along w."""
-    q = m.sin_apex * (w[0] * ray[0] + w[1] * ray[1]) + m.cos_apex * ray[2]
-    if not (q > 0.0 and ray[2] > 0.0):
-        return invalid_ray()
-    shift = (wp.sqrt(m.index2 - 1.0 + q * q) - q) * m.sin_apex
-    return shift_bearing(ray, w, shift)
-
-
-@wp.func
-def leave_tilted_face(m: ExactParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
-    """In through the flat face, out through the tilted one: the reverse of :func:`enter_tilted_face`."""
-    p = wp.sqrt(m.index2 - 1.0 + ray[2] * ray[2])
-    q = m.sin_apex * (w[0] * ray[0] + w[1] * ray[1]) + m.cos_apex * p
-    radicand = 1.0 - m.index2 + q * q
-    if not (radicand > 0.0 and ray[2] > 0.0):
-        return invalid_ray()
-    shift = (q - wp.sqrt(radicand)) * m.sin_apex
-    return shift_bearing(ray, w, -shift)
+def through(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float, entering: int):
+    """Through the prism, entering at the tilted (1) or the flat (0) face; directions in the camera's frame."""
+    if m.tilted == 0:
+        d, e, f = refracted(m, x, y, z, w0, w1, entering)
+        return d, e, f
+    d, e, f = rotated(wp.transpose(m.axis), x, y, z)
+    d, e, f = refracted(m, d, e, f, w0, w1, entering)
+    return rotated(m.axis, d, e, f)
 
 
 @wp.func
 def trace(m: ExactParams, ray: wp.vec3, w: wp.vec2, entering: int) -> wp.vec3:
-    """Through the prism in its own frame, entering at the tilted (1) or the flat (0) face."""
-    local = wp.transpose(m.axis) * ray
-    if entering == 1:
-        return m.axis * enter_tilted_face(m, local, w)
-    return m.axis * leave_tilted_face(m, local, w)
+    x, y, z = through(m, ray[0], ray[1], ray[2], w[0], w[1], entering)
+    return wp.vec3(x, y, z)
 
 
 @wp.func
-def compensate(model: ExactParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    return ray_to_pixel(camera, trace(model, pixel_to_ray(camera, xy), w, model.flat_to_scene))
+def moved(model: ExactParams, x: float, y: float, z: float, w0: float, w1: float):
+    return through(model, x, y, z, w0, w1, model.flat_to_scene)
 
 
 @wp.func
@@ -184,19 +224,27 @@ def deflect(model: ExactParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -
 
 
 @wp.func
-def lookup(table: wp.array2d(dtype=wp.vec2), xy: wp.vec2) -> wp.vec2:
-    """Bilinear look-up, held constant past the border."""
-    x = wp.clamp(xy[0], 0.0, float(table.shape[1] - 1))
-    y = wp.clamp(xy[1], 0.0, float(table.shape[0] - 1))
-    col = wp.min(int(x), wp.max(table.shape[1] - 2, 0))
-    row = wp.min(int(y), wp.max(table.shape[0] - 2, 0))
-    fx = x - float(col)
-    fy = y - float(row)
-    next_col = wp.min(col + 1, table.shape[1] - 1)
-    next_row = wp.min(row + 1, table.shape[0] - 1)
-    top = table[row, col] * (1.0 - fx) + table[row, next_col] * fx
-    bottom = table[next_row, col] * (1.0 - fx) + table[next_row, next_col] * fx
-    return top * (1.0 - fy) + bottom * fy
+def on_ellipse(m: EllipseParams, row: int, col: int, w0: float, w1: float):
+    """Displacement of one pixel."""
+    x = m.table[row, col, 0] + m.table[row, col, 2] * w0 + m.table[row, col, 4] * w1
+    return x, m.table[row, col, 1] + m.table[row, col, 3] * w0 + m.table[row, col, 5] * w1
+
+
+@wp.func
+def between_ellipses(m: EllipseParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Displacement bilinear between pixels, held constant past the border."""
+    x = wp.clamp(xy[0], 0.0, float(m.table.shape[1] - 1))
+    y = wp.clamp(xy[1], 0.0, float(m.table.shape[0] - 1))
+    col = wp.min(int(x), wp.max(m.table.shape[1] - 2, 0))
+    row = wp.min(int(y), wp.max(m.table.shape[0] - 2, 0))
+    total = wp.vec2(0.0, 0.0)
+    for k in range(4):
+        across = wp.min(col + k % 2, m.table.shape[1] - 1)
+        down = wp.min(row + k / 2, m.table.shape[0] - 1)
+        dx, dy = on_ellipse(m, down, across, w[0], w[1])
+        weight = (1.0 - wp.abs(x - float(col + k % 2))) * (1.0 - wp.abs(y - float(row + k / 2)))
+        total += wp.vec2(dx, dy) * weight
+    return total
 
 
 @wp.func
@@ -205,10 +253,11 @@ def compensate(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.ve
         return invalid_pixel()
     col = int(xy[0])
     row = int(xy[1])
-    inside = col >= 0 and row >= 0 and col < model.offset.shape[1] and row < model.offset.shape[0]
+    inside = col >= 0 and row >= 0 and col < model.table.shape[1] and row < model.table.shape[0]
     if inside and float(col) == xy[0] and float(row) == xy[1]:
-        return xy + model.offset[row, col] + model.cosine[row, col] * w[0] + model.sine[row, col] * w[1]
-    return xy + lookup(model.offset, xy) + lookup(model.cosine, xy) * w[0] + lookup(model.sine, xy) * w[1]
+        dx, dy = on_ellipse(model, row, col, w[0], w[1])
+        return xy + wp.vec2(dx, dy)
+    return xy + between_ellipses(model, xy, w)
 
 
 @wp.func
@@ -222,6 +271,37 @@ def deflect(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2)
     if not (wp.length(error) < 0.01):
         return invalid_pixel()
     return observed
+
+
+# -- every model: pixels to pixels
+
+
+@wp.func
+def compensate(model: Any, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    ray = pixel_to_ray(camera, xy)
+    x, y, z = moved(model, ray[0], ray[1], ray[2], w[0], w[1])
+    return ray_to_pixel(camera, wp.vec3(x, y, z))
+
+
+@wp.func
+def place(model: Any, camera: CameraParams, x: float, y: float, w0: float, w1: float):
+    """Where an event of a pixel belongs; NaN: nowhere."""
+    xy = compensate(model, camera, wp.vec2(x, y), wp.vec2(w0, w1))
+    return xy[0], xy[1]
+
+
+@wp.func
+def place(model: EllipseParams, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
+    dx, dy = on_ellipse(model, int(y), int(x), w0, w1)
+    return x + dx, y + dy
+
+
+@wp.func
+def place(model: Any, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
+    """The same without a branch, for cameras without distortion."""
+    a, b, c = moved(model, (x - camera.cx) * camera.inverse_fx, (y - camera.cy) * camera.inverse_fy, 1.0, w0, w1)
+    scale = wp.where(c > 1.0e-6, 1.0 / c, NAN)
+    return camera.fx * (a * scale) + camera.cx, camera.fy * (b * scale) + camera.cy
 
 
 @wp.kernel
@@ -254,9 +334,7 @@ def deflect_points(
 def fit_harmonics(
     model: Any,
     camera: CameraParams,
-    offset: wp.array2d(dtype=wp.vec2),
-    cosine: wp.array2d(dtype=wp.vec2),
-    sine: wp.array2d(dtype=wp.vec2),
+    table: wp.array3d(dtype=float),
 ):
     """Least squares of offset and first harmonic over evenly spaced angles (their Fourier sums)."""
     row, col = wp.tid()
@@ -272,9 +350,10 @@ def fit_harmonics(
         c += d * w[0]
         s += d * w[1]
     n = float(HARMONIC_ANGLES)
-    offset[row, col] = mean / n
-    cosine[row, col] = c * (2.0 / n)
-    sine[row, col] = s * (2.0 / n)
+    for k in range(2):
+        table[row, col, k] = mean[k] / n
+        table[row, col, 2 + k] = c[k] * (2.0 / n)
+        table[row, col, 4 + k] = s[k] * (2.0 / n)
 
 
 MODEL_STRUCTS = (CircleParams, RadialCircleParams, EllipseParams, ExactParams)

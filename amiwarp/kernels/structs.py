@@ -34,6 +34,24 @@ def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
     return c
 
 
+def pinhole_params(camera: Camera) -> "kernels.PinholeParams | None":
+    """The camera for kernels without branches; None where its lens distorts."""
+    if camera.distortion is not None:
+        return None
+    c = kernels.PinholeParams()
+    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    c.inverse_fx, c.inverse_fy = 1.0 / camera.fx, 1.0 / camera.fy
+    return c
+
+
+@lru_cache(maxsize=4)
+def azimuths(device: str) -> wp.array:
+    """Cosine and sine of 65,536 angles of a turn, flat: from NumPy in float64, so the same bits on every device."""
+    angle = np.arange(1 << 16) * (2.0 * math.pi / (1 << 16))
+    table = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+    return wp.array(table.ravel(), dtype=float, device=device)
+
+
 def fold(*k: float, largest: float) -> float:
     """Radius up to which r(1 + k1 r² + k2 r⁴ + …) grows: the first root of its slope, at most ``largest``.
 

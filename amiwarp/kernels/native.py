@@ -1,0 +1,35 @@
+"""Loads and stores without strides, and an addition that tells its carries: so that CPU compilers vectorise a loop."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func_native("return ((const uint16_t*)values.data)[i];")
+def load_uint16(values: wp.array(dtype=wp.uint16), i: int) -> wp.uint16: ...
+
+
+@wp.func_native("return ((const uint8_t*)values.data)[i];")
+def load_uint8(values: wp.array(dtype=wp.uint8), i: int) -> wp.uint8: ...
+
+
+@wp.func_native("return ((const float*)values.data)[i];")
+def load_float(values: wp.array(dtype=float), i: int) -> float: ...
+
+
+@wp.func_native("((int32_t*)values.data)[i] = value;")
+def store_int(values: wp.array(dtype=int), i: int, value: int): ...
+
+
+@wp.func_native("((uint64_t*)values.data)[i] = value;")
+def store_word(values: wp.array(dtype=wp.uint64), i: int, value: wp.uint64): ...
+
+
+@wp.func_native("""
+    uint64_t* word = (uint64_t*)values.data + i;
+    const uint64_t old = *word, now = old + value;
+    *word = now;
+    return (old & value) | ((old | value) & ~now);
+""")
+def add_word(values: wp.array(dtype=wp.uint64), i: int, value: wp.uint64) -> wp.uint64:
+    """Adds on a CPU, where the array is one thread's own; bit k of the answer: a carry went out of bit k."""
