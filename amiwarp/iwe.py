@@ -71,6 +71,47 @@ class CanvasShape:
         return c
 
 
+class Image:
+    """An image of a canvas on a device, zeros around it so that kernels need not look for its border."""
+
+    def __init__(self, canvas: CanvasShape, radius: int, device: Any) -> None:
+        """``radius``: how far kernels look [px]."""
+        import warp as wp
+
+        from amiwarp.kernels.iwe import CPU_WIDTH, Frame
+
+        self.shape = canvas.shape
+        self.device = wp.get_device(device)
+        self.width = CPU_WIDTH if self.device.is_cpu else 1
+        layers, rows, columns = canvas.shape
+        f = Frame()
+        f.rows, f.columns, f.blocks = rows, columns, -(-columns // self.width)
+        f.stride = max(f.blocks * self.width, columns + radius)
+        f.layer = (rows + radius) * f.stride
+        f.first = (radius + 1) * f.stride
+        self.frame = f
+        self.blocks = layers * rows * f.blocks
+        self.pixels = wp.zeros(f.first + layers * f.layer + f.stride, dtype=float, device=device)
+
+    def _view(self, flat: NDArray[np.float32]) -> NDArray[np.float32]:
+        layers, rows, columns = self.shape
+        end = self.frame.first + layers * self.frame.layer
+        stacked = flat[self.frame.first : end].reshape(layers, -1, self.frame.stride)
+        return np.asarray(stacked[:, :rows, :columns])
+
+    def numpy(self) -> NDArray[np.float32]:
+        """A copy, shape (layers, rows, columns)."""
+        return self._view(self.pixels.numpy()).copy()
+
+    def write(self, image: NDArray[np.float32]) -> None:
+        """Sets all pixels; shape (layers, rows, columns)."""
+        import warp as wp
+
+        flat = np.zeros(len(self.pixels), np.float32)
+        self._view(flat)[...] = image
+        wp.copy(self.pixels, wp.array(flat, dtype=float, device="cpu"))
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceEvents:
     """Events with their angles on a device; see :func:`upload_events`."""
@@ -106,6 +147,7 @@ class Votes:
         self.canvas = canvas
         self.device = wp.get_device(device)
         self._params = canvas.params()
+        self._image = Image(canvas, 1, self.device)
         n, slices = canvas.shape[0] * self._params.rows * self._params.columns, slice_count(self.device)
         self._trash = n
         self._words = wp.zeros((slices, n + int(TRASH)), dtype=wp.uint64, device=self.device)
@@ -209,10 +251,10 @@ class Votes:
     def _empty(self, slot: int, count: int) -> None:
         import warp as wp
 
-        from amiwarp.kernels.votes import empty_words
+        from amiwarp.kernels.iwe import empty_words
 
-        n = int(np.prod(self.canvas.shape))
-        wp.launch(empty_words, n, [self._counts, slot, count, self._params], [self._cells[0]], device=self.device)
+        inputs = [self._counts, slot, count, self._params, self._image.frame]
+        wp.launch(empty_words, self._image.blocks, inputs, [self._cells[0]], device=self.device)
         self._words.zero_()
 
     def _settle(self) -> None:
@@ -227,23 +269,20 @@ class Votes:
         if batches:
             self._quick = not lost
 
-    def read(self, image: Any) -> None:
-        """Writes the image so far [events] to a flat float32 Warp array; the votes stay."""
+    def read(self, image: Image) -> None:
+        """Writes the image so far [events]; the votes stay."""
+        from amiwarp.kernels.iwe import read_votes
         from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.votes import read_votes
 
         self._settle()
-        inputs = [self._words, self._totals, self._params, int(self._any_total)]
-        launch(read_votes, len(image), inputs, [image], device=self.device)
+        inputs = [self._words, self._totals, int(self._any_total), self._params, image.frame]
+        launch(read_votes(image.width), image.blocks, inputs, [image.pixels], device=self.device, smallest=512)
 
     def take(self) -> NDArray[np.float32]:
         """The image so far [events], shape (layers, rows, columns); the canvas is empty afterwards."""
-        import warp as wp
-
-        image = wp.empty(int(np.prod(self.canvas.shape)), dtype=float, device=self.device)
-        self.read(image)
+        self.read(self._image)
         self.clear()
-        return np.asarray(image.numpy().reshape(self.canvas.shape))
+        return self._image.numpy()
 
 
 def upload_events(

@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.iwe import CanvasShape
+from amiwarp.iwe import CanvasShape, Image
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PAPER_ETA = 1.0
 """η of the paper's J [events]; He et al. give none."""
+
+
+FEW_SUMS = 256
+"""Sums that are left for the host to add."""
 
 
 class Sharpness(enum.Enum):
@@ -40,36 +44,48 @@ class SharpnessMeter:
         """``smoothing``: standard deviation of the Gaussian in canvas pixels; 0 for none."""
         import warp as wp
 
-        from amiwarp.kernels import iwe as kernels
+        from amiwarp.kernels.iwe import STRIP
 
+        weights = gaussian(smoothing)
         self.kind = kind
-        self.smoothing = smoothing
-        self._layers, self._height, self._width = canvas.shape
-        self._n = self._layers * self._height * self._width
-        self._device = device
-        self._weights = wp.array(gaussian(smoothing), dtype=float, device=device)
-        self.image = wp.empty(self._n, dtype=float, device=device)
-        """Where the image to measure is put [events], flat."""
-        self._half = wp.empty(self._n, dtype=float, device=device)
-        self._smooth = wp.empty(self._n, dtype=float, device=device) if smoothing > 0 else self.image
-        segments = -(-self._n // int(kernels.SEGMENT))
-        self._sums = wp.empty(segments, dtype=wp.vec2d, device=device)
+        self.device = wp.get_device(device)
+        self.image = Image(canvas, len(weights), self.device)
+        """Where the image to measure is put [events]."""
+        self._weights = wp.array(weights, dtype=float, device=device)
+        self._half, self._smooth = (wp.zeros_like(self.image.pixels) for _ in range(2))
+        layers, rows, columns = canvas.shape
+        self._n = layers * rows * columns
+        strips = layers * -(-rows // int(STRIP)) * self.image.frame.blocks
+        self._sums = wp.empty(strips, dtype=wp.vec2d, device=device)
+        self._few = wp.empty(min(strips, FEW_SUMS), dtype=wp.vec2d, device=device)
 
-    def measure(self) -> float:
-        """Sharpness of :attr:`image`."""
+    def launch(self) -> None:
+        """Measures :attr:`image` on the device, without waiting for it."""
+        import warp as wp
+
         from amiwarp.kernels import iwe as kernels
         from amiwarp.kernels.launch import launch
 
-        if self.smoothing > 0:
-            launch(kernels.smooth_along_x, self._n, [self.image, self._weights, self._width], [self._half],
-                   device=self._device)  # fmt: skip
-            launch(kernels.smooth_along_y, self._n, [self._half, self._weights, self._width, self._height],
-                   [self._smooth], device=self._device)  # fmt: skip
-        kind = list(Sharpness).index(self.kind)
-        launch(kernels.sum_terms, len(self._sums), [kind, self._smooth, self._width, self._height, PAPER_ETA],
-               [self._sums], device=self._device, smallest=256)  # fmt: skip
-        total, terms = self._sums.numpy().sum(axis=0)
+        smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
+        if len(self._weights) > 1:
+            for step, out in ((1, self._half), (frame.stride, self._smooth)):
+                inputs = [smoothed, self._weights, step, frame]
+                launch(kernels.smooth(width), self.image.blocks, inputs, [out], device=self.device, smallest=512)
+                smoothed = out
+        kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
+        inputs = [smoothed, frame, PAPER_ETA]
+        launch(kernel, len(self._sums), inputs, [self._sums], device=self.device, smallest=64)
+        wp.launch(kernels.gather_sums, len(self._few), [self._sums], [self._few], device=self.device)
+
+    def result(self) -> float:
+        """Sharpness of the image that was measured last."""
+        total, terms = self._few.numpy().sum(axis=0)
         return self._score(float(total), float(terms))
+
+    def measure(self) -> float:
+        """Sharpness of :attr:`image`."""
+        self.launch()
+        return self.result()
 
     def _score(self, total: float, terms: float) -> float:
         if total <= 0.0:
@@ -105,12 +121,10 @@ def sharpness(
 
     ``smoothing``: standard deviation [px].
     """
-    import warp as wp
-
     stack = np.atleast_3d(image) if image.ndim != 2 else image[None]
     canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
     if len(stack) > 2 or not np.all(np.isfinite(image)):
         raise AmiwarpError(f"image of shape {image.shape} is not a finite (height, width) or (2, height, width) image")
     meter = SharpnessMeter(canvas, kind, smoothing=smoothing, device=device)
-    wp.copy(meter.image, wp.array(stack.astype(np.float32).ravel(), dtype=float, device=device))
+    meter.image.write(stack)
     return meter.measure()

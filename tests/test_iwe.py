@@ -10,7 +10,7 @@ from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
-from amiwarp.iwe import PROBE, CanvasShape, Vote, Votes, iwe, upload_events
+from amiwarp.iwe import PROBE, CanvasShape, Image, Vote, Votes, iwe, upload_events
 from amiwarp.optics import MODELS, ExactModel, Prism
 
 
@@ -108,12 +108,12 @@ def test_a_full_cell_loses_nothing(n: int, device: str) -> None:
     xy[: n // 2] = 511 / 256  # nearly a whole vote for the next pixel: the fields fill up as fast as they can
     votes = Votes(CanvasShape(5, 4), device)
     votes.add_points(wp.array(xy, dtype=wp.vec2, device=device), wp.zeros(n, dtype=wp.uint8, device=device))
-    image = wp.empty(20, dtype=float, device=device)
+    image = Image(CanvasShape(5, 4), 1, device)
     votes.read(image)
     expected = fixed_point(xy, 4, 5)
-    np.testing.assert_array_equal(image.numpy().reshape(4, 5), (expected / 256.0).astype(np.float32))
+    np.testing.assert_array_equal(image.numpy()[0], (expected / 256.0).astype(np.float32))
     assert expected.sum() == 256 * n
-    np.testing.assert_array_equal(votes.take()[0], image.numpy().reshape(4, 5))
+    np.testing.assert_array_equal(votes.take(), image.numpy())
     assert votes.take().sum() == 0.0  # and nothing is left of it
 
 

@@ -1,111 +1,224 @@
-"""Smoothing of the image of warped events (IWE), and sums over it."""
+"""The image of warped events (IWE): read from votes, smoothed, and summed.
+
+Kernels come in two widths: a CPU's thread takes 64 pixels of a row in loops that vectorise, a GPU's takes one. Every
+thread writes places of its own, so the bits do not depend on the schedule.
+"""
+
+from functools import cache
+from typing import Any
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from amiwarp.kernels.native import load_float, load_word, store_float, store_int
+from amiwarp.kernels.votes import Canvas, Cells
 
-SEGMENT = wp.constant(64)  # pixels that one thread sums
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
 VARIANCE = wp.constant(0)
 GRADIENT = wp.constant(1)
 LAPLACIAN = wp.constant(2)
 PAPER_J = wp.constant(3)
 ENTROPY = wp.constant(4)
+STRIP = wp.constant(16)  # rows that one thread sums
+CPU_WIDTH = 64
 
 
-# every thread writes a place of its own, so the bits do not depend on the schedule
+@wp.struct
+class Frame:
+    """An image in a flat array, zeros around it: to the right of each row, above, below, and between the layers."""
 
-
-@wp.kernel
-def smooth_along_x(
-    image: wp.array(dtype=float), weights: wp.array(dtype=float), width: int, start: int, out: wp.array(dtype=float)
-):
-    """The image smoothed along x with a symmetric kernel (centre first)."""
-    i = start + wp.tid()
-    col = i % width
-    radius = weights.shape[0] - 1
-    total = float(0.0)
-    for k in range(wp.max(-radius, -col), wp.min(radius, width - 1 - col) + 1):
-        total += weights[wp.abs(k)] * image[i + k]
-    out[i] = total
-
-
-@wp.kernel
-def smooth_along_y(
-    image: wp.array(dtype=float),
-    weights: wp.array(dtype=float),
-    width: int,
-    height: int,
-    start: int,
-    out: wp.array(dtype=float),
-):
-    i = start + wp.tid()
-    row = (i / width) % height
-    radius = weights.shape[0] - 1
-    total = float(0.0)
-    for k in range(wp.max(-radius, -row), wp.min(radius, height - 1 - row) + 1):
-        total += weights[wp.abs(k)] * image[i + k * width]
-    out[i] = total
+    rows: int
+    columns: int
+    stride: int
+    layer: int  # from one layer to the next
+    first: int  # the first pixel
+    blocks: int  # of a row
 
 
 @wp.func
-def neighbour(image: wp.array(dtype=float), i: int, step: int, exists: bool) -> float:
-    """The pixel ``step`` on, zero past the border (the padding holds no events)."""
-    if exists:
-        return image[i + step]
-    return 0.0
+def block_column(frame: Frame, block: int, width: int) -> int:
+    return (block % frame.blocks) * width
 
 
 @wp.func
-def gradient2(image: wp.array(dtype=float), i: int, width: int, height: int) -> float:
+def block_start(frame: Frame, block: int, width: int, step: int) -> int:
+    """Where block ``block`` begins; rows are counted in steps of ``step``."""
+    lines = (frame.rows + step - 1) / step
+    line = block / frame.blocks
+    row = (line % lines) * step
+    return frame.first + (line / lines) * frame.layer + row * frame.stride + block_column(frame, block, width)
+
+
+# -- from votes
+
+
+@wp.func
+def field(word: wp.uint64, first: int, mask: int) -> int:
+    return int((word >> wp.uint64(first)) & wp.uint64(mask))
+
+
+@wp.func
+def votes_of_pixel(words: wp.array(dtype=wp.uint64), cell: int, width: int) -> int:
+    """1/256 votes that the four cells around a pixel hold for it."""
+    a = load_word(words, cell)
+    b = load_word(words, cell - 1)
+    c = load_word(words, cell - width)
+    d = load_word(words, cell - width - 1)
+    mask = 262143
+    total = 256 * field(a, 54, 1023) - field(a, 0, mask) - field(a, 18, mask) + field(a, 36, mask)
+    return total + field(b, 0, mask) - field(b, 36, mask) + field(c, 18, mask) - field(c, 36, mask) + field(d, 36, mask)
+
+
+@wp.func
+def cell_of(canvas: Canvas, frame: Frame, block: int, width: int) -> int:
+    """Cell of a block's first pixel."""
+    line = block / frame.blocks
+    row = (line / frame.rows) * canvas.rows + line % frame.rows + 1
+    return row * canvas.columns + block_column(frame, block, width) + 1
+
+
+@wp.kernel
+def empty_words(
+    counts: wp.array(dtype=wp.int64), slot: int, count: wp.int64, canvas: Canvas, frame: Frame, cells: Cells
+):
+    """Moves a batch's votes to the totals, unless some are lost: the batch is voted again then."""
+    i = wp.tid()
+    if counts[slot] == count:
+        cell = cell_of(canvas, frame, i, 1)
+        cells.totals[cell] = cells.totals[cell] + wp.int64(votes_of_pixel(cells.words, cell, canvas.columns))
+
+
+@cache
+def read_votes(width: int) -> Any:
+    """Kernel that reads ``width`` pixels [events] of all slices, which are left as they are."""
+
+    @wp.kernel
+    def read_votes(
+        words: wp.array2d(dtype=wp.uint64),
+        totals: wp.array2d(dtype=wp.int64),
+        spilled: int,
+        canvas: Canvas,
+        frame: Frame,
+        start: int,
+        image: wp.array(dtype=float),
+    ):
+        block = start + wp.tid()
+        cell = cell_of(canvas, frame, block, width)
+        at = block_start(frame, block, width, 1)
+        column = block_column(frame, block, width)
+        votes = wp.zeros(shape=(width,), dtype=int)
+        for s in range(words.shape[0]):
+            for k in range(width):
+                store_int(votes, k, votes[k] + votes_of_pixel(words[s], cell + k, canvas.columns))
+        for k in range(width):
+            store_float(image, at + k, wp.where(column + k < frame.columns, float(votes[k]) / 256.0, 0.0))
+        if spilled != 0:
+            for k in range(wp.min(width, frame.columns - column)):
+                total = wp.int64(votes[k])
+                for s in range(words.shape[0]):
+                    total += totals[s, cell + k]
+                image[at + k] = float(wp.float64(total) / wp.float64(256.0))
+
+    return read_votes
+
+
+# -- smoothing and sums
+
+
+@cache
+def smooth(width: int) -> Any:
+    """Kernel that smooths ``width`` pixels with a symmetric kernel (centre first) along the axis of ``step``."""
+
+    @wp.kernel
+    def smooth(
+        image: wp.array(dtype=float),
+        weights: wp.array(dtype=float),
+        step: int,
+        frame: Frame,
+        start: int,
+        out: wp.array(dtype=float),
+    ):
+        block = start + wp.tid()
+        at = block_start(frame, block, width, 1)
+        column = block_column(frame, block, width)
+        total = wp.zeros(shape=(width,), dtype=float)
+        for k in range(width):
+            store_float(total, k, weights[0] * load_float(image, at + k))
+        for tap in range(1, weights.shape[0]):
+            weight = weights[tap]
+            for k in range(width):
+                both = load_float(image, at + k - tap * step) + load_float(image, at + k + tap * step)
+                store_float(total, k, load_float(total, k) + weight * both)
+        for k in range(width):
+            store_float(out, at + k, wp.where(column + k < frame.columns, load_float(total, k), 0.0))
+
+    return smooth
+
+
+@wp.func
+def gradient2(image: wp.array(dtype=float), i: int, stride: int) -> float:
     """Squared central-difference gradient."""
-    col = i % width
-    row = (i / width) % height
-    dx = neighbour(image, i, 1, col + 1 < width) - neighbour(image, i, -1, col > 0)
-    dy = neighbour(image, i, width, row + 1 < height) - neighbour(image, i, -width, row > 0)
+    dx = load_float(image, i + 1) - load_float(image, i - 1)
+    dy = load_float(image, i + stride) - load_float(image, i - stride)
     return 0.25 * (dx * dx + dy * dy)
 
 
 @wp.func
-def laplacian2(image: wp.array(dtype=float), i: int, width: int, height: int) -> float:
+def laplacian2(image: wp.array(dtype=float), i: int, stride: int) -> float:
     """Squared five-point Laplacian."""
-    col = i % width
-    row = (i / width) % height
-    total = neighbour(image, i, 1, col + 1 < width) + neighbour(image, i, -1, col > 0)
-    total += neighbour(image, i, width, row + 1 < height) + neighbour(image, i, -width, row > 0)
-    value = total - 4.0 * image[i]
+    across = load_float(image, i + 1) + load_float(image, i - 1)
+    value = across + load_float(image, i + stride) + load_float(image, i - stride) - 4.0 * load_float(image, i)
     return value * value
 
 
 @wp.func
-def pixel_term(kind: int, image: wp.array(dtype=float), i: int, width: int, height: int, eta: float) -> float:
-    h = image[i]
-    if kind == GRADIENT:
-        return gradient2(image, i, width, height)
-    if kind == LAPLACIAN:
-        return laplacian2(image, i, width, height)
+def other_term(kind: int, h: float, eta: float) -> float:
     if kind == PAPER_J:
         return wp.where(h > 0.0, 1.0 / (1.0 + wp.exp(wp.min(h / eta, 80.0))), 0.0)
-    if kind == ENTROPY:
-        return wp.where(h > 0.0, h * wp.log(wp.max(h, 1.0e-30)), 0.0)
-    return h * h
+    return wp.where(h > 0.0, h * wp.log(wp.max(h, 1.0e-30)), 0.0)
+
+
+@cache
+def sum_terms(width: int, kind: int) -> Any:
+    """Kernel that sums ``width`` columns of a strip of rows: the image, and the sharpness' terms."""
+
+    @wp.func
+    def term(image: wp.array(dtype=float), i: int, stride: int, eta: float) -> float:
+        h = load_float(image, i)
+        if wp.static(kind == int(VARIANCE)):
+            return h * h
+        if wp.static(kind == int(GRADIENT)):
+            return gradient2(image, i, stride)
+        if wp.static(kind == int(LAPLACIAN)):
+            return laplacian2(image, i, stride)
+        return other_term(kind, h, eta)
+
+    @wp.kernel
+    def sum_terms(image: wp.array(dtype=float), frame: Frame, eta: float, start: int, sums: wp.array(dtype=wp.vec2d)):
+        block = start + wp.tid()
+        at = block_start(frame, block, width, STRIP)
+        column = block_column(frame, block, width)
+        row = ((block / frame.blocks) % ((frame.rows + STRIP - 1) / STRIP)) * STRIP
+        total = wp.zeros(shape=(width,), dtype=float)
+        terms = wp.zeros(shape=(width,), dtype=float)
+        for line in range(wp.min(STRIP, frame.rows - row)):
+            for k in range(width):
+                i = at + line * frame.stride + k
+                store_float(total, k, load_float(total, k) + load_float(image, i))
+                store_float(terms, k, load_float(terms, k) + term(image, i, frame.stride, eta))
+        both = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
+        for k in range(wp.min(width, frame.columns - column)):
+            both += wp.vec2d(wp.float64(total[k]), wp.float64(terms[k]))
+        sums[block] = both
+
+    return sum_terms
 
 
 @wp.kernel
-def sum_terms(
-    kind: int,
-    image: wp.array(dtype=float),
-    width: int,
-    height: int,
-    eta: float,
-    start: int,
-    sums: wp.array(dtype=wp.vec2d),
-):
-    """Per segment of SEGMENT pixels: the sum of the image and the sum of the sharpness' terms."""
-    segment = start + wp.tid()
-    total = wp.float64(0.0)
-    terms = wp.float64(0.0)
-    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, image.shape[0])):
-        total += wp.float64(image[i])
-        terms += wp.float64(pixel_term(kind, image, i, width, height, eta))
-    sums[segment] = wp.vec2d(total, terms)
-
+def gather_sums(sums: wp.array(dtype=wp.vec2d), out: wp.array(dtype=wp.vec2d)):
+    """Sums of sums, as many as ``out`` is long."""
+    i = wp.tid()
+    total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
+    for k in range(i, sums.shape[0], out.shape[0]):
+        total += sums[k]
+    out[i] = total

@@ -220,72 +220,14 @@ def drift_turns(
     turn[i] = wp.uint16((int(base[i]) + int(wp.floor(drift * slope[i] + 0.5))) & 65535)
 
 
-# -- reading: every thread writes a place of its own
-
-
-@wp.func
-def field(word: wp.uint64, first: int, mask: int) -> wp.int64:
-    return wp.int64((word >> wp.uint64(first)) & wp.uint64(mask))
-
-
-@wp.func
-def votes_of_pixel(words: wp.array(dtype=wp.uint64), cell: int, width: int) -> wp.int64:
-    """1/256 votes that the four cells around a pixel hold for it."""
-    a = words[cell]
-    b = words[cell - 1]
-    c = words[cell - width]
-    d = words[cell - width - 1]
-    total = (field(a, 54, 1023) << wp.int64(8)) - field(a, 0, 262143) - field(a, 18, 262143) + field(a, 36, 262143)
-    total += field(b, 0, 262143) - field(b, 36, 262143)
-    total += field(c, 18, 262143) - field(c, 36, 262143)
-    return total + field(d, 36, 262143)
-
-
-@wp.func
-def cell_of(i: int, canvas: Canvas) -> int:
-    """Cell of pixel ``i`` of an image without the ring."""
-    width = canvas.columns - 2
-    height = canvas.rows - 2
-    return (i / (width * height)) * canvas.layer + ((i / width) % height + 1) * canvas.columns + i % width + 1
-
-
-@wp.kernel
-def read_votes(
-    words: wp.array2d(dtype=wp.uint64),
-    totals: wp.array2d(dtype=wp.int64),
-    canvas: Canvas,
-    spilled: int,
-    start: int,
-    image: wp.array(dtype=float),
-):
-    """The image [events] of all slices; they are left as they are."""
-    i = start + wp.tid()
-    cell = cell_of(i, canvas)
-    total = wp.int64(0)
-    for k in range(words.shape[0]):
-        total += votes_of_pixel(words[k], cell, canvas.columns)
-        if spilled != 0:
-            total += totals[k, cell]
-    image[i] = float(wp.float64(total) / wp.float64(256.0))
-
-
 @wp.kernel
 def count_votes(words: wp.array(dtype=wp.uint64), slot: int, counts: wp.array(dtype=wp.int64)):
     """Events that the words and the trash say they hold: fewer than were voted if any overflowed, never more."""
     i = wp.tid()
     total = wp.int64(0)
     for k in range(i, words.shape[0], 16384):
-        total += field(words[k], 54, 1023)
+        total += wp.int64(words[k] >> wp.uint64(54))
     wp.atomic_add(counts, slot, total)
-
-
-@wp.kernel
-def empty_words(counts: wp.array(dtype=wp.int64), slot: int, count: wp.int64, canvas: Canvas, cells: Cells):
-    """Moves the votes of a batch to the totals, unless some are lost: the batch is voted again then."""
-    i = wp.tid()
-    if counts[slot] == count:
-        cell = cell_of(i, canvas)
-        cells.totals[cell] = cells.totals[cell] + votes_of_pixel(cells.words, cell, canvas.columns)
 
 
 for _struct in MODEL_STRUCTS:
