@@ -50,15 +50,28 @@ class CanvasShape:
     per_polarity: bool = False
     """Two layers, OFF then ON, in place of one."""
     vote: Vote = Vote.BILINEAR
+    parts: int = 1
+    """Disjoint parts of the events, every so manieth, with images of their own."""
     dither: bool = False
     """Put each event somewhere in its pixel, not at its centre: nothing is won then by events on the pixel grid."""
+
+    @property
+    def layers(self) -> int:
+        """Images: parts, and in each OFF and ON where these are apart."""
+        return self.parts * (2 if self.per_polarity else 1)
+
+    def layer_of(self, p: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image that each event goes to."""
+        part = np.arange(len(p)) % self.parts if self.parts > 1 else 0
+        layer = 2 * part + (p != 0) if self.per_polarity else part + np.zeros(len(p))
+        return np.asarray(layer).astype(np.uint8)
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(layers, rows, columns)."""
         rows = max(1, round((self.height + 2 * self.pad) * self.scale))
         columns = max(1, round((self.width + 2 * self.pad) * self.scale))
-        return (2 if self.per_polarity else 1, rows, columns)
+        return (self.layers, rows, columns)
 
     def params(self) -> Any:
         from amiwarp.kernels.votes import Canvas
@@ -67,7 +80,7 @@ class CanvasShape:
         c.pad, c.scale = float(self.pad), self.scale
         c.nearest, c.dither = int(self.vote is Vote.NEAREST), float(self.dither)
         c.rows, c.columns = self.shape[1] + 2, self.shape[2] + 2
-        c.layer = c.rows * c.columns if self.per_polarity else 0
+        c.layer = c.rows * c.columns if self.layers > 1 else 0
         return c
 
 
@@ -200,18 +213,18 @@ class Votes:
         else:
             self._exactly(vote_events, inputs, events.count)
 
-    def add_points(self, xy: Any, p: Any) -> None:
-        """Votes points as they are: ``xy`` a Warp array of vec2 [px], ``p`` of uint8."""
+    def add_points(self, xy: Any, layer: Any) -> None:
+        """Votes points as they are: ``xy`` a Warp array of vec2 [px], ``layer`` of uint8, the image each goes to."""
         from amiwarp.kernels.votes import vote_points
 
-        self._exactly(vote_points, [xy, p, self._params], len(xy))
+        self._exactly(vote_points, [xy, layer, self._params], len(xy))
 
     def add_as_they_are(self, events: Events) -> None:
         """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""
         import warp as wp
 
         xy = wp.array(np.stack([events.x, events.y], axis=1).astype(np.float32), dtype=wp.vec2, device=self.device)
-        self.add_points(xy, wp.array(events.p, dtype=wp.uint8, device=self.device))
+        self.add_points(xy, wp.array(self.canvas.layer_of(events.p), dtype=wp.uint8, device=self.device))
 
     def _exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
         """Every event looks at what its word held."""
@@ -290,13 +303,15 @@ def upload_events(
     theta: NDArray[np.float64],
     device: Any,
     *,
+    canvas: CanvasShape | None = None,
     slope: NDArray[np.float64] | None = None,
     middle_us: int | None = None,
 ) -> DeviceEvents:
     """Events and their angles [rad] on ``device``; pixels must be whole (uint16).
 
-    ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events get
-    their times from it, so that the camera's turning can be taken back.
+    ``canvas``: says which image each event goes to; without it OFF and ON go to the first and second, or to the only
+    one. ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events
+    get their times from it, so that the camera's turning can be taken back.
     """
     import warp as wp
 
@@ -316,7 +331,8 @@ def upload_events(
         return array
 
     e = EventArrays()
-    e.x, e.y, e.p = put(events.x, wp.uint16), put(events.y, wp.uint16), put(events.p, wp.uint8)
+    e.x, e.y = put(events.x, wp.uint16), put(events.y, wp.uint16)
+    e.layer = put((events.p != 0).astype(np.uint8) if canvas is None else canvas.layer_of(events.p), wp.uint8)
     e.turn = put(np.rint(theta * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
     e.azimuths = azimuths(str(wp.get_device(device)))
     e.time = wp.empty(0, dtype=float, device=device)

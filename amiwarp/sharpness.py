@@ -54,10 +54,13 @@ class SharpnessMeter:
         self._weights = wp.array(weights, dtype=float, device=device)
         self._half, self._smooth = (wp.zeros_like(self.image.pixels) for _ in range(2))
         layers, rows, columns = canvas.shape
-        self._n = layers * rows * columns
-        strips = layers * -(-rows // int(STRIP)) * self.image.frame.blocks
-        self._sums = wp.empty(strips, dtype=wp.vec2d, device=device)
-        self._few = wp.empty(min(strips, FEW_SUMS), dtype=wp.vec2d, device=device)
+        self._parts = canvas.parts
+        self._n = layers // canvas.parts * rows * columns
+        strips = -(-rows // int(STRIP)) * self.image.frame.blocks
+        self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
+        few = (layers, min(strips, FEW_SUMS))
+        self._few = wp.empty(few, dtype=wp.vec2d, device=device)
+        self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=self.device.is_cuda)
 
     def launch(self) -> None:
         """Measures :attr:`image` on the device, without waiting for it."""
@@ -74,18 +77,23 @@ class SharpnessMeter:
                 smoothed = out
         kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
         inputs = [smoothed, frame, PAPER_ETA]
-        launch(kernel, len(self._sums), inputs, [self._sums], device=self.device, smallest=64)
-        wp.launch(kernels.gather_sums, len(self._few), [self._sums], [self._few], device=self.device)
+        launch(kernel, self._sums.size, inputs, [self._sums.flatten()], device=self.device, smallest=64)
+        wp.launch(kernels.gather_sums, self._few.shape, [self._sums], [self._few], device=self.device)
+        wp.copy(self._host, self._few)
 
-    def result(self) -> float:
-        """Sharpness of the image that was measured last."""
-        total, terms = self._few.numpy().sum(axis=0)
-        return self._score(float(total), float(terms))
+    def results(self) -> list[float]:
+        """Sharpness of each part of the image that was measured last."""
+        import warp as wp
+
+        if self.device.is_cuda:
+            wp.synchronize_stream(self.device)
+        sums = self._host.numpy().reshape(self._parts, -1, 2).sum(axis=1)
+        return [self._score(float(total), float(terms)) for total, terms in sums]
 
     def measure(self) -> float:
-        """Sharpness of :attr:`image`."""
+        """Sharpness of :attr:`image`, of one part."""
         self.launch()
-        return self.result()
+        return self.results()[0]
 
     def _score(self, total: float, terms: float) -> float:
         if total <= 0.0:

@@ -24,7 +24,7 @@ ORDER = (
     ("optics", "events", "encoder", "turning"),
     ("pictures", "motion", "clouds"),
     ("io", "iwe", "link"),
-    ("compensate", "iwe_files", "sharpness", "metrics", "scenery"),
+    ("compensate", "iwe_files", "sharpness", "metrics", "scenery", "tiles"),
     ("pairs",),
     ("brightness",),
     ("calib", "engine", "reconstruct"),

@@ -19,12 +19,18 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.parameters import Space
     from amiwarp.events import Events
+    from amiwarp.iwe import DeviceEvents
+    from amiwarp.optics import Model
+    from amiwarp.turning import Turning
 
 MOTION_ROOM_PX = 16.0
 
 
 class Objective:
-    """Sharpness of the IWE of a set of events as a function of the free parameters; counts its evaluations."""
+    """Sharpness of the IWE of a set of events as a function of the free parameters; counts its evaluations.
+
+    On CUDA the events are sorted by tile once, and an evaluation is one captured graph.
+    """
 
     def __init__(
         self,
@@ -37,43 +43,97 @@ class Objective:
         smoothing: float,
         scale: float = 1.0,
         per_polarity: bool = False,
+        parts: int = 1,
         device: Any = "cpu",
     ) -> None:
         """``theta``: encoder's angle of each event [rad]; ``slope``: its change per unit of the drifting parameter.
 
-        ``smoothing``: standard deviation [sensor px]; ``scale``: canvas pixels per sensor pixel.
+        ``smoothing``: standard deviation [sensor px]; ``scale``: canvas pixels per sensor pixel. ``parts``: disjoint
+        parts of the events that :meth:`each` measures apart.
         """
         self.space = space
         self.evaluations = 0
-        middle = space.middle_us if space.moving else None
-        self._arrays = upload_events(events, theta, device, slope=slope, middle_us=middle)
         camera = space.camera
         # the paper's J is left as it was written
         dither = kind is not Sharpness.PAPER_J
-        canvas = CanvasShape(camera.width, camera.height, padding(space), scale, per_polarity, dither=dither)
-        self._votes = Votes(canvas, device)
+        pad = padding(space)
+        canvas = CanvasShape(camera.width, camera.height, pad, scale, per_polarity, parts=parts, dither=dither)
+        middle = space.middle_us if space.moving else None
+        uploaded = upload_events(events, theta, device, canvas=canvas, slope=slope, middle_us=middle)
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
+        # tiles take their camera as it is when they are prepared
+        if self._meter.device.is_cuda and "focal_length" not in space.names:
+            self._image: _Voted | _Captured = _Captured(canvas, uploaded, self._meter, self._model(space.start))
+        else:
+            self._image = _Voted(canvas, uploaded, self._meter)
 
-    def _vote(self, values: dict[str, float]) -> None:
-        self._votes.clear()
-        drift, turning = self.space.drift(values), self.space.turning(values)
-        self._votes.add_events(self.space.build(values), self._arrays, drift=drift, turning=turning)
+    def _model(self, values: Mapping[str, float]) -> Model:
+        """The ellipse is the exact model's first harmonic: the same optimum, without tables for every point."""
+        kind = "exact" if self.space.model == "ellipse" else self.space.model
+        return build_model(kind, self.space.camera, self.space.prism, values)
 
-    def values(self, values: dict[str, float]) -> float:
-        """Sharpness at parameter values."""
+    def _measure(self, values: Mapping[str, float]) -> list[float]:
         self.evaluations += 1
-        self._vote(values)
-        self._votes.read(self._meter.image)
-        return self._meter.measure()
+        self._image.measure(self._model(values), self.space.drift(values), self.space.turning(values))
+        return self._meter.results()
+
+    def values(self, values: Mapping[str, float]) -> float:
+        """Sharpness at parameter values."""
+        return self._measure(values)[0]
 
     def __call__(self, v: NDArray[np.float64]) -> float:
         """Sharpness at a vector of the space [px]."""
         return self.values(self.space.to_values(v))
 
-    def image(self, values: dict[str, float]) -> NDArray[np.float32]:
+    def each(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Sharpness of each part at parameter values, shape (parts,)."""
+        return np.array(self._measure(values))
+
+    def image(self, values: Mapping[str, float]) -> NDArray[np.float32]:
         """The IWE at parameter values, shape (layers, rows, columns), padding included."""
-        self._vote(values)
-        return self._votes.take()
+        self._measure(values)
+        return self._meter.image.numpy()
+
+
+class _Voted:
+    """Images by one pass over the events, in their order."""
+
+    def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter) -> None:
+        self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
+
+    def measure(self, model: Model, drift: float, turning: Turning) -> None:
+        self._votes.clear()
+        self._votes.add_events(model, self._events, drift=drift, turning=turning)
+        self._votes.read(self._meter.image)
+        self._meter.launch()
+
+
+class _Captured:
+    """Images by tiles, everything in one CUDA graph."""
+
+    def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter, like: Model) -> None:
+        from amiwarp.tiles import TileVotes
+
+        self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
+        self._graph: Any = None
+
+    def measure(self, model: Model, drift: float, turning: Turning) -> None:
+        import warp as wp
+
+        self._tiles.set(0, model, drift=drift, turning=turning)
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        self._launch()  # once as it is: a capture cannot load modules
+        wp.synchronize_stream(self._meter.device)
+        with wp.ScopedCapture(self._meter.device) as capture:
+            self._launch()
+        self._graph = capture.graph
+
+    def _launch(self) -> None:
+        self._tiles.launch()
+        self._tiles.read(0, self._meter.image)
+        self._meter.launch()
 
 
 def padding(space: Space) -> int:

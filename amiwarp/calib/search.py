@@ -128,12 +128,17 @@ class Search:
         self.stages: list[StageSummary] = []
         self.fine = self._objective(material, 1.0, settings.smoothing_px)
 
-    def _parts(self, kind: Sharpness) -> list[Objective]:
-        smoothing = max(1.0, self.settings.smoothing_px)
-        return [self._objective(self.material.every(PARTS, k), 1.0, smoothing, kind) for k in range(PARTS)]
+    def _parts(self, kind: Sharpness) -> Objective:
+        return self._objective(self.material, 1.0, max(1.0, self.settings.smoothing_px), kind, parts=PARTS)
 
     def _objective(
-        self, m: Material, scale: float, smoothing: float, kind: Sharpness | None = None, space: Space | None = None
+        self,
+        m: Material,
+        scale: float,
+        smoothing: float,
+        kind: Sharpness | None = None,
+        space: Space | None = None,
+        parts: int = 1,
     ) -> Objective:
         s = self.settings
         kind = kind or s.sharpness
@@ -141,7 +146,7 @@ class Search:
             smoothing = 0.0  # the tails of a Gaussian are pixels with h > 0, each of which J would count
         return Objective(
             space or self.space, m.events, m.theta, m.slope, kind=kind, smoothing=smoothing, scale=scale,
-            per_polarity=s.per_polarity, device=self.device,
+            per_polarity=s.per_polarity, parts=parts, device=self.device,
         )  # fmt: skip
 
     def run(self) -> None:
@@ -212,14 +217,14 @@ class Search:
         if self.space.sized:
             self._check(best, parts, name)
         v = self.space.to_vector(best)
-        covariance, warnings = scatter(parts, self.fine, v)
+        covariance, warnings = scatter(parts, v)
         return self._at_bounds(best) + warnings, self.space.deviations(v, covariance)
 
-    def _check(self, best: dict[str, float], parts: list[Objective], name: str) -> None:
+    def _check(self, best: dict[str, float], parts: Objective, name: str) -> None:
         # by variance, whatever the cost: the paper's J may like an image without motion best
         plain = parts if self.settings.sharpness is Sharpness.VARIANCE else self._parts(Sharpness.VARIANCE)
         points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
-        sharp, turned, still = (np.array([part.values(values) for part in plain]) for values in points)
+        sharp, turned, still = (plain.each(values) for values in points)
         checks.check_texture(sharp, turned, still, name)
         checks.check_directions(self.image(), name)
 
@@ -249,47 +254,36 @@ def distinct_optima(stage: Stage, most: int, apart: float = 6.0) -> list[NDArray
 
 
 def scatter(
-    parts: list[Objective], whole: Objective, v: NDArray[np.float64], step: float = 0.25
+    parts: Objective, v: NDArray[np.float64], step: float = 0.25
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Covariance of the optimum [px²]: the cost's curvature, and the scatter of its slope over parts of the events.
 
     H⁻¹ cov(g) H⁻¹, the sandwich estimate, g being a part's slope at the whole's optimum and H the mean curvature of
-    the parts; the whole has ``len(parts)`` times the events. A direction without curvature is named in a warning.
+    the parts; the whole has as many times the events. A direction without curvature is named in a warning.
     """
     n = len(v)
-    gradients = np.empty((len(parts), n))
-    hessian = np.zeros((n, n))
+
+    def at(*shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+        return parts.each(parts.space.to_values(v + sum(shifts)))
+
     steps = np.eye(n) * step
-    for k, part in enumerate(parts):
-        up, down = (np.array([part(v + sign * h) for h in steps]) for sign in (1.0, -1.0))
-        gradients[k] = (up - down) / (2.0 * step)
-        hessian += _curvature(part, v, steps, step, up, down) / len(parts)
+    centre, up, down = at(), [at(h) for h in steps], [at(-h) for h in steps]
+    gradients = (np.array(up) - np.array(down)).T / (2.0 * step)
+    hessian = np.zeros((n, n))
+    for i in range(n):
+        hessian[i, i] = np.mean(up[i] - 2.0 * centre + down[i]) / step**2
+        for j in range(i):
+            both = at(steps[i], steps[j]) + at(-steps[i], -steps[j])
+            mixed = both - up[i] - up[j] - down[i] - down[j] + 2.0 * centre
+            hessian[i, j] = hessian[j, i] = np.mean(mixed) / (2.0 * step**2)
     values, vectors = np.linalg.eigh(-hessian)
     largest = max(float(values.max()), 1e-12)
     weak = values < 1e-3 * largest
     inverse = vectors @ np.diag(1.0 / np.maximum(values, 1e-3 * largest)) @ vectors.T
-    names = whole.space.names
+    names = parts.space.names
     warnings = tuple(
         f"the events hardly determine {names[int(np.argmax(np.abs(vectors[:, k])))]} (curvature "
         f"{values[k] / largest:.1e} of the best determined)"
         for k in np.flatnonzero(weak)
     )
-    return inverse @ np.atleast_2d(np.cov(gradients.T)) @ inverse / len(parts), warnings
-
-
-def _curvature(
-    part: Objective,
-    v: NDArray[np.float64],
-    steps: NDArray[np.float64],
-    step: float,
-    up: NDArray[np.float64],
-    down: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    n = len(v)
-    centre = part(v)
-    hessian = np.diag((up - 2.0 * centre + down) / step**2)
-    for i in range(n):
-        for j in range(i):
-            both = part(v + steps[i] + steps[j]) + part(v - steps[i] - steps[j])
-            hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] - down[i] - down[j] + 2.0 * centre) / (2.0 * step**2)
-    return hessian
+    return inverse @ np.atleast_2d(np.cov(gradients.T)) @ inverse / len(gradients), warnings

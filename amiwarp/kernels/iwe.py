@@ -215,10 +215,10 @@ def sum_terms(width: int, kind: int) -> Any:
 
 
 @wp.kernel
-def gather_sums(sums: wp.array(dtype=wp.vec2d), out: wp.array(dtype=wp.vec2d)):
-    """Sums of sums, as many as ``out`` is long."""
-    i = wp.tid()
+def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array2d(dtype=wp.vec2d)):
+    """Sums of sums, row by row, as many as ``out`` has columns."""
+    row, i = wp.tid()
     total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
-    for k in range(i, sums.shape[0], out.shape[0]):
-        total += sums[k]
-    out[i] = total
+    for k in range(i, sums.shape[1], out.shape[1]):
+        total += sums[row, k]
+    out[row, i] = total

@@ -27,12 +27,13 @@ CARRIES = wp.constant(wp.uint64((1 << 63) | (1 << 53) | (1 << 35) | (1 << 17)))
 
 @wp.struct
 class EventArrays:
-    """Events on a device, padded to whole blocks. ``turn``: the encoder's angle in 1/65536 turn; ``azimuths``: cosine
-    and sine of each such angle; ``time``: from the window's middle [s], or empty where the camera does not turn."""
+    """Events on a device, padded to whole blocks. ``layer``: the image that an event goes to, by its polarity;
+    ``turn``: the encoder's angle in 1/65536 turn; ``azimuths``: cosine and sine of each such angle; ``time``: from the
+    window's middle [s], or empty where the camera does not turn."""
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
-    p: wp.array(dtype=wp.uint8)
+    layer: wp.array(dtype=wp.uint8)
     turn: wp.array(dtype=wp.uint16)
     azimuths: wp.array(dtype=float)
     time: wp.array(dtype=float)
@@ -48,7 +49,7 @@ class Canvas:
     dither: float  # 1: an event lies somewhere in its pixel, 0: at its centre
     rows: int
     columns: int
-    layer: int  # cells from OFF to ON; 0: together
+    layer: int  # cells from one image to the next; 0: together
 
 
 @wp.struct
@@ -137,7 +138,7 @@ def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: 
     w0, w1 = azimuth_at(model, events, i)
     x, y = place(model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1)
     dx, dy = somewhere(i)
-    layer = wp.where(load_uint8(events.p, i) != wp.uint8(0), canvas.layer, 0)
+    layer = int(load_uint8(events.layer, i)) * canvas.layer
     inside, cell, word = vote_at(canvas, x + canvas.dither * dx, y + canvas.dither * dy, layer)
     return inside, cell, word
 
@@ -183,7 +184,7 @@ def vote_turning(
     x, y = place(model, camera, float(events.x[i]), float(events.y[i]), w0, w1)
     xy = turn_back(camera, wp.vec2(x, y), turning, events.time[i])
     dx, dy = somewhere(i)
-    layer = wp.where(events.p[i] != wp.uint8(0), canvas.layer, 0)
+    layer = int(events.layer[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, xy[0] + canvas.dither * dx, xy[1] + canvas.dither * dy, layer)
     cast_vote(cells, cell, canvas.columns, word)
 
@@ -200,9 +201,11 @@ def vote_quickly(model: Any, camera: Any, events: EventArrays, canvas: Canvas, t
 
 
 @wp.kernel
-def vote_points(xy: wp.array(dtype=wp.vec2), p: wp.array(dtype=wp.uint8), canvas: Canvas, start: int, cells: Cells):
+def vote_points(
+    xy: wp.array(dtype=wp.vec2), layers: wp.array(dtype=wp.uint8), canvas: Canvas, start: int, cells: Cells
+):
     i = start + wp.tid()
-    layer = wp.where(p[i] != wp.uint8(0), canvas.layer, 0)
+    layer = int(layers[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, xy[i][0], xy[i][1], layer)
     cast_vote(cells, cell, canvas.columns, word)
 
