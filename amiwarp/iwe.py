@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,12 +59,6 @@ class CanvasShape:
     def layers(self) -> int:
         """Images: parts, and in each OFF and ON where these are apart."""
         return self.parts * (2 if self.per_polarity else 1)
-
-    def layer_of(self, p: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image that each event goes to."""
-        part = np.arange(len(p)) % self.parts if self.parts > 1 else 0
-        layer = 2 * part + (p != 0) if self.per_polarity else part + np.zeros(len(p))
-        return np.asarray(layer).astype(np.uint8)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -130,7 +124,7 @@ class DeviceEvents:
     """Events with their angles on a device; see :func:`upload_events`."""
 
     arrays: Any
-    """``amiwarp.kernels.votes.EventArrays``."""
+    """``amiwarp.kernels.votes.EventArrays``: OFF goes to the first image, ON to the second, or both to the only one."""
     count: int
     base: Any
     """Angles without drift, where there is a slope."""
@@ -143,6 +137,19 @@ class DeviceEvents:
         from amiwarp.kernels.votes import drift_turns
 
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
+
+    def in_parts(self, canvas: CanvasShape) -> DeviceEvents:
+        """The same events, each going to the image of its part."""
+        import warp as wp
+
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.votes import EventArrays, layer_events
+
+        a, e = self.arrays, EventArrays()
+        e.x, e.y, e.turn, e.azimuths, e.time, e.layer = a.x, a.y, a.turn, a.azimuths, a.time, wp.empty_like(a.layer)
+        inputs = [a.layer, canvas.parts, int(canvas.per_polarity)]
+        launch(layer_events, len(e.layer), inputs, [e.layer], device=e.layer.device)
+        return replace(self, arrays=e)
 
 
 class Votes:
@@ -171,12 +178,16 @@ class Votes:
             cells = Cells()
             cells.words, cells.totals, cells.spilled = self._words[k], self._totals[k], self._spilled[k]
             self._cells.append(cells)
-        self._counts = wp.zeros(64, dtype=wp.int64, device=self.device)
-        self._batches: list[tuple[list[Any], int, int]] = []
+        self._batches: list[tuple[list[Any], int, int]] = []  # of the fast way, not settled yet
         self._quick: bool | None = None if self.device.is_cuda else False
+        if self.device.is_cuda:
+            self._counts = wp.zeros((64, 1024), dtype=wp.int64, device=self.device)
+            self._fast = Cells()
+            self._fast.words = wp.zeros_like(self._words[0])
+            self._fast.totals, self._fast.spilled = wp.zeros_like(self._totals[0]), self._spilled[0]
 
     def clear(self) -> None:
-        self._batches.clear()
+        self._forget()
         self._words.zero_()
         if self._any_total:
             self._totals.zero_()
@@ -224,7 +235,7 @@ class Votes:
         import warp as wp
 
         xy = wp.array(np.stack([events.x, events.y], axis=1).astype(np.float32), dtype=wp.vec2, device=self.device)
-        self.add_points(xy, wp.array(self.canvas.layer_of(events.p), dtype=wp.uint8, device=self.device))
+        self.add_points(xy, wp.array(events.p, dtype=wp.uint8, device=self.device))
 
     def _exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
         """Every event looks at what its word held."""
@@ -250,37 +261,38 @@ class Votes:
     def _quickly(self, inputs: list[Any], count: int, first: int) -> None:
         import warp as wp
 
-        from amiwarp.kernels import votes as kernels
+        from amiwarp.kernels.iwe import empty_words
+        from amiwarp.kernels.votes import vote_quickly
 
-        slot, cells = len(self._batches), self._cells[0]
-        self._counts[slot : slot + 1].zero_()
-        if not self._batches:
-            self._empty(slot, 0)  # of what was voted exactly
-        wp.launch(kernels.vote_quickly, count, [*inputs, self._trash, first], [cells], device=self.device)
-        wp.launch(kernels.count_votes, 16384, [cells.words, slot], [self._counts], device=self.device)
-        self._empty(slot, count)
+        fast, slot = self._fast, len(self._batches)
+        wp.launch(vote_quickly, count, [*inputs, self._trash, first], [fast], device=self.device)
+        wp.launch(empty_words, len(fast.words), [self._params, fast, slot], [self._counts], device=self.device)
+        fast.words.zero_()
         self._batches.append((inputs, count, first))
 
-    def _empty(self, slot: int, count: int) -> None:
+    def _settle(self) -> None:
+        """Keeps what was voted fast, or votes it again, exactly, where words overflowed."""
         import warp as wp
 
-        from amiwarp.kernels.iwe import empty_words
-
-        inputs = [self._counts, slot, count, self._params, self._image.frame]
-        wp.launch(empty_words, self._image.blocks, inputs, [self._cells[0]], device=self.device)
-        self._words.zero_()
-
-    def _settle(self) -> None:
-        """Votes again, exactly, the batches in which a word overflowed."""
+        from amiwarp.kernels.iwe import add_totals
         from amiwarp.kernels.votes import vote_events
 
-        batches, self._batches = self._batches, []
-        counts = self._counts.numpy()[: len(batches)] if batches else []
-        lost = [batch for batch, count in zip(batches, counts, strict=True) if count != batch[1]]
-        for inputs, count, first in lost:
-            self._exactly(vote_events, inputs, count, first)
-        if batches:
-            self._quick = not lost
+        if not self._batches:
+            return
+        counts = self._counts[: len(self._batches)].numpy().sum(axis=1)
+        self._quick = bool((counts == [count for _, count, _ in self._batches]).all())
+        if self._quick:
+            wp.launch(add_totals, len(self._fast.totals), [self._fast.totals], [self._totals[0]], device=self.device)
+        else:
+            for inputs, count, first in self._batches:
+                self._exactly(vote_events, inputs, count, first)
+        self._forget()
+
+    def _forget(self) -> None:
+        if self._batches:
+            self._fast.totals.zero_()
+            self._counts.zero_()
+            self._batches.clear()
 
     def read(self, image: Image) -> None:
         """Writes the image so far [events]; the votes stay."""
@@ -300,44 +312,55 @@ class Votes:
 
 def upload_events(
     events: Events,
-    theta: NDArray[np.float64],
+    angles: Encoder | NDArray[np.float64],
     device: Any,
     *,
-    canvas: CanvasShape | None = None,
     slope: NDArray[np.float64] | None = None,
     middle_us: int | None = None,
 ) -> DeviceEvents:
-    """Events and their angles [rad] on ``device``; pixels must be whole (uint16).
+    """Events and their angles on ``device``: an encoder's, or given [rad]; pixels must be whole (uint16).
 
-    ``canvas``: says which image each event goes to; without it OFF and ON go to the first and second, or to the only
-    one. ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events
-    get their times from it, so that the camera's turning can be taken back.
+    ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events get
+    their times from it, so that the camera's turning can be taken back. Raises :class:`AmiwarpError` where the encoder
+    does not cover the events.
     """
     import warp as wp
 
-    from amiwarp.kernels.structs import azimuths
-    from amiwarp.kernels.votes import BLOCK, EventArrays
+    from amiwarp.kernels.launch import launch
+    from amiwarp.kernels.structs import azimuths, encoder_params
+    from amiwarp.kernels.votes import BLOCK, EventArrays, time_events, turn_events
 
     if events.x.dtype != np.uint16:
         raise AmiwarpError(
             f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
         )
-    n = len(events)
-    padded = -(-n // int(BLOCK)) * int(BLOCK)
+    n, device = len(events), wp.get_device(device)
+    # CPUs vote whole blocks
+    padded = -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
 
     def put(values: NDArray[Any], dtype: Any) -> Any:
+        if padded == n:
+            return wp.array(values, dtype=dtype, device=device)
         array = wp.zeros(padded, dtype=dtype, device=device)
-        wp.copy(array, wp.array(values, dtype=dtype, device=device), count=n)
+        array.numpy()[:n] = values
         return array
 
     e = EventArrays()
     e.x, e.y = put(events.x, wp.uint16), put(events.y, wp.uint16)
-    e.layer = put((events.p != 0).astype(np.uint8) if canvas is None else canvas.layer_of(events.p), wp.uint8)
-    e.turn = put(np.rint(theta * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
-    e.azimuths = azimuths(str(wp.get_device(device)))
-    e.time = wp.empty(0, dtype=float, device=device)
+    e.layer = put(events.p, wp.uint8)
+    e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
+    if not isinstance(angles, np.ndarray) or middle_us is not None:
+        t = wp.array(events.t, dtype=wp.int64, device=device)
+    if isinstance(angles, np.ndarray):
+        e.turn = put(np.rint(angles * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
+    else:
+        e.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
+        if n:
+            encoder = encoder_params(angles, int(events.t[0]), int(events.t[-1]), device)
+            launch(turn_events, n, [encoder, t], [e.turn], device=device)
     if middle_us is not None:
-        e.time = put(((events.t - middle_us) * 1e-6).astype(np.float32), float)
+        e.time = wp.empty(n, dtype=float, device=device)
+        launch(time_events, n, [t, middle_us], [e.time], device=device)
     if slope is None:
         return DeviceEvents(e, n, None, None)
     return DeviceEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
@@ -369,7 +392,7 @@ def iwe(
         piece = events[start : start + PIECE]
         if model is not None and encoder is not None:
             middle = None if turning is None else turning.middle_us
-            arrays = upload_events(piece, encoder.angle_at(piece.t), device, middle_us=middle)
+            arrays = upload_events(piece, encoder, device, middle_us=middle)
             votes.add_events(model, arrays, turning=turning)
         else:
             votes.add_as_they_are(piece)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,20 +29,25 @@ class TileVotes:
         from amiwarp.kernels import tiles as kernels
         from amiwarp.kernels.camera import TurningParams
         from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams
+        from amiwarp.kernels.structs import pinhole_params
         from amiwarp.optics import CircleModel, ExactModel, RadialCircleModel, model_camera
 
         device = self.device = image.device
         self.canvas, self.candidates = canvas, candidates
-        self._params, self._camera = canvas.params(), model_camera(like, self.device)
+        still = len(events.arrays.time) == 0
+        self._params = canvas.params()
+        self._camera = (pinhole_params(like.camera) if still else None) or model_camera(like, self.device)
         self._arrays = self._sort(events)
         self.votes = wp.zeros((candidates, len(image.pixels)), dtype=wp.int64, device=device)
         """Votes of each candidate in 1/256, laid out as the image."""
         frame, self._layout = image.frame, kernels.Layout()
         self._layout.stride, self._layout.layer, self._layout.first = frame.stride, frame.layer, frame.first
+        self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
         kind = {CircleModel: CircleParams, RadialCircleModel: RadialCircleParams, ExactModel: ExactParams}[type(like)]
         self._host = [
             wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True) for dtype in (kind, float, TurningParams)
         ]
+        self._drifts = self._host[1].numpy()
         self._there = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
         self._motion = kernels.Motion()
         self._motion.drift, self._motion.turning = self._there[1:]
@@ -92,9 +98,15 @@ class TileVotes:
 
     def set(self, k: int, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:
         """Parameters of candidate ``k`` for the next :meth:`launch`, which must not be under way."""
-        values = (model.params(self.device).numpy_value(), drift, (turning or Turning()).params().numpy_value())
-        for array, value in zip(self._host, values, strict=True):
-            array.numpy()[k] = value
+        import warp as wp
+
+        self._drifts[k] = drift
+        for array, struct in (
+            (self._host[0], model.params(self.device)),
+            (self._host[2], (turning or Turning()).params()),
+        ):
+            size = wp.types.type_size_in_bytes(array.dtype)
+            ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)
 
     def launch(self) -> None:
         """Votes all events under all candidates."""

@@ -22,6 +22,8 @@ from amiwarp.events import Events, MemoryEvents
 from amiwarp.optics import Prism
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from amiwarp.camera import Camera
     from amiwarp.events import Recording
 
@@ -29,6 +31,8 @@ NOMINAL_PRISM = Prism(math.radians(2.0))
 """What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
 LINEAR = ("off_ratio", "leak")
 """Names that are free in the photometric stage alone: unknowns of its linear equations."""
+RUN = 8
+"""Events that stay together where a recording is thinned: a cache line of times."""
 MOVING_TURNS, MOVING_US = 2.1, 100_000.0
 """Length of the window where the camera's motion is free: in turns, or without a prism."""
 LEAST_SHARPNESS_KEPT = 0.88
@@ -118,7 +122,7 @@ def prepare(
         space = _space(recording, camera, encoder, events, settings, free)
         material = _material(events, encoder, space, _middle(recording))
         if space.sized:
-            checks.check_turn(material.theta, name)
+            checks.check_turn(encoder.angle_at(events.t[:: max(1, len(events) // 10_000)]), name)
         searches.append(Search(space, material, settings, device, progress))
     return searches
 
@@ -171,15 +175,24 @@ def _middle(recording: Recording) -> int:
 
 
 def thin(recording: Recording, most: int) -> Events:
-    """At most ``most`` events, every k-th of the recording, read in blocks."""
+    """At most ``most`` events, evenly: every k-th run of the recording's, read in blocks."""
     step = max(1, -(-len(recording.events) // most))
-    kept, offset = [], 0
-    for block in recording.events.blocks():
-        # a copy, so that the block itself can go
-        part = block[slice((-offset) % step, None, step)]
-        kept.append(Events(part.x.copy(), part.y.copy(), part.t.copy(), part.p.copy()) if step > 1 else part)
-        offset += len(block)
-    return Events.concatenate(kept)
+    if step == 1:
+        return Events.concatenate(list(recording.events.blocks()))
+    # blocks of whole periods, so that every run but the last is whole
+    blocks = recording.events.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
+    return Events.concatenate([_runs(block, step) for block in blocks])
+
+
+def _runs(block: Events, step: int) -> Events:
+    """The first of every ``step`` runs, copied, so that the block itself can go."""
+    whole = len(block) // (step * RUN) * step * RUN
+
+    def pick(values: NDArray[Any]) -> NDArray[Any]:
+        rest = values[whole : whole + RUN]
+        return np.concatenate([values[:whole].reshape(-1, step * RUN)[:, :RUN].ravel(), rest])
+
+    return Events(pick(block.x), pick(block.y), pick(block.t), pick(block.p))
 
 
 def _space(
@@ -210,7 +223,7 @@ def _material(events: Events, encoder: Encoder, space: Space, middle: int) -> Ma
     if "clock_offset" in space.start:
         encoder = encoder.with_clock_offset(space.start["clock_offset"])
     if "clock_offset" in space.names:
-        return Material.of(events, encoder, lambda t: encoder.speed_at(t) * 1e-6)
+        return Material(events, encoder, lambda t: encoder.speed_at(t) * 1e-6)
     if "rpm" in space.names:
-        return Material.of(events, encoder, lambda t: (t - middle).astype(np.float64) * (2.0 * math.pi / 60e6))
-    return Material.of(events, encoder, None)
+        return Material(events, encoder, lambda t: (t - middle).astype(np.float64) * (2.0 * math.pi / 60e6))
+    return Material(events, encoder, None)

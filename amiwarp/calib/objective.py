@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib.parameters import MOTION, build_model
-from amiwarp.iwe import CanvasShape, Votes, upload_events
+from amiwarp.iwe import CanvasShape, Votes
 from amiwarp.sharpness import Sharpness, SharpnessMeter
 from amiwarp.turning import border
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import Space
-    from amiwarp.events import Events
     from amiwarp.iwe import DeviceEvents
     from amiwarp.optics import Model
     from amiwarp.turning import Turning
@@ -35,9 +34,7 @@ class Objective:
     def __init__(
         self,
         space: Space,
-        events: Events,
-        theta: NDArray[np.float64],
-        slope: NDArray[np.float64] | None,
+        events: DeviceEvents,
         *,
         kind: Sharpness,
         smoothing: float,
@@ -46,7 +43,7 @@ class Objective:
         parts: int = 1,
         device: Any = "cpu",
     ) -> None:
-        """``theta``: encoder's angle of each event [rad]; ``slope``: its change per unit of the drifting parameter.
+        """``events`` are on the device, with slopes where a parameter drifts and times where the camera turns.
 
         ``smoothing``: standard deviation [sensor px]; ``scale``: canvas pixels per sensor pixel. ``parts``: disjoint
         parts of the events that :meth:`each` measures apart.
@@ -58,14 +55,14 @@ class Objective:
         dither = kind is not Sharpness.PAPER_J
         pad = padding(space)
         canvas = CanvasShape(camera.width, camera.height, pad, scale, per_polarity, parts=parts, dither=dither)
-        middle = space.middle_us if space.moving else None
-        uploaded = upload_events(events, theta, device, canvas=canvas, slope=slope, middle_us=middle)
+        if parts > 1:
+            events = events.in_parts(canvas)
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
         # tiles take their camera as it is when they are prepared
         if self._meter.device.is_cuda and "focal_length" not in space.names:
-            self._image: _Voted | _Captured = _Captured(canvas, uploaded, self._meter, self._model(space.start))
+            self._image: _Voted | _Captured = _Captured(canvas, events, self._meter, self._model(space.start))
         else:
-            self._image = _Voted(canvas, uploaded, self._meter)
+            self._image = _Voted(canvas, events, self._meter)
 
     def _model(self, values: Mapping[str, float]) -> Model:
         """The ellipse is the exact model's first harmonic: the same optimum, without tables for every point."""

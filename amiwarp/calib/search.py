@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
 from amiwarp.errors import AmiwarpError
+from amiwarp.iwe import upload_events
 from amiwarp.optics import MODELS
 from amiwarp.sharpness import Sharpness
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from amiwarp.calib.parameters import Space
     from amiwarp.encoder import Encoder
     from amiwarp.events import Events
+    from amiwarp.iwe import DeviceEvents
 
     SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
@@ -85,22 +87,24 @@ class Settings:
 
 @dataclass(frozen=True)
 class Material:
-    """The events of a calibration with their angles."""
+    """The events of a calibration, and what gives them their angles."""
 
     events: Events
     encoder: Encoder
-    theta: NDArray[np.float64]
-    slope: NDArray[np.float64] | None
     slope_of: SlopeOf | None
     """Where a parameter drifts the angle: change of the angle at times [us] per unit of it."""
+    _uploaded: dict[tuple[str, int | None], DeviceEvents] = field(default_factory=dict, repr=False, init=False)
 
-    @classmethod
-    def of(cls, events: Events, encoder: Encoder, slope_of: SlopeOf | None) -> Material:
-        slope = None if slope_of is None else slope_of(events.t)
-        return cls(events, encoder, encoder.angle_at(events.t), slope, slope_of)
+    def on(self, device: Any, middle_us: int | None) -> DeviceEvents:
+        """The events on a device, put there once; with their times from ``middle_us`` if it is given."""
+        if (str(device), middle_us) not in self._uploaded:
+            slope = None if self.slope_of is None else self.slope_of(self.events.t)
+            events = upload_events(self.events, self.encoder, device, slope=slope, middle_us=middle_us)
+            self._uploaded[str(device), middle_us] = events
+        return self._uploaded[str(device), middle_us]
 
-    def every(self, step: int, first: int = 0) -> Material:
-        return self._cut(slice(first, None, step))
+    def every(self, step: int) -> Material:
+        return self if step == 1 else self._cut(slice(0, None, step))
 
     def central(self, share: float) -> Material:
         """The events within ``share`` of the time about its middle."""
@@ -110,8 +114,7 @@ class Material:
         return self._cut(slice(int(first), int(last) + 1))
 
     def _cut(self, cut: slice) -> Material:
-        slope = None if self.slope is None else self.slope[cut]
-        return replace(self, events=self.events[cut], theta=self.theta[cut], slope=slope)
+        return Material(self.events[cut], self.encoder, self.slope_of)
 
 
 class Search:
@@ -141,11 +144,12 @@ class Search:
         parts: int = 1,
     ) -> Objective:
         s = self.settings
-        kind = kind or s.sharpness
+        kind, space = kind or s.sharpness, space or self.space
         if kind is Sharpness.PAPER_J:
             smoothing = 0.0  # the tails of a Gaussian are pixels with h > 0, each of which J would count
         return Objective(
-            space or self.space, m.events, m.theta, m.slope, kind=kind, smoothing=smoothing, scale=scale,
+            space, m.on(self.device, space.middle_us if space.moving else None),
+            kind=kind, smoothing=smoothing, scale=scale,
             per_polarity=s.per_polarity, parts=parts, device=self.device,
         )  # fmt: skip
 

@@ -78,14 +78,23 @@ def cell_of(canvas: Canvas, frame: Frame, block: int, width: int) -> int:
 
 
 @wp.kernel
-def empty_words(
-    counts: wp.array(dtype=wp.int64), slot: int, count: wp.int64, canvas: Canvas, frame: Frame, cells: Cells
-):
-    """Moves a batch's votes to the totals, unless some are lost: the batch is voted again then."""
+def empty_words(canvas: Canvas, cells: Cells, slot: int, counts: wp.array2d(dtype=wp.int64)):
+    """Moves a batch's votes to the totals, and counts its events, those in the trash too.
+
+    Fewer than were voted, never more, says that words overflowed: the batch is voted again then.
+    """
     i = wp.tid()
-    if counts[slot] == count:
-        cell = cell_of(canvas, frame, i, 1)
-        cells.totals[cell] = cells.totals[cell] + wp.int64(votes_of_pixel(cells.words, cell, canvas.columns))
+    count = wp.int64(load_word(cells.words, i) >> wp.uint64(54))
+    if count != wp.int64(0):
+        wp.atomic_add(counts, slot, i % counts.shape[1], count)
+    if i > canvas.columns and i < cells.totals.shape[0]:
+        cells.totals[i] = cells.totals[i] + wp.int64(votes_of_pixel(cells.words, i, canvas.columns))
+
+
+@wp.kernel
+def add_totals(more: wp.array(dtype=wp.int64), totals: wp.array(dtype=wp.int64)):
+    i = wp.tid()
+    totals[i] = totals[i] + more[i]
 
 
 @cache

@@ -2,12 +2,17 @@
 
 import math
 from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.kernels import camera as kernels
+from amiwarp.kernels.encoder import EncoderParams
+
+if TYPE_CHECKING:
+    from amiwarp.encoder import Encoder
 
 
 @lru_cache(maxsize=16)
@@ -50,6 +55,39 @@ def azimuths(device: str) -> wp.array:
     angle = np.arange(1 << 16) * (2.0 * math.pi / (1 << 16))
     table = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
     return wp.array(table.ravel(), dtype=float, device=device)
+
+
+def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -> EncoderParams:
+    """The samples about the events of ``t_first`` .. ``t_last`` [us] on ``device``, for ``kernels.encoder.angle_at``.
+
+    Raises :class:`AmiwarpError` as :meth:`Encoder.angle_at` does, where the encoder does not cover that span.
+    """
+    encoder.angle_at(np.array([t_first, t_last], np.int64))
+    # Whole and fractional offset: a piece starts at the first whole event time at or after its sample.
+    whole = math.floor(encoder.clock_offset_us)
+    begins = encoder.t - whole
+    low = min(max(int(np.searchsorted(begins, t_first, side="right")) - 1, 0), begins.size - 2)
+    high = min(max(int(np.searchsorted(begins, t_last, side="right")), low + 1), begins.size - 1)
+    turns = encoder.angle[low : high + 1] / (2.0 * math.pi)
+    slope = np.diff(turns) / np.diff(encoder.t[low : high + 1])
+    origin = int(begins[low])
+    start = begins[low:high] - origin
+    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1  # a bucket is no longer than pieces are on average
+    edges = np.arange((int(start[-1]) >> shift) + 1, dtype=np.int64) << shift
+    first = np.append(np.searchsorted(start, edges, side="right") - 1, start.size - 1)
+    p = EncoderParams()
+    p.origin, p.shift = origin, shift
+    p.first = wp.array(first.astype(np.int32), dtype=int, device=device)
+    p.start = wp.array(start, dtype=wp.int64, device=device)
+    p.angle = wp.array(_wrapped(turns[:-1] + slope * (encoder.clock_offset_us - whole)), dtype=wp.uint64, device=device)
+    p.slope = wp.array(_wrapped(slope), dtype=wp.uint64, device=device)
+    return p
+
+
+def _wrapped(turns: Any) -> Any:
+    """Turns, whole ones left out, in 2**-64 turn, uint64."""
+    part = np.maximum(turns - np.floor(turns + 0.5), -0.5)
+    return np.ldexp(part, 64).astype(np.int64).view(np.uint64)
 
 
 def fold(*k: float, largest: float) -> float:

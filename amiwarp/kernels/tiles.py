@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, TurningParams, turn_back
+from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
 from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams, place
 from amiwarp.kernels.votes import Canvas, somewhere
 
@@ -61,6 +61,7 @@ class Layout:
     stride: int
     layer: int
     first: int
+    shift: float  # what a place on the sensor, scaled, is moved by to be one on the canvas
 
 
 @wp.func
@@ -117,52 +118,6 @@ def pack_events(
 def wait_for_block(): ...
 
 
-@wp.func
-def azimuth_of(model: Any, events: TileEvents, i: int, packed: wp.uint32, drift: float):
-    turn = int(packed >> wp.uint32(16))
-    if events.slope.shape[0] > 0:
-        turn = (turn + int(wp.floor(drift * events.slope[i] + 0.5))) & 65535
-    c = events.azimuths[2 * turn]
-    s = events.azimuths[2 * turn + 1]
-    return c * model.phase_cos - s * model.phase_sin, s * model.phase_cos + c * model.phase_sin
-
-
-@wp.func
-def canvas_place(
-    model: Any,
-    camera: CameraParams,
-    events: TileEvents,
-    canvas: Canvas,
-    i: int,
-    packed: wp.uint32,
-    chunk: Chunk,
-    motion: Motion,
-    k: int,
-):
-    """Where an event falls on the canvas, without its ring, under candidate ``k``."""
-    x = float(chunk.x + int(packed & wp.uint32(31)))
-    y = float(chunk.y + int((packed >> wp.uint32(5)) & wp.uint32(31)))
-    w0, w1 = azimuth_of(model, events, i, packed, motion.drift[k])
-    u, v = place(model, camera, x, y, w0, w1)
-    if events.time.shape[0] > 0:
-        xy = turn_back(camera, wp.vec2(u, v), motion.turning[k], events.time[i])
-        u = xy[0]
-        v = xy[1]
-    if canvas.dither != 0.0:
-        dx, dy = somewhere(i)
-        u += dx
-        v += dy
-    return (u + canvas.pad + 0.5) * canvas.scale - 0.5, (v + canvas.pad + 0.5) * canvas.scale - 0.5
-
-
-@wp.func
-def add_outside(
-    canvas: Canvas, stride: int, image: wp.array(dtype=wp.int64), base: int, row: int, col: int, votes: int
-):
-    if row >= 0 and col >= 0 and row < canvas.rows - 2 and col < canvas.columns - 2 and votes != 0:
-        wp.atomic_add(image, base + row * stride + col, wp.int64(votes))
-
-
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     __shared__ int words[3 * 62 * 62];
@@ -177,53 +132,113 @@ def window(what: int, at: int, votes: int) -> int:
 
 
 @wp.func
-def cast(
-    canvas: Canvas,
-    stride: int,
-    image: wp.array(dtype=wp.int64),
-    base: int,
-    corner: int,
-    row: int,
-    col: int,
-    r: int,
-    c: int,
-    votes: int,
+def turned_back(camera: PinholeParams, xy: wp.vec2, turning: TurningParams, time: wp.array(dtype=float), i: int):
+    return xy  # the camera that turns comes as CameraParams
+
+
+@wp.func
+def turned_back(camera: CameraParams, xy: wp.vec2, turning: TurningParams, time: wp.array(dtype=float), i: int):
+    if time.shape[0] == 0:
+        return xy
+    return turn_back(camera, xy, turning, time[i])
+
+
+@wp.func
+def add_outside(layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), r: int, c: int, v: int):
+    """Votes for row ``r`` and column ``c``, counted from the window's corner, to the image."""
+    row = chunk.row + r
+    col = chunk.column + c
+    if row >= 0 and col >= 0 and row < canvas.rows - 2 and col < canvas.columns - 2 and v != 0:
+        wp.atomic_add(image, layout.first + chunk.layer * layout.layer + row * layout.stride + col, wp.int64(v))
+
+
+@wp.func
+def cast_outside(
+    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), u: float, v: float, nearest: int
 ):
-    """Into the window, at row ``r`` and column ``c``, or past it into the image."""
-    if r >= 0 and c >= 0 and r < WINDOW and c < WINDOW:
-        window(1, corner + r * WINDOW + c, votes)
+    """A vote that does not lie in the window alone; NaN, and what is far off, votes nowhere."""
+    if not (wp.abs(u) < 1.0e6 and wp.abs(v) < 1.0e6):
+        return
+    r = int(wp.floor(v))
+    c = int(wp.floor(u))
+    fx = wp.where(nearest != 0, 0, int((u - float(c)) * 256.0 + 0.5))
+    fy = wp.where(nearest != 0, 0, int((v - float(r)) * 256.0 + 0.5))
+    b = (fx * fy + 128) >> 8
+    add_outside(layout, canvas, chunk, image, r, c, 256 - fx - fy + b)
+    add_outside(layout, canvas, chunk, image, r, c + 1, fx - b)
+    add_outside(layout, canvas, chunk, image, r + 1, c, fy - b)
+    add_outside(layout, canvas, chunk, image, r + 1, c + 1, b)
+
+
+@wp.func
+def cast_nearest(
+    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), corner: int, u: float, v: float
+):
+    u += 0.5
+    v += 0.5
+    if u >= 0.0 and v >= 0.0 and u < float(WINDOW) and v < float(WINDOW):
+        window(1, corner + int(v) * WINDOW + int(u), 256)
     else:
-        add_outside(canvas, stride, image, base, row, col, votes)
+        cast_outside(layout, canvas, chunk, image, u, v, 1)
+
+
+@wp.func
+def cast_bilinear(
+    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), corner: int, u: float, v: float
+):
+    if u >= 0.0 and v >= 0.0 and u < float(WINDOW - 1) and v < float(WINDOW - 1):
+        c = int(u)
+        r = int(v)
+        fx = int((u - float(c)) * 256.0 + 0.5)
+        fy = int((v - float(r)) * 256.0 + 0.5)
+        b = (fx * fy + 128) >> 8
+        at = corner + r * WINDOW + c
+        window(1, at, 256 - fx - fy + b)
+        window(1, at + 1, fx - b)
+        window(1, at + WINDOW, fy - b)
+        window(1, at + WINDOW + 1, b)
+    else:
+        cast_outside(layout, canvas, chunk, image, u, v, 0)
 
 
 @wp.func
 def cast_event(
-    canvas: Canvas, stride: int, image: wp.array(dtype=wp.int64), base: int, k: int, chunk: Chunk, u: float, v: float
+    model: Any,
+    camera: Any,
+    events: TileEvents,
+    motion: Motion,
+    layout: Layout,
+    canvas: Canvas,
+    chunk: Chunk,
+    images: wp.array2d(dtype=wp.int64),
+    first: int,
+    k: int,
+    i: int,
+    turn: int,
+    x: float,
+    y: float,
 ):
-    corner = k * WINDOW * WINDOW
+    """The vote of event ``i`` under candidate ``k`` of those from ``first``."""
+    if events.slope.shape[0] > 0:
+        turn = (turn + int(wp.floor(motion.drift[first + k] * events.slope[i] + 0.5))) & 65535
+    c = events.azimuths[2 * turn]
+    s = events.azimuths[2 * turn + 1]
+    w0 = c * model.phase_cos - s * model.phase_sin
+    px, py = place(model, camera, x, y, w0, s * model.phase_cos + c * model.phase_sin)
+    xy = turned_back(camera, wp.vec2(px, py), motion.turning[first + k], events.time, i)
+    dx, dy = somewhere(i)
+    u = (xy[0] + canvas.dither * dx) * canvas.scale + layout.shift - float(chunk.column)
+    v = (xy[1] + canvas.dither * dy) * canvas.scale + layout.shift - float(chunk.row)
     if canvas.nearest != 0:
-        u = wp.floor(u + 0.5)
-        v = wp.floor(v + 0.5)
-    col = int(wp.floor(u))
-    row = int(wp.floor(v))
-    r = row - chunk.row
-    c = col - chunk.column
-    if canvas.nearest != 0:
-        cast(canvas, stride, image, base, corner, row, col, r, c, 256)
-        return
-    fx = int((u - float(col)) * 256.0 + 0.5)
-    fy = int((v - float(row)) * 256.0 + 0.5)
-    b = (fx * fy + 128) >> 8
-    cast(canvas, stride, image, base, corner, row, col, r, c, 256 - fx - fy + b)
-    cast(canvas, stride, image, base, corner, row, col + 1, r, c + 1, fx - b)
-    cast(canvas, stride, image, base, corner, row + 1, col, r + 1, c, fy - b)
-    cast(canvas, stride, image, base, corner, row + 1, col + 1, r + 1, c + 1, b)
+        cast_nearest(layout, canvas, chunk, images[first + k], k * WINDOW * WINDOW, u, v)
+    else:
+        cast_bilinear(layout, canvas, chunk, images[first + k], k * WINDOW * WINDOW, u, v)
 
 
 @wp.kernel
 def vote_tiles(
     models: wp.array(dtype=Any),
-    camera: CameraParams,
+    camera: Any,
     events: TileEvents,
     motion: Motion,
     canvas: Canvas,
@@ -234,26 +249,32 @@ def vote_tiles(
     chunk = events.chunks[block % events.chunks.shape[0]]
     first = (block / events.chunks.shape[0]) * AT_ONCE
     candidates = wp.min(AT_ONCE, images.shape[0] - first)
-    base = layout.first + chunk.layer * layout.layer
+    a = models[first]
+    b = models[first + wp.min(1, candidates - 1)]
+    c = models[first + candidates - 1]
     for i in range(thread, candidates * WINDOW * WINDOW, THREADS):
         window(0, i, 0)
     wait_for_block()
     for i in range(chunk.start + thread, chunk.stop, THREADS):
-        packed = events.packed[i]
-        for k in range(candidates):
-            u, v = canvas_place(models[first + k], camera, events, canvas, i, packed, chunk, motion, first + k)
-            if u > -1.0e6 and u < 1.0e6 and v > -1.0e6 and v < 1.0e6:
-                cast_event(canvas, layout.stride, images[first + k], base, k, chunk, u, v)
+        packed = int(events.packed[i])
+        turn = (packed >> 16) & 65535
+        x = float(chunk.x + (packed & 31))
+        y = float(chunk.y + ((packed >> 5) & 31))
+        cast_event(a, camera, events, motion, layout, canvas, chunk, images, first, 0, i, turn, x, y)
+        if candidates > 1:
+            cast_event(b, camera, events, motion, layout, canvas, chunk, images, first, 1, i, turn, x, y)
+        if candidates > 2:
+            cast_event(c, camera, events, motion, layout, canvas, chunk, images, first, 2, i, turn, x, y)
     wait_for_block()
     for i in range(thread, candidates * WINDOW * WINDOW, THREADS):
         at = i % (WINDOW * WINDOW)
         image = images[first + i / (WINDOW * WINDOW)]
-        votes = window(2, i, 0)
-        add_outside(canvas, layout.stride, image, base, chunk.row + at / WINDOW, chunk.column + at % WINDOW, votes)
+        add_outside(layout, canvas, chunk, image, at / WINDOW, at % WINDOW, window(2, i, 0))
 
 
 for _struct in (CircleParams, RadialCircleParams, ExactParams):
-    wp.overload(vote_tiles, {"models": wp.array(dtype=_struct)})
+    for _camera in (PinholeParams, CameraParams):
+        wp.overload(vote_tiles, {"models": wp.array(dtype=_struct), "camera": _camera})
 
 
 @wp.kernel

@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
+from amiwarp.kernels.encoder import EncoderParams, angle_at
 from amiwarp.kernels.native import add_word, load_float, load_uint8, load_uint16, store_int, store_word
 from amiwarp.kernels.optics import MODEL_STRUCTS, place
 
@@ -21,6 +22,8 @@ BLOCK = wp.constant(64)  # events that a CPU places eight at a time before it vo
 TRASH = wp.constant(4096)  # words past the cells: votes outside the image, spread so that none fills up
 CAPACITY = wp.constant(1024)  # events that overflow a word
 FIELD = wp.constant(wp.int64(1 << 18))  # what a carry out of the fields fx, fy, b is worth
+MIX_1 = wp.constant(wp.uint32(0x85EBCA6B))
+MIX_2 = wp.constant(wp.uint32(0xC2B2AE35))
 ONE = wp.constant(wp.uint64(1 << 54))
 CARRIES = wp.constant(wp.uint64((1 << 63) | (1 << 53) | (1 << 35) | (1 << 17)))
 
@@ -98,8 +101,8 @@ def cast_vote(cells: Cells, cell: int, width: int, word: wp.uint64):
 def somewhere(i: int):
     """A place in the pixel, even over it, the same for event ``i`` at every call (MurmurHash3's finaliser)."""
     h = wp.uint32(i + 1)
-    h = (h ^ (h >> wp.uint32(16))) * wp.uint32(0x85EBCA6B)
-    h = (h ^ (h >> wp.uint32(13))) * wp.uint32(0xC2B2AE35)
+    h = (h ^ (h >> wp.uint32(16))) * MIX_1
+    h = (h ^ (h >> wp.uint32(13))) * MIX_2
     h = h ^ (h >> wp.uint32(16))
     scale = 1.0 / 65536.0
     return float(int(h & wp.uint32(0xFFFF))) * scale - 0.5, float(int(h >> wp.uint32(16))) * scale - 0.5
@@ -201,6 +204,28 @@ def vote_quickly(model: Any, camera: Any, events: EventArrays, canvas: Canvas, t
 
 
 @wp.kernel
+def turn_events(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
+    """The encoder's angle at each event's time, to the nearest 1/65536 turn."""
+    i = start + wp.tid()
+    turn[i] = wp.uint16((angle_at(encoder, t[i]) + wp.uint32(32768)) >> wp.uint32(16))
+
+
+@wp.kernel
+def time_events(t: wp.array(dtype=wp.int64), middle: wp.int64, start: int, time: wp.array(dtype=float)):
+    i = start + wp.tid()
+    time[i] = float(int(t[i] - middle)) * 1.0e-6
+
+
+@wp.kernel
+def layer_events(
+    p: wp.array(dtype=wp.uint8), parts: int, per_polarity: int, start: int, layer: wp.array(dtype=wp.uint8)
+):
+    """Which image an event goes to: that of its part, every so manieth, and there OFF or ON."""
+    i = start + wp.tid()
+    layer[i] = wp.uint8((i % parts) * (1 + per_polarity) + per_polarity * wp.where(p[i] != wp.uint8(0), 1, 0))
+
+
+@wp.kernel
 def vote_points(
     xy: wp.array(dtype=wp.vec2), layers: wp.array(dtype=wp.uint8), canvas: Canvas, start: int, cells: Cells
 ):
@@ -221,16 +246,6 @@ def drift_turns(
     """Angles [1/65536 turn] after a parameter changed by ``drift``; ``slope``: their change per unit of it."""
     i = start + wp.tid()
     turn[i] = wp.uint16((int(base[i]) + int(wp.floor(drift * slope[i] + 0.5))) & 65535)
-
-
-@wp.kernel
-def count_votes(words: wp.array(dtype=wp.uint64), slot: int, counts: wp.array(dtype=wp.int64)):
-    """Events that the words and the trash say they hold: fewer than were voted if any overflowed, never more."""
-    i = wp.tid()
-    total = wp.int64(0)
-    for k in range(i, words.shape[0], 16384):
-        total += wp.int64(words[k] >> wp.uint64(54))
-    wp.atomic_add(counts, slot, total)
 
 
 for _struct in MODEL_STRUCTS:
