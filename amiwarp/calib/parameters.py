@@ -83,6 +83,8 @@ class Space:
     middle_us: int
     """Time to which a turning camera is turned back."""
     duration_us: float
+    undrifted: Mapping[str, float]
+    """Values of the drifting parameters under which events have the angles that they were given."""
 
     @property
     def size_name(self) -> str:
@@ -157,8 +159,8 @@ class Space:
         return turning_of(values, self.middle_us)
 
     def drift(self, values: Mapping[str, float]) -> float:
-        """Distance of the drifting parameter, if one is free, from its start."""
-        return float(sum(values[n] - self.start[n] for n in self.names if n in DRIFTS))
+        """Distance of the drifting parameter, free or held, from where the events' angles belong to it."""
+        return float(sum((values if n in self.names else self.start)[n] - x for n, x in self.undrifted.items()))
 
 
 def _difference(name: str, a: float, b: float) -> float:
@@ -226,7 +228,8 @@ def make_space(
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower first")
         values[name] = min(max(values[name], low[name]), high[name])
     shifts = _pixels_per_unit(model, camera, prism, names, values, rad_per_us, duration_us)
-    return Space(model, camera, prism, names, low, high, values, shifts, middle_us, duration_us)
+    undrifted = {n: x for n, x in values.items() if n in DRIFTS}
+    return Space(model, camera, prism, names, low, high, values, shifts, middle_us, duration_us, undrifted)
 
 
 def _order(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
