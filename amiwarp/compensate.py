@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,18 +14,21 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
 from amiwarp.io import RecordingWriter
-from amiwarp.optics import wrap_angle
+from amiwarp.io.chunks import CHUNK
+from amiwarp.io.native import NativeEvents
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.result import Calibration
     from amiwarp.encoder import Encoder
-    from amiwarp.events import MetadataValue, Recording
+    from amiwarp.events import EventSource, MetadataValue, Recording
     from amiwarp.optics import Model
 
 BLOCK = 1 << 20
-"""Events that are in memory at a time."""
+"""Events of a block where nothing else is asked for."""
+PIECE = 2 * CHUNK
+"""Events that a thread works on at a time, from the file and back: few, so that they stay in its core's cache."""
 
 Progress = Callable[[int, int], None]
 """Called with events done and all."""
@@ -46,24 +50,78 @@ class CompensationSummary:
         return self.events / max(self.seconds, 1e-9) / 1e6
 
 
+class Mover:
+    """Moves events to where they are without the prism: a model and an encoder on a device, for any thread.
+
+    Raises :class:`AmiwarpError` where the encoder does not cover the times ``t_first`` .. ``t_last`` [us].
+    """
+
+    def __init__(self, model: Model, encoder: Encoder, t_first: int, t_last: int, device: Any) -> None:
+        import warp as wp
+
+        from amiwarp.kernels import compensate as kernels
+        from amiwarp.kernels.structs import azimuths, camera_params, encoder_params, pinhole_params
+
+        self._device = wp.get_device(device)
+        self._size = (model.camera.width, model.camera.height)
+        name = str(self._device)
+        self._camera = camera_params(model.camera, name)
+        self._pinhole = pinhole_params(model.camera) or self._camera
+        self._model, self._encoder = model.params(name), encoder_params(encoder, t_first, t_last, name)
+        self._azimuths = azimuths(name)
+        self._kernel = kernels.compensate_blocks if self._device.is_cpu else kernels.compensate_events
+        # once, before threads would each try
+        self._kernel.module.load(self._device, **({"block_dim": 1} if self._device.is_cpu else {}))
+
+    def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
+        """The events moved (NaN: nowhere), and 1 for each that lies on a pixel of the image, shape ``(n,)``."""
+        import warp as wp
+
+        from amiwarp.kernels.compensate import BLOCK, Columns
+        from amiwarp.kernels.launch import launch
+
+        if events.x.dtype != np.uint16:
+            raise AmiwarpError(
+                f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
+            )
+        n, block = len(events), int(BLOCK) if self._device.is_cpu else 1
+        if not n:
+            return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
+        padded = -(-n // block) * block
+        width, height = self._size
+        # The quick way of placing takes the event's pixel from the image's tables without a look.
+        camera = self._pinhole if events.x.max() < width and events.y.max() < height else self._camera
+        c = Columns()
+        c.x, c.y = (_on(self._device, values, wp.uint16, padded) for values in (events.x, events.y))
+        c.t = _on(self._device, events.t, wp.int64, padded)
+        c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=self._device) for _ in range(2))
+        c.inside = wp.empty(padded, dtype=wp.uint8, device=self._device)
+        inputs = [self._model, camera, wp.vec2(width, height), self._encoder, self._azimuths, c]
+        if all_cores:
+            launch(self._kernel, padded // block, inputs, [], device=self._device, smallest=512)
+        else:
+            wp.launch(self._kernel, dim=padded // block, inputs=[*inputs, 0], device=self._device)
+        x, y, inside = (values.numpy()[:n] for values in (c.out_x, c.out_y, c.inside))
+        return Events(x, y, events.t, events.p), inside
+
+
+def _on(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
+    """A column on the device, without a copy on CPUs where that can be."""
+    import warp as wp
+
+    if len(values) < padded:
+        values = np.concatenate([values, np.zeros(padded - len(values), values.dtype)])
+    return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
+
+
 def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = "cpu") -> NDArray[np.float32]:
     """Places of the events without the prism [px], shape (n, 2); NaN where there is none.
 
     ``events`` come from a sensor (uint16). Raises :class:`AmiwarpError` where the encoder does not cover them.
     """
-    import warp as wp
-
-    if events.x.dtype != np.uint16:
-        raise AmiwarpError(
-            f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-        )
-    xy = np.empty((len(events), 2), dtype=np.float32)
-    xy[:, 0], xy[:, 1] = events.x, events.y
-    theta = wrap_angle(encoder.angle_at(events.t)).astype(np.float32)
-    moved = model.compensate_points(
-        wp.array(xy, dtype=wp.vec2, device=device), wp.array(theta, dtype=float, device=device)
-    )
-    return moved.numpy()
+    first, last = (int(events.t.min()), int(events.t.max())) if len(events) else encoder.coverage
+    moved, _inside = Mover(model, encoder, first, last, device)(events, all_cores=True)
+    return np.stack([moved.x, moved.y], axis=1)
 
 
 def inside_image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np.bool_]:
@@ -76,9 +134,12 @@ def compensated_blocks(
     recording: Recording, model: Model, encoder: Encoder, *, device: Any = "cpu", **blocks: int
 ) -> Iterator[Events]:
     """The recording's events, compensated, block by block (``count=`` or ``duration_us=``), in order, none dropped."""
-    for block in recording.events.blocks(**(blocks or {"count": BLOCK})):
-        xy = compensate_events(block, model, encoder, device=device)
-        yield Events(np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1]), block.t, block.p)
+    source = recording.events
+    if not len(source):
+        return
+    mover = Mover(model, encoder, source.t_first, source.t_last, device)
+    for block in source.blocks(**(blocks or {"count": BLOCK})):
+        yield mover(block, all_cores=True)[0]
 
 
 def compensate(
@@ -106,20 +167,39 @@ def compensate(
     outside = done = 0
     metadata: dict[str, MetadataValue] = {**recording.metadata, "compensated_with": calibration.model_name}
     truth = None if recording.truth is None else recording.truth.parameters
+
+    def count(events: Events, inside: NDArray[np.uint8]) -> None:
+        nonlocal outside, done
+        outside += len(events) - int(np.count_nonzero(inside))
+        done += len(events)
+        if on_block is not None:
+            on_block(events)
+        if progress is not None:
+            progress(done, n)
+
     with RecordingWriter(
         out_path, width=width, height=height, camera=recording.camera or calibration.camera, prism=recording.prism,
         encoder=encoder, truth_parameters=truth, metadata=metadata,
     ) as writer:  # fmt: skip
-        for block in compensated_blocks(recording, calibration.model, encoder, device=device) if encoder else ():
-            inside = inside_image(np.stack([block.x, block.y], axis=1), width, height)
-            writer.append(block, inside=inside)
-            outside += int((~inside).sum())
-            done += len(block)
-            if on_block is not None:
-                on_block(block)
-            if progress is not None:
-                progress(done, n)
+        if encoder is not None and n:
+            first, last = recording.events.t_first, recording.events.t_last
+            mover = Mover(calibration.model, encoder, first, last, device)
+            writer.fill(moved_pieces(recording.events, mover), t_first=first, done=count)
     return CompensationSummary(done, outside, time.perf_counter() - began)
+
+
+def moved_pieces(source: EventSource, mover: Mover) -> Iterator[Callable[[], tuple[Events, NDArray[np.uint8]]]]:
+    """The recording, moved, in pieces: threads read them where the file lets them, and move them."""
+    if isinstance(source, NativeEvents):
+        for read in source.pieces(PIECE):
+            yield partial(_read_and_move, read, mover)
+    else:
+        for events in source.blocks(count=PIECE):
+            yield partial(mover, events)
+
+
+def _read_and_move(read: Callable[[], Events], mover: Mover) -> tuple[Events, NDArray[np.uint8]]:
+    return mover(read())
 
 
 def check_size(calibration: Calibration, recording: Recording) -> None:

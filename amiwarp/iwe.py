@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.turning import Turning
+from amiwarp.uploads import DeviceEvents, upload_events
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,12 +21,12 @@ if TYPE_CHECKING:
 
 PIECE = 1 << 22
 """Events that are put on the device at a time."""
-BATCH = 1 << 24
-"""Events that are voted at a time without a look at what their words held: on CUDA the words are emptied between."""
-TURNS = 1 << 16
-"""Angles of the prism that are told apart: 0.0055 deg, 0.0005 px on an orbit of 10 px."""
-PROBE = 1 << 21
-"""Events of the first such batch. Where some were lost, and fewer at once, every event looks."""
+PROBE, BATCH = 1 << 21, 1 << 27
+"""Events that are voted at a time without a look at what their words held: on CUDA the words are emptied between. At
+first few; then as many as the fullest word has room for, at most :data:`BATCH`. Where some were lost, and fewer at
+once, every event looks."""
+FILL = 600
+"""Events that the fullest word of a batch should get: it has room for 1,023."""
 
 
 class Vote(enum.Enum):
@@ -119,39 +120,6 @@ class Image:
         wp.copy(self.pixels, wp.array(flat, dtype=float, device="cpu"))
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceEvents:
-    """Events with their angles on a device; see :func:`upload_events`."""
-
-    arrays: Any
-    """``amiwarp.kernels.votes.EventArrays``: OFF goes to the first image, ON to the second, or both to the only one."""
-    count: int
-    base: Any
-    """Angles without drift, where there is a slope."""
-    slope: Any
-    """Change of the angles [1/65536 turn] per unit of the drifting parameter, or None."""
-
-    def drift(self, value: float) -> None:
-        """Sets the angles to what they are where the drifting parameter has ``value``."""
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.votes import drift_turns
-
-        launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
-
-    def in_parts(self, canvas: CanvasShape) -> DeviceEvents:
-        """The same events, each going to the image of its part."""
-        import warp as wp
-
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.votes import EventArrays, layer_events
-
-        a, e = self.arrays, EventArrays()
-        e.x, e.y, e.turn, e.azimuths, e.time, e.layer = a.x, a.y, a.turn, a.azimuths, a.time, wp.empty_like(a.layer)
-        inputs = [a.layer, canvas.parts, int(canvas.per_polarity)]
-        launch(layer_events, len(e.layer), inputs, [e.layer], device=e.layer.device)
-        return replace(self, arrays=e)
-
-
 class Votes:
     """Vote buffers of a canvas on a device, allocated once: one image per CPU slice, one on CUDA.
 
@@ -181,10 +149,27 @@ class Votes:
         self._batches: list[tuple[list[Any], int, int]] = []  # of the fast way, not settled yet
         self._quick: bool | None = None if self.device.is_cuda else False
         if self.device.is_cuda:
-            self._counts = wp.zeros((64, 1024), dtype=wp.int64, device=self.device)
-            self._fast = Cells()
-            self._fast.words = wp.zeros_like(self._words[0])
-            self._fast.totals, self._fast.spilled = wp.zeros_like(self._totals[0]), self._spilled[0]
+            self._make_fast()
+
+    def _make_fast(self) -> None:
+        import warp as wp
+
+        from amiwarp.kernels.iwe import add_totals, empty_words
+        from amiwarp.kernels.votes import Cells
+
+        self._counts = wp.zeros((64, 1024), dtype=wp.int64, device=self.device)
+        self._fullest = wp.zeros(1, dtype=int, device=self.device)
+        self._batch = PROBE
+        fast = self._fast = Cells()
+        fast.words = wp.zeros_like(self._words[0])
+        fast.totals, fast.spilled = wp.zeros_like(self._totals[0]), self._spilled[0]
+        self._empty = wp.launch(
+            empty_words, len(fast.words), [self._params, fast, 0], [self._counts, self._fullest], device=self.device,
+            record_cmd=True,
+        )  # fmt: skip
+        self._keep = wp.launch(
+            add_totals, len(fast.totals), [fast.totals], [self._totals[0]], device=self.device, record_cmd=True
+        )
 
     def clear(self) -> None:
         self._forget()
@@ -216,9 +201,9 @@ class Votes:
         if turning is not None and events.arrays.time.shape[0]:
             inputs = [params, model_camera(model, self.device), *inputs[2:], turning.params()]
             self._exactly(vote_turning, inputs, events.count)
-        elif self.device.is_cuda:
+        elif self.device.is_cuda and not len(events.arrays.weight):
             self._in_batches(inputs, events.count)
-        elif camera is not None:
+        elif self.device.is_cpu and camera is not None:
             blocks = -(-events.count // int(BLOCK))
             launch_slices(vote_blocks, blocks, [*inputs, events.count], self._cells, device=self.device, smallest=512)
         else:
@@ -245,44 +230,42 @@ class Votes:
 
     def _in_batches(self, inputs: list[Any], count: int) -> None:
         """On CUDA: fast, then checked; where words overflow, and for few events, exactly at once."""
-        from amiwarp.kernels.votes import vote_events
+        import warp as wp
 
-        start = 0
+        from amiwarp.kernels.votes import vote_events, vote_quickly
+
+        start, vote = 0, None
         while start < count:
-            batch = min(count - start, PROBE if self._quick is None else BATCH)
+            batch = min(count - start, self._batch)
             if self._quick is False or batch < PROBE:
                 self._exactly(vote_events, inputs, count - start, start)
                 return
-            self._quickly(inputs, batch, start)
+            if vote is None:  # once: to launch again what was recorded is quick
+                given = [*inputs, self._trash, start]
+                vote = wp.launch(vote_quickly, batch, given, [self._fast], device=self.device, record_cmd=True)
+            vote.set_dim(batch)
+            vote.set_param_at_index(len(inputs) + 1, start)
+            vote.launch()
+            self._empty.set_param_at_index(2, len(self._batches))
+            self._empty.launch()
+            self._fast.words.zero_()
+            self._batches.append((inputs, batch, start))
             if self._quick is None or len(self._batches) == len(self._counts):
                 self._settle()
             start += batch
 
-    def _quickly(self, inputs: list[Any], count: int, first: int) -> None:
-        import warp as wp
-
-        from amiwarp.kernels.iwe import empty_words
-        from amiwarp.kernels.votes import vote_quickly
-
-        fast, slot = self._fast, len(self._batches)
-        wp.launch(vote_quickly, count, [*inputs, self._trash, first], [fast], device=self.device)
-        wp.launch(empty_words, len(fast.words), [self._params, fast, slot], [self._counts], device=self.device)
-        fast.words.zero_()
-        self._batches.append((inputs, count, first))
-
     def _settle(self) -> None:
         """Keeps what was voted fast, or votes it again, exactly, where words overflowed."""
-        import warp as wp
-
-        from amiwarp.kernels.iwe import add_totals
         from amiwarp.kernels.votes import vote_events
 
         if not self._batches:
             return
         counts = self._counts[: len(self._batches)].numpy().sum(axis=1)
+        if self._quick is None:
+            self._batch = min(max(PROBE * FILL // max(int(self._fullest.numpy()[0]), 1), PROBE), BATCH)
         self._quick = bool((counts == [count for _, count, _ in self._batches]).all())
         if self._quick:
-            wp.launch(add_totals, len(self._fast.totals), [self._fast.totals], [self._totals[0]], device=self.device)
+            self._keep.launch()
         else:
             for inputs, count, first in self._batches:
                 self._exactly(vote_events, inputs, count, first)
@@ -308,62 +291,6 @@ class Votes:
         self.read(self._image)
         self.clear()
         return self._image.numpy()
-
-
-def upload_events(
-    events: Events,
-    angles: Encoder | NDArray[np.float64],
-    device: Any,
-    *,
-    slope: NDArray[np.float64] | None = None,
-    middle_us: int | None = None,
-) -> DeviceEvents:
-    """Events and their angles on ``device``: an encoder's, or given [rad]; pixels must be whole (uint16).
-
-    ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events get
-    their times from it, so that the camera's turning can be taken back. Raises :class:`AmiwarpError` where the encoder
-    does not cover the events.
-    """
-    import warp as wp
-
-    from amiwarp.kernels.launch import launch
-    from amiwarp.kernels.structs import azimuths, encoder_params
-    from amiwarp.kernels.votes import BLOCK, EventArrays, time_events, turn_events
-
-    if events.x.dtype != np.uint16:
-        raise AmiwarpError(
-            f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-        )
-    n, device = len(events), wp.get_device(device)
-    # CPUs vote whole blocks
-    padded = -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
-
-    def put(values: NDArray[Any], dtype: Any) -> Any:
-        if padded == n:
-            return wp.array(values, dtype=dtype, device=device)
-        array = wp.zeros(padded, dtype=dtype, device=device)
-        array.numpy()[:n] = values
-        return array
-
-    e = EventArrays()
-    e.x, e.y = put(events.x, wp.uint16), put(events.y, wp.uint16)
-    e.layer = put(events.p, wp.uint8)
-    e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
-    if not isinstance(angles, np.ndarray) or middle_us is not None:
-        t = wp.array(events.t, dtype=wp.int64, device=device)
-    if isinstance(angles, np.ndarray):
-        e.turn = put(np.rint(angles * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
-    else:
-        e.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
-        if n:
-            encoder = encoder_params(angles, int(events.t[0]), int(events.t[-1]), device)
-            launch(turn_events, n, [encoder, t], [e.turn], device=device)
-    if middle_us is not None:
-        e.time = wp.empty(n, dtype=float, device=device)
-        launch(time_events, n, [t, middle_us], [e.time], device=device)
-    if slope is None:
-        return DeviceEvents(e, n, None, None)
-    return DeviceEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
 
 
 def iwe(

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Points = TypeVar("Points")
 """A NumPy array of shape (n, 2) or a Warp array of vec2, shape (n,): the same kind comes out as goes in."""
 
+UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
 
 class FlatSide(enum.Enum):
     """Which way the flat face of the prism looks."""
@@ -232,7 +234,7 @@ class ExactModel(_OnDevice):
         _set_phase(p, self.phase)
         p.flat_to_scene = int(self.prism.flat_side is FlatSide.SCENE)
         p.tilted = int(any(self.tilt))
-        p.axis = wp.mat33(*axis_rotation(*self.tilt).ravel().tolist())
+        p.axis = wp.mat33(*(axis_rotation(*self.tilt).ravel().tolist() if p.tilted else UPRIGHT))
         return p
 
 

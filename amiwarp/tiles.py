@@ -10,8 +10,9 @@ import numpy as np
 from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
-    from amiwarp.iwe import CanvasShape, DeviceEvents, Image
+    from amiwarp.iwe import CanvasShape, Image
     from amiwarp.optics import Model
+    from amiwarp.uploads import DeviceEvents
 
 
 class TileVotes:
@@ -34,7 +35,7 @@ class TileVotes:
 
         device = self.device = image.device
         self.canvas, self.candidates = canvas, candidates
-        still = len(events.arrays.time) == 0
+        still = len(events.arrays.time) == 0 and events.slope is None
         self._params = canvas.params()
         self._camera = (pinhole_params(like.camera) if still else None) or model_camera(like, self.device)
         self._arrays = self._sort(events)
@@ -49,8 +50,9 @@ class TileVotes:
         ]
         self._drifts = self._host[1].numpy()
         self._there = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
-        self._motion = kernels.Motion()
-        self._motion.drift, self._motion.turning = self._there[1:]
+        motion = kernels.Motion()
+        motion.drift, motion.turning = self._there[1:]
+        self._motion = kernels.Still() if still else motion
 
     def _sort(self, events: DeviceEvents) -> Any:
         import warp as wp
@@ -68,10 +70,10 @@ class TileVotes:
         wp.utils.radix_sort_pairs(keys, order, n)
         slope = events.slope if events.slope is not None else wp.empty(0, dtype=float, device=device)
         out = kernels.TileEvents()
-        out.packed, out.azimuths = wp.empty(n, dtype=wp.uint32, device=device), a.azimuths
+        out.packed = wp.empty(n, dtype=wp.uint32, device=device)
         out.slope, out.time = (wp.empty(n if len(v) else 0, dtype=float, device=device) for v in (slope, a.time))
         turn = events.base if events.base is not None else a.turn
-        wp.launch(kernels.pack_events, n, [a.x, a.y, turn, slope, a.time, order, size], [out], device=device)
+        wp.launch(kernels.pack_events, n, [a.x, a.y, turn, slope, a.time, a.weight, order, size], [out], device=device)
         out.chunks = wp.array(self._chunks(counts.numpy(), size, across, down), dtype=kernels.Chunk, device=device)
         return out
 
@@ -91,9 +93,9 @@ class TileVotes:
         tile = key % (across * down)
         chunks["start"], chunks["stop"], chunks["layer"] = start, stop, key // (across * down)
         chunks["x"], chunks["y"] = tile % across * size, tile // across * size
-        for name, origin in (("column", "x"), ("row", "y")):
+        for name, origin, window in (("column", "x", kernels.COLUMNS), ("row", "y", kernels.ROWS)):
             middle = (chunks[origin] + size / 2.0 + self.canvas.pad) * self.canvas.scale
-            chunks[name] = np.rint(middle - int(kernels.WINDOW) / 2)
+            chunks[name] = np.rint(middle - int(window) / 2)
         return chunks
 
     def set(self, k: int, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:

@@ -1,22 +1,123 @@
 """Compensation of recordings: nothing lost, nothing reordered, places those of the model."""
 
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import reference
+import warp as wp
 from conftest import TRUE_PRISM
 
 from amiwarp.calib import Calibration, calibrate
+from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.compensate import compensate, compensate_events, compensated_blocks, inside_image
+from amiwarp.encoder import TURN, Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, Recording
-from amiwarp.io import open_recording
+from amiwarp.io import open_recording, save_recording
+from amiwarp.io.chunks import CHUNK
 from amiwarp.iwe import iwe
+from amiwarp.kernels.encoder import EncoderParams, angle_at
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.structs import encoder_params
 from amiwarp.metrics import edge_blur, truth_model
-from amiwarp.optics import ExactModel, FlatSide
+from amiwarp.optics import MODELS, CircleModel, ExactModel, FlatSide
 from amiwarp.sharpness import sharpness
+
+
+@wp.kernel
+def angles(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, out: wp.array(dtype=wp.uint32)):
+    i = start + wp.tid()
+    out[i] = angle_at(encoder, t[i])
+
+
+def angle_error(encoder: Encoder, t: np.ndarray, device: str) -> float:
+    """Largest distance of the kernel's angle to the encoder's own, in float64 [turn]."""
+    params = encoder_params(encoder, int(t.min()), int(t.max()), device)
+    out = wp.empty(len(t), dtype=wp.uint32, device=device)
+    launch(angles, len(t), [params, wp.array(t, dtype=wp.int64, device=device)], [out], device=device)
+    away = encoder.angle_at(t) / TURN - out.numpy() / 2.0**32
+    return float(np.abs(away - np.round(away)).max())
+
+
+EPOCH = 1_700_000_000_000_000
+
+
+@pytest.mark.parametrize("offset", [0.0, -1234.75, 0.5, 1e6 + 0.75])
+@pytest.mark.parametrize(
+    ("interval", "turns_per_s"), [((1000, 1001), 50.0), ((1, 2000), -12.0), ((1, 4), 300.0), ((10**7, 10**8), 100.0)]
+)
+def test_angle_of_the_kernel(interval: tuple[int, int], turns_per_s: float, offset: float, device: str) -> None:
+    """Even and uneven samples, close and far apart, with a fractional offset, at today's times; unsorted events."""
+    rng = np.random.default_rng(5)
+    times = EPOCH + np.cumsum(rng.integers(*interval, 3000))
+    angle = (times - times[0]) * (TURN * turns_per_s * 1e-6) + np.cumsum(rng.normal(0.0, 0.01, times.size))
+    encoder = Encoder(times, angle, offset)
+    first, last = encoder.coverage
+    at_samples = np.clip(times + np.round(-offset).astype(int), first, last)
+    t = np.concatenate([rng.integers(first, last + 1, 50_000), at_samples, at_samples[1:] - 1, [first, last]])
+    # Float64 itself keeps 1e7 turns, as there are here at most, to 2**-28.
+    assert angle_error(encoder, t, device) < 2.0**-26
+    some = t[(t > first + (last - first) // 3) & (t < last - (last - first) // 3)]
+    assert angle_error(encoder, some, device) < 2.0**-26
+
+
+def test_angle_where_samples_crowd_and_jump(device: str) -> None:
+    """Thousands of samples in one bucket, a gap of an hour, steps of many turns; only two samples."""
+    times = np.concatenate([np.arange(5000), [3_600_000_000, 3_600_000_001, 7_200_000_000]]).astype(np.int64)
+    angle = np.random.default_rng(2).normal(0.0, 300.0, times.size)
+    encoder = Encoder(times, angle)
+    t = np.concatenate([times[:-1], np.linspace(0, 7_200_000_000, 5001).astype(np.int64)])
+    assert angle_error(encoder, t, device) < 2.0**-26  # float64 itself: 1e9 us times a slope of 1e-15
+    two = Encoder(np.array([7, 7_000_007]), np.array([1.0, -4000.0]), 0.3)
+    assert angle_error(two, np.arange(-1000, 7_001_000, 997), device) < 2.0**-30
+
+
+def test_events_without_an_angle_are_refused(device: str) -> None:
+    encoder = Encoder.constant_speed(600.0, 1000, 100_000)
+    first, last = encoder.coverage
+    for t in ([first - 1, 2000], [2000, last + 1]):
+        with pytest.raises(AmiwarpError, match="outside the encoder"):
+            encoder_params(encoder, *t, device)
+        events = Events.from_arrays([1, 2], [1, 2], t, [0, 1])
+        with pytest.raises(AmiwarpError, match="outside the encoder"):
+            compensate_events(events, CircleModel(Camera.from_fov(64, 48, 1.0), 0.02), encoder, device=device)
+
+
+LENSES = (None, RadialTangential(-0.2, 0.05, 1e-4, -1e-4, 0.0), Fisheye(0.05, 0.01, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=["pinhole", "radial-tangential", "fisheye"])
+@pytest.mark.parametrize("name", MODELS)
+def test_places_are_the_models(name: str, lens: RadialTangential | Fisheye | None, device: str) -> None:
+    """In one pass from the file's columns: the places of compensate_points, and of a float64 trace."""
+    rng = np.random.default_rng(3)
+    camera = replace(Camera.from_fov(320, 240, math.radians(60.0)), distortion=lens)
+    model = MODELS[name].from_prism(camera, TRUE_PRISM, 0.4)
+    n = 40_007
+    t = np.sort(rng.integers(0, 400_000, n))
+    events = Events.from_arrays(rng.integers(0, 320, n), rng.integers(0, 240, n), t, rng.integers(0, 2, n))
+    encoder = Encoder.constant_speed(-900.0, 0, 400_000)
+    moved = compensate_events(events, model, encoder, device=device)
+    xy = np.stack([events.x, events.y], axis=1).astype(np.float64)
+    expected = model.compensate_points(xy, encoder.angle_at(t))
+    np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-3)
+    if name == "exact":
+        some = slice(0, 3000)
+        traced = reference.move(camera, TRUE_PRISM, xy[some], encoder.angle_at(t[some]), to_scene=True, phase=0.4)
+        np.testing.assert_allclose(moved[some], traced, rtol=0, atol=1e-3)
+
+
+def test_events_outside_the_camera_do_not_leave_its_tables(device: str) -> None:
+    model = MODELS["ellipse"].from_prism(Camera.from_fov(64, 48, 1.0), TRUE_PRISM)
+    events = Events.from_arrays([65_535, 3], [65_535, 3], [10, 20], [0, 1])
+    moved = compensate_events(events, model, Encoder.constant_speed(600.0, 0, 1000), device=device)
+    assert np.abs(moved[0] - 65_535).max() < 20.0
+    assert len(compensate_events(Events.empty(), model, Encoder.constant_speed(600.0, 0, 1000), device=device)) == 0
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +176,51 @@ def test_blocks_by_time_hold_every_event_once(recording: Recording, calibration:
     blocks = list(compensated_blocks(recording, calibration.model, recording.encoder, duration_us=33_000))
     assert sum(map(len, blocks)) == len(recording.events)
     assert all(np.ptp(b.t) < 33_000 for b in blocks)
+
+
+def test_files_and_memory_give_the_same(
+    recording: Recording, calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    """A file whose chunks threads read past HDF5, one that HDF5 reads, and events in memory, in several pieces."""
+    monkeypatch.setattr(sys.modules["amiwarp.compensate"], "PIECE", CHUNK)
+    count = len(recording.events)
+    raw = recording.events.slice(0, count)
+    repeats = 2 * CHUNK // count + 1
+    step = int(raw.t[-1] - raw.t[0]) + 1
+    encoder = Encoder.constant_speed(720.0, int(raw.t[0]), int(raw.t[0]) + (repeats + 1) * step)
+    many = Events.concatenate([Events(raw.x, raw.y, raw.t + k * step, raw.p) for k in range(repeats + 1)])
+    memory = replace(recording, events=MemoryEvents(many, *recording.events.size), truth=None, encoder=encoder)
+    save_recording(tmp_path / "ours.h5", memory)
+    expected = compensate_events(many, calibration.model, calibration.encoder_for(encoder, 0, 0), device=device)
+    with h5py.File(tmp_path / "ours.h5") as ours, h5py.File(tmp_path / "plain.h5", "w") as plain:
+        for name in ("events/x", "events/y", "events/t", "events/p", "encoder/t", "encoder/angle", "t_offset"):
+            plain[name] = ours[name][()]
+        plain.attrs.update(ours.attrs)
+    for name, source in (
+        ("memory", memory),
+        ("ours", open_recording(tmp_path / "ours.h5")),
+        ("plain", open_recording(tmp_path / "plain.h5")),
+    ):
+        blocks: list[Events] = []
+        summary = compensate(source, calibration, tmp_path / "out.h5", device=device, on_block=blocks.append)
+        moved = open_recording(tmp_path / "out.h5").events.slice(0, len(many))
+        assert summary.events == len(many) > 2 * CHUNK, name
+        for events in (moved, Events.concatenate(blocks)):
+            np.testing.assert_array_equal(np.stack([events.x, events.y], axis=1), expected, name)
+            np.testing.assert_array_equal(events.t, many.t)
+            np.testing.assert_array_equal(events.p, many.p)
+
+
+def test_a_fault_in_the_middle_of_a_file_leaves_nothing(
+    recording: Recording, calibration: Calibration, tmp_path: Path
+) -> None:
+    save_recording(tmp_path / "in.h5", replace(recording, truth=None))
+    at = len(recording.events) * 2 // 3
+    with h5py.File(tmp_path / "in.h5", "r+") as file:
+        file["events/x"][at] = 60_000
+    with pytest.raises(AmiwarpError, match=f"event {at} .* outside the 200x150 frame"):
+        compensate(open_recording(tmp_path / "in.h5"), calibration, tmp_path / "out.h5")
+    assert list(tmp_path.iterdir()) == [tmp_path / "in.h5"]
 
 
 def test_empty_recording(recording: Recording, calibration: Calibration, tmp_path: Path) -> None:

@@ -4,9 +4,12 @@ import itertools
 import math
 import os
 import re
+import threading
+import time
 from pathlib import Path
 
 import h5py
+import hdf5plugin
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -17,7 +20,7 @@ from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, EventSource, MemoryEvents, Recording, Truth
 from amiwarp.io import RecordingWriter, open_recording, save_recording
-from amiwarp.io.native_writer import CHUNK
+from amiwarp.io.chunks import CHUNK, StoredColumn, checksum, decode, encode, in_order
 from amiwarp.optics import FlatSide, Prism
 
 SIZE = (320, 240)
@@ -329,3 +332,159 @@ def test_example_of_the_documentation(tmp_path, monkeypatch):
     assert recording.encoder is not None
     assert recording.encoder.covers(recording.events.t_first, recording.events.t_last)
     assert len(recording.events.between(5_010_000, 5_020_000)) == pytest.approx(10_000, abs=500)
+
+
+def columns_of(file: h5py.File) -> list[h5py.Dataset]:
+    return [file[f"events/{name}"] for name in ("x", "y", "t", "p")]
+
+
+def test_hdf5_reads_every_chunk_with_its_own_filters(tmp_path):
+    events = make(2 * CHUNK + 4321)
+    with h5py.File(write(tmp_path / "a.h5", events)) as file:
+        for name, values in (("x", events.x), ("y", events.y), ("t", events.t - events.t[0]), ("p", events.p)):
+            dataset = file[f"events/{name}"]
+            creation = dataset.id.get_create_plist()
+            assert [creation.get_filter(at)[0] for at in range(creation.get_nfilters())] == [32001, 3]
+            assert dataset.id.get_num_chunks() == 3
+            np.testing.assert_array_equal(dataset[:], values, strict=True)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int64, np.float32])
+@pytest.mark.parametrize("bits", [0, 3, 13, 40])
+def test_chunks_are_those_of_hdf5(tmp_path, kind, bits):
+    """Files of plain h5py with our filters are read past HDF5, and their checksums are ours, for odd lengths too."""
+    rng = np.random.default_rng(bits)
+    values = rng.integers(0, 1 << min(bits, 8 * np.dtype(kind).itemsize - 2), 3 * CHUNK - 5).astype(kind)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        blosc = hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
+        file.create_dataset("v", data=values, chunks=(CHUNK,), fletcher32=True, compression=blosc)
+    with h5py.File(tmp_path / "a.h5") as file:
+        column = StoredColumn.of(file["v"])
+        assert column is not None
+        np.testing.assert_array_equal(column.read(CHUNK, values.size), values[CHUNK:], strict=True)
+        for start in range(0, values.size, CHUNK):
+            _mask, stored = file["v"].id.read_direct_chunk((start,))
+            assert checksum(stored[:-4]) == int.from_bytes(stored[-4:], "little")
+            whole = np.zeros(CHUNK, kind)
+            whole[: len(values[start : start + CHUNK])] = values[start : start + CHUNK]
+            out = np.empty_like(whole)
+            assert decode(encode(whole), out)
+            np.testing.assert_array_equal(out, whole)
+
+
+def test_noise_that_does_not_compress(tmp_path):
+    """HDF5 leaves Blosc out of such chunks, we keep its frame: each is read."""
+    rng = np.random.default_rng(1)
+    t = np.arange(CHUNK + 9)
+    x, y = rng.integers(0x3F800000, 0x43800000, (2, t.size), dtype=np.uint32).view(np.float32)
+    events = Events(x, y, t, np.ones(t.size, np.uint8))
+    ours, theirs = write(tmp_path / "ours.h5", events), tmp_path / "theirs.h5"
+    with h5py.File(ours) as file, h5py.File(theirs, "w") as copy:
+        for dataset in columns_of(file):
+            values = dataset[:]
+            noise = rng.integers(0, 256, values.size).astype(np.uint8) if dataset.name.endswith("p") else values
+            blosc = hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
+            copy.create_dataset(dataset.name, data=noise, chunks=(CHUNK,), fletcher32=True, compression=blosc)
+        assert copy["events/p"].id.get_chunk_info(0).filter_mask == 1
+        np.testing.assert_array_equal(file["events/x"][:], x)
+    for path in (ours, theirs):
+        got = open_recording(path).events.slice(0, t.size)
+        np.testing.assert_array_equal(got.x, x)
+        np.testing.assert_array_equal(got.t, t)
+
+
+@given(st.binary(max_size=3000), st.integers(0, 3))
+@settings(deadline=None, max_examples=200)
+def test_checksum_is_fletchers(data, fill):
+    """Word by word, as HDF5 does it."""
+    data = data + bytes([0, 255, 0, 1][fill : fill + 1]) * (700 * fill)
+    first = second = 0
+    for at in range(0, len(data) - 1, 2):
+        first += (data[at] << 8) + data[at + 1]
+        first = (first & 0xFFFF) + (first >> 16)
+        second += first
+        second = (second & 0xFFFF) + (second >> 16)
+    if len(data) % 2:
+        first += data[-1] << 8
+        first = (first & 0xFFFF) + (first >> 16)
+        second += first
+        second = (second & 0xFFFF) + (second >> 16)
+    assert checksum(data) == second << 16 | first
+
+
+@pytest.mark.parametrize("name", ["x", "y", "t", "p"])
+@pytest.mark.parametrize("place", [0.1, 0.5, 1.0])
+def test_a_flipped_bit_in_a_chunk_is_noticed(tmp_path, name, place):
+    path = write(tmp_path / "a.h5", make(CHUNK + 999))
+    with h5py.File(path) as file:
+        chunk = file[f"events/{name}"].id.get_chunk_info(0)
+    raw = bytearray(path.read_bytes())
+    raw[chunk.byte_offset + 16 + int((chunk.size - 17) * place)] ^= 4
+    path.write_bytes(raw)
+    with pytest.raises(AmiwarpError, match=r"a\.h5: events 0 \.\. "):
+        next(iter(open_recording(path).events.blocks()))
+
+
+def test_threads_may_slice_at_once(tmp_path):
+    events = make(5 * CHUNK + 7)
+    source = open_recording(write(tmp_path / "a.h5", events)).events
+    for got, start in zip(in_order(source.pieces(CHUNK)), range(0, len(events), CHUNK), strict=True):
+        assert_equal(got, events[start : start + CHUNK])
+    odd = [(start, start + CHUNK // 2) for start in range(3, len(events), CHUNK // 3)]
+    for got, (start, stop) in zip(in_order(lambda a=a, b=b: source.slice(a, b) for a, b in odd), odd, strict=True):
+        assert_equal(got, events[start:stop])
+
+
+def test_jobs_run_a_bounded_number_ahead_and_stop_with_the_first_error():
+    begun, results = [], []
+
+    def job(k: int) -> int:
+        begun.append(k)
+        time.sleep(0.001 * (k % 3))
+        if k == 40:
+            raise ZeroDivisionError
+        return k
+
+    def take() -> None:
+        for result in in_order(lambda k=k: job(k) for k in range(1000)):
+            results.append(result)
+            assert len(begun) - len(results) <= 2 * 16 + 1
+
+    with pytest.raises(ZeroDivisionError):
+        take()
+    assert results == list(range(40))
+    assert len(begun) < 100
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("amiwarp-io")]
+
+
+def test_filled_files_are_those_of_append(tmp_path):
+    sensor = make(3 * CHUNK + 77)
+    events = Events(sensor.x.astype(np.float32) - 10.5, sensor.y.astype(np.float32), sensor.t, sensor.p)
+    inside = (events.x >= -0.5).astype(np.uint8)
+    cuts = [slice(start, start + CHUNK) for start in range(0, len(events), CHUNK)]
+    seen = []
+    with RecordingWriter(tmp_path / "fill.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        pieces = [lambda cut=cut: (events[cut], inside[cut]) for cut in cuts]
+        writer.fill(pieces, t_first=int(events.t[0]), done=lambda block, _flags: seen.append(len(block)))
+    with RecordingWriter(tmp_path / "append.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        writer.append(events, inside=inside)
+    assert seen == [CHUNK, CHUNK, CHUNK, 77]
+    with h5py.File(tmp_path / "fill.h5") as filled, h5py.File(tmp_path / "append.h5") as appended:
+        for name in ("events/x", "events/y", "events/t", "events/p", "events/inside", "ms_to_idx", "t_offset"):
+            np.testing.assert_array_equal(filled[name][()], appended[name][()], strict=True)
+
+
+@pytest.mark.parametrize(
+    ("order", "message"),
+    [
+        ([slice(0, CHUNK), slice(0, CHUNK)], f"event {CHUNK} .* earlier than the one before"),
+        ([slice(0, 10), slice(10, 20)], "ends within a chunk"),
+    ],
+)
+def test_pieces_that_do_not_follow_leave_nothing(tmp_path, order, message):
+    events = make(2 * CHUNK)
+    with pytest.raises(AmiwarpError, match=message):  # noqa: PT012, SIM117
+        with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+            pieces = [lambda cut=cut: (events[cut], np.ones(len(events.t[cut]), np.uint8)) for cut in order]
+            writer.fill(pieces, t_first=int(events.t[0]), done=lambda *_: None)
+    assert_nothing_left(tmp_path)

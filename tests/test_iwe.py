@@ -10,8 +10,9 @@ from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
-from amiwarp.iwe import PROBE, CanvasShape, Image, Vote, Votes, iwe, upload_events
+from amiwarp.iwe import PROBE, CanvasShape, Image, Vote, Votes, iwe
 from amiwarp.optics import MODELS, ExactModel, Prism
+from amiwarp.uploads import upload_events
 
 
 def random_events(n: int, width: int, height: int, seed: int = 0) -> Events:

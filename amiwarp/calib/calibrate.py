@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from amiwarp.calib.speed import estimate_rpm
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents
+from amiwarp.io.chunks import in_order
 from amiwarp.optics import Prism
 
 if TYPE_CHECKING:
@@ -120,7 +122,7 @@ def prepare(
     for encoder in encoders:
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
         space = _space(recording, camera, encoder, events, settings, free)
-        material = _material(events, encoder, space, _middle(recording))
+        material = _material(events, encoder, space, _middle(recording), settings.fold)
         if space.sized:
             checks.check_turn(encoder.angle_at(events.t[:: max(1, len(events) // 10_000)]), name)
         searches.append(Search(space, material, settings, device, progress))
@@ -181,7 +183,7 @@ def thin(recording: Recording, most: int) -> Events:
         return Events.concatenate(list(recording.events.blocks()))
     # blocks of whole periods, so that every run but the last is whole
     blocks = recording.events.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
-    return Events.concatenate([_runs(block, step) for block in blocks])
+    return Events.concatenate(list(in_order(partial(_runs, block, step) for block in blocks)))
 
 
 def _runs(block: Events, step: int) -> Events:
@@ -219,11 +221,15 @@ def _space(
     )  # fmt: skip
 
 
-def _material(events: Events, encoder: Encoder, space: Space, middle: int) -> Material:
+def _material(events: Events, encoder: Encoder, space: Space, middle: int, fold: int) -> Material:
+    if fold and (space.moving or {"clock_offset", "rpm"} & set(space.names)):
+        raise AmiwarpError(
+            f"fold = {fold} with {', '.join(space.names)} free: folding forgets when an event came; leave it out"
+        )
     if "clock_offset" in space.start:
         encoder = encoder.with_clock_offset(space.start["clock_offset"])
     if "clock_offset" in space.names:
         return Material(events, encoder, lambda t: encoder.speed_at(t) * 1e-6)
     if "rpm" in space.names:
         return Material(events, encoder, lambda t: (t - middle).astype(np.float64) * (2.0 * math.pi / 60e6))
-    return Material(events, encoder, None)
+    return Material(events, encoder, None, fold)

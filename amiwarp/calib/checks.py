@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
@@ -81,14 +81,12 @@ def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
 
     Noise has no direction of its own and lowers it, so gradients weaker than the median are left out.
     """
-    smooth = ndimage.gaussian_filter(image.astype(np.float64), smoothing)
-    gy, gx = (np.asarray(slope, np.float64) for slope in np.gradient(smooth))
-    energy = gx**2 + gy**2
+    slopes: Any = np.gradient(ndimage.gaussian_filter(image.astype(np.float32), smoothing))
+    energy = slopes[0] ** 2 + slopes[1] ** 2
     strong = energy > 0.1 * energy.max()
-    total = float(energy[strong].sum())
-    if total <= 0.0:
-        return 0.0
-    return math.hypot(float((gx**2 - gy**2)[strong].sum()), float((2 * gx * gy)[strong].sum())) / total
+    gy, gx = (slope[strong].astype(np.float64) for slope in slopes)
+    total = float(np.sum(gx**2 + gy**2))
+    return math.hypot(float(np.sum(gx**2 - gy**2)), float(np.sum(2.0 * gx * gy))) / total if total > 0.0 else 0.0
 
 
 def check_directions(image: NDArray[np.float32], name: str) -> None:

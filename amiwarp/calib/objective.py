@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import Space
-    from amiwarp.iwe import DeviceEvents
     from amiwarp.optics import Model
     from amiwarp.turning import Turning
+    from amiwarp.uploads import DeviceEvents
 
 MOTION_ROOM_PX = 16.0
 
@@ -56,7 +56,7 @@ class Objective:
         pad = padding(space)
         canvas = CanvasShape(camera.width, camera.height, pad, scale, per_polarity, parts=parts, dither=dither)
         if parts > 1:
-            events = events.in_parts(canvas)
+            events = events.in_parts(parts, per_polarity=per_polarity)
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
         # tiles take their camera as it is when they are prepared
         if self._meter.device.is_cuda and "focal_length" not in space.names:

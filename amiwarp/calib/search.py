@@ -17,9 +17,9 @@ from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
 from amiwarp.errors import AmiwarpError
-from amiwarp.iwe import upload_events
 from amiwarp.optics import MODELS
 from amiwarp.sharpness import Sharpness
+from amiwarp.uploads import upload_events
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from amiwarp.calib.parameters import Space
     from amiwarp.encoder import Encoder
     from amiwarp.events import Events
-    from amiwarp.iwe import DeviceEvents
+    from amiwarp.uploads import DeviceEvents
 
     SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
@@ -66,6 +66,8 @@ class Settings:
     """ON and OFF events in images of their own."""
     events: int = 1_000_000
     """At most so many events, thinned evenly; the global search uses a fifth of them."""
+    fold: int = 0
+    """Angles a turn into which the events of a pixel are folded, each point then standing for several; 0: none."""
     seed: int = 0
     stages: tuple[str, ...] = STAGES
     """Without "photometric" the answer of sharpness stands."""
@@ -93,13 +95,15 @@ class Material:
     encoder: Encoder
     slope_of: SlopeOf | None
     """Where a parameter drifts the angle: change of the angle at times [us] per unit of it."""
+    fold: int = 0
+    """See :class:`Settings`."""
     _uploaded: dict[tuple[str, int | None], DeviceEvents] = field(default_factory=dict, repr=False, init=False)
 
     def on(self, device: Any, middle_us: int | None) -> DeviceEvents:
         """The events on a device, put there once; with their times from ``middle_us`` if it is given."""
         if (str(device), middle_us) not in self._uploaded:
             slope = None if self.slope_of is None else self.slope_of(self.events.t)
-            events = upload_events(self.events, self.encoder, device, slope=slope, middle_us=middle_us)
+            events = upload_events(self.events, self.encoder, device, slope=slope, middle_us=middle_us, fold=self.fold)
             self._uploaded[str(device), middle_us] = events
         return self._uploaded[str(device), middle_us]
 
@@ -114,7 +118,7 @@ class Material:
         return self._cut(slice(int(first), int(last) + 1))
 
     def _cut(self, cut: slice) -> Material:
-        return Material(self.events[cut], self.encoder, self.slope_of)
+        return Material(self.events[cut], self.encoder, self.slope_of, self.fold)
 
 
 class Search:

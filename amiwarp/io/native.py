@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +16,7 @@ from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import DEFAULT_BLOCK, Events, MetadataValue, Recording, Truth, as_times, check_events, regroup
+from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32, StoredColumn, in_order
 from amiwarp.io.files import errors_name, register_reader
 from amiwarp.io.native_writer import FORMAT, FORMAT_VERSION
 from amiwarp.io.scan import smallest_sensor
@@ -23,9 +26,6 @@ if TYPE_CHECKING:
 
 DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px]; its files do not tell."""
-
-BLOSC = 32001
-"""Number of the Blosc filter in HDF5."""
 
 
 class NativeEvents:
@@ -42,6 +42,7 @@ class NativeEvents:
         if len(set(lengths.values())) != 1:
             raise AmiwarpError(f"{path}: events differ in length: {lengths}; the file is damaged")
         self._count = lengths["t"]
+        self._stored = {name: StoredColumn.of(column) for name, column in self._columns.items()}
         self._offset = as_times(file["t_offset"][()]).item() if "t_offset" in file else 0
         self._ms_to_idx = _dataset(file, "ms_to_idx", "iu") if "ms_to_idx" in file else None
         self._size = self._find_size()
@@ -86,10 +87,10 @@ class NativeEvents:
         return self._size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Events ``start <= index < stop``; they are checked as they are read."""
+        """Events ``start <= index < stop``; they are checked as they are read. Threads may call it at once."""
         start, stop = max(start, 0), min(max(stop, start, 0), self._count)
         with errors_name(self.path, lambda: f"events {start} .. {stop}"):
-            x, y, p = (self._columns[name][start:stop] for name in ("x", "y", "p"))
+            x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
             events = Events.from_arrays(x, y, self._times(start, stop), p)
             nan = "inside" in self._columns
             check_events(events, *self._size, where=str(self.path), first_index=start, allow_nan=nan)
@@ -100,7 +101,7 @@ class NativeEvents:
         if "inside" not in self._columns:
             return None
         with errors_name(self.path, lambda: f"events/inside {start} .. {stop}"):
-            return np.asarray(self._columns["inside"][max(start, 0) : max(stop, 0)], np.bool_)
+            return np.asarray(self._read("inside", max(start, 0), min(max(stop, 0), self._count)), np.bool_)
 
     def between(self, t_start: int, t_end: int) -> Events:
         """Events with ``t_start <= t < t_end`` [us]; the file's millisecond index finds them."""
@@ -109,11 +110,29 @@ class NativeEvents:
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
         """See :meth:`amiwarp.events.EventSource.blocks`."""
-        read = (self.slice(start, start + DEFAULT_BLOCK) for start in range(0, self._count, DEFAULT_BLOCK))
-        return regroup(read, count=count, duration_us=duration_us)
+        return regroup(self._pieces_in_order(), count=count, duration_us=duration_us)
+
+    def pieces(self, count: int) -> Iterator[Callable[[], Events]]:
+        """The same, each yet to be read, by any thread; ``count`` is best a number of whole chunks."""
+        for start in range(0, self._count, count):
+            yield partial(self.slice, start, start + count)
+
+    def _pieces_in_order(self) -> Iterator[Events]:
+        with contextlib.closing(in_order(self.pieces(4 * CHUNK))) as pieces:
+            yield from pieces
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:
-        return as_times(self._columns["t"][start:stop]) + self._offset
+        return as_times(self._read("t", start, stop)) + self._offset
+
+    def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """A part of a column; whole chunks of our own layout past HDF5, which lets one thread at a time read."""
+        stored = self._stored[name]
+        if stored is not None and start < stop and start % CHUNK == 0 and (stop % CHUNK == 0 or stop == self._count):
+            values = stored.read(start, stop)
+            if values is not None:
+                return values
+        # HDF5 reads any layout, and says what is wrong with a damaged one.
+        return np.asarray(self._columns[name][start:stop])
 
     def _find(self, t: int) -> int:
         """Index of the first event at or after ``t``."""
@@ -227,6 +246,10 @@ def _chunks_are_damaged(dataset: Any) -> bool:
             nonlocal damaged
             raw.seek(chunk.byte_offset)
             header = raw.read(16)
+            if chunk.filter_mask == 1:  # Blosc, the first filter, left out what it could not shorten
+                plain = chunk_bytes + 4 * (FLETCHER32 in [code for code, *_ in filters])
+                damaged |= chunk.byte_offset + plain > file_bytes or chunk.size != plain
+                return
             # Blosc's header: four bytes, then the bytes before and after decompression, little-endian.
             fits = chunk.byte_offset + chunk.size <= file_bytes and len(header) == 16
             damaged |= not fits or int.from_bytes(header[4:8], "little") != chunk_bytes or chunk.filter_mask != 0

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -16,6 +17,7 @@ from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MetadataValue, Recording, check_events
+from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name, part_path, refuse_overwriting, same_file
 
 if TYPE_CHECKING:
@@ -27,8 +29,11 @@ FORMAT_VERSION = 1
 Progress: TypeAlias = Callable[[int, int | None], None]
 """Called with the number of events done and of all, or None where that is not known."""
 
-CHUNK = 1 << 16
-"""Events per HDF5 chunk. With Blosc's LZ4 and bit shuffle it writes and reads faster than no compression does."""
+Columns: TypeAlias = dict[str, NDArray[Any]]
+"""Events as the file has them, by the dataset's name."""
+
+Marked: TypeAlias = tuple[Events, NDArray[np.uint8]]
+"""Compensated events and, shape ``(n,)``, 1 where one lies on the picture."""
 
 MAX_MS = 100_000_000
 """Longest recording [ms], 28 h: beyond it a timestamp is damaged, and the index would swell with it."""
@@ -64,14 +69,17 @@ class RecordingWriter:
         self._truth_parameters = truth_parameters
         self._metadata = dict(metadata or {})
         self._file: Any = None
+        self._datasets: dict[str, Any] = {}
         self._part = self.path
-        self._pending: list[dict[str, NDArray[Any]]] = []
+        self._pending: list[Columns] = []
         self._pending_count = 0
         self._written = 0
         self._columns: dict[str, np.dtype[Any]] | None = None
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
+        self._ms: list[NDArray[np.int64]] = []
+        self._ms_count = 0
 
     def __len__(self) -> int:
         return self._written + self._pending_count
@@ -131,6 +139,36 @@ class RecordingWriter:
             self._pending_count += len(events)
             self._flush(whole=self._pending_count - self._pending_count % CHUNK)
 
+    def fill(
+        self, pieces: Iterable[Callable[[], Marked]], *, t_first: int, done: Callable[[Events, NDArray[np.uint8]], None]
+    ) -> None:
+        """Write a whole recording, the first event at ``t_first`` [us], piece by piece, made on all cores.
+
+        Threads call the pieces, each of whole chunks (the last one may end within), and encode what they return.
+        ``done`` sees it, once it is written, in order and in the calling thread.
+        """
+        if self._file is None or len(self):
+            raise AmiwarpError(f"{self.path}: fill outside the writer's with block or after other events")
+        self._t_offset = t_first
+        with contextlib.closing(in_order(partial(self._made, piece) for piece in pieces)) as made:
+            for events, inside, columns, encoded in made:
+                with errors_name(self.path, lambda: f"after {len(self)} events"):
+                    if self._written % CHUNK:
+                        raise AmiwarpError("a piece that is not the last ends within a chunk")
+                    check_events(events, *self._size, where=str(self.path), first_index=len(self), allow_nan=True,
+                                 after_t=self._t_last)  # fmt: skip
+                    self._index(events.t)
+                    self._store(columns, encoded)
+                    self._written += len(events)
+                done(events, inside)
+
+    def _made(self, piece: Callable[[], Marked]) -> tuple[Events, NDArray[np.uint8], Columns, list[bytes]]:
+        """All that can be done of a piece on a thread of its own."""
+        events, inside = piece()
+        columns = {"events/x": events.x, "events/y": events.y, "events/t": events.t - self._t_offset}
+        columns |= {"events/p": events.p, "events/inside": inside}
+        return events, inside, columns, [encode(part) for part in _chunks(columns)]
+
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder that is written at the end."""
         self._encoder = encoder
@@ -166,27 +204,47 @@ class RecordingWriter:
         relative = t - self._t_offset
         for first in range(self._next_ms, last_ms + 1, 1 << 20):
             ms = np.arange(first, min(first + (1 << 20), last_ms + 1), dtype=np.int64)
-            self._extend("ms_to_idx", np.searchsorted(relative, ms * 1000) + len(self))
+            self._ms.append(np.searchsorted(relative, ms * 1000) + len(self))
+            self._ms_count += ms.size
+            self._write_index(CHUNK)
         self._next_ms, self._t_last = last_ms + 1, int(t[-1])
+
+    def _write_index(self, least: int) -> None:
+        if self._ms_count >= least:
+            self._extend("ms_to_idx", np.concatenate(self._ms))
+            self._ms, self._ms_count = [], 0
 
     def _flush(self, whole: int) -> None:
         """Write the first ``whole`` pending events; whole chunks are compressed once only."""
         if not whole:
             return
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
-        for name, column in joined.items():
-            self._extend(name, column[:whole])
+        begun = {name: column[:whole] for name, column in joined.items()}
+        with contextlib.closing(in_order(partial(encode, part) for part in _chunks(begun))) as encoded:
+            self._store(begun, encoded)
         self._written += whole
         self._pending_count -= whole
         self._pending = [{name: column[whole:] for name, column in joined.items()}] if self._pending_count else []
 
+    def _store(self, columns: Columns, encoded: Iterable[bytes]) -> None:
+        """Write columns from their encoded chunks, which follow what was written before."""
+        stored = iter(encoded)
+        for name, column in columns.items():
+            dataset = self._dataset(name, column.dtype)
+            for at in range(0, column.size, CHUNK):
+                append_chunk(dataset, self._written + at, next(stored), min(CHUNK, column.size - at))
+
     def _extend(self, name: str, values: NDArray[Any]) -> None:
-        if name not in self._file:
-            _make(self._file, name, values.dtype)
-        dataset = self._file[name]
+        """Add to a dataset through HDF5: for those that are small or grow by parts of chunks."""
+        dataset = self._dataset(name, values.dtype)
         start = dataset.shape[0]
         dataset.resize(start + values.size, axis=0)
         dataset[start:] = values
+
+    def _dataset(self, name: str, dtype: np.dtype[Any]) -> Any:
+        if name not in self._datasets:
+            self._datasets[name] = _make(self._file, name, dtype)
+        return self._datasets[name]
 
     def _write_header(self) -> None:
         file = self._file
@@ -209,7 +267,8 @@ class RecordingWriter:
 
     def _finish(self) -> None:
         self._flush(whole=self._pending_count)
-        self._extend("ms_to_idx", np.array([len(self)] if len(self) else [0], np.int64))
+        self._ms.append(np.array([len(self)], np.int64))
+        self._write_index(0)
         for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
             self._extend(f"events/{name}", np.zeros(0, (self._columns or {}).get(f"events/{name}", np.dtype(dtype))))
         self._file["t_offset"] = np.int64(self._t_offset)
@@ -230,15 +289,22 @@ class RecordingWriter:
             self._part.unlink()
 
 
+def _chunks(columns: Columns) -> Iterator[NDArray[Any]]:
+    """All chunks of the first column, then of the next."""
+    for column in columns.values():
+        for at in range(0, column.size, CHUNK):
+            yield column[at : at + CHUNK]
+
+
 def _listed(columns: Mapping[str, np.dtype[Any]]) -> str:
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
 
 
-def _make(file: Any, name: str, dtype: np.dtype[Any]) -> None:
+def _make(file: Any, name: str, dtype: np.dtype[Any]) -> Any:
     import hdf5plugin
 
     # The checksum lies on the compressed bytes: it costs nothing measurable and LZ4 alone misses most damage.
-    file.create_dataset(
+    return file.create_dataset(
         name,
         shape=(0,),
         maxshape=(None,),

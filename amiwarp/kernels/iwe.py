@@ -78,8 +78,10 @@ def cell_of(canvas: Canvas, frame: Frame, block: int, width: int) -> int:
 
 
 @wp.kernel
-def empty_words(canvas: Canvas, cells: Cells, slot: int, counts: wp.array2d(dtype=wp.int64)):
-    """Moves a batch's votes to the totals, and counts its events, those in the trash too.
+def empty_words(
+    canvas: Canvas, cells: Cells, slot: int, counts: wp.array2d(dtype=wp.int64), fullest: wp.array(dtype=int)
+):
+    """Moves a batch's votes to the totals, and counts its events, those in the trash too; the most in one word.
 
     Fewer than were voted, never more, says that words overflowed: the batch is voted again then.
     """
@@ -87,6 +89,8 @@ def empty_words(canvas: Canvas, cells: Cells, slot: int, counts: wp.array2d(dtyp
     count = wp.int64(load_word(cells.words, i) >> wp.uint64(54))
     if count != wp.int64(0):
         wp.atomic_add(counts, slot, i % counts.shape[1], count)
+        if int(count) > fullest[0]:
+            wp.atomic_max(fullest, 0, int(count))
     if i > canvas.columns and i < cells.totals.shape[0]:
         cells.totals[i] = cells.totals[i] + wp.int64(votes_of_pixel(cells.words, i, canvas.columns))
 

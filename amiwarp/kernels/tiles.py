@@ -4,6 +4,7 @@ A block of threads takes a chunk of one tile's events and a few candidates (para
 once for all of them. Votes that leave the window around the tile go to the image at once. Used by :mod:`amiwarp.tiles`.
 """
 
+import math
 from typing import Any
 
 import warp as wp
@@ -16,10 +17,13 @@ from amiwarp.kernels.votes import Canvas, somewhere
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 TILE = 32  # sensor pixels
-WINDOW = wp.constant(62)  # canvas pixels
-THREADS = wp.constant(512)
+COLUMNS = wp.constant(61)  # of a window [canvas px]; odd, so that one column spreads over all banks of the memory
+ROWS = wp.constant(64)
+THREADS = wp.constant(256)
+BLOCKS = 4  # of a multiprocessor at once
 AT_ONCE = wp.constant(3)  # candidates that share the reading of an event: their windows fill the 48 KiB there are
-CHUNK = 1 << 16  # events: 2**24 of 1/256 votes at most, so that no word of the window overflows
+TURN = wp.constant(2.0 * math.pi / 65536.0)
+CHUNK = 1 << 16  # points: 63 * 2**24 of 1/256 votes at most, so that no word of the window overflows
 
 
 @wp.struct
@@ -37,13 +41,31 @@ class Chunk:
 
 @wp.struct
 class TileEvents:
-    """Events by tile. ``packed``: angle [1/65536 turn], 1 bit free, y and x in the tile of 5 bits each."""
+    """Events by tile. ``packed``: angle [1/65536 turn], weight less one in 6 bits, y and x in the tile in 5 each."""
 
     packed: wp.array(dtype=wp.uint32)
-    azimuths: wp.array(dtype=float)
     slope: wp.array(dtype=float)  # change of the angle [1/65536 turn] per unit of drift, or empty
     time: wp.array(dtype=float)  # from the window's middle [s], or empty
     chunks: wp.array(dtype=Chunk)
+
+
+@wp.struct
+class Event:
+    """One of them, unpacked."""
+
+    x: float  # on the sensor
+    y: float
+    dither_x: float
+    dither_y: float
+    turn: int
+    weight: int
+
+
+@wp.struct
+class Still:
+    """Candidates that have nothing besides their model."""
+
+    nothing: int
 
 
 @wp.struct
@@ -96,6 +118,7 @@ def pack_events(
     turn: wp.array(dtype=wp.uint16),
     slope: wp.array(dtype=float),
     time: wp.array(dtype=float),
+    weight: wp.array(dtype=wp.uint8),
     order: wp.array(dtype=int),
     size: int,
     out: TileEvents,
@@ -103,6 +126,8 @@ def pack_events(
     i = wp.tid()
     k = order[i]
     place_in_tile = (int(y[k]) % size) * 32 + int(x[k]) % size
+    if weight.shape[0] > 0:
+        place_in_tile += (int(weight[k]) - 1) * 1024
     out.packed[i] = (wp.uint32(turn[k]) << wp.uint32(16)) | wp.uint32(place_in_tile)
     if slope.shape[0] > 0:
         out.slope[i] = slope[k]
@@ -120,7 +145,7 @@ def wait_for_block(): ...
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __shared__ int words[3 * 62 * 62];
+    __shared__ int words[3 * 61 * 64];
     if (what == 0) words[at] = 0;
     else if (what == 1) atomicAdd(&words[at], votes);
     else return words[at];
@@ -132,15 +157,40 @@ def window(what: int, at: int, votes: int) -> int:
 
 
 @wp.func
-def turned_back(camera: PinholeParams, xy: wp.vec2, turning: TurningParams, time: wp.array(dtype=float), i: int):
-    return xy  # the camera that turns comes as CameraParams
+def drifted(motion: Still, events: TileEvents, candidate: int, i: int, turn: int):
+    return turn
 
 
 @wp.func
-def turned_back(camera: CameraParams, xy: wp.vec2, turning: TurningParams, time: wp.array(dtype=float), i: int):
-    if time.shape[0] == 0:
-        return xy
-    return turn_back(camera, xy, turning, time[i])
+def drifted(motion: Motion, events: TileEvents, candidate: int, i: int, turn: int):
+    if events.slope.shape[0] == 0:
+        return turn
+    return turn + int(wp.floor(motion.drift[candidate] * events.slope[i] + 0.5))
+
+
+@wp.func
+def turned_back(motion: Still, camera: Any, x: float, y: float, events: TileEvents, candidate: int, i: int):
+    return x, y
+
+
+@wp.func
+def turned_back(motion: Motion, camera: CameraParams, x: float, y: float, events: TileEvents, candidate: int, i: int):
+    if events.time.shape[0] == 0:
+        return x, y
+    xy = turn_back(camera, wp.vec2(x, y), motion.turning[candidate], events.time[i])
+    return xy[0], xy[1]
+
+
+@wp.func
+def place_event(model: Any, camera: Any, motion: Any, events: TileEvents, candidate: int, i: int, event: Event):
+    """Where an event belongs under a candidate [sensor px]."""
+    angle = float(drifted(motion, events, candidate, i, event.turn)) * TURN
+    c = wp.cos(angle)
+    s = wp.sin(angle)
+    w0 = c * model.phase_cos - s * model.phase_sin
+    x, y = place(model, camera, event.x, event.y, w0, s * model.phase_cos + c * model.phase_sin)
+    x, y = turned_back(motion, camera, x, y, events, candidate, i)
+    return x + event.dither_x, y + event.dither_y
 
 
 @wp.func
@@ -154,127 +204,146 @@ def add_outside(layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dt
 
 @wp.func
 def cast_outside(
-    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), u: float, v: float, nearest: int
+    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), u: float, v: float, weight: int
 ):
-    """A vote that does not lie in the window alone; NaN, and what is far off, votes nowhere."""
-    if not (wp.abs(u) < 1.0e6 and wp.abs(v) < 1.0e6):
+    """A vote that does not lie in the window alone, [px] from its corner; NaN, and what is far off, votes nowhere."""
+    if not (wp.abs(u) < 16000.0 and wp.abs(v) < 16000.0):
         return
-    r = int(wp.floor(v))
-    c = int(wp.floor(u))
-    fx = wp.where(nearest != 0, 0, int((u - float(c)) * 256.0 + 0.5))
-    fy = wp.where(nearest != 0, 0, int((v - float(r)) * 256.0 + 0.5))
+    fine = wp.where(canvas.nearest != 0, 1.0, 256.0)
+    x = to_int(u * fine) << wp.where(canvas.nearest != 0, 8, 0)
+    y = to_int(v * fine) << wp.where(canvas.nearest != 0, 8, 0)
+    b = ((x & 255) * (y & 255) + 128) >> 8
+    add_outside(layout, canvas, chunk, image, y >> 8, x >> 8, weight * (256 - (x & 255) - (y & 255) + b))
+    add_outside(layout, canvas, chunk, image, y >> 8, (x >> 8) + 1, weight * ((x & 255) - b))
+    add_outside(layout, canvas, chunk, image, (y >> 8) + 1, x >> 8, weight * ((y & 255) - b))
+    add_outside(layout, canvas, chunk, image, (y >> 8) + 1, (x >> 8) + 1, weight * b)
+
+
+@wp.func
+def to_int(value: float) -> int:
+    """The nearest integer, of less than 2**22: an addition, where a conversion takes a GPU four times as long."""
+    return wp.cast(value + 12582912.0, int) - 0x4B400000
+
+
+@wp.func
+def cast_nearest(corner: int, weight: int, u: float, v: float) -> int:
+    """Votes in the window; 1 where the vote does not lie there."""
+    c = to_int(u)
+    r = to_int(v)
+    if wp.uint32(c) >= wp.uint32(COLUMNS) or wp.uint32(r) >= wp.uint32(ROWS):
+        return 1
+    window(1, corner + r * COLUMNS + c, weight << 8)
+    return 0
+
+
+@wp.func
+def cast_bilinear(corner: int, weight: int, u: float, v: float) -> int:
+    """The same, into four pixels."""
+    x = to_int(u * 256.0)
+    y = to_int(v * 256.0)
+    if wp.uint32(x) >= wp.uint32(256 * (COLUMNS - 1)) or wp.uint32(y) >= wp.uint32(256 * (ROWS - 1)):
+        return 1
+    fx = x & 255
+    fy = y & 255
     b = (fx * fy + 128) >> 8
-    add_outside(layout, canvas, chunk, image, r, c, 256 - fx - fy + b)
-    add_outside(layout, canvas, chunk, image, r, c + 1, fx - b)
-    add_outside(layout, canvas, chunk, image, r + 1, c, fy - b)
-    add_outside(layout, canvas, chunk, image, r + 1, c + 1, b)
-
-
-@wp.func
-def cast_nearest(
-    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), corner: int, u: float, v: float
-):
-    u += 0.5
-    v += 0.5
-    if u >= 0.0 and v >= 0.0 and u < float(WINDOW) and v < float(WINDOW):
-        window(1, corner + int(v) * WINDOW + int(u), 256)
-    else:
-        cast_outside(layout, canvas, chunk, image, u, v, 1)
-
-
-@wp.func
-def cast_bilinear(
-    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), corner: int, u: float, v: float
-):
-    if u >= 0.0 and v >= 0.0 and u < float(WINDOW - 1) and v < float(WINDOW - 1):
-        c = int(u)
-        r = int(v)
-        fx = int((u - float(c)) * 256.0 + 0.5)
-        fy = int((v - float(r)) * 256.0 + 0.5)
-        b = (fx * fy + 128) >> 8
-        at = corner + r * WINDOW + c
-        window(1, at, 256 - fx - fy + b)
-        window(1, at + 1, fx - b)
-        window(1, at + WINDOW, fy - b)
-        window(1, at + WINDOW + 1, b)
-    else:
-        cast_outside(layout, canvas, chunk, image, u, v, 0)
+    at = corner + (y >> 8) * COLUMNS + (x >> 8)
+    window(1, at, weight * (256 - fx - fy + b))
+    window(1, at + 1, weight * (fx - b))
+    window(1, at + COLUMNS, weight * (fy - b))
+    window(1, at + COLUMNS + 1, weight * b)
+    return 0
 
 
 @wp.func
 def cast_event(
-    model: Any,
-    camera: Any,
-    events: TileEvents,
-    motion: Motion,
-    layout: Layout,
-    canvas: Canvas,
-    chunk: Chunk,
-    images: wp.array2d(dtype=wp.int64),
-    first: int,
-    k: int,
-    i: int,
-    turn: int,
-    x: float,
-    y: float,
-):
-    """The vote of event ``i`` under candidate ``k`` of those from ``first``."""
-    if events.slope.shape[0] > 0:
-        turn = (turn + int(wp.floor(motion.drift[first + k] * events.slope[i] + 0.5))) & 65535
-    c = events.azimuths[2 * turn]
-    s = events.azimuths[2 * turn + 1]
-    w0 = c * model.phase_cos - s * model.phase_sin
-    px, py = place(model, camera, x, y, w0, s * model.phase_cos + c * model.phase_sin)
-    xy = turned_back(camera, wp.vec2(px, py), motion.turning[first + k], events.time, i)
-    dx, dy = somewhere(i)
-    u = (xy[0] + canvas.dither * dx) * canvas.scale + layout.shift - float(chunk.column)
-    v = (xy[1] + canvas.dither * dy) * canvas.scale + layout.shift - float(chunk.row)
+    model: Any, camera: Any, motion: Any, events: TileEvents, canvas: Canvas, corner: wp.vec2, first: int, k: int,
+    i: int, event: Event,
+) -> int:  # fmt: skip
+    """The vote of event ``i`` under candidate ``first + k``; 1 where it does not lie in the window."""
+    x, y = place_event(model, camera, motion, events, first + k, i, event)
+    u = x * canvas.scale + corner[0]
+    v = y * canvas.scale + corner[1]
     if canvas.nearest != 0:
-        cast_nearest(layout, canvas, chunk, images[first + k], k * WINDOW * WINDOW, u, v)
-    else:
-        cast_bilinear(layout, canvas, chunk, images[first + k], k * WINDOW * WINDOW, u, v)
+        return cast_nearest(k * COLUMNS * ROWS, event.weight, u, v)
+    return cast_bilinear(k * COLUMNS * ROWS, event.weight, u, v)
 
 
-@wp.kernel
-def vote_tiles(
-    models: wp.array(dtype=Any),
-    camera: Any,
-    events: TileEvents,
-    motion: Motion,
-    canvas: Canvas,
-    layout: Layout,
-    images: wp.array2d(dtype=wp.int64),
+@wp.func
+def unpack(packed: int, chunk: Chunk, canvas: Canvas, i: int) -> Event:
+    e = Event()
+    e.x = float(chunk.x + (packed & 31))
+    e.y = float(chunk.y + ((packed >> 5) & 31))
+    e.weight = ((packed >> 10) & 63) + 1
+    e.turn = packed >> 16  # signed: half a turn either way
+    if canvas.dither != 0.0:
+        dx, dy = somewhere(i)
+        e.dither_x = dx
+        e.dither_y = dy
+    return e
+
+
+@wp.func
+def clear_window(thread: int, many: int):
+    for i in range(thread, many * COLUMNS * ROWS, THREADS):
+        window(0, i, 0)
+    wait_for_block()
+
+
+@wp.func
+def flush_window(
+    layout: Layout, canvas: Canvas, chunk: Chunk, images: wp.array2d(dtype=wp.int64), first: int, thread: int, many: int
 ):
+    wait_for_block()
+    for i in range(thread, many * COLUMNS * ROWS, THREADS):
+        at = i % (COLUMNS * ROWS)
+        image = images[first + i / (COLUMNS * ROWS)]
+        add_outside(layout, canvas, chunk, image, at / COLUMNS, at % COLUMNS, window(2, i, 0))
+
+
+@wp.func
+def cast_left(
+    models: wp.array(dtype=Any), camera: Any, motion: Any, events: TileEvents, canvas: Canvas, layout: Layout,
+    chunk: Chunk, images: wp.array2d(dtype=wp.int64), corner: wp.vec2, first: int, left: int, i: int, event: Event,
+):  # fmt: skip
+    """Votes outside the window, of the candidates whose bits are set in ``left``."""
+    for k in range(wp.where(left != 0, AT_ONCE, 0)):
+        if ((left >> k) & 1) != 0:
+            x, y = place_event(models[first + k], camera, motion, events, first + k, i, event)
+            u = x * canvas.scale + corner[0]
+            v = y * canvas.scale + corner[1]
+            cast_outside(layout, canvas, chunk, images[first + k], u, v, event.weight)
+
+
+@wp.kernel(launch_bounds=(int(THREADS), BLOCKS))
+def vote_tiles(
+    models: wp.array(dtype=Any), camera: Any, events: TileEvents, motion: Any, canvas: Canvas, layout: Layout,
+    images: wp.array2d(dtype=wp.int64),
+):  # fmt: skip
     block, thread = wp.tid()
     chunk = events.chunks[block % events.chunks.shape[0]]
     first = (block / events.chunks.shape[0]) * AT_ONCE
-    candidates = wp.min(AT_ONCE, images.shape[0] - first)
+    many = wp.min(AT_ONCE, images.shape[0] - first)
     a = models[first]
-    b = models[first + wp.min(1, candidates - 1)]
-    c = models[first + candidates - 1]
-    for i in range(thread, candidates * WINDOW * WINDOW, THREADS):
-        window(0, i, 0)
-    wait_for_block()
+    b = models[first + wp.min(1, many - 1)]
+    c = models[first + many - 1]
+    corner = wp.vec2(layout.shift - float(chunk.column), layout.shift - float(chunk.row))
+    clear_window(thread, many)
+    packed = int(events.packed[wp.min(chunk.start + thread, chunk.stop - 1)])
     for i in range(chunk.start + thread, chunk.stop, THREADS):
-        packed = int(events.packed[i])
-        turn = (packed >> 16) & 65535
-        x = float(chunk.x + (packed & 31))
-        y = float(chunk.y + ((packed >> 5) & 31))
-        cast_event(a, camera, events, motion, layout, canvas, chunk, images, first, 0, i, turn, x, y)
-        if candidates > 1:
-            cast_event(b, camera, events, motion, layout, canvas, chunk, images, first, 1, i, turn, x, y)
-        if candidates > 2:
-            cast_event(c, camera, events, motion, layout, canvas, chunk, images, first, 2, i, turn, x, y)
-    wait_for_block()
-    for i in range(thread, candidates * WINDOW * WINDOW, THREADS):
-        at = i % (WINDOW * WINDOW)
-        image = images[first + i / (WINDOW * WINDOW)]
-        add_outside(layout, canvas, chunk, image, at / WINDOW, at % WINDOW, window(2, i, 0))
+        event = unpack(packed, chunk, canvas, i)
+        packed = int(events.packed[wp.min(i + THREADS, chunk.stop - 1)])  # under way while this one is voted
+        left = cast_event(a, camera, motion, events, canvas, corner, first, 0, i, event)
+        if many > 1:
+            left += 2 * cast_event(b, camera, motion, events, canvas, corner, first, 1, i, event)
+        if many > 2:
+            left += 4 * cast_event(c, camera, motion, events, canvas, corner, first, 2, i, event)
+        cast_left(models, camera, motion, events, canvas, layout, chunk, images, corner, first, left, i, event)
+    flush_window(layout, canvas, chunk, images, first, thread, many)
 
 
 for _struct in (CircleParams, RadialCircleParams, ExactParams):
-    for _camera in (PinholeParams, CameraParams):
-        wp.overload(vote_tiles, {"models": wp.array(dtype=_struct), "camera": _camera})
+    for _camera, _motion in ((PinholeParams, Still), (CameraParams, Still), (CameraParams, Motion)):
+        wp.overload(vote_tiles, {"models": wp.array(dtype=_struct), "camera": _camera, "motion": _motion})
 
 
 @wp.kernel

@@ -40,6 +40,7 @@ class EventArrays:
     turn: wp.array(dtype=wp.uint16)
     azimuths: wp.array(dtype=float)
     time: wp.array(dtype=float)
+    weight: wp.array(dtype=wp.uint8)
 
 
 @wp.struct
@@ -136,6 +137,14 @@ def azimuth_at(model: Any, events: EventArrays, i: int):
 
 
 @wp.func
+def weighted(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
+    """The word of as many events in one place: up to 255, so that no field overflows."""
+    if events.weight.shape[0] == 0:
+        return word
+    return word * wp.uint64(events.weight[i])
+
+
+@wp.func
 def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: int):
     """Angle, displacement and vote of one event."""
     w0, w1 = azimuth_at(model, events, i)
@@ -159,7 +168,7 @@ def vote_blocks(
         store_int(places, k, cell)
         store_word(words, k, wp.where(first + k < count, word, wp.uint64(0)))
     for k in range(BLOCK):
-        carry = add_word(cells.words, places[k], words[k]) & CARRIES
+        carry = add_word(cells.words, places[k], weighted(events, first + k, words[k])) & CARRIES
         if carry != wp.uint64(0):
             take_down(cells, places[k], canvas.columns, carry)
 
@@ -167,8 +176,9 @@ def vote_blocks(
 @wp.kernel
 def vote_events(model: Any, camera: Any, events: EventArrays, canvas: Canvas, start: int, cells: Cells):
     """One event, exactly."""
-    _inside, cell, word = event_vote(model, camera, events, canvas, start + wp.tid())
-    cast_vote(cells, cell, canvas.columns, word)
+    i = start + wp.tid()
+    _inside, cell, word = event_vote(model, camera, events, canvas, i)
+    cast_vote(cells, cell, canvas.columns, weighted(events, i, word))
 
 
 @wp.kernel
@@ -223,6 +233,34 @@ def layer_events(
     """Which image an event goes to: that of its part, every so manieth, and there OFF or ON."""
     i = start + wp.tid()
     layer[i] = wp.uint8((i % parts) * (1 + per_polarity) + per_polarity * wp.where(p[i] != wp.uint8(0), 1, 0))
+
+
+@wp.kernel
+def fold_keys(
+    x: wp.array(dtype=wp.uint16),
+    y: wp.array(dtype=wp.uint16),
+    layer: wp.array(dtype=wp.uint8),
+    turn: wp.array(dtype=wp.uint16),
+    bins: int,
+    start: int,
+    keys: wp.array(dtype=wp.int64),
+):
+    """One number for the angle's bin, the pixel and the polarity, in that order."""
+    i = start + wp.tid()
+    bin_of = wp.int64((wp.uint32(turn[i]) * wp.uint32(bins)) >> wp.uint32(16))
+    pixel = (wp.int64(y[i]) << wp.int64(16)) | wp.int64(x[i])
+    keys[i] = (bin_of << wp.int64(33)) | (pixel << wp.int64(1)) | wp.int64(wp.where(layer[i] != wp.uint8(0), 1, 0))
+
+
+@wp.kernel
+def unfold_keys(keys: wp.array(dtype=wp.int64), bins: int, start: int, events: EventArrays):
+    i = start + wp.tid()
+    key = keys[i]
+    events.layer[i] = wp.uint8(key & wp.int64(1))
+    events.x[i] = wp.uint16((key >> wp.int64(1)) & wp.int64(65535))
+    events.y[i] = wp.uint16((key >> wp.int64(17)) & wp.int64(65535))
+    bin_of = key >> wp.int64(33)
+    events.turn[i] = wp.uint16((wp.int64(65536) * bin_of + wp.int64(32768)) / wp.int64(bins))
 
 
 @wp.kernel

@@ -1,0 +1,333 @@
+"""Speed of the compensation of a file, reading and writing included, and the error of that very run.
+
+    python -m benchmarks.compensate [--events 100000000] [--device cuda:0] [--models circle exact] [--out FILE]
+
+640x480, 60 degrees, 720 turns/min: half a second (six turns) of the simulator, repeated to the number of events asked
+for. Each row is a process of its own, so that its peak memory is its own. ``copy_s`` is what the disk needs for the
+same bytes: the recording read and the result written, in plain pieces. ``alone`` tells each stage's rate without the
+others. ``cpu_ns`` is processor time an event, which a busy machine stretches less than the clock. Nothing is flushed to
+the disk at the end, of neither; run it twice where the first run finds the file not in memory.
+With ``--columns`` both files are bare columns, for machines without HDF5's filters: that measures everything but the
+coding of chunks. Ends with 1 where a sample of the result is more than 1e-3 px off a float64 trace of its own, or where
+times, polarities or flags differ.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.camera import Camera
+from amiwarp.compensate import PIECE, Mover, compensate, inside_image
+from amiwarp.encoder import Encoder
+from amiwarp.events import Events
+from amiwarp.io import RecordingWriter, open_recording
+from amiwarp.io.chunks import in_order
+from amiwarp.optics import MODELS, Model, Prism
+from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import reference
+
+APEX, PHASE, RPM, REPEATED_US = math.radians(2.0), 0.7, 720.0, 500_000
+CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, FOV), Prism(APEX, INDEX)
+BAR_PX = 1e-3
+ALONE = 20_000_000  # events of a stage that is measured alone
+COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
+MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside": np.uint8}
+
+
+def half_a_second() -> Events:
+    from amiwarp.motion import EncoderModel
+    from amiwarp.simulate import Scene, Simulation
+
+    scene = Scene.from_picture(blocks_picture())
+    simulation = Simulation(scene, CAMERA, PRISM, REPEATED_US * 1e-6, encoder_model=EncoderModel.ideal())
+    events = Events.concatenate([block for block, _points in simulation.blocks()])
+    return events[(events.t >= 0) & (events.t < REPEATED_US)]
+
+
+def repeated(events: int) -> Iterator[Events]:
+    once, done = half_a_second(), 0
+    while done < events:
+        turn = once[: events - done]
+        yield Events(turn.x, turn.y, turn.t + done // len(once) * REPEATED_US, turn.p)
+        done += len(turn)
+
+
+def make(path: Path, events: int, columns: bool) -> None:
+    """The recording: a file of the native layout, or a folder of bare columns."""
+    encoder = Encoder.constant_speed(RPM, 0, (events // 1_000_000 + 2) * REPEATED_US)
+    if columns:
+        path.mkdir()
+        with contextlib.ExitStack() as stack:
+            files = {name: stack.enter_context((path / name).open("wb")) for name in COLUMNS}
+            for block in repeated(events):
+                for name, file in files.items():
+                    getattr(block, name).tofile(file)
+        return
+    with RecordingWriter(path, width=WIDTH, height=HEIGHT, camera=CAMERA, prism=PRISM, encoder=encoder) as writer:
+        for block in repeated(events):
+            writer.append(block)
+
+
+class Bare:
+    """A folder of bare columns, read and written by threads in place of HDF5."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.count = (path / "p").stat().st_size
+
+    def read(self, start: int, dtypes: dict[str, Any], count: int = PIECE) -> dict[str, Any]:
+        count = min(count, self.count - start)
+        return {
+            name: np.fromfile(self.path / name, dtype, count, offset=start * np.dtype(dtype).itemsize)
+            for name, dtype in dtypes.items()
+        }
+
+    def piece(self, start: int) -> Events:
+        return Events(**self.read(start, COLUMNS))
+
+    def compensate(self, out: Path, mover: Mover) -> None:
+        out.mkdir()
+
+        def job(start: int) -> dict[str, Any]:
+            events, inside = mover(self.piece(start))
+            return {name: getattr(events, name) for name in COLUMNS} | {"inside": inside}
+
+        with contextlib.ExitStack() as stack:
+            files = {name: stack.enter_context((out / name).open("wb", buffering=0)) for name in MOVED}
+            for columns in in_order(partial(job, start) for start in range(0, self.count, PIECE)):
+                for name, file in files.items():
+                    file.write(columns[name])
+
+
+class Calibrated:
+    """What compensation asks of a calibration."""
+
+    def __init__(self, name: str) -> None:
+        self.model_name, self.camera = name, CAMERA
+        self.model: Model = MODELS[name].from_prism(CAMERA, PRISM, PHASE)
+
+    def encoder_for(self, encoder: Encoder, _first: int, _last: int) -> Encoder:
+        return encoder
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+def truth(name: str, model: Any, xy: Any, theta: Any) -> Any:
+    """Places by the float64 oracle of the tests; for the ellipse, its own tables in float64."""
+    if name == "exact":
+        return reference.move(CAMERA, PRISM, xy, theta, to_scene=True, phase=PHASE)
+    phi = (theta + PHASE)[:, None]
+    if name == "ellipse":
+        at = xy[:, 1].astype(int), xy[:, 0].astype(int)
+        return xy + model.offset[at] + model.cosine[at] * np.cos(phi) + model.sine[at] * np.sin(phi)
+    rays = reference.pixels_to_rays(CAMERA, xy)
+    angle: Any = PRISM.deflection
+    if name == "radial":
+        cosine2 = rays[:, 2] ** 2
+        angle = angle * (np.sqrt((INDEX**2 - 1.0 + cosine2) / cosine2) - 1.0) / (INDEX - 1.0)
+    return reference.rays_to_pixels(CAMERA, reference.turn(rays, theta + PHASE, angle))
+
+
+def error_of(name: str, model: Any, encoder: Encoder, raw: Events, moved: Events, inside: Any) -> float:
+    """Largest distance to the truth [px]; infinite where anything else is wrong."""
+    xy = np.stack([raw.x, raw.y], axis=1).astype(np.float64)
+    found = np.stack([moved.x, moved.y], axis=1)
+    away = np.linalg.norm(found - truth(name, model, xy, encoder.angle_at(raw.t)), axis=1)
+    same = np.array_equal(raw.t, moved.t) and np.array_equal(raw.p, moved.p)
+    same &= np.array_equal(inside.astype(bool), inside_image(found, WIDTH, HEIGHT))
+    return float(away.max()) if same and np.isfinite(away).all() else math.inf
+
+
+def plain_copy(source: Path, result: Path, folder: Path) -> float:
+    """Seconds to read the one and to write as much as the other."""
+
+    def files(path: Path) -> list[Path]:
+        return sorted(path.iterdir()) if path.is_dir() else [path]
+
+    def copy() -> None:
+        piece = bytearray(1 << 20)
+        for path in files(source):
+            with path.open("rb", buffering=0) as file:
+                while file.readinto(piece):
+                    pass
+        with (folder / "copy").open("wb", buffering=0) as out:
+            for _ in range(sum(path.stat().st_size for path in files(result)) >> 20):
+                out.write(piece)
+
+    try:
+        return seconds(copy)
+    finally:
+        (folder / "copy").unlink()
+
+
+def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any]:
+    return Events(events.x, events.y, events.t + piece * int(events.t[-1] - events.t[0]), events.p), inside
+
+
+def stages_alone(recording: Any, mover: Mover, folder: Path) -> dict[str, float]:
+    """Million events a second of each stage, over all cores, the others left out."""
+    count = min(ALONE, len(recording.events)) // PIECE * PIECE
+    reads = list(recording.events.pieces(PIECE))[: count // PIECE]
+    held = [read() for read in reads[:8]]
+    moved, inside = mover(held[0])
+
+    def write() -> None:
+        with RecordingWriter(folder / "alone.h5", width=WIDTH, height=HEIGHT) as writer:
+            pieces = (partial(moved_again, moved, inside, k) for k in range(len(reads)))
+            writer.fill(pieces, t_first=int(moved.t[0]), done=lambda _events, _inside: None)
+
+    def drain(jobs: Iterator[Callable[[], Any]]) -> None:
+        for _ in in_order(jobs):
+            pass
+
+    stages = {
+        "read": lambda: drain(iter(reads)),
+        "move": lambda: drain(partial(mover, held[k % len(held)]) for k in range(len(reads))),
+        "write": write,
+    }
+    rates = {name: count / 1e6 / min(seconds(work) for _ in range(2)) for name, work in stages.items()}
+    (folder / "alone.h5").unlink()
+    return rates
+
+
+def peak_mib() -> float:
+    """Of this process; what its parent held when it started does not count."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM"):
+            return int(line.split()[1]) / 1024.0
+    return math.nan
+
+
+def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> dict[str, Any]:
+    folder, calibration = source.parent, Calibrated(name)
+    result: dict[str, Any] = {"model": name, "device": device, "layout": "columns" if columns else "native"}
+    out = folder / "moved"
+    times, copies, cpu = [], [], []
+    bare = Bare(source) if columns else None
+    recording = None if columns else open_recording(source)
+    encoder = Encoder.constant_speed(RPM, 0, int(bare.piece(bare.count - 1).t[0])) if bare else recording.encoder
+    first, last = (0, int(encoder.t[-1])) if bare else (recording.events.t_first, recording.events.t_last)
+    began = time.perf_counter()
+    mover = Mover(calibration.model, encoder, first, last, device)
+    mover(bare.piece(0) if bare else recording.events.slice(0, PIECE))
+    result["compile_s"] = time.perf_counter() - began
+    for _ in range(repeats):
+        began_cpu = time.process_time()
+        for path in sorted(out.iterdir()) if out.is_dir() else [out]:
+            path.unlink(missing_ok=True)
+        if out.is_dir():
+            out.rmdir()
+        if bare:
+            times.append(seconds(lambda: bare.compensate(out, mover)))
+        else:
+            times.append(seconds(lambda: compensate(recording, calibration, out, device=device)))  # type: ignore[arg-type]
+        cpu.append(time.process_time() - began_cpu)
+        result["peak_mib"] = peak_mib()
+        copies.append(plain_copy(source, out, folder))
+    n = bare.count if bare else len(recording.events)
+    middle, copy = float(np.median(times)), float(np.median(copies))
+    result |= {"events": n, "seconds": times, "mev_per_s": n / middle / 1e6, "copy_s": copies, "of_copy": middle / copy}
+    result["cpu_ns"] = [spent / n * 1e9 for spent in cpu]
+    for key, path in (("bytes_in", source), ("bytes_out", out)):
+        result[key] = sum(p.stat().st_size for p in (path.iterdir() if columns else [path]))
+    result["error_px"] = max(errors(name, calibration.model, encoder, recording, source, out, n))
+    if not bare:
+        result["alone_mev_per_s"] = stages_alone(recording, mover, folder)
+    return result
+
+
+def errors(
+    name: str, model: Model, encoder: Encoder, recording: Any, source: Path, out: Path, n: int
+) -> Iterator[float]:
+    """Of stretches all over the file that was written."""
+    written = None if recording is None else open_recording(out).events
+    for start in np.linspace(0, max(n - 5000, 0), 40).astype(int).tolist():
+        stop = min(start + 5000, n)
+        if written is None:
+            raw = Events(**Bare(source).read(start, COLUMNS, 5000))
+            columns = Bare(out).read(start, MOVED, 5000)
+            inside = columns.pop("inside")
+            moved = Events(**columns)
+        else:
+            raw, moved, inside = (
+                recording.events.slice(start, stop),
+                written.slice(start, stop),
+                written.inside(start, stop),
+            )
+        yield error_of(name, model, encoder, raw, moved, inside)
+
+
+def about(device: str) -> dict[str, Any]:
+    wp.init()
+    found = {"python": platform.python_version()}
+    for name in ("warp-lang", "numpy", "h5py", "hdf5plugin", "numcodecs"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    info = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.partition(":")[2].strip() for line in info if line.startswith("model name")]
+    cores = len(os.sched_getaffinity(0))
+    return {"machine": f"{(names or [platform.machine()])[0]}, {cores} cores", "device": wp.get_device(device).name,
+            "versions": found}  # fmt: skip
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--events", type=int, default=100_000_000)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--models", nargs="+", choices=list(MODELS), default=["circle", "exact"])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--columns", action="store_true", help="bare columns in place of HDF5")
+    parser.add_argument("--folder", type=Path, help="where the files go (default: a temporary folder)")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument("--row", type=Path, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def main() -> None:
+    a = arguments()
+    wp.config.quiet = True
+    if a.row:
+        print(json.dumps(row(a.row, a.models[0], a.device, a.repeats, a.columns)))
+        return
+    result = about(a.device) | {"rows": []}
+    with tempfile.TemporaryDirectory(dir=a.folder) as folder:
+        source = Path(folder) / "recording"
+        child = [sys.executable, "-m", "benchmarks.compensate", "--device", a.device, "--repeats", str(a.repeats)]
+        child += ["--columns"] * a.columns
+        make(source, a.events, a.columns)
+        for name in a.models:
+            ran = subprocess.run([*child, "--row", str(source), "--models", name], stdout=subprocess.PIPE, check=True)
+            result["rows"].append(json.loads(ran.stdout.splitlines()[-1]))
+            print(json.dumps(result["rows"][-1]), flush=True)
+    if a.out:
+        a.out.write_text(json.dumps(result, indent=1) + "\n")
+    wrong = [r["model"] for r in result["rows"] if not r["error_px"] <= BAR_PX]
+    if wrong:
+        raise SystemExit(f"more than {BAR_PX} px off: {', '.join(wrong)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Events on a device: their angles against the encoder in float64, and folding, which loses no event."""
+
+import math
+
+import numpy as np
+import pytest
+
+from amiwarp.camera import Camera
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events
+from amiwarp.iwe import CanvasShape, Votes
+from amiwarp.optics import ExactModel, Prism
+from amiwarp.uploads import LARGEST_WEIGHT, TURNS, upload_events
+
+
+def still_scene(n: int, points: int = 200, seed: int = 0) -> Events:
+    """Events of a few pixels, again at every turn; the last pixel fires far too often."""
+    rng = np.random.default_rng(seed)
+    which = rng.integers(0, points, n)
+    which[: n // 4] = points - 1
+    t = np.sort(rng.integers(0, 250_000, n))
+    return Events.from_arrays(which % 64, which // 64, t, which % 2)
+
+
+def test_angles_are_the_encoder_s(device: str) -> None:
+    t = np.cumsum(np.random.default_rng(1).integers(500, 1500, 300)) + 1_700_000_000_000_000
+    encoder = Encoder.from_angles(t, 0.04 * np.arange(300) ** 1.1, clock_offset_us=12.25)
+    events = Events.from_arrays(
+        [1] * 1000, [2] * 1000, np.linspace(t[0], t[-1] - 20, 1000).astype(np.int64), [1] * 1000
+    )
+    turn = upload_events(events, encoder, device).arrays.turn.numpy()[:1000]
+    expected = encoder.angle_at(events.t) * (TURNS / (2.0 * math.pi))
+    error = (turn - expected + TURNS / 2) % TURNS - TURNS / 2
+    assert np.abs(error).max() < 0.5 + 1e-3
+
+
+def test_uncovered_events_are_refused(device: str) -> None:
+    encoder = Encoder.constant_speed(720.0, 0, 100_000)
+    with pytest.raises(AmiwarpError, match="outside the encoder"):
+        upload_events(still_scene(100), encoder, device)
+
+
+@pytest.mark.parametrize("per_polarity", [False, True])
+def test_folding_by_the_finest_bins_changes_nothing(per_polarity: bool, device: str) -> None:
+    events, encoder = still_scene(20_000), Encoder.constant_speed(720.0, 0, 250_000)
+    model = ExactModel(Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2)), 0.4)
+    images = []
+    for fold in (0, TURNS):
+        votes = Votes(CanvasShape(64, 48, 4, per_polarity=per_polarity), device)
+        votes.add_events(model, upload_events(events, encoder, device, fold=fold))
+        images.append(votes.take())
+    np.testing.assert_array_equal(*images)
+
+
+def test_points_stand_for_all_events_of_their_bin(device: str) -> None:
+    events, encoder = still_scene(20_000), Encoder.constant_speed(720.0, 0, 250_000)
+    folded = upload_events(events, encoder, device, fold=64)
+    weight = folded.arrays.weight.numpy()[: folded.count].astype(int)
+    assert weight.sum() == len(events)
+    assert weight.max() == LARGEST_WEIGHT  # of the pixel that fires too often: its points come more than once
+    x, y = (a.numpy()[: folded.count].astype(int) for a in (folded.arrays.x, folded.arrays.y))
+    expected = np.bincount(events.y.astype(int) * 64 + events.x, minlength=64 * 48)
+    np.testing.assert_array_equal(np.bincount(y * 64 + x, weight, minlength=64 * 48), expected)
+    middle = folded.arrays.turn.numpy()[: folded.count] % (TURNS // 64)
+    assert (middle == TURNS // 128).all()
+
+
+@pytest.mark.parametrize("fold", [-1, TURNS + 1])
+def test_senseless_bins_are_refused(fold: int) -> None:
+    with pytest.raises(AmiwarpError, match="angles a turn"):
+        upload_events(still_scene(100), Encoder.constant_speed(720.0, 0, 250_000), "cpu", fold=fold)
