@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -70,23 +72,30 @@ class Mover:
         self._model, self._encoder = model.params(name), encoder_params(encoder, t_first, t_last, name)
         self._azimuths = azimuths(name)
         self._kernel = kernels.compensate_blocks if self._device.is_cpu else kernels.compensate_events
+        # Warp's CUDA side keeps its books for one thread at a time
+        self._alone = contextlib.nullcontext() if self._device.is_cpu else threading.Lock()
         # once, before threads would each try
         self._kernel.module.load(self._device, **({"block_dim": 1} if self._device.is_cpu else {}))
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
         """The events moved (NaN: nowhere), and 1 for each that lies on a pixel of the image, shape ``(n,)``."""
+        if events.x.dtype != np.uint16:
+            raise AmiwarpError(
+                f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
+            )
+        if not len(events):
+            return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
+        with self._alone:
+            x, y, inside = self._move(events, all_cores)
+        return Events(x, y, events.t, events.p), inside
+
+    def _move(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
         import warp as wp
 
         from amiwarp.kernels.compensate import BLOCK, Columns
         from amiwarp.kernels.launch import launch
 
-        if events.x.dtype != np.uint16:
-            raise AmiwarpError(
-                f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-            )
         n, block = len(events), int(BLOCK) if self._device.is_cpu else 1
-        if not n:
-            return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
         padded = -(-n // block) * block
         width, height = self._size
         # The quick way of placing takes the event's pixel from the image's tables without a look.
@@ -101,8 +110,7 @@ class Mover:
             launch(self._kernel, padded // block, inputs, [], device=self._device, smallest=512)
         else:
             wp.launch(self._kernel, dim=padded // block, inputs=[*inputs, 0], device=self._device)
-        x, y, inside = (values.numpy()[:n] for values in (c.out_x, c.out_y, c.inside))
-        return Events(x, y, events.t, events.p), inside
+        return [values.numpy()[:n] for values in (c.out_x, c.out_y, c.inside)]
 
 
 def _on(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
+from amiwarp.kernels.native import load_uint32
 from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams, place
 from amiwarp.kernels.votes import Canvas, somewhere
 
@@ -19,11 +20,12 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 TILE = 32  # sensor pixels
 COLUMNS = wp.constant(61)  # of a window [canvas px]; odd, so that one column spreads over all banks of the memory
 ROWS = wp.constant(64)
+SIZE = wp.constant(4 * 61 * 64)  # of a window [bytes]
 THREADS = wp.constant(256)
 BLOCKS = 4  # of a multiprocessor at once
 AT_ONCE = wp.constant(3)  # candidates that share the reading of an event: their windows fill the 48 KiB there are
 TURN = wp.constant(2.0 * math.pi / 65536.0)
-CHUNK = 1 << 16  # points: 63 * 2**24 of 1/256 votes at most, so that no word of the window overflows
+CHUNK = 1 << 17  # points: 63 * 2**25 of 1/256 votes at most, so that no word of the window overflows
 
 
 @wp.struct
@@ -55,8 +57,9 @@ class Event:
 
     x: float  # on the sensor
     y: float
-    dither_x: float
-    dither_y: float
+    corner_x: float  # what a place on the sensor, scaled, is moved by to be one in the window: its own for each event,
+    corner_y: float  # where these lie somewhere in their pixels
+    scale: float
     turn: int
     weight: int
 
@@ -135,9 +138,22 @@ def pack_events(
         out.time[i] = time[k]
 
 
+# The block's shared memory goes by its address: looked up once, where an array's name would be at every vote.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __syncthreads();
+    __shared__ int words[3 * 61 * 64];
+    unsigned address = (unsigned)__cvta_generic_to_shared(words);
+    asm volatile("" : "+r"(address));  // or the compiler would look it up again and again
+    return (int)address;
+#endif
+    return 0;
+""")
+def window() -> int: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("bar.sync 0;" ::: "memory");
 #endif
 """)
 def wait_for_block(): ...
@@ -145,15 +161,28 @@ def wait_for_block(): ...
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __shared__ int words[3 * 61 * 64];
-    if (what == 0) words[at] = 0;
-    else if (what == 1) atomicAdd(&words[at], votes);
-    else return words[at];
+    asm volatile("st.shared.u32 [%0], %1;" :: "r"(address), "r"(value) : "memory");
 #endif
-    return 0;
 """)
-def window(what: int, at: int, votes: int) -> int:
-    """The block's shared memory: sets to zero (0), adds (1), reads (2)."""
+def set_word(address: int, value: int): ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("red.shared.add.u32 [%0], %1;" :: "r"(address), "r"(value));
+#endif
+""")
+def add_to_word(address: int, value: int): ...
+
+
+@wp.func_native("""
+    int value = 0;
+#if defined(__CUDA_ARCH__)
+    asm volatile("ld.shared.u32 %0, [%1];" : "=r"(value) : "r"(address) : "memory");
+#endif
+    return value;
+""")
+def get_word(address: int) -> int: ...
 
 
 @wp.func
@@ -183,14 +212,14 @@ def turned_back(motion: Motion, camera: CameraParams, x: float, y: float, events
 
 @wp.func
 def place_event(model: Any, camera: Any, motion: Any, events: TileEvents, candidate: int, i: int, event: Event):
-    """Where an event belongs under a candidate [sensor px]."""
+    """Where an event belongs under a candidate, from the window's corner."""
     angle = float(drifted(motion, events, candidate, i, event.turn)) * TURN
     c = wp.cos(angle)
     s = wp.sin(angle)
     w0 = c * model.phase_cos - s * model.phase_sin
     x, y = place(model, camera, event.x, event.y, w0, s * model.phase_cos + c * model.phase_sin)
     x, y = turned_back(motion, camera, x, y, events, candidate, i)
-    return x + event.dither_x, y + event.dither_y
+    return x * event.scale + event.corner_x, y * event.scale + event.corner_y
 
 
 @wp.func
@@ -226,91 +255,91 @@ def to_int(value: float) -> int:
 
 
 @wp.func
-def cast_nearest(corner: int, weight: int, u: float, v: float) -> int:
-    """Votes in the window; 1 where the vote does not lie there."""
+def cast_nearest(window: int, weight: int, u: float, v: float) -> int:
+    """Votes in the window at that address; 1 where the vote does not lie there."""
     c = to_int(u)
     r = to_int(v)
-    if wp.uint32(c) >= wp.uint32(COLUMNS) or wp.uint32(r) >= wp.uint32(ROWS):
-        return 1
-    window(1, corner + r * COLUMNS + c, weight << 8)
-    return 0
+    inside = wp.uint32(c) < wp.uint32(COLUMNS) and wp.uint32(r) < wp.uint32(ROWS)
+    # no branch: elsewhere nothing is added to the first word
+    add_to_word(window + wp.where(inside, 4 * (r * COLUMNS + c), 0), wp.where(inside, weight << 8, 0))
+    return wp.where(inside, 0, 1)
 
 
 @wp.func
-def cast_bilinear(corner: int, weight: int, u: float, v: float) -> int:
+def cast_bilinear(window: int, weight: int, u: float, v: float) -> int:
     """The same, into four pixels."""
     x = to_int(u * 256.0)
     y = to_int(v * 256.0)
-    if wp.uint32(x) >= wp.uint32(256 * (COLUMNS - 1)) or wp.uint32(y) >= wp.uint32(256 * (ROWS - 1)):
-        return 1
+    inside = wp.uint32(x) < wp.uint32(256 * (COLUMNS - 1)) and wp.uint32(y) < wp.uint32(256 * (ROWS - 1))
     fx = x & 255
     fy = y & 255
     b = (fx * fy + 128) >> 8
-    at = corner + (y >> 8) * COLUMNS + (x >> 8)
-    window(1, at, weight * (256 - fx - fy + b))
-    window(1, at + 1, weight * (fx - b))
-    window(1, at + COLUMNS, weight * (fy - b))
-    window(1, at + COLUMNS + 1, weight * b)
-    return 0
+    at = window + wp.where(inside, 4 * ((y >> 8) * COLUMNS + (x >> 8)), 0)
+    given = wp.where(inside, weight, 0)
+    add_to_word(at, given * (256 - fx - fy + b))
+    add_to_word(at + 4, given * (fx - b))
+    add_to_word(at + 4 * COLUMNS, given * (fy - b))
+    add_to_word(at + 4 * COLUMNS + 4, given * b)
+    return wp.where(inside, 0, 1)
 
 
 @wp.func
 def cast_event(
-    model: Any, camera: Any, motion: Any, events: TileEvents, canvas: Canvas, corner: wp.vec2, first: int, k: int,
-    i: int, event: Event,
+    model: Any, camera: Any, motion: Any, events: TileEvents, nearest: int, window: int, candidate: int, i: int,
+    event: Event,
 ) -> int:  # fmt: skip
-    """The vote of event ``i`` under candidate ``first + k``; 1 where it does not lie in the window."""
-    x, y = place_event(model, camera, motion, events, first + k, i, event)
-    u = x * canvas.scale + corner[0]
-    v = y * canvas.scale + corner[1]
-    if canvas.nearest != 0:
-        return cast_nearest(k * COLUMNS * ROWS, event.weight, u, v)
-    return cast_bilinear(k * COLUMNS * ROWS, event.weight, u, v)
+    """The vote of event ``i`` under a candidate; 1 where it does not lie in the window."""
+    u, v = place_event(model, camera, motion, events, candidate, i, event)
+    if nearest != 0:
+        return cast_nearest(window, event.weight, u, v)
+    return cast_bilinear(window, event.weight, u, v)
 
 
 @wp.func
-def unpack(packed: int, chunk: Chunk, canvas: Canvas, i: int) -> Event:
+def unpack(packed: int, chunk: Chunk, canvas: Canvas, layout: Layout, i: int) -> Event:
     e = Event()
     e.x = float(chunk.x + (packed & 31))
     e.y = float(chunk.y + ((packed >> 5) & 31))
     e.weight = ((packed >> 10) & 63) + 1
     e.turn = packed >> 16  # signed: half a turn either way
+    e.scale = canvas.scale
+    e.corner_x = layout.shift - float(chunk.column)
+    e.corner_y = layout.shift - float(chunk.row)
     if canvas.dither != 0.0:
         dx, dy = somewhere(i)
-        e.dither_x = dx
-        e.dither_y = dy
+        e.corner_x += dx * canvas.scale
+        e.corner_y += dy * canvas.scale
     return e
 
 
 @wp.func
-def clear_window(thread: int, many: int):
+def clear_window(window: int, thread: int, many: int):
     for i in range(thread, many * COLUMNS * ROWS, THREADS):
-        window(0, i, 0)
+        set_word(window + 4 * i, 0)
     wait_for_block()
 
 
 @wp.func
 def flush_window(
-    layout: Layout, canvas: Canvas, chunk: Chunk, images: wp.array2d(dtype=wp.int64), first: int, thread: int, many: int
-):
+    layout: Layout, canvas: Canvas, chunk: Chunk, images: wp.array2d(dtype=wp.int64), window: int, first: int,
+    thread: int, many: int,
+):  # fmt: skip
     wait_for_block()
     for i in range(thread, many * COLUMNS * ROWS, THREADS):
         at = i % (COLUMNS * ROWS)
         image = images[first + i / (COLUMNS * ROWS)]
-        add_outside(layout, canvas, chunk, image, at / COLUMNS, at % COLUMNS, window(2, i, 0))
+        add_outside(layout, canvas, chunk, image, at / COLUMNS, at % COLUMNS, get_word(window + 4 * i))
 
 
 @wp.func
 def cast_left(
     models: wp.array(dtype=Any), camera: Any, motion: Any, events: TileEvents, canvas: Canvas, layout: Layout,
-    chunk: Chunk, images: wp.array2d(dtype=wp.int64), corner: wp.vec2, first: int, left: int, i: int, event: Event,
+    chunk: Chunk, images: wp.array2d(dtype=wp.int64), first: int, left: int, i: int, event: Event,
 ):  # fmt: skip
     """Votes outside the window, of the candidates whose bits are set in ``left``."""
     for k in range(wp.where(left != 0, AT_ONCE, 0)):
         if ((left >> k) & 1) != 0:
-            x, y = place_event(models[first + k], camera, motion, events, first + k, i, event)
-            u = x * canvas.scale + corner[0]
-            v = y * canvas.scale + corner[1]
+            u, v = place_event(models[first + k], camera, motion, events, first + k, i, event)
             cast_outside(layout, canvas, chunk, images[first + k], u, v, event.weight)
 
 
@@ -326,19 +355,20 @@ def vote_tiles(
     a = models[first]
     b = models[first + wp.min(1, many - 1)]
     c = models[first + many - 1]
-    corner = wp.vec2(layout.shift - float(chunk.column), layout.shift - float(chunk.row))
-    clear_window(thread, many)
-    packed = int(events.packed[wp.min(chunk.start + thread, chunk.stop - 1)])
+    words = window()
+    clear_window(words, thread, many)
+    packed = int(load_uint32(events.packed, wp.min(chunk.start + thread, chunk.stop - 1)))
     for i in range(chunk.start + thread, chunk.stop, THREADS):
-        event = unpack(packed, chunk, canvas, i)
-        packed = int(events.packed[wp.min(i + THREADS, chunk.stop - 1)])  # under way while this one is voted
-        left = cast_event(a, camera, motion, events, canvas, corner, first, 0, i, event)
+        event = unpack(packed, chunk, canvas, layout, i)
+        # under way while this one is voted
+        packed = int(load_uint32(events.packed, wp.min(i + THREADS, chunk.stop - 1)))
+        left = cast_event(a, camera, motion, events, canvas.nearest, words, first, i, event)
         if many > 1:
-            left += 2 * cast_event(b, camera, motion, events, canvas, corner, first, 1, i, event)
+            left += 2 * cast_event(b, camera, motion, events, canvas.nearest, words + SIZE, first + 1, i, event)
         if many > 2:
-            left += 4 * cast_event(c, camera, motion, events, canvas, corner, first, 2, i, event)
-        cast_left(models, camera, motion, events, canvas, layout, chunk, images, corner, first, left, i, event)
-    flush_window(layout, canvas, chunk, images, first, thread, many)
+            left += 4 * cast_event(c, camera, motion, events, canvas.nearest, words + 2 * SIZE, first + 2, i, event)
+        cast_left(models, camera, motion, events, canvas, layout, chunk, images, first, left, i, event)
+    flush_window(layout, canvas, chunk, images, words, first, thread, many)
 
 
 for _struct in (CircleParams, RadialCircleParams, ExactParams):
