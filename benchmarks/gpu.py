@@ -1,32 +1,42 @@
 """Everything a CUDA GPU is asked for, in one call: correctness, then every figure, each with the error of its own run.
 
-    python -m benchmarks.gpu FOLDER_OF_PICTURES --out FOLDER [--limit-s 500] [--only tests simulate …]
+    python -m benchmarks.gpu FOLDER_OF_PICTURES --out FOLDER [--limit-s 500] [--only tests speed …]
 
-Runs the tests on the device, then each benchmark as a process of its own; writes one JSON file each, and ends with a
-summary. Exit status 1 where anything failed.
+Runs the tests on the device, then each benchmark as a process of its own: ``speed`` is ``python -m benchmarks``,
+``chart`` the two charts. Writes what they found beside what they said, and ends with a summary. Exit status 1 where
+anything failed.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-NEEDS_FILES = "test_file_keeps"  # writes HDF5 through a plug-in that a bare GPU machine may lack
+PICTURE = "china.jpg"
+TESTS = (
+    "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "simulate",
+    "translate", "benchmarks",
+)  # fmt: skip
+"""Of what runs on a device, and needs neither the command line's packages nor video."""
+PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
+"""What writes HDF5 through a plug-in that a bare GPU machine may lack."""
 
 
 def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
     """Every run by name."""
-    modules = ("camera", "optics", "iwe", "sharpness", "calibrate", "photometric", "compensate", "simulate")
-    tests = [f"tests/test_{m}.py" for m in modules]
+    tests = [f"tests/test_{name}.py" for name in TESTS]
     module = [sys.executable, "-m"]
     calibration = [*module, "benchmarks.calibration"]
-    device = ["--device", "cuda:0"]
+    picture, device = str(folder / PICTURE), ["--device", "cuda:0"]
     return {
-        "tests": [*module, "pytest", "-q", "-k", f"cuda and not {NEEDS_FILES}", *tests],
-        "simulate": [*module, "benchmarks.simulate", *device, "--picture", str(folder / "china.jpg")],
+        "tests": [*module, "pytest", "-q", "-k", " and not ".join(("(cuda or test_tiles)", *PLUGIN)), *tests],
+        "speed": [*module, "benchmarks", *device, "--picture", picture, "--out", str(out / "speed_cuda.json")],
+        "chart": [*module, "benchmarks.chart", picture, *device, "--out", str(out / "chart")],
+        "simulate": [*module, "benchmarks.simulate", *device, "--picture", picture],
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,
                    "--limit-s", str(limit)]
@@ -48,9 +58,11 @@ def main() -> int:
         if args.only and name not in args.only:
             continue
         began = time.perf_counter()
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-        (args.out / f"{name}_cuda.log").write_text(done.stdout)
-        print(f"{name}: exit {done.returncode}, {time.perf_counter() - began:.0f} s\n{done.stdout[-1500:]}", flush=True)
+        log = args.out / f"{name}_cuda.log"
+        with log.open("w") as file:
+            done = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, check=False)
+        took, said = time.perf_counter() - began, log.read_text()[-1500:]
+        print(f"{name}: exit {done.returncode}, {took:.0f} s\n{said}", flush=True)
         if done.returncode:
             failed.append(name)
     print("failed: " + ", ".join(failed) if failed else "all passed")

@@ -17,6 +17,7 @@ from amiwarp.sharpness import Sharpness
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration, Settings
+    from amiwarp.calib.photometric import PhotometricSettings
     from amiwarp.events import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
@@ -60,7 +61,13 @@ class SearchOptions:
     events: Annotated[
         int | None, typer.Option(min=1, help="At most so many events, thinned evenly.", rich_help_panel=_SEARCH)
     ] = None
-
+    fold: Annotated[
+        int | None,
+        typer.Option(
+            min=0, help="Join a pixel's events within one of so many angles a turn. Default: 0, none.",
+            rich_help_panel=_SEARCH,
+        ),
+    ] = None  # fmt: skip
     stages: Annotated[
         str | None,
         typer.Option(help="sharpness: without the photometric stage. Default: both.", rich_help_panel=_SEARCH),
@@ -76,9 +83,8 @@ class SearchOptions:
         float, typer.Option(min=0.0, help="Known refractory time of the sensor.", rich_help_panel=_SEARCH)
     ] = 0.0
 
-    def changes(self) -> dict[str, Any]:
-        """Fields of the settings that were given."""
-        from amiwarp.calib.photometric import PhotometricSettings
+    def changes(self, base: PhotometricSettings) -> dict[str, Any]:
+        """Fields of the settings that were given; ``base``: those of the photometric stage that were not."""
         from amiwarp.pairs import Sensor
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
@@ -88,8 +94,8 @@ class SearchOptions:
             given["stages"] = tuple(name.strip() for name in self.stages.split(","))
         sensor = Sensor(given.pop("latency_us"), given.pop("refractory_us"))
         algorithm = given.pop("photometric_algorithm", None)
-        photometric = PhotometricSettings(sensor=sensor)
-        return given | {"photometric": replace(photometric, algorithm=algorithm) if algorithm else photometric}
+        photometric = replace(base, sensor=sensor, algorithm=algorithm or base.algorithm)
+        return given | {"photometric": photometric}
 
 
 @dataclass(frozen=True)
@@ -161,6 +167,9 @@ def run(
         Path | None, typer.Argument(help="Calibration to write; default: NAME.calibration.json beside the recording.")
     ] = None,
     *,
+    preset: Annotated[
+        Path | None, typer.Option(help="Settings that 'amiwarp chart' chose; options given beside it win.")
+    ] = None,
     figure: Annotated[
         Path | None, typer.Option(help="Draw the cost surface, and the events' image before and after (.png).")
     ] = None,
@@ -176,9 +185,11 @@ def run(
     """Find the prism's parameters: those that make the image of the events sharpest. No guess is needed."""
     from amiwarp.calib import Settings, calibrate
     from amiwarp.io import open_recording
+    from amiwarp.presets import Preset
 
     device = choose_device(common.device)
-    settings = Settings(seed=common.seed, **search.changes(), **parameters.changes())
+    base = Settings() if preset is None else Preset.load(preset, "calibration").calibration_settings()
+    settings = replace(base, seed=common.seed, **search.changes(base.photometric), **parameters.changes())
     opened = complete(open_recording(recording), camera, prism)
     opened = cut(opened, window) if window else opened
     out = out or recording.with_name(f"{recording.stem}.calibration.json")

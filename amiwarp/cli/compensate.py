@@ -59,6 +59,10 @@ def run(
     out: Annotated[Path, typer.Argument(help="Compensated recording to write (.h5).")],
     *,
     calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
+    preset: Annotated[
+        Path | None,
+        typer.Option(help="The model that 'amiwarp chart' chose, of the same prism. Default: as calibrated."),
+    ] = None,
     iwe: IweOptions,
     common: Common,
 ) -> None:
@@ -69,9 +73,12 @@ def run(
     from amiwarp.calib import Calibration
     from amiwarp.compensate import compensate
     from amiwarp.io import open_recording
+    from amiwarp.presets import Preset, simplified
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)
+    if preset is not None:
+        found = simplified(found, Preset.load(preset, "compensation").settings["model"])
     opened = open_recording(recording)
     files = iwe.build(opened, device)
     with progress("compensating") as advance:
@@ -86,6 +93,7 @@ def run(
                 done = compensate(opened, found, out, device=device, progress=update, on_block=files.add)
     data: dict[str, Any] = {
         "file": str(out),
+        "model": found.model_name,
         "events": done.events,
         "outside": done.outside,
         "seconds": done.seconds,
@@ -98,5 +106,5 @@ def run(
 
 def _lines(d: dict[str, Any]) -> list[str]:
     images = d["iwe"] if len(d["iwe"]) <= 3 else [f"{d['iwe'][0]} .. {d['iwe'][-1]} ({len(d['iwe'])} files)"]
-    speed = f"{d['seconds']:.2f} s, {d['mev_per_s']:.3g} Mev/s on {d['device']}"
+    speed = f"{d['seconds']:.2f} s, {d['mev_per_s']:.3g} Mev/s by the {d['model']} model on {d['device']}"
     return [f"{d['file']}: {d['events']:,} events ({d['outside']:,} outside the image), {speed}", *images]

@@ -1,0 +1,111 @@
+"""``amiwarp chart``: what each bit of speed costs on this machine, drawn; and settings for a budget."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli.console import choose_device, progress, report, table
+from amiwarp.cli.options import Common
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from amiwarp.chart import Charts
+    from amiwarp.chart.rows import Row
+
+EXAMPLE = "amiwarp chart --out amiwarp-chart --budget-px 0.3"
+
+
+def run(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Recording with truth. Default: simulated, 10 million events.")
+    ] = None,
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for charts, tables and presets.")] = Path("amiwarp-chart"),
+    picture: Annotated[Path | None, typer.Option(help="Picture to simulate from. Default: a map of the earth.")] = None,
+    budget_px: Annotated[
+        float | None, typer.Option(min=0.0, help="Answer with the fastest settings within this error (px).")
+    ] = None,
+    budget_ms: Annotated[
+        float | None, typer.Option(min=0.0, help="Answer with the most accurate calibration within this time (ms).")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A few settings, once each: to see that it works.")] = False,
+    common: Common,
+) -> None:
+    """Measure speed and error of every sensible setting on a recording with truth, and draw both Pareto fronts.
+
+    The answer to a budget is written as preset_calibration.json and preset_compensation.json, which calibrate and
+    compensate take as --preset.
+    """
+    if budget_px is not None and budget_ms is not None:
+        raise AmiwarpError("--budget-px and --budget-ms both ask for a setting; give one of them")
+    if recording is not None and picture is not None:
+        raise AmiwarpError("a recording and --picture both say what to measure on; give one of them")
+    device = choose_device(common.device)
+    from amiwarp.chart import make, simulated
+    from amiwarp.io import open_recording
+
+    with progress("starting") as advance:
+        if recording is not None:
+            opened = open_recording(recording)
+        else:
+            opened = simulated(picture, seed=common.seed, device=device, quick=quick,
+                               progress=lambda share: advance(0.0, f"simulating, {100 * share:.0f} %"))  # fmt: skip
+        charts = make(opened, out, device=device, seed=common.seed, quick=quick,
+                      progress=lambda what, share: advance(share, what))  # fmt: skip
+    answers = charts.answer(out, budget_px=budget_px, budget_ms=budget_ms)
+    report(common, summary(charts, answers, out) | {"device": device}, lines(charts, answers, out))
+
+
+def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
+    """Fronts, defaults and answers; the whole table is in the files."""
+    from amiwarp.chart.rows import fronts
+
+    def fields(row: Row) -> dict[str, Any]:
+        return {"label": row.label, "job": row.job, "mev_per_s": row.mev_per_s, "ms": row.seconds * 1e3,
+                "error_px": row.error_px, "settings": dict(row.settings)}  # fmt: skip
+
+    rows = {"compensation": charts.compensation, "calibration": charts.calibration}
+    return {
+        "fronts": {name: {job: [fields(r) for r in chosen] for job, chosen in fronts(all_)}
+                   for name, all_ in rows.items()},
+        "defaults": {name: [fields(r) for r in all_ if r.default] for name, all_ in rows.items()},
+        "answers": {kind: None if row is None else {**fields(row), "file": str(out / f"preset_{kind}.json")}
+                    for kind, row in answers.items()},
+        "files": {name: str(path) for name, path in charts.files.items()},
+        "notes": list(charts.notes),
+    }  # fmt: skip
+
+
+def lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> list[Any]:
+    """The same for people."""
+    from amiwarp.chart.rows import beaten_by, fronts, told_apart
+
+    shown: list[Any] = []
+    for rows in (charts.compensation, charts.calibration):
+        for job, chosen in fronts(rows):
+            default = [r for r in rows if r.default and r.job == job and r not in chosen]
+            listed = [(_name(r), *_speed(r)) for r in [*told_apart(chosen), *default]]
+            shown += [table(listed, f"front, {job}", "speed", "error"), ""]
+            shown += [f"faster or more accurate than the default: {', '.join(b.label for b in better)}"
+                      for r in rows if r.default and r.job == job and (better := beaten_by(r, rows))]  # fmt: skip
+    shown += [f"note: {note}" for note in charts.notes]
+    for kind, row in answers.items():
+        if row is None:
+            shown.append(f"{kind}: nothing measured lies within the budget; see the front above")
+        else:
+            speed, error = _speed(row)
+            file = out / f"preset_{kind}.json"
+            shown.append(f"{kind} within the budget: {row.label}, {speed}, {error} measured; --preset {file}")
+    return [*shown, *(f"{name}: {path}" for name, path in charts.files.items())]
+
+
+def _name(row: Row) -> str:
+    return f"{row.label} (default)" if row.default and row.label != "default" else row.label
+
+
+def _speed(row: Row) -> tuple[str, str]:
+    speed = f"{row.seconds * 1e3:,.0f} ms" if row.chart == "calibration" else f"{row.mev_per_s:.3g} Mev/s"
+    return speed, f"{row.error_px:.3g} px"

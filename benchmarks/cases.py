@@ -1,0 +1,172 @@
+"""What is measured, as data. A new row is a :class:`Case` here, and a function that makes its :class:`Job`.
+
+A new kind of scene is an entry in ``SCENES``, an aim one in ``AIMS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from amiwarp import peers
+from amiwarp.calib.search import STAGES
+from amiwarp.iwe import Vote
+from benchmarks import ours
+from benchmarks.job import Job
+from benchmarks.peers import image
+from benchmarks.scenes import RECORDED, event_scene, file_scene, recording_scene
+
+
+@dataclass(frozen=True, slots=True)
+class SceneKind:
+    """What cases are given."""
+
+    make: Callable[[int, str, Path | None], Any]
+    """From a number of events, the device, and a picture to look at."""
+    events: dict[str, int]
+    """How many by default, on a CPU and on CUDA."""
+
+
+def _events(name: str, points: int) -> SceneKind:
+    return SceneKind(lambda n, *_: event_scene(name, n, points=points), {"cpu": 5_000_000, "cuda": 100_000_000})
+
+
+EVENT_SCENES = ("random pixels", "20,000 edge points", "500 edge points")
+RECORDING, FILE = "simulated recording", "recording in a file"
+SCENES = {
+    **{name: _events(name, points) for name, points in zip(EVENT_SCENES, (0, 20_000, 500), strict=True)},
+    RECORDING: SceneKind(recording_scene, {"cpu": RECORDED, "cuda": RECORDED}),
+    FILE: SceneKind(lambda n, *_: file_scene(n), {"cpu": 100_000_000, "cuda": 100_000_000}),
+}
+
+IMAGE = "image of warped events"
+PREPARED = "votes of prepared events, 12 candidates a pass"
+SHARPNESS = "calibration without a guess, sharpness stage"
+BOTH = "calibration without a guess, both stages"
+PICTURE = "picture of one turn, from given parameters"
+MOVED = "compensation of a file"
+EXACT_PX = {"plane circle": 4.0, "circle": 2.5, "radial": 0.1, "ellipse": 0.02, "exact": 0.002}
+"""Bars of the models: what each costs at this camera, a little more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One method. ``make(scene, device, model, vote)`` puts its data in place."""
+
+    what: str
+    """The job; rows of one job share a table."""
+    name: str
+    make: Callable[[Any, str, str, Vote], Job]
+    model: str = "plane circle"
+    vote: Vote = Vote.BILINEAR
+    scenes: tuple[str, ...] = EVENT_SCENES
+    devices: tuple[str, ...] = ("cpu", "cuda")
+    bars: dict[str, float] = field(default_factory=dict)
+    """Largest errors by name: above one of them, or NaN, the answer is wrong."""
+    unit: str = "ev"
+    """Of the job's ``work``; none where its time is what counts."""
+    most_repeats: int = 1_000
+
+
+def image_bars(model: str, vote: Vote) -> dict[str, float]:
+    """Of an image. Votes in 1/256 px put 0.2 % elsewhere, the less the more events meet; a nearest vote at half a pixel
+    goes to either side, so one pixel may differ by a few events."""
+    return {"misplaced": 4e-3, "local": 6e-3 if vote is Vote.BILINEAR else 0.3, "exact_px": EXACT_PX[model]}
+
+
+def _peer(name: str, way: Callable[..., peers.Peer], *devices: str, most_repeats: int = 1_000) -> Case:
+    bars = image_bars("plane circle", Vote.BILINEAR)
+    return Case(IMAGE, name, partial(image, way), devices=devices, bars=bars, most_repeats=most_repeats)
+
+
+LADDER = tuple(
+    Case(IMAGE, f"amiwarp {model} {vote.value}", ours.image, model, vote, bars=image_bars(model, vote))
+    for model in ("circle", "radial", "ellipse", "exact")
+    for vote in (Vote.BILINEAR, Vote.NEAREST)
+)
+PEERS = (
+    _peer("NumPy", peers.with_numpy, "cpu"),
+    _peer("NumPy, blocks of 65,536", partial(peers.with_numpy, block=peers.BLOCK), "cpu"),
+    _peer("Numba", peers.with_numba, "cpu"),
+    _peer("Numba, angle table", peers.with_numba_table, "cpu"),
+    _peer("PyTorch", peers.with_torch, "cpu", "cuda"),
+    _peer("PyTorch, blocks of 65,536", partial(peers.with_torch, block=peers.BLOCK), "cpu", most_repeats=5),
+    _peer("CuPy scatter_add", peers.with_cupy, "cuda"),
+    _peer("CuPy, four float atomics", peers.with_cupy_kernel, "cuda"),
+    Case(IMAGE, "Warp, four float atomics", ours.warp_atomics, devices=("cuda",),
+         bars=image_bars("plane circle", Vote.BILINEAR)),
+)  # fmt: skip
+PREPARED_VOTES = tuple(
+    Case(PREPARED, f"amiwarp circle {vote.value}, prepared", ours.prepared, "circle", vote, devices=("cuda",),
+         bars=image_bars("circle", vote), unit="votes")
+    for vote in (Vote.BILINEAR, Vote.NEAREST)
+)  # fmt: skip
+WHOLE = (
+    Case(SHARPNESS, "amiwarp sharpness stage", partial(ours.calibration, stages=STAGES[:1]), "exact",
+         scenes=(RECORDING,), bars={"model_px": 0.3}, unit="", most_repeats=7),
+    Case(BOTH, "amiwarp both stages", partial(ours.calibration, stages=STAGES), "exact",
+         scenes=(RECORDING,), bars={"model_px": 0.02}, unit="", most_repeats=7),
+    Case(PICTURE, "amiwarp picture", ours.picture, "exact",
+         scenes=(RECORDING,), bars={"decorrelation": 0.1}, unit="", most_repeats=7),
+    *(
+        Case(MOVED, f"amiwarp {model}, file to file", ours.file, model,
+             scenes=(FILE,), bars={"places_px": 1e-3}, most_repeats=ours.FILE_PASSES)
+        for model in ("circle", "exact")
+    ),
+)  # fmt: skip
+"""Of the main job, from end to end."""
+CASES = (*LADDER, *PEERS, *PREPARED_VOTES, *WHOLE)
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """What was asked for: a rate, a time, or how a case's rate or time compares with another's."""
+
+    what: str
+    device: str
+    of: str
+    bars: dict[str, float]
+    """By scene."""
+    unit: str
+    """``Gev/s`` and the like: at least so fast. ``s``: at most so long. ``x faster``: at least; ``x time``: at most.
+    ``MiB``: the process's memory at its peak, at most."""
+    beside: str | None = None
+    """The case it is compared with, round by round of the same run."""
+
+
+def _everywhere(bar: float, scenes: tuple[str, ...] = EVENT_SCENES) -> dict[str, float]:
+    return dict.fromkeys(scenes, bar)
+
+
+def _whole(device: str, seconds: tuple[float, float, float], mev_per_s: float) -> tuple[Aim, ...]:
+    """Of the main job on one kind of device: both calibrations, the picture, and the file."""
+    names, moved = [case.name for case in WHOLE[:3]], WHOLE[-1].name
+    whats = (SHARPNESS, "the same with the photometric stage, to 0.02 px", PICTURE)
+    return (
+        *(Aim(what, device, of, {RECORDING: bar}, "s") for what, of, bar in zip(whats, names, seconds, strict=True)),
+        Aim("compensation of a file, exact model", device, moved, {FILE: mev_per_s}, "Mev/s"),
+        Aim("the same, peak memory", device, moved, {FILE: 1024.0}, "MiB"),
+    )
+
+
+CIRCLE, EXACT = "amiwarp circle bilinear", "amiwarp exact bilinear"
+AIMS = (
+    Aim("bilinear image, one pass, from device memory", "cuda", CIRCLE,
+        dict(zip(EVENT_SCENES, (80.0, 75.0, 50.0), strict=True)), "Gev/s"),
+    Aim("the same beside four float atomics", "cuda", CIRCLE, _everywhere(3.3), "x faster", "Warp, four float atomics"),
+    Aim("the same beside PyTorch", "cuda", CIRCLE, _everywhere(10.0), "x faster", "PyTorch"),
+    Aim("bilinear votes of prepared events", "cuda", "amiwarp circle bilinear, prepared",
+        _everywhere(300.0, EVENT_SCENES[:2]), "Gvotes/s"),
+    Aim("nearest votes of prepared events", "cuda", "amiwarp circle nearest, prepared",
+        _everywhere(600.0, EVENT_SCENES[:2]), "Gvotes/s"),
+    Aim("exact model over circle, time", "cuda", EXACT, _everywhere(1.1), "x time", CIRCLE),
+    *_whole("cuda", (0.05, 0.25, 0.05), 100.0),
+    Aim("bilinear image beside Numba", "cpu", CIRCLE, _everywhere(1.5), "x faster", "Numba"),
+    Aim("the same beside NumPy", "cpu", CIRCLE, _everywhere(12.0), "x faster", "NumPy"),
+    Aim("the same beside PyTorch", "cpu", CIRCLE, _everywhere(12.0), "x faster", "PyTorch"),
+    Aim("exact model over circle, time", "cpu", EXACT, _everywhere(1.5), "x time", CIRCLE),
+    *_whole("cpu", (2.0, 6.0, 2.0), 40.0),
+)  # fmt: skip

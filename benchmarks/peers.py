@@ -1,0 +1,38 @@
+"""Other libraries at the same job, :mod:`amiwarp.peers`, as rows here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from amiwarp.iwe import Vote
+from amiwarp.peers import Peer, PeerEvents
+from benchmarks import truth
+from benchmarks.job import Job
+from benchmarks.scenes import MARGIN, EventScene
+
+
+def peer_events(scene: EventScene) -> PeerEvents:
+    """The scene as all of them hold it."""
+
+    def make() -> PeerEvents:
+        angle = np.remainder(scene.theta, 2.0 * np.pi).astype(np.float32)
+        e, c = scene.events, scene.camera
+        return PeerEvents(e.x, e.y, angle, scene.radius, c.width, c.height, MARGIN)
+
+    return scene.keep("peers", make)
+
+
+def job(scene: EventScene, vote: Vote, peer: Peer, model: str = "plane circle") -> Job:
+    """Of a library that has the scene in place."""
+
+    def errors() -> dict[str, float]:
+        return truth.iwe_errors(scene, model, vote, peer.image(), peer.events.places(scene.some))
+
+    return Job(peer.run, errors, len(scene))
+
+
+def image(way: Callable[[PeerEvents, str], Peer], scene: EventScene, device: str, model: str, vote: Vote) -> Job:
+    """By one of the functions of :mod:`amiwarp.peers`."""
+    return job(scene, vote, way(peer_events(scene), device), model)

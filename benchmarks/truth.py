@@ -1,0 +1,116 @@
+"""The images that votes are compared with: float64 NumPy, the angle from time, and places by independent formulas.
+
+Needs a checkout: the traces are those of the oracle in tests/reference.py.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from amiwarp.iwe import Vote
+from benchmarks.scenes import DEFLECTION, INDEX, MARGIN, PHASE, Array, EventScene, in_chunks
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import reference
+
+Floats = NDArray[np.floating[Any]]
+
+HARMONIC_ANGLES = 16  # of the ellipse's least squares
+
+
+def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
+    """Where events belong [px], shape (n, 2)."""
+    camera = scene.camera
+    if model == "plane circle":
+        return xy - scene.radius * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    if model == "exact":
+        return reference.move(camera, scene.prism, xy, theta, to_scene=True, phase=PHASE)
+    if model == "ellipse":
+        table = scene.keep("ellipse", lambda: _ellipses(scene))[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+        return (
+            xy
+            + table[:, 0]
+            + table[:, 1] * np.cos(theta + PHASE)[:, None]
+            + table[:, 2] * np.sin(theta + PHASE)[:, None]
+        )
+    rays = reference.pixels_to_rays(camera, xy)
+    angle: Array | float = DEFLECTION
+    if model == "radial":
+        cosine2 = rays[:, 2] ** 2
+        angle = DEFLECTION * (np.sqrt((INDEX**2 - 1.0 + cosine2) / cosine2) - 1.0) / (INDEX - 1.0)
+    return reference.rays_to_pixels(camera, reference.turn(rays, theta + PHASE, angle))
+
+
+def _ellipses(scene: EventScene) -> Array:
+    """Per pixel the mean and first harmonic of the exact displacement, shape (height, width, 3, 2)."""
+    width, height = scene.camera.width, scene.camera.height
+    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
+
+    def moments(k: int) -> Array:
+        phi = 2.0 * np.pi * k / HARMONIC_ANGLES
+        d = places(scene, "exact", xy, np.full(len(xy), phi - PHASE)) - xy
+        return np.stack([d, 2.0 * np.cos(phi) * d, 2.0 * np.sin(phi) * d], axis=1) / HARMONIC_ANGLES
+
+    return np.sum([moments(k) for k in range(HARMONIC_ANGLES)], axis=0).reshape(height, width, 3, 2)
+
+
+def votes(xy: Array, width: int, height: int) -> dict[Vote, Array]:
+    """Images of both votes [events]; what falls outside is left out, corner by corner."""
+    columns, rows = width + 2 * MARGIN, height + 2 * MARGIN
+    inner = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
+    u, v = (xy + MARGIN).T
+
+    def count(i: Array, j: Array, weights: Array | None = None) -> Any:
+        return np.bincount(j.astype(np.intp) * columns + i.astype(np.intp), weights, rows * columns)
+
+    i, j = np.floor(u), np.floor(v)
+    fx, fy = u - i, v - j
+    bilinear = count(i, j, (1.0 - fx) * (1.0 - fy)) + count(i + 1, j, fx * (1.0 - fy))
+    bilinear += count(i, j + 1, (1.0 - fx) * fy) + count(i + 1, j + 1, fx * fy)
+    nearest = count(np.floor(u + 0.5), np.floor(v + 0.5))
+    return {
+        Vote.BILINEAR: bilinear.reshape(rows, columns)[inner],
+        Vote.NEAREST: nearest.reshape(rows, columns)[inner].astype(np.float64),
+    }
+
+
+def images(scene: EventScene, model: str) -> dict[Vote, Array]:
+    """The true images of all events."""
+    camera, e = scene.camera, scene.events
+
+    def part(start: int, stop: int) -> dict[Vote, Array]:
+        xy = np.stack([e.x[start:stop], e.y[start:stop]], axis=1).astype(np.float64)
+        return votes(places(scene, model, xy, scene.theta[start:stop]), camera.width, camera.height)
+
+    def total() -> dict[Vote, Array]:
+        if model == "ellipse":
+            scene.keep("ellipse", lambda: _ellipses(scene))  # before the threads would each make it
+        parts = in_chunks(part, len(e))
+        return {vote: np.sum([p[vote] for p in parts], axis=0) for vote in Vote}
+
+    return scene.keep(("images", model), total)
+
+
+def iwe_errors(scene: EventScene, model: str, vote: Vote, image: Floats, found: Floats) -> dict[str, float]:
+    """Of an image against the true one, and of the places ``found`` for the scene's sample against the exact model's.
+
+    ``rms_events``, ``max_events``: difference of a pixel [events]. ``misplaced``: share of all votes that another pixel
+    got. ``local``: largest difference over what the pixel's neighbourhood holds, plus 10 events. ``exact_px``: rms
+    distance of the places to the exact model's [px].
+    """
+    true = images(scene, model)[vote]
+    difference = np.abs(image.astype(np.float64) - true)
+    away = found - places(scene, "exact", *scene.sample())
+    return {
+        "rms_events": float(np.sqrt(np.mean(difference**2))),
+        "max_events": float(difference.max()),
+        "misplaced": float(difference.sum() / (2.0 * true.sum())),
+        "local": float((difference / (10.0 + maximum_filter(true, 3))).max()),
+        "exact_px": float(np.sqrt(np.mean(np.sum(away**2, axis=1)))),
+    }

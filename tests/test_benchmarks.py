@@ -1,0 +1,256 @@
+"""The benchmark runner on small scenes: right answers pass, wrong ones are named, and the page shows the files."""
+
+import dataclasses
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from amiwarp.compensate import PIECE
+from amiwarp.events import Events
+from amiwarp.iwe import Vote
+from amiwarp.peers import Missing
+from benchmarks import __main__ as runner
+from benchmarks import cases, compensate, ours, report, scenes, truth
+from benchmarks.job import Job
+from benchmarks.scenes import SECONDS, TURNS_PER_S, EventScene, RecordingScene, event_scene
+
+EVENTS = 4_000
+RECORDED = 60_000
+LESS_SURE = {"model_px": 0.2, "decorrelation": 0.05}
+"""Bars for a recording of so few events."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> EventScene:
+    return event_scene("small", EVENTS, points=50, width=160, height=120)
+
+
+@pytest.fixture(scope="module")
+def recorded(texture: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> RecordingScene:
+    picture = tmp_path_factory.mktemp("picture") / "texture.png"
+    Image.fromarray(texture).save(picture)
+    return scenes.recording_scene(RECORDED, "cpu", picture)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, scene: EventScene) -> None:
+    """Every scene is the small one."""
+    kind = cases.SceneKind(lambda n, device, picture: scene, {"cpu": 1, "cuda": 1})
+    monkeypatch.setattr(runner, "SCENES", dict.fromkeys(cases.EVENT_SCENES, kind))
+    monkeypatch.setattr(runner, "REST_S", 0.0)
+
+
+def test_events_are_in_order_and_on_their_orbits(scene: EventScene) -> None:
+    e = scene.events
+    assert (np.diff(e.t) >= 0).all()
+    assert 0.99 * SECONDS < (e.t[-1] - e.t[0]) * 1e-6 <= SECONDS
+    np.testing.assert_allclose(scene.theta, e.t * (2e-6 * math.pi * TURNS_PER_S), atol=1e-9)
+    image = truth.images(scene, "plane circle")[Vote.NEAREST]
+    assert image.sum() == EVENTS  # nobody leaves the image
+    assert np.count_nonzero(image) < 9 * 50  # rounding to the pixel spreads an edge point, no more
+
+
+@pytest.mark.parametrize("model", ["circle", "radial", "ellipse", "exact", "plane circle"])
+def test_models_agree_on_where_events_belong(scene: EventScene, model: str) -> None:
+    """Every truth is near the exact one: sign and angle of the peers' formula too."""
+    xy, theta = scene.sample()
+    away = truth.places(scene, model, xy, theta) - truth.places(scene, "exact", xy, theta)
+    assert np.sqrt(np.mean(np.sum(away**2, axis=1))) <= cases.EXACT_PX[model]
+
+
+OF_EVENTS = [c for c in cases.CASES if c.scenes[0] in cases.EVENT_SCENES]
+
+
+@pytest.mark.parametrize("case", OF_EVENTS, ids=lambda c: c.name)
+def test_answers_are_right(scene: EventScene, case: cases.Case, device: str) -> None:
+    if device.partition(":")[0] not in case.devices:
+        pytest.skip(f"not a case of {device}")
+    try:
+        job = case.make(scene, device, case.model, case.vote)
+    except Missing as missing:
+        pytest.skip(str(missing))
+    for _ in range(2):  # a pass starts with an empty image
+        job.run()
+    assert runner.wrong(case, job.errors()) == []
+    assert job.work == EVENTS * (ours.CANDIDATES if case.what == cases.PREPARED else 1)
+
+
+@pytest.mark.parametrize("case", [c for c in cases.CASES if cases.RECORDING in c.scenes], ids=lambda c: c.name)
+def test_whole_jobs_find_what_the_recording_was_made_with(
+    recorded: RecordingScene, case: cases.Case, device: str
+) -> None:
+    job = case.make(recorded, device, case.model, case.vote)
+    job.run()
+    errors = job.errors()
+    assert errors.keys() == case.bars.keys()
+    assert runner.wrong(dataclasses.replace(case, bars={name: LESS_SURE[name] for name in case.bars}), errors) == []
+    if case.what == cases.BOTH:
+        sharpness = next(c for c in cases.CASES if c.what == cases.SHARPNESS)
+        first = sharpness.make(recorded, device, sharpness.model, sharpness.vote)
+        first.run()
+        assert errors["model_px"] < 0.5 * first.errors()["model_px"]
+        assert abs(job.also()["apex_error_deg"]) < 0.05
+    if case.what == cases.PICTURE:
+        assert job.also()["psnr_db"] > 20.0
+
+
+def test_recordings_are_as_long_as_was_asked(recorded: RecordingScene) -> None:
+    assert len(recorded) == pytest.approx(RECORDED, rel=0.15)
+    camera = recorded.made.camera
+    density = len(recorded) / (camera.width * camera.height * recorded.made.duration_s)
+    assert density == pytest.approx(scenes.RECORDED / (640 * 480 * SECONDS), rel=0.15)
+    assert recorded.recording.prism is not None
+    assert recorded.recording.prism.apex == pytest.approx(1.2 * recorded.model.prism.apex)
+
+
+@pytest.fixture
+def strewn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of half a second of the simulator."""
+    rng, n = np.random.default_rng(0), 100_000
+    x, y = rng.integers(0, [640, 480], (n, 2)).astype(np.uint16).T
+    times = np.sort(rng.integers(0, compensate.REPEATED_US, n))
+    events = Events(x, y, times, rng.integers(0, 2, n).astype(np.uint8))
+    monkeypatch.setattr(compensate, "half_a_second", lambda: events)
+
+
+def run_files(tmp_path: Path, events: int) -> list[dict[str, Any]]:
+    out = tmp_path / "speed.json"
+    words = ["--scenes", cases.FILE, "--only", "exact", "--events", str(events), "--repeats", "2", "--out", str(out)]
+    assert runner.main(words) == 0
+    rows: list[dict[str, Any]] = json.loads(out.read_text())["rows"]
+    return rows
+
+
+def test_files_are_compensated_in_a_process_of_their_own(strewn: None, tmp_path: Path) -> None:
+    (row,) = run_files(tmp_path, PIECE)
+    assert row["errors"]["places_px"] <= compensate.BAR_PX
+    assert 50.0 < row["also"]["peak_mib"] < 1024.0
+    assert (row["events"], len(row["seconds"]), row["note"]) == (PIECE, 2, "")
+    assert "| peak memory [MiB] |" in "\n".join(report.measured([row]))
+
+
+def test_files_are_bare_columns_where_filters_are_missing(
+    strewn: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr(scenes, "FILTERS", ("numpy", "nofilter"))
+    (row,) = run_files(tmp_path, 10_000)
+    assert row["errors"]["places_px"] <= compensate.BAR_PX
+    assert row["note"] == "bare columns, without nofilter"
+    assert "(bare columns, without nofilter)" in capsys.readouterr().out
+    aim = next(a for a in cases.AIMS if (a.device, a.unit) == ("cpu", "MiB"))
+    found = report.aim_cells(aim, {"device": "cpu", "rows": [row]})
+    assert found[2].endswith(" (bare columns, without nofilter)")
+    assert found[3] == "yes"
+
+
+def test_files_go_when_the_scene_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compensate, "make", lambda path, n, columns: path.mkdir())
+    made = scenes.file_scene(10)
+    folder = made.source.parent
+    assert made.source.is_dir()
+    del made
+    assert not folder.exists()
+
+
+def test_without_a_picture_rows_are_skipped(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    monkeypatch.setitem(sys.modules, "pyvista.examples", None)
+    assert runner.main(["--scenes", cases.RECORDING, "--repeats", "1"]) == 0
+    assert capsys.readouterr().out.count("skipped: no picture: give --picture") == 3
+
+
+def test_wrong_answers_are_named(scene: EventScene, small: None, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    def a_third_missing(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
+        job = ours.image(scene, device, model, vote)
+        image = truth.images(scene, model)[vote] * (2.0 / 3.0)
+        places = truth.places(scene, model, *scene.sample())
+        return dataclasses.replace(job, errors=lambda: truth.iwe_errors(scene, model, vote, image, places))
+
+    bad = dataclasses.replace(cases.LADDER[0], name="bad", make=a_third_missing)
+    monkeypatch.setattr(runner, "CASES", (bad, cases.LADDER[6]))
+    assert runner.main(["--events", "1", "--repeats", "1", "--scenes", "random pixels"]) == 1
+    last = capsys.readouterr().out.splitlines()
+    assert last[-2] == "wrong answers:"
+    assert last[-1].startswith("random pixels, bad: misplaced 0.167 > 0.004; local 0.")
+
+
+def test_nan_is_wrong() -> None:
+    assert runner.wrong(cases.LADDER[0], {"misplaced": math.nan, "local": 0.0, "exact_px": 0.0}) == [
+        "misplaced nan > 0.004"
+    ]
+
+
+def test_missing_libraries_are_seen_and_files_are_read(
+    small: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def not_there(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
+        raise Missing("nolib is not installed")
+
+    absent = dataclasses.replace(cases.LADDER[0], name="absent", make=not_there)
+    monkeypatch.setattr(runner, "CASES", (*cases.LADDER, absent))
+    file = tmp_path / "speed.json"
+    assert runner.main(["--events", "1", "--repeats", "2", "--out", str(file)]) == 0
+    results = json.loads(file.read_text())
+    rows = results["rows"]
+    assert len(rows) == 3 * (len(cases.LADDER) + 1)
+    assert [row["skipped"] for row in rows if "skipped" in row] == ["nolib is not installed"] * 3
+    text = report.page(f"a\n{report.BEGIN}\nold\n{report.END}\nb\n", [results])
+    assert "old" not in text
+    assert text.count("| absent | nolib is not installed |") == 3
+    assert "| exact model over circle, time | ≤ 1.5 × |" in text
+    assert "beside NumPy" not in text  # which was not in the run
+    assert report.page(text, [results]) == text
+
+
+def results_of(name: str, **seconds: float) -> dict[str, Any]:
+    rows: list[dict[str, Any]] = [
+        {"scene": s, "name": n, "work": 1e9, "seconds": [t, t, t], "median_s": t, "rate_per_s": 1e9 / t,
+         "note": "", "also": {"peak_mib": 10.0 * t}}
+        for s in cases.EVENT_SCENES
+        for n, t in seconds.items()
+    ]  # fmt: skip
+    rows += [{"scene": s, "name": "none", "skipped": "not there"} for s in cases.EVENT_SCENES]
+    return {"device": name, "rows": rows}
+
+
+@pytest.mark.parametrize(
+    ("aim", "expected"),
+    [
+        (cases.Aim("", "cuda", "a", dict(zip(cases.EVENT_SCENES, (3.0, 5.0, 6.0), strict=True)), "Gev/s"),
+         ["", "≥ 3 / 5 / 6 Gev/s", "5.00 / 5.00 / 5.00", "yes / yes / no"]),
+        (cases.Aim("", "cuda", "a", {"random pixels": 2.0}, "x faster", "b"), ["", "≥ 2 × faster", "2.50", "yes"]),
+        (cases.Aim("", "cuda", "b", {"random pixels": 2.0}, "x time", "a"), ["", "≤ 2 ×", "2.50", "no"]),
+        (cases.Aim("", "cuda", "a", {"random pixels": 0.3}, "s"), ["", "≤ 0.3 s", "0.20", "yes"]),
+        (cases.Aim("", "cuda", "a", {"random pixels": 0.3}, "x time", "c"), []),
+        (cases.Aim("", "cpu", "a", {"random pixels": 0.3}, "s"), []),
+        (cases.Aim("", "cuda", "a", {"random pixels": 2.0}, "MiB"), ["", "≤ 2 MiB", "2.00", "yes"]),
+        (cases.Aim("", "cuda", "a", {"random pixels": 2.0}, "x time", "none"),
+         ["", "≤ 2 ×", "skipped: not there", "–"]),
+    ],
+)  # fmt: skip
+def test_aims_are_judged(aim: cases.Aim, expected: list[str]) -> None:
+    assert report.aim_cells(aim, results_of("cuda:0", a=0.2, b=0.5)) == expected
+
+
+def test_aims_and_names_belong_together() -> None:
+    names = [case.name for case in cases.CASES]
+    assert len(set(names)) == len(names)
+    for aim in cases.AIMS:
+        for name in filter(None, (aim.of, aim.beside)):
+            (case,) = (c for c in cases.CASES if c.name == name)
+            assert aim.device in case.devices
+            assert set(aim.bars) <= set(case.scenes)
+
+
+def test_the_page_shows_the_files() -> None:
+    results = [json.loads(path.read_text()) for path in report.FILES.values() if path.exists()]
+    assert results
+    text = report.PAGE.read_text()
+    assert report.page(text, results) == text
+    assert not [row["name"] for r in results for row in r["rows"] if row.get("wrong")]
