@@ -8,6 +8,7 @@ of the ON threshold. See ``docs/calibration.md``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,20 +16,19 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.multilevel import Levels
 from amiwarp.optics import model_camera
-from amiwarp.pairs import PairSet, Sensor, upload_pairs
+from amiwarp.residuals import CHUNKS, Residuals
 from amiwarp.turning import Turning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.encoder import Encoder
     from amiwarp.optics import Model
-
-WEAK_WEIGHT = 0.05
-"""Of a pair that is not of two events (:func:`open_ends`, :func:`quiet_pairs`): right only to within a threshold."""
+    from amiwarp.pairs import PairSet
 
 DAMPING = 0.02
 """Weight of the map's own square beside the equations: it holds unknowns that none determines."""
+FEW_BLOCKS = 256
+"""Fewer blocks of pairs are not worth a second CPU thread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,205 +57,255 @@ class Tiles:
 
 
 class BrightnessMap:
-    """The map of a set of pairs and its solver; owns its buffers. Solves warm-start from the last map."""
+    """The map of a set of pairs and its solver; owns its buffers. Solves warm-start from the last map.
+
+    What is done often is recorded once (:class:`amiwarp.kernels.program.Program`); nothing is read back meanwhile.
+    """
 
     def __init__(
         self,
         pairs: PairSet,
         tiles: Tiles,
-        encoder: Encoder,
         *,
-        sensor: Sensor | None = None,
-        slope: NDArray[np.float32] | None = None,
         with_leak: bool = False,
         off_excess: float | None = None,
         damping: float = DAMPING,
         smoothness: Smoothness | None = None,
-        weak: float = WEAK_WEIGHT,
         middle_us: int = 0,
-        device: Any = "cpu",
     ) -> None:
-        """``slope`` (n, 2): change of the encoder's angle at either event per unit of a drifting parameter.
+        """``off_excess``: the OFF threshold's excess over the ON threshold where it is known: held, not solved for.
 
-        ``off_excess``: the OFF threshold's excess over the ON threshold where it is known: held, not solved for.
-        ``middle_us``: the time to which a turning camera is turned back.
+        ``middle_us``: the time to which a turning camera is turned back, the pairs' times being from there.
         """
         import warp as wp
 
-        from amiwarp.kernels import descent
         from amiwarp.kernels import photometric as kernels
         from amiwarp.kernels.launch import slice_count
-        from amiwarp.kernels.prior import Prior
+        from amiwarp.kernels.prior import EXTRA
 
         if not len(pairs):
             raise AmiwarpError("no pixel fired twice in time: there is no pair of events to learn the brightness from")
-        self.device, self.tiles, self.count = wp.get_device(device), tiles, len(pairs)
-        self.middle_us = middle_us
-        self._pairs = upload_pairs(
-            pairs, encoder, sensor or Sensor(), slope, middle_us=self.middle_us, weak=weak, device=self.device
-        )
+        self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
+        self.pairs, self.middle_us, self.smoothness = pairs, middle_us, smoothness
         self._atlas = kernels.Atlas()
-        self._atlas.origin = wp.array(tiles.origin, dtype=wp.vec2, device=device)
+        self._atlas.origin = wp.array(tiles.origin.ravel(), dtype=float, device=self.device)
         self._atlas.rows, self._atlas.columns, self._atlas.density = tiles.rows, tiles.columns, tiles.density
-        self._atlas.with_leak = float(with_leak)
-        unknowns = tiles.nodes + int(kernels.EXTRA)
-        names = ("image", "change", "residual", "direction", "product", "diagonal")
-        self._image, self._change, self._r, self._p, self._q, self._diagonal = (
-            wp.zeros(unknowns, dtype=float, device=device) for _ in names
-        )
-        self._sums = wp.zeros((slice_count(device), unknowns), dtype=wp.int64, device=device)
+        self._atlas.with_leak, self._atlas.with_off = float(with_leak), int(off_excess is None)
+        unknowns = tiles.nodes + int(EXTRA)
+        self._image = self._zeros(unknowns)
+        self._sums = wp.zeros((slice_count(self.device), unknowns), dtype=wp.int64, device=self.device)
         self._slices = [self._sums[k] for k in range(len(self._sums))]
-        self._partial = wp.zeros(-(-unknowns // int(descent.SEGMENT)), dtype=wp.float64, device=device)
-        self._scalars = wp.zeros(3, dtype=wp.float64, device=device)
-        self.smoothness = smoothness
-        self._prior = Prior()
-        self._prior.damping, self._prior.columns = damping, tiles.columns
-        self._prior.linked, self._prior.held = int(smoothness is not None), unknowns
-        links = unknowns if smoothness is not None else 0
-        self._prior.right, self._prior.down = (wp.zeros(links, dtype=float, device=device) for _ in "xy")
-        one = smoothness is not None and len(tiles.origin) == 1
-        self._levels = Levels(tiles.rows, tiles.columns, self.device) if one else None
-        self._z = wp.zeros(unknowns if one else 0, dtype=float, device=device)
+        self._make_vectors(unknowns)
+        self._make_prior(damping, unknowns)
         if off_excess is not None:
             self._prior.held = tiles.nodes + 1  # the leak comes first
-            self._image.assign(np.concatenate([np.zeros(tiles.nodes + 1), [off_excess]]).astype(np.float32))
-        self._weight, self._residual, self._scratch, self._other = (
-            wp.zeros(self.count, dtype=float, device=device) for _ in range(4)
-        )
-        self._geometry = kernels.Geometry()
-        self._geometry.cell = wp.zeros(self.count, dtype=wp.vec2i, device=device)
-        self._geometry.first = wp.zeros(self.count, dtype=wp.vec2, device=device)
-        self._geometry.second = wp.zeros(self.count, dtype=wp.vec2, device=device)
+            self._image[-1:].fill_(off_excess)
+        self.residuals = Residuals(pairs, len(tiles.origin))
+        self._scale = self._zeros(1)
+        self._geometry = self._new_geometry()
 
-    def place(self, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:
-        """Where the pairs fall for these parameters, the camera's ``turning`` taken back to ``middle_us``."""
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import place_pairs
+    def _zeros(self, n: int) -> Any:
+        import warp as wp
 
-        inputs = [model.params(self.device), model_camera(model, self.device), self._pairs, self._atlas, drift]
-        turning = (turning or Turning()).about(self.middle_us)
-        launch(place_pairs, self.count, [*inputs, turning.params()], [self._geometry], device=self.device)
+        return wp.zeros(n, dtype=float, device=self.device)
 
-    def solve(self, scale: float, *, steps: int, rounds: int = 1) -> NDArray[np.float32]:
-        """``rounds`` of Cauchy weights of ``scale`` [thresholds] and ``steps`` of conjugate gradients each.
-
-        Returns the residual of every pair [thresholds], NaN for pairs off the map.
-        """
-        for _ in range(rounds):
-            self._weigh(scale)
-            self._descend(self._image, self._residual, steps)
-        self._weigh(scale)
-        residual: NDArray[np.float32] = self._residual.numpy()
-        return residual.copy()
-
-    def residual(self) -> NDArray[np.float32]:
-        """Residual of every pair [thresholds] for the map as it is, where :meth:`place` has put them last."""
-        self._weigh(1.0, self._scratch)
-        residual: NDArray[np.float32] = self._other.numpy()
-        return residual.copy()
-
-    def unexplained(self, target: NDArray[np.float32], *, steps: int) -> NDArray[np.float32]:
-        """What of ``target`` (pairs) no change of the map explains, under the weights of the last :meth:`solve`.
-
-        The projection of variable projection (Golub and Pereyra 1973), by conjugate gradients from no change.
-        """
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import subtract
-
-        self._other.assign(np.nan_to_num(target).astype(np.float32))
-        self._change.zero_()
-        self._descend(self._change, self._other, steps)
-        inputs = [self._pairs, self._atlas, self._geometry, self._change]
-        launch(subtract, self.count, inputs, [self._other], device=self.device)
-        rest: NDArray[np.float32] = self._other.numpy()
-        return rest.copy()
-
-    def _weigh(self, scale: float, weight: Any = None) -> None:
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import weigh
-
-        inputs = [self._pairs, self._atlas, self._geometry, self._image, scale]
-        outputs = [self._weight, self._residual] if weight is None else [weight, self._other]
-        launch(weigh, self.count, inputs, outputs, device=self.device)
-
-    def _descend(self, image: Any, residual: Any, steps: int) -> None:
-        """Conjugate gradients on the normal equations, preconditioned by the diagonal or by :class:`Levels`.
-
-        ``image`` moves so that less is left of ``residual``, which is that of ``image`` as it comes in.
-        """
+    def _make_vectors(self, unknowns: int) -> None:
         import warp as wp
 
         from amiwarp.kernels import descent as cg
-        from amiwarp.kernels import photometric as k
-        from amiwarp.kernels.launch import launch, launch_slices
+        from amiwarp.kernels.program import BLOCK_DIM
 
-        equations = [self._pairs, self._atlas, self._geometry, self._weight]
-        unknowns = len(image)
-        self._link()
-        self._find_diagonal()
-        if self._levels is not None:
-            self._levels.prepare(equations, self.count, self._sums, self._slices)
-        launch_slices(k.apply_transpose, self.count, [*equations, residual], self._slices, device=self.device)
-        launch(cg.gather, unknowns, [self._sums], [self._r], device=self.device)
-        self._by_segment(cg.start_descent, [self._prior, self._diagonal, image, self._r, self._p], [], 0)
-        if self._levels is not None:
-            self._correct(0)
-            wp.copy(self._p, self._z)
-        for _ in range(steps):
-            launch_slices(k.apply_normal, self.count, [*equations, self._p], self._slices, device=self.device)
-            self._by_segment(cg.finish_product, [self._sums, self._prior, self._p, self._q], [], 1)
-            inputs = [self._prior, self._scalars, self._diagonal, self._p, self._q, self._r]
-            self._by_segment(cg.descend, inputs, [image], 2)
-            self._turn()
-            wp.copy(self._scalars, self._scalars, 0, 2, 1)
+        self._width = cg.CPU_WIDTH if self.device.is_cpu else 1
+        self._threads = -(-unknowns // self._width)
+        self._u, self._dots = cg.Unknowns(), cg.Dots()
+        for name in ("diagonal", "residual", "direction", "product"):
+            setattr(self._u, name, self._zeros(unknowns))
+        parts = -(-self._threads // (1 if self.device.is_cpu else BLOCK_DIM))
+        for name, n in (("scalars", 2), ("pq", parts), ("rz", parts)):
+            setattr(self._dots, name, wp.zeros(n, dtype=wp.float64, device=self.device))
 
-    def _by_segment(self, kernel: Any, inputs: list[Any], outputs: list[Any], at: int) -> None:
-        """Run a kernel that leaves partial sums, and put their total into the scalar ``at``."""
+    def _make_prior(self, damping: float, unknowns: int) -> None:
+        from amiwarp.kernels.prior import Prior
+
+        linked = self.smoothness is not None
+        self._prior = Prior()
+        self._prior.damping, self._prior.columns = damping, self.tiles.columns
+        self._prior.linked, self._prior.held = int(linked), unknowns
+        self._prior.right, self._prior.down = (self._zeros(unknowns * linked) for _ in "xy")
+        self._prior.smooth = self._zeros(1)
+        if self.smoothness is not None:
+            self._prior.smooth.fill_(self.smoothness.weight)
+        one = linked and len(self.tiles.origin) == 1
+        self._levels = Levels(self.tiles.rows, self.tiles.columns, self.device) if one else None
+        self._z = self._zeros(unknowns * one)
+
+    def _new_geometry(self) -> Any:
         import warp as wp
 
-        from amiwarp.kernels.descent import sum_partial
+        from amiwarp.kernels.photometric import Geometry
+
+        g = Geometry()
+        g.stride = self.pairs.arrays.stride
+        g.cell = wp.full(2 * g.stride, -1, dtype=int, device=self.device)
+        g.part = self._zeros(4 * g.stride)
+        return g
+
+    # -- where pairs fall
+
+    def place(self, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:
+        """Where the pairs fall for these parameters, the camera's ``turning`` taken back to ``middle_us``."""
+        self._place(model, drift, turning, self._geometry)
+
+    def _place(self, model: Model, drift: float, turning: Turning | None, out: Any) -> None:
+        from amiwarp.kernels import places as k
         from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.photometric import BLOCK
+        from amiwarp.kernels.structs import pinhole_params
 
-        launch(kernel, len(self._partial), inputs, [*outputs, self._partial], device=self.device, smallest=64)
-        wp.launch(sum_partial, dim=1, inputs=[self._partial, at, self._scalars], device=self.device)
-
-    def _correct(self, at: int) -> None:
-        """The preconditioned residual, and its product with the residual into the scalar ``at``."""
-        from amiwarp.kernels.multilevel import dot
-
-        assert self._levels is not None
-        assert self.smoothness is not None
-        self._levels.correct(self._diagonal, self._prior, self.smoothness.weight, self._r, self._z)
-        self._by_segment(dot, [self._r, self._z], [], at)
-
-    def _turn(self) -> None:
-        """The next direction."""
-        from amiwarp.kernels import multilevel
-        from amiwarp.kernels.descent import turn
-        from amiwarp.kernels.launch import launch
-
-        if self._levels is None:
-            inputs = [self._prior, self._scalars, self._diagonal, self._r]
-            launch(turn, len(self._image), inputs, [self._p], device=self.device)
+        arrays, params = self.pairs.arrays, model.params(self.device)
+        turning = (turning or Turning()).about(self.middle_us)
+        pinhole = pinhole_params(model.camera)
+        if pinhole is None or arrays.slope.shape[0] or any(turning.rate) or any(turning.change):
+            inputs = [params, model_camera(model, self.device), arrays, self._atlas, drift, turning.params()]
+            launch(k.place_pairs, self.count, inputs, [out], device=self.device)
             return
-        self._correct(2)
-        launch(multilevel.turn_to, len(self._image), [self._scalars, self._z], [self._p], device=self.device)
+        inputs = [params, pinhole, arrays, self._atlas]
+        if self.device.is_cpu:
+            blocks = arrays.stride // int(BLOCK)
+            launch(k.place_blocks, blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
+        else:
+            launch(k.place_still, arrays.stride, inputs, [out], device=self.device)
 
-    def _link(self) -> None:
-        """Weights of the links between nodes, from the map as it is."""
+    @cached_property
+    def _sides(self) -> tuple[Any, Any]:
+        """Two more geometries, for differences."""
+        return self._new_geometry(), self._new_geometry()
+
+    def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float) -> Any:
+        """Slope of the residuals, the map as it is, by their difference between two placings, on the device.
+
+        ``plus`` and ``minus``: arguments of :meth:`place`, ``width`` apart; the pairs' own places stay.
+        """
         from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.prior import link
+        from amiwarp.kernels.slopes import slope_between
 
+        for side, at in zip(self._sides, (plus, minus), strict=True):
+            self._place(at["model"], at["drift"], at["turning"], side)
+        out = self._zeros(self.pairs.arrays.stride)
+        inputs = [self.pairs.arrays, self._atlas, *self._sides, self._image, width]
+        launch(slope_between, self.count, inputs, [out], device=self.device)
+        return out
+
+    def keep(self, nodes: NDArray[np.bool_]) -> None:
+        """Pairs of two events that lie off ``nodes`` (tiles, rows, columns), either of them, are left out: noise."""
+        import warp as wp
+
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.pairs import keep_nodes
+
+        on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
+        inputs = [on, self.pairs.arrays.on, self._geometry.stride]
+        launch(keep_nodes, self.count, inputs, [self._geometry.cell], device=self.device)
+
+    # -- solving
+
+    def solve(self, scale: float, *, steps: int, rounds: int = 1) -> None:
+        """``rounds`` of Cauchy weights of ``scale`` [thresholds] and ``steps`` of conjugate gradients each.
+
+        Leaves the residual of every pair [thresholds], NaN for pairs off the map, in ``residuals`` on the device.
+        """
+        self._scale.fill_(scale)
+        for _ in range(rounds):
+            self._weigh.run()
+            self._prepare.run()
+            self._descent.run(steps)
+        self._weigh.run()
+
+    def restart(self, smoothness: float) -> None:
+        """From an empty map, with another weight of the prior."""
+        self._image[: self.tiles.nodes].zero_()
+        self._prior.smooth.fill_(smoothness)
+
+    def prepare_projection(self) -> None:
+        """For :meth:`unexplained`, with the weights of the last :meth:`solve`."""
+        self._prepare.run()
+
+    def new_change(self) -> Any:
+        """No change of the map, on the device: for :meth:`unexplained` to start from."""
+        return self._zeros(len(self._image))
+
+    def unexplained(self, target: Any, change: Any, *, steps: int) -> Any:
+        """What of ``target`` (pairs, on the device) no change of the map explains.
+
+        The projection of variable projection (Golub and Pereyra 1973), by conjugate gradients from ``change``, a guess
+        of the change that explains it; a better one is left there.
+        """
+        import warp as wp
+
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.photometric import subtract
+
+        inputs = [self.pairs.arrays, self._atlas, self._geometry, self._projection.image]
+        wp.copy(self._projection.image, change)
+        wp.copy(self._projection.residual, target)
+        launch(subtract, self.count, inputs, [self._projection.residual], device=self.device)
+        self._projection.run(steps)
+        wp.copy(change, self._projection.image)
+        rest = wp.clone(target)
+        launch(subtract, self.count, inputs, [rest], device=self.device)
+        return rest
+
+    @property
+    def _equations(self) -> list[Any]:
+        return [self.pairs.arrays, self._atlas, self._geometry, self.residuals.weight]
+
+    @cached_property
+    def _weigh(self) -> Any:
+        from amiwarp.kernels.program import Program
+
+        program = Program(self.device)
+        self._add_weigh(program)
+        return program
+
+    def _add_weigh(self, program: Any) -> None:
+        from amiwarp.kernels.photometric import weigh
+
+        inputs = [self.pairs.arrays, self._atlas, self._geometry, self._image, self._scale]
+        program.add(weigh, self.count, inputs, [self.residuals.weight, self.residuals.values])
+
+    @cached_property
+    def _prepare(self) -> Any:
+        """Links and diagonals, for the weights and the map as they are."""
+        from amiwarp.kernels.descent import gather_diagonal
+        from amiwarp.kernels.photometric import add_diagonal
+        from amiwarp.kernels.prior import link
+        from amiwarp.kernels.program import Program
+
+        program = Program(self.device)
         if self.smoothness is not None:
-            weight, edge = self.smoothness.weight, self.smoothness.edge
-            inputs = [self._image, self.tiles.rows, self.tiles.columns, weight, edge]
-            launch(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down], device=self.device)
+            inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
+            program.add(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
+        program.add_slices(add_diagonal, self.count, self._equations, self._slices)
+        program.add(gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
+        if self._levels is not None:
+            self._levels.prepare(program, self._equations[1:], self.count, self._sums, self._slices)
+        return program
+
+    @cached_property
+    def _descent(self) -> _Descent:
+        return _Descent(self, self._image, self.residuals.values)
+
+    @cached_property
+    def _projection(self) -> _Descent:
+        return _Descent(self, self._zeros(len(self._image)), self._zeros(self.pairs.arrays.stride))
+
+    # -- what came out
 
     @property
     def unknowns(self) -> NDArray[np.float32]:
-        """A copy of the map and, behind it, the OFF threshold's excess over the ON threshold and the leak [1/s]."""
+        """A copy of the map and, behind it, the leak [1/s] and the OFF threshold's excess over the ON threshold."""
         values: NDArray[np.float32] = self._image.numpy()
-        return values.copy()
+        return values.copy() if self.device.is_cpu else values
 
     @unknowns.setter
     def unknowns(self, values: NDArray[np.float32]) -> None:
@@ -268,36 +318,83 @@ class BrightnessMap:
 
     def coverage(self, scale: float = 1.0) -> NDArray[np.float32]:
         """How much pairs of two events say of each node, with weights of ``scale``, shape (tiles, rows, columns)."""
-        weak, self._pairs.weak = self._pairs.weak, 0.0
-        self._weigh(scale)
-        self._find_diagonal()
-        self._pairs.weak = weak
+        from amiwarp.kernels.descent import gather
+        from amiwarp.kernels.photometric import add_diagonal
+        from amiwarp.kernels.program import Program
+
+        self._scale.fill_(scale)
+        weak, self.pairs.arrays.weak = self.pairs.arrays.weak, 0.0
+        program = Program(self.device)
+        self._add_weigh(program)
+        program.add_slices(add_diagonal, self.count, self._equations, self._slices)
+        out = self._zeros(len(self._image))
+        program.add(gather, len(out), [self._sums], [out])
+        program.launch()
+        self.pairs.arrays.weak = weak
         shape = (len(self.tiles.origin), self.tiles.rows, self.tiles.columns)
-        diagonal: NDArray[np.float32] = self._diagonal.numpy()[: self.tiles.nodes].reshape(shape)
-        return diagonal.copy()
+        diagonal: NDArray[np.float32] = out.numpy()[: self.tiles.nodes].reshape(shape)
+        return diagonal
 
     @property
     def extra(self) -> NDArray[np.float32]:
         """The unknowns behind the map: the leak [thresholds/s], and the OFF threshold's excess."""
         return self.unknowns[self.tiles.nodes :]
 
-    def keep(self, nodes: NDArray[np.bool_]) -> None:
-        """Pairs of two events that lie off ``nodes`` (tiles, rows, columns), either of them, are left out: noise."""
-        import warp as wp
 
-        cell: NDArray[np.int32] = self._geometry.cell.numpy().copy()
-        on = nodes.ravel()
-        inside = (cell[:, 0] >= 0) & (self._pairs.on.numpy() < 2)
-        off = np.zeros(self.count, np.bool_)
-        off[inside] = ~(on[cell[inside, 0]] & on[cell[inside, 1]])
-        cell[off] = -1
-        self._geometry.cell = wp.array(cell, dtype=wp.vec2i, device=self.device)
+class _Descent:
+    """Conjugate gradients on the normal equations, preconditioned by the diagonal or by :class:`Levels`.
 
-    def _find_diagonal(self) -> None:
+    ``image`` moves so that less is left of ``residual``, which is that of ``image`` as it comes in.
+    """
+
+    def __init__(self, of: BrightnessMap, image: Any, residual: Any) -> None:
+        from amiwarp.kernels.program import Program
+
+        self.image, self.residual = image, residual
+        self._of, self._begin, self._step = of, Program(of.device), Program(of.device)
+        self._add_begin(self._begin)
+        self._add_step(self._step)
+
+    def run(self, steps: int) -> None:
+        self._begin.run()
+        self._step.run(steps)
+
+    def _add_begin(self, program: Any) -> None:
         from amiwarp.kernels import descent as cg
         from amiwarp.kernels import photometric as k
-        from amiwarp.kernels.launch import launch, launch_slices
 
-        equations = [self._pairs, self._atlas, self._geometry, self._weight]
-        launch_slices(k.add_diagonal, self.count, equations, self._slices, device=self.device)
-        launch(cg.gather, len(self._image), [self._sums], [self._diagonal], device=self.device)
+        of = self._of
+        program.add_slices(k.apply_transpose, of.count, [*of._equations, self.residual], of._slices)
+        self._add(program, cg.start_descent, [of._sums, of._prior, self.image], [of._u, of._dots])
+        self._correct(program)
+
+    def _add_step(self, program: Any) -> None:
+        from amiwarp.kernels import descent as cg
+        from amiwarp.kernels import photometric as k
+
+        of = self._of
+        if of._levels is None:
+            self._add(program, cg.turn, [], [of._u, of._dots])
+        else:
+            self._add(program, cg.turn_to, [of._z], [of._u, of._dots])
+        inputs = [*of._equations, of._u.direction]
+        if of.device.is_cpu:
+            blocks = of.pairs.arrays.stride // int(k.BLOCK)
+            program.add_slices(k.apply_normal_blocks, blocks, inputs, of._slices, smallest=FEW_BLOCKS)
+        else:
+            program.add_slices(k.apply_normal, of.count, inputs, of._slices)
+        self._add(program, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
+        self._add(program, cg.descend, [], [self.image, of._u, of._dots])
+        self._correct(program)
+
+    def _correct(self, program: Any) -> None:
+        """The preconditioned residual, and its product with the residual."""
+        from amiwarp.kernels.descent import dot
+
+        of = self._of
+        if of._levels is not None:
+            of._levels.correct(program, of._u.diagonal, of._prior, of._u.residual, of._z)
+            self._add(program, dot, [of._u.residual, of._z], [of._dots.rz])
+
+    def _add(self, program: Any, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        program.add(kernel, self._of._threads, [*inputs, self._of._width], outputs, smallest=CHUNKS)

@@ -20,14 +20,14 @@ from amiwarp.brightness import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensate import check_size
 from amiwarp.encoder import TURN, Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.pairs import PairSet, open_ends, pair_events, quiet_pairs
+from amiwarp.pairs import EventTable, PairSet
 from amiwarp.turning import Turning, border
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.result import Calibration
-    from amiwarp.events import Events, Recording
+    from amiwarp.events import Recording
     from amiwarp.optics import Model
 
 SCALES = (1.0, 0.5, 0.5)
@@ -177,37 +177,38 @@ class Reconstruction:
         began = time.perf_counter()
         recording = self.recording
         width, height = recording.events.size
-        events = recording.events.between(start_us, start_us + length_us)
-        hot = hot_pixels(events, width, height)
-        pairs = self._pairs(events, np.where(hot, -1, 0).astype(np.int32), start_us, length_us)
-        if not (pairs.on < 2).any():
+        table, count = self._table(start_us, length_us)
+        pairs = self._pairs(table, start_us, length_us)
+        real = int((pairs.column("on") < 2).sum())
+        if not real:
             where = f"{start_us} .. {start_us + length_us} us"
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
         off = self._off_excess(start_us, length_us)
         if self._smoothness is None:
-            self._smoothness = self._choose(events, pairs, start_us, length_us, off)
+            self._smoothness = self._choose(count, pairs, start_us, length_us, off)
         left, top, tiles = self._tile(start_us, length_us)
-        solver = self._solver(pairs, tiles, off, self._smoothness, start_us + length_us // 2)
+        solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
         if last is not None:
             unknowns = last.unknowns.copy()
             unknowns[tiles.nodes :] = solver.unknowns[tiles.nodes :]
             solver.unknowns = unknowns
         for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
-            residual = solver.solve(scale, steps=STEPS)
+            solver.solve(scale, steps=STEPS)
+        typical = solver.residuals.median(real)
         covered = known_nodes(solver)
         if covered.any():
-            solver.keep(ndimage.binary_dilation(covered, iterations=NEAR)[None])
+            solver.keep(grown(covered, NEAR)[None])
         solver.solve(SCALES[-1], steps=STEPS)
         cut = np.s_[top : top + height, left : left + width]
-        log, known = solver.maps()[0][cut], covered[cut]
+        unknowns = solver.unknowns
+        log, known = unknowns[: tiles.nodes].reshape(tiles.rows, tiles.columns)[cut], covered[cut]
         log = log - np.median(log[known] if known.any() else log)
         if self.fill is Fill.NONE:
             log = np.where(known, log, np.float32(np.nan))
-        of_events = np.abs(residual[pairs.on < 2])
-        typical = float(np.nanmedian(of_events)) if np.isfinite(of_events).any() else math.nan
+        hot = int((table.tile_of.numpy() < 0).sum())
         return Picture(
-            log.astype(np.float32), known, start_us, length_us, int((pairs.on < 2).sum()), off, self._smoothness,
-            typical, int(hot.sum()), time.perf_counter() - began, solver.unknowns,
+            log.astype(np.float32), known, start_us, length_us, real, off, self._smoothness,
+            typical, hot, time.perf_counter() - began, unknowns,
         )  # fmt: skip
 
     def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
@@ -229,24 +230,26 @@ class Reconstruction:
         room = self.recording.events.t_last + 1 - start_us - length_us
         return max(1, math.floor(room / step_us) + 1)
 
-    def _pairs(self, events: Events, tile_of: NDArray[np.int32], start_us: int, length_us: int) -> PairSet:
+    def _table(self, start_us: int, length_us: int) -> tuple[EventTable, NDArray[np.int32]]:
+        """The window's events without those of hot pixels, and how many each pixel fired, shape (height, width)."""
+        events = self.recording.events.between(start_us, start_us + length_us)
+        width, height = self.recording.events.size
+        table = EventTable([events], np.zeros((height, width), np.int32), self.device)
+        return table, table.leave_out_hot()
+
+    def _pairs(self, table: EventTable, start_us: int, length_us: int) -> PairSet:
         """All equations of a window: pairs of events, open ends, and silence."""
         turn = min(self.turn_us or length_us, length_us)
         spans = max(2, round(SPANS * length_us / turn))
         edges = np.round(np.linspace(start_us, start_us + length_us, spans + 1)).astype(np.int64)
-        parts = [
-            pair_events(events, tile_of, longest_gap_us=length_us, device=self.device),
-            open_ends(events, tile_of, start_us, start_us + length_us),
-            quiet_pairs(events, tile_of, edges, at_least=min(spans, SPANS)),
-        ]
-        return PairSet.concatenate(parts)
-
-    def _solver(self, pairs: PairSet, tiles: Tiles, off: float, smoothness: float, middle_us: int) -> BrightnessMap:
-        prior = Smoothness(smoothness, EDGE if self.fill is Fill.EDGE else 0.0)
-        solver = BrightnessMap(
-            pairs, tiles, self.encoder, off_excess=off, damping=MEAN_HOLD, smoothness=prior, weak=WEAK,
-            middle_us=middle_us, device=self.device,
+        return table.pairs(
+            self.encoder, longest_gap_us=length_us, middle_us=start_us + length_us // 2, weak=WEAK,
+            window=(start_us, start_us + length_us), quiet=(edges, min(spans, SPANS)),
         )  # fmt: skip
+
+    def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:
+        prior = Smoothness(self._smoothness or SMOOTHNESS[0], EDGE if self.fill is Fill.EDGE else 0.0)
+        solver = BrightnessMap(pairs, tiles, off_excess=off, damping=MEAN_HOLD, smoothness=prior, middle_us=middle_us)
         solver.place(self.model, turning=self.turning)
         return solver
 
@@ -261,29 +264,22 @@ class Reconstruction:
         on = int(p.sum())
         return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0
 
-    def _choose(self, events: Events, pairs: PairSet, start_us: int, length_us: int, off: float) -> float:
+    def _choose(self, count: NDArray[np.int32], pairs: PairSet, start_us: int, length_us: int, off: float) -> float:
         """The prior's weight under which held-out equations come out best, on the busiest part of the image."""
-        x0, y0 = busiest(events, *self.recording.events.size)
-        inside = (pairs.x >= x0) & (pairs.x < x0 + PROBE) & (pairs.y >= y0) & (pairs.y < y0 + PROBE)
-        part = pairs[np.flatnonzero(inside)]
-        real = np.flatnonzero(part.on < 2)
-        out = np.zeros(len(part), np.bool_)
-        out[real[::HELD_OUT]] = True
-        if out.sum() < 50:
+        x0, y0 = busiest(count)
+        part = pairs.of_square(x0, y0, PROBE)
+        if part.hold_out(HELD_OUT) < 50:
             return SMOOTHNESS[-1]
         left, top, _ = self._tile(start_us, length_us)
-        middle = start_us + length_us // 2
         shape = (PROBE + 2 * top, PROBE + 2 * left)
         tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), *shape, 1.0)
-        judge = self._solver(part[out], tiles, off, SMOOTHNESS[0], middle)
+        solver = self._solver(part, tiles, off, start_us + length_us // 2)
         scores = []
         for weight in SMOOTHNESS:
-            solver = self._solver(part[~out], tiles, off, weight, middle)
+            solver.restart(weight)
             for scale in SCALES[:2]:
                 solver.solve(scale, steps=STEPS)
-            judge.unknowns = solver.unknowns
-            residual = judge.solve(SCALES[0], steps=0, rounds=0)
-            scores.append(float(np.nanmean(np.log1p(residual**2))))
+            scores.append(solver.residuals.mean_cost(SCALES[0], held=True))
         return SMOOTHNESS[int(np.nanargmin(scores))]
 
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
@@ -320,18 +316,21 @@ def reconstruct(
     return work.window(*work.span(start_us, length_us, turns))
 
 
-def hot_pixels(events: Events, width: int, height: int) -> NDArray[np.bool_]:
-    """Pixels that fire far more than the busiest of those around them, shape (height, width)."""
-    index = events.y.astype(np.int64) * width + events.x
-    count = np.bincount(index, minlength=width * height).reshape(height, width).astype(np.float32)
-    typical = ndimage.percentile_filter(count, 75, size=5, mode="mirror")
-    return np.asarray(count > 3.0 * typical + 5.0 * np.sqrt(typical) + 8.0)
-
-
 def known_nodes(solver: BrightnessMap) -> NDArray[np.bool_]:
     """Nodes of the map that events determine: enough equations hold there, and most of those that there are."""
     hold, everything = solver.coverage(HOLDS)[0], solver.coverage(1e6)[0]
     return without_pinholes(without_specks((hold >= COVERED) & (hold >= AGREED * everything)))
+
+
+def grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """The mask and all within so many steps to a neighbour, sideways or up and down."""
+    for _ in range(by):
+        out = mask.copy()
+        for one, other in ((out, mask), (out.T, mask.T)):
+            one[1:] |= other[:-1]
+            one[:-1] |= other[1:]
+        mask = out
+    return mask
 
 
 def without_specks(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -349,12 +348,12 @@ def without_pinholes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(known | (size[label] <= PINHOLE))
 
 
-def busiest(events: Events, width: int, height: int) -> tuple[int, int]:
-    """First column and row of the :data:`PROBE` pixels' square with the most events."""
-    columns, rows = -(-width // PROBE), -(-height // PROBE)
-    cell = (events.y // PROBE).astype(np.int64) * columns + events.x // PROBE
-    best = int(np.argmax(np.bincount(cell, minlength=columns * rows)))
-    return best % columns * PROBE, best // columns * PROBE
+def busiest(count: NDArray[np.int32]) -> tuple[int, int]:
+    """First column and row of the :data:`PROBE` pixels' square with the most events (``count``, by pixel)."""
+    rows = np.add.reduceat(count, np.arange(0, count.shape[0], PROBE), axis=0)
+    cells = np.add.reduceat(rows, np.arange(0, count.shape[1], PROBE), axis=1)
+    row, column = np.unravel_index(int(cells.argmax()), cells.shape)
+    return int(column) * PROBE, int(row) * PROBE
 
 
 def orbit(model: Model) -> NDArray[np.float64]:

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import TRUE_PRISM
+from conftest import NOMINAL_PRISM, TRUE_PRISM
 
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.calibrate import RUN, prepare, thin
 from amiwarp.calib.checks import edge_coherence
+from amiwarp.calib.parameters import make_space
 from amiwarp.calib.search import PARTS
 from amiwarp.calib.speed import estimate_rpm
 from amiwarp.camera import Camera
@@ -298,3 +299,15 @@ def test_coherence_of_edges() -> None:
     assert edge_coherence(rng.poisson(3.0, (80, 100)).astype(np.float32)) < 0.2
     stripes = np.tile(rng.poisson(9.0, 100).astype(np.float32), (80, 1))
     assert edge_coherence(stripes) > 0.99
+
+
+def test_a_drift_that_is_held_still_turns_the_angles(recording: Recording) -> None:
+    """Events get the angles of the start; where the parameter is held elsewhere, they must follow it there."""
+    assert recording.camera is not None
+    space = make_space(
+        "exact", recording.camera, NOMINAL_PRISM, free=("apex", "phase", "clock_offset"), start={"clock_offset": 100.0},
+        bounds={}, rad_per_us=75e-6, duration_us=250e3,
+    )  # fmt: skip
+    values = {"apex": 0.03, "phase": 1.0, "clock_offset": 140.0}
+    held = space.without(("clock_offset",)).holding(values)
+    assert space.drift(values) == held.drift(values) == held.drift({}) == 40.0

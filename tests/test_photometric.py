@@ -20,7 +20,7 @@ from amiwarp.events import Events, MemoryEvents, Recording
 from amiwarp.metrics import model_error, truth_model
 from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.optics import ExactModel, FlatSide, Prism
-from amiwarp.pairs import Sensor, pair_events
+from amiwarp.pairs import EventTable, PairSet, Sensor
 from amiwarp.simulate import SensorModel, simulate
 
 KNOWN = PhotometricSettings(sensor=Sensor(latency_us=100.0, refractory_us=100.0))
@@ -148,12 +148,15 @@ def test_the_map_is_the_scene(device: str) -> None:
     rows.sort()
     at, x, y, p = np.array(rows).T
     events = Events.from_arrays(x, y, at, p)
-    pairs = pair_events(events, np.zeros((height, width), dtype=np.int32), longest_gap_us=200_000, device=device)
+    everywhere = np.zeros((height, width), dtype=np.int32)
+    pairs = EventTable([events], everywhere, device).pairs(encoder, longest_gap_us=200_000)
     tiles = Tiles(np.array([[-10.0, -10.0]], dtype=np.float32), height + 20, width + 20, 1.0)
-    brightness = BrightnessMap(pairs, tiles, encoder, damping=1e-4, device=device)
+    brightness = BrightnessMap(pairs, tiles, damping=1e-4)
     brightness.place(model)
-    residual = brightness.solve(1.0, steps=200, rounds=2)
+    brightness.solve(1.0, steps=200, rounds=2)
+    residual = brightness.residuals.values.numpy()[: len(pairs)]
     assert np.nanmedian(np.abs(residual)) < 0.05
+    assert brightness.residuals.median() == pytest.approx(np.nanmedian(np.abs(residual)), abs=1e-4)
     inner = brightness.maps()[0, 12:24, 14:30]
     np.testing.assert_allclose(np.diff(inner, axis=1), slope, rtol=0, atol=0.15)
     np.testing.assert_allclose(np.diff(inner, axis=0), 0.0, rtol=0, atol=0.15)
@@ -165,26 +168,27 @@ def test_single_precision_is_enough(recording: Recording, device: str) -> None:
     width, height = recording.events.size
     tile_of = np.full((height, width), -1, dtype=np.int32)
     tile_of[50:90, 60:110] = 0
-    pairs = pair_events(events, tile_of, longest_gap_us=60_000, device=device)
-    tiles = Tiles(np.array([[44.0, 34.0]], dtype=np.float32), 72, 82, 1.0)
     assert recording.camera is not None
     assert recording.encoder is not None
-    brightness = BrightnessMap(pairs, tiles, recording.encoder, off_excess=0.0, damping=0.02, device=device)
+    pairs = EventTable([events], tile_of, device).pairs(recording.encoder, longest_gap_us=60_000)
+    tiles = Tiles(np.array([[44.0, 34.0]], dtype=np.float32), 72, 82, 1.0)
+    brightness = BrightnessMap(pairs, tiles, off_excess=0.0, damping=0.02)
     brightness.place(ExactModel(recording.camera, TRUE_PRISM, TRUE_PHASE))
-    residual = brightness.solve(1e6, steps=300)  # all weights are 1
-    geometry = brightness._geometry
-    cell = geometry.cell.numpy()
-    on = np.flatnonzero(cell[:, 0] >= 0)
+    brightness.solve(1e6, steps=300)  # all weights are 1
+    residual = brightness.residuals.values.numpy()
+    cell = brightness._geometry.cell.numpy().reshape(2, -1)
+    part = brightness._geometry.part.numpy().reshape(2, 2, -1)
+    on = np.flatnonzero(cell[0] >= 0)
     rows, columns, values = [], [], []
-    for side, sign, fraction in ((1, 1.0, geometry.second.numpy()), (0, -1.0, geometry.first.numpy())):
-        fx, fy = fraction[on].astype(np.float64).T
+    for side, sign in ((1, 1.0), (0, -1.0)):
+        fx, fy = part[side][:, on].astype(np.float64)
         for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
             rows.append(np.arange(len(on)))
-            columns.append(cell[on, side] + dx + dy * tiles.columns)
+            columns.append(cell[side, on] + dx + dy * tiles.columns)
             values.append(sign * np.abs(1 - dx - fx) * np.abs(1 - dy - fy))
     shape = (len(on), tiles.nodes)
     matrix = csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
-    right = np.where(pairs.on[on] == 1, 1.0, -1.0)
+    right = np.where(pairs.column("on")[on] == 1, 1.0, -1.0)
     solved = spsolve((matrix.T @ matrix + 0.02 * eye_array(tiles.nodes)).tocsc(), matrix.T @ right)
     np.testing.assert_allclose(brightness.maps()[0].ravel(), solved, rtol=0, atol=0.01)
     np.testing.assert_allclose(residual[on], right - matrix @ solved, rtol=0, atol=2e-3)
@@ -195,8 +199,10 @@ def test_pairs_are_neighbours_in_time_of_one_pixel(recording: Recording, device:
     width, height = recording.events.size
     tile_of = np.full((height, width), -1, dtype=np.int32)
     tile_of[20:60, 30:90] = 0
-    pairs = pair_events(events, tile_of, longest_gap_us=20_000, shortest_gap_us=100.0, device=device)
-    gap = pairs.second_t - pairs.first_t
+    assert recording.encoder is not None
+    table = EventTable([events], tile_of, device)
+    pairs = table.pairs(recording.encoder, longest_gap_us=20_000, shortest_gap_us=100.0)
+    gap = np.rint(np.diff(pairs.time, axis=0)[0] * 1e6)
     assert gap.min() > 100
     assert gap.max() <= 20_000
     counts = []
@@ -204,16 +210,36 @@ def test_pairs_are_neighbours_in_time_of_one_pixel(recording: Recording, device:
         of_pixel = events.t[(events.x == x) & (events.y == y)]
         gaps = np.diff(of_pixel)
         counts.append(int(((gaps <= 20_000) & (gaps > 100)).sum()))
-        assert ((pairs.x == x) & (pairs.y == y)).sum() == counts[-1]
+        assert ((pairs.column("x") == x) & (pairs.column("y") == y)).sum() == counts[-1]
     assert sum(counts) > 0
+
+
+def test_pairs_of_spans_add_up(recording: Recording, device: str) -> None:
+    width, height = recording.events.size
+    tile_of = np.zeros((height, width), dtype=np.int32)
+    assert recording.encoder is not None
+    spans = [recording.events.slice(0, 30_000), recording.events.slice(50_000, 90_000)]
+
+    def of(which: list[Events]) -> PairSet:
+        assert recording.encoder is not None
+        found = EventTable(which, tile_of, device).pairs(recording.encoder, longest_gap_us=20_000)
+        return found.with_slope(lambda t: t * 1e-3, 0)
+
+    whole, parts = of(spans), PairSet.concatenate([of(spans[:1]), of(spans[1:])])
+    assert len(parts) == len(whole) > 1000
+    for name in ("x", "y", "tile", "on"):
+        assert np.array_equal(parts.column(name), whole.column(name))
+    for name in ("azimuth", "time", "slope"):
+        one, other = (getattr(p.arrays, name).numpy().reshape(-1, p.arrays.stride) for p in (parts, whole))
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-6)
 
 
 def test_no_pair_is_an_error() -> None:
     one = Events.from_arrays([1], [1], [5], [1])
     tile_of = np.zeros((4, 4), dtype=np.int32)
-    pairs = pair_events(one, tile_of, longest_gap_us=100)
+    pairs = EventTable([one], tile_of, "cpu").pairs(Encoder.constant_speed(60, 0, 1000), longest_gap_us=100)
     with pytest.raises(AmiwarpError, match="no pixel fired twice"):
-        BrightnessMap(pairs, Tiles(np.zeros((1, 2), np.float32), 8, 8), Encoder.constant_speed(60, 0, 1000))
+        BrightnessMap(pairs, Tiles(np.zeros((1, 2), np.float32), 8, 8))
 
 
 def test_turns_are_spread() -> None:

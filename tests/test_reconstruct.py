@@ -23,8 +23,9 @@ from amiwarp.io import open_recording, save_recording
 from amiwarp.io.text import read_calib
 from amiwarp.motion import CameraMotion, PrismMotion
 from amiwarp.optics import ExactModel, Prism
+from amiwarp.pairs import EventTable
 from amiwarp.picture_files import Tone, save_picture, save_video, tones
-from amiwarp.reconstruct import Fill, Picture, Reconstruction, hot_pixels, reconstruct, without_pinholes
+from amiwarp.reconstruct import Fill, Picture, Reconstruction, grown, reconstruct, without_pinholes
 from amiwarp.simulate import Scene, SensorModel, Simulation
 from amiwarp.turning import Turning
 
@@ -162,12 +163,37 @@ def test_hot_pixels_leave_no_salt(recording: Recording, picture: Picture) -> Non
     assert float(away.max()) < 3.0
 
 
-def test_hot_pixels_are_told_from_texture() -> None:
+def test_hot_pixels_are_told_from_texture(device: str) -> None:
     count = np.full((20, 30), 12)
     count[5, 7], count[6, 8] = 200, 14
     y, x = (np.repeat(a.ravel(), count.ravel()) for a in np.indices(count.shape))
     events = Events.from_arrays(x.astype(np.uint16), y.astype(np.uint16), np.arange(len(x)), np.ones(len(x)))
-    assert np.argwhere(hot_pixels(events, 30, 20)).tolist() == [[5, 7]]
+    table = EventTable([events], np.zeros(count.shape, np.int32), device)
+    assert np.array_equal(table.leave_out_hot(), count)
+    assert np.argwhere(table.tile_of.numpy() < 0).tolist() == [[5, 7]]
+
+
+def test_hot_pixels_are_those_of_a_percentile_filter(device: str) -> None:
+    rng = np.random.default_rng(3)
+    count = rng.integers(0, 6, (40, 50)) ** 2
+    count[rng.random(count.shape) < 0.05] += 40
+    count[rng.random(count.shape) < 0.05] += 70
+    count[rng.random(count.shape) < 0.02] += 200
+    y, x = (np.repeat(a.ravel(), count.ravel()) for a in np.indices(count.shape))
+    events = Events.from_arrays(x.astype(np.uint16), y.astype(np.uint16), np.arange(len(x)), np.ones(len(x)))
+    typical = ndimage.percentile_filter(count.astype(np.float32), 75, size=5, mode="mirror")
+    table = EventTable([events], np.zeros(count.shape, np.int32), device)
+    table.leave_out_hot()
+    expected = count > 3.0 * typical + 5.0 * np.sqrt(typical) + 8.0
+    assert 50 < expected.sum() < (count > 40).sum() - 20  # some stand out, some do not
+    assert np.array_equal(table.tile_of.numpy() < 0, expected)
+
+
+def test_growing_is_a_dilation() -> None:
+    mask = np.random.default_rng(2).random((30, 40)) < 0.05
+    before = mask.copy()
+    assert np.array_equal(grown(mask, 3), ndimage.binary_dilation(mask, iterations=3))
+    assert np.array_equal(mask, before)
 
 
 def test_the_mask_has_no_pinholes(picture: Picture) -> None:

@@ -29,33 +29,29 @@ UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
 
 @dataclass(frozen=True)
 class Slopes:
-    """Residuals r of a weighted least-squares problem, and their slopes with the map projected out (Kaufman 1975)."""
+    """Of a weighted least-squares problem with the map projected out (Kaufman 1975): sums over all pairs."""
 
-    residual: NDArray[np.float32]
-    """Shape (pairs,) [thresholds]."""
-    slope: NDArray[np.float32]
-    """Shape (parameters, pairs) [thresholds/px]."""
-    plain: NDArray[np.float32]
-    """The slopes with the map as it is: the map is at its best, so it adds nothing to the cost's first derivative."""
-    weight: NDArray[np.float64]
+    hessian: Vector
+    """Of the slopes' products, shape (parameters, parameters) [thresholds²/px²]."""
+    gradient: Vector
+    """Half the cost's first derivative [thresholds²/px]. It is that with the map as it is: the map is at its best, so
+    it adds nothing."""
+    parts: Vector
+    """What each cluster of pairs adds to it with the map projected out, shape (parameters, clusters)."""
 
-    @property
-    def hessian(self) -> Vector:
-        return np.asarray((self.slope * self.weight) @ self.slope.T, np.float64)
+    def of(self, which: list[int]) -> Slopes:
+        """By some of the parameters alone."""
+        return Slopes(self.hessian[np.ix_(which, which)], self.gradient[which], self.parts[which])
 
     def step(self) -> Vector:
         """Gauss and Newton's."""
-        gradient = (self.plain * self.weight) @ self.residual
-        hessian = self.hessian
-        ridge = 1e-6 * float(np.trace(hessian)) * np.eye(len(hessian))
-        return np.asarray(-np.linalg.solve(hessian + ridge, gradient))
+        ridge = 1e-6 * float(np.trace(self.hessian)) * np.eye(len(self.hessian))
+        return np.asarray(-np.linalg.solve(self.hessian + ridge, self.gradient))
 
-    def covariance(self, clusters: NDArray[np.int64]) -> Vector:
-        """Sandwich estimate [px²] from the scatter of the slopes of the cost between ``clusters`` of pairs."""
-        _, index = np.unique(clusters, return_inverse=True)
-        parts = np.array([np.bincount(index, weights=s * self.weight * self.residual) for s in self.slope])
-        many = parts.shape[1]
-        parts = parts - parts.mean(axis=1, keepdims=True)
+    def covariance(self) -> Vector:
+        """Sandwich estimate [px²] from the scatter of the slopes of the cost between clusters."""
+        many = self.parts.shape[1]
+        parts = self.parts - self.parts.mean(axis=1, keepdims=True)
         scatter = parts @ parts.T * many / max(1, many - 1 - len(parts))
         # pairs of one pixel share an event, so neighbours count against each other: H alone would be too sure
         inverse = _inverse(self.hessian)
@@ -67,7 +63,7 @@ def _inverse(hessian: Vector) -> Vector:
     return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
 
 
-def determined(slopes: Slopes, clusters: NDArray[np.int64], space: Space, left: float) -> tuple[str, ...]:
+def determined(slopes: Slopes, space: Space, left: float) -> tuple[str, ...]:
     """Names that the curvature determines; size, phase and rates always stay, of the others the worst goes first.
 
     A parameter is weak where its standard deviation is large, or its curvature, the others left to follow, is nothing
@@ -77,10 +73,9 @@ def determined(slopes: Slopes, clusters: NDArray[np.int64], space: Space, left: 
     core = sum(n in (space.size_name, "phase", *RATES) for n in names)
     names.sort(key=lambda n: n not in (space.size_name, "phase", *RATES))
     while len(names) > max(core, 1):
-        which = [space.names.index(n) for n in names]
-        part = Slopes(slopes.residual, slopes.slope[which], slopes.plain[which], slopes.weight)
+        part = slopes.of([space.names.index(n) for n in names])
         curvature = 1.0 / np.diag(_inverse(part.hessian)) / part.hessian.diagonal().max()
-        deviation = np.sqrt(np.diag(part.covariance(clusters))) / left
+        deviation = np.sqrt(np.diag(part.covariance())) / left
         weak = [
             k for k in range(core, len(names))
             if not (deviation[k] <= UNDETERMINED_PX and curvature[k] >= LEAST_CURVATURE)

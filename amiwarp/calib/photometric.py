@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from amiwarp.calib.parameters import LATE, MOTION
 from amiwarp.calib.result import Photometric, StageSummary
 from amiwarp.calib.solve import Stage, maximise
 from amiwarp.errors import AmiwarpError
-from amiwarp.pairs import PairSet, Sensor, off_excess, pair_events, places_of
+from amiwarp.pairs import EventTable, PairSet, Sensor, off_excess
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,7 +58,7 @@ LARGEST_COST = 0.35
 class PhotometricSettings:
     """How the second stage works."""
 
-    pairs: int = 600_000
+    pairs: int = 300_000
     """At most about so many pairs of events, in whole turns spread over the recording."""
     algorithm: str = GAUSS_NEWTON
     """That, or one of NLopt's derivative-free local algorithms by name."""
@@ -112,36 +112,30 @@ class _Gatherer:
         far = math.ceil(reach(search.space, search.best)) + 1
         near = ndimage.maximum_filter((tile_of >= 0).astype(np.uint8), size=2 * far + 1) > 0
         self.near = np.where(near, 0, -1).astype(np.int32)
+        self._found: list[PairSet] = []
+        self._done = 0
 
-    def between(self, start: int, stop: int) -> PairSet:
-        pairs = pair_events(
-            self.recording.events.between(start, stop), self.near, longest_gap_us=LONGEST_GAP_US,
-            shortest_gap_us=2.0 * self.sensor.refractory_us, device=self.search.device,
+    def within(self, spans: list[tuple[int, int]]) -> PairSet:
+        """Of spans of time [us], which no pair leaves: those found before, and those of spans that are new."""
+        if len(spans) > self._done:
+            self._found.append(self._of(spans[self._done :]))
+            self._done = len(spans)
+        return PairSet.concatenate(self._found)
+
+    def _of(self, spans: list[tuple[int, int]]) -> PairSet:
+        search, source = self.search, self.recording.events
+        space, best, material = search.space, search.best, search.material
+        table = EventTable([source.between(*span) for span in spans], self.near, search.device)
+        pairs = table.pairs(
+            material.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
+            sensor=self.sensor, middle_us=space.middle_us,
         )  # fmt: skip
         if not len(pairs):
             return pairs
-        space, best = self.search.space, self.search.best
-        places = places_of(
-            pairs, space.build(best), self.search.material.encoder, self.sensor, space.turning(best),
-            drift=space.drift(best), slope=slopes_of(self.search, pairs), device=self.search.device,
-        )  # fmt: skip
-        tiles = self._tile(places[:, :2])
-        pairs = replace(pairs, tile=tiles)
-        return pairs[np.flatnonzero((tiles >= 0) & (tiles == self._tile(places[:, 2:])))]
-
-    def _tile(self, xy: NDArray[np.float32]) -> NDArray[np.int32]:
-        height, width = self.tile_of.shape
-        at = np.floor(np.nan_to_num(xy, nan=-1.0) + 0.5).astype(np.int64)
-        inside = (at[:, 0] >= 0) & (at[:, 1] >= 0) & (at[:, 0] < width) & (at[:, 1] < height)
-        tiles = np.full(len(xy), -1, np.int32)
-        tiles[inside] = self.tile_of[at[inside, 1], at[inside, 0]]
-        return tiles
-
-
-def slopes_of(search: Search, pairs: PairSet) -> NDArray[np.float32] | None:
-    """Change of the encoder's angle at either event per unit of the drifting parameter, where one is free."""
-    of = search.material.slope_of
-    return None if of is None else np.stack([of(t) for t in (pairs.first_t, pairs.second_t)], axis=1).astype(np.float32)
+        if material.slope_of is not None:
+            pairs = pairs.with_slope(material.slope_of, space.middle_us)
+        every = np.ones(int(self.tile_of.max()) + 1, np.bool_)
+        return pairs.on_tiles(space.build(best), space.turning(best), space.drift(best), self.tile_of, every)
 
 
 def turn_length(recording: Recording, encoder: Encoder) -> float:
@@ -166,15 +160,16 @@ def gather_pairs(recording: Recording, search: Search, settings: PhotometricSett
     gatherer = _Gatherer(recording, search, tile_of, settings.sensor)
     # the two turns of a camera that moves belong together
     spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in _spread(turns)]
-    parts: list[PairSet] = []
-    for start, stop in [(first, last + 1)] if search.whole.moving else spans:
-        parts.append(gatherer.between(start, stop))
-        if len(parts) >= FEWEST_TURNS and sum(map(len, parts)) >= settings.pairs:
-            break
-    pairs = PairSet.concatenate(parts)
+    if search.whole.moving:
+        spans = [(first, last + 1)]
+    many = min(FEWEST_TURNS, len(spans))
+    pairs = gatherer.within(spans[:many])
+    while len(pairs) < settings.pairs and many < len(spans):
+        many = min(len(spans), max(many + 1, math.ceil(many * settings.pairs / max(len(pairs), 1))))
+        pairs = gatherer.within(spans[:many])
     count = len(tiles.origin)
     keep = max(FEWEST_TILES, round(count * settings.pairs / max(len(pairs), 1)))
-    return (pairs if keep >= count else pairs[np.isin(pairs.tile, np.array(_spread(count)[:keep]))]), tiles
+    return (pairs if keep >= count else pairs.of_tiles(np.isin(np.arange(count), _spread(count)[:keep]))), tiles
 
 
 def _spread(n: int) -> list[int]:
@@ -201,55 +196,60 @@ class Cost:
         self.space, self.brightness, self.steps = space, brightness, steps
         self.scale = FIRST_SCALE
         self.evaluations = 0
+        self._solved: NDArray[np.float64] | None = None
+        self._changes: list[Any] = []
+        """Of the map as each parameter changes [per px], as the last slopes found them: the next start from there."""
 
     def warm_up(self, v: NDArray[np.float64]) -> None:
         """First map, and the scale of the weights from its residual."""
         self.residuals(v, rounds=3, steps=2 * self.steps)
-        self.scale = max(0.1, 1.5 * float(np.nanmedian(np.abs(self.last))))
+        self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
 
-    def place(self, v: NDArray[np.float64]) -> None:
+    def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
+        """Arguments of :meth:`BrightnessMap.place`."""
         values = self.space.to_values(v)
-        self.brightness.place(
-            self.space.build(values), drift=self.space.drift(values), turning=self.space.turning(values)
-        )
+        space = self.space
+        return {"model": space.build(values), "drift": space.drift(values), "turning": space.turning(values)}
 
-    def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> NDArray[np.float32]:
-        self.place(v)
-        self.last = self.brightness.solve(self.scale, steps=steps or self.steps, rounds=rounds)
-        return self.last
+    def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> None:
+        """Leaves them with the map, on the device."""
+        self.brightness.place(**self.at(v))
+        self.brightness.solve(self.scale, steps=steps or self.steps, rounds=rounds)
+        self._solved = v
 
-    def terms(self, residuals: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Cauchy's cost of each pair over that of a pair with no map; a pair off the map counts as such."""
-        known = np.where(np.isfinite(residuals), residuals, 1.0).astype(np.float64)
-        return np.asarray(np.log1p((known / self.scale) ** 2) / math.log1p(1.0 / self.scale**2))
-
-    def weights(self, residuals: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Cauchy's weights; 0 for a pair off the map."""
-        known = np.isfinite(residuals)
-        return np.where(known, 1.0 / (1.0 + (np.nan_to_num(residuals).astype(np.float64) / self.scale) ** 2), 0.0)
+    def mean(self) -> float:
+        """Cauchy's cost of the pairs over that of pairs with no map; a pair off the map counts as such."""
+        return self.brightness.residuals.mean_cost(self.scale, missing=1.0) / math.log1p(1.0 / self.scale**2)
 
     def __call__(self, v: NDArray[np.float64], *, steps: int | None = None) -> float:
         self.evaluations += 1
-        return -float(self.terms(self.residuals(v, steps=steps)).mean())
+        self.residuals(v, steps=steps)
+        return -self.mean()
 
     def settled(self, v: NDArray[np.float64]) -> float:
-        """The same with twice the steps: a map that lags a long step of the parameters would speak against it."""
-        return self(v, steps=2 * self.steps)
+        """The same with more steps: a map that lags a long step of the parameters would speak against it."""
+        return self(v, steps=3 * self.steps // 2)
 
-    def slopes(self, v: NDArray[np.float64]) -> Slopes:
-        """The residuals at ``v`` and their slopes, less what a change of the map would make of them."""
-        here = self.residuals(v)
-        rows = []
-        for step in np.eye(len(v)) * SLOPE_PX:
-            sides = []
-            for sign in (1.0, -1.0):
-                self.place(v + sign * step)
-                sides.append(self.brightness.residual())
-            rows.append((sides[0] - sides[1]) / np.float32(2.0 * SLOPE_PX))
-        self.place(v)
-        left = [self.brightness.unexplained(row, steps=self.steps) for row in rows]
-        return Slopes(np.nan_to_num(here), np.array(left), np.nan_to_num(np.array(rows)), self.weights(here))
+    def slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Slopes:
+        """The residuals' slopes at ``v``, less what a change of the map would make of them."""
+        b, n = self.brightness, len(v)
+        if self._solved is None or not np.array_equal(self._solved, v):
+            self.residuals(v)
+        if len(self._changes) != n:
+            self._changes = [b.new_change() for _ in v]
+        b.prepare_projection()
+        steps = np.eye(n) * SLOPE_PX
+        plain = [b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX) for step in steps]
+        both = zip(plain, self._changes, strict=True)
+        left = [b.unexplained(row, change, steps=self.steps // 2) for row, change in both]
+        upper = np.triu_indices(n)
+        pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]
+        sums = b.residuals.products([*pairs, *((row, b.residuals.values) for row in plain)])
+        hessian = np.zeros((n, n))
+        hessian[upper] = sums[:-n]
+        hessian.T[upper] = sums[:-n]
+        return Slopes(hessian, sums[-n:], b.residuals.clusters(left) if with_parts else np.empty((n, 0)))
 
 
 def refine(
@@ -266,16 +266,14 @@ def refine(
     whole = abs(search.material.encoder.rpm) * (recording.events.t_last - recording.events.t_first) >= 60e6
     excess = off_excess(pairs, with_leak="leak" in linear) if whole else 0.0
     brightness = BrightnessMap(
-        pairs, tiles, search.material.encoder, sensor=settings.sensor, slope=slopes_of(search, pairs),
-        off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
-        middle_us=space.middle_us, device=search.device,
+        pairs, tiles, off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
+        middle_us=space.middle_us,
     )  # fmt: skip
     cost = Cost(space, brightness, settings.steps)
     v = space.to_vector({**space.start, **search.best})
     cost.warm_up(v)
     left = check_pairs(recording.name, brightness.coverage(cost.scale), len(pairs))
-    clusters = pairs.tile if len(tiles.origin) > 1 else pairs.x // 64 * 64 + pairs.y // 64
-    keep = determined(cost.slopes(v), clusters.astype(np.int64), space, left)
+    keep = determined(cost.slopes(v, with_parts=True), space, left)
     held = tuple(n for n in space.names if n not in keep)
     # sharpness was free to move the others along with them, so they stay where it left them
     cost.space = space = space.without(held).holding({n: x for n, x in search.best.items() if n in held})
@@ -283,7 +281,7 @@ def refine(
     if held:
         cost.warm_up(v)
     stage = _search(cost, v, settings, progress)
-    result = _conclude(cost, stage.x, v, clusters.astype(np.int64), left)
+    result = _conclude(cost, stage.x, v, left)
     found = replace(
         result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held,
         off_over_on=1.0 + float(brightness.extra[1]), leak=float(brightness.extra[0]),
@@ -339,16 +337,16 @@ def _conclude(
     cost: Cost,
     best: NDArray[np.float64],
     v: NDArray[np.float64],
-    clusters: NDArray[np.int64],
     left: float,
 ) -> Photometric:
     """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`."""
     space = cost.space
     # like with like: the map had longer by now than when the search began
-    at_start = float(cost.terms(cost.residuals(v, rounds=2)).mean())
-    residuals = cost.residuals(best, rounds=2)
-    final = float(cost.terms(residuals).mean())
-    covariance = cost.slopes(best).covariance(clusters) / left**2
+    cost.residuals(v, rounds=2)
+    at_start = cost.mean()
+    cost.residuals(best, rounds=2)
+    final, residual = cost.mean(), cost.brightness.residuals.median()
+    covariance = cost.slopes(best, with_parts=True).covariance() / left**2
     asked = np.array([n not in LATE for n in space.names])
     near = np.array([n not in (*LATE, *MOTION) for n in space.names])
     accepted, verdict = _verdict(final, at_start, float(np.linalg.norm((best - v)[near])))
@@ -361,7 +359,7 @@ def _conclude(
         moved_px=float(np.linalg.norm((best - v)[asked])),
         cost=final,
         cost_at_sharpness=at_start,
-        residual=float(np.nanmedian(np.abs(residuals))),
+        residual=residual,
         pairs=0,
         off_over_on=1.0,
     )

@@ -7,12 +7,11 @@ near nodes, so brightness travels across the map only slowly where each node is 
 import warp as wp
 
 from amiwarp.kernels.descent import add_fixed
-from amiwarp.kernels.photometric import Atlas, Geometry, Pairs, bilinear, fraction
-from amiwarp.kernels.prior import Prior, prior_diagonal
+from amiwarp.kernels.photometric import Atlas, Geometry, bilinear, fraction, part_of
+from amiwarp.kernels.prior import Prior
 
 wp.set_module_options({"enable_backward": False})
 
-SEGMENT = wp.constant(256)
 HAT = wp.constant(8.0 / 3.0)  # energy of a bilinear hat under links of weight 1, whatever its width
 
 
@@ -38,7 +37,6 @@ def share(a: int, wa: wp.vec4, node: int, columns: int) -> float:
 
 @wp.kernel
 def add_coarse_diagonal(
-    pairs: Pairs,
     atlas: Atlas,
     geometry: Geometry,
     weight: wp.array(dtype=float),
@@ -50,11 +48,10 @@ def add_coarse_diagonal(
 ):
     """sums += diag(Pᵀ Aᵀ W A P) of the grid of that ``spacing``, from every ``stride``-th pair."""
     i = (start + wp.tid()) * stride
-    cell = geometry.cell[i]
-    if cell[0] < 0:
+    if geometry.cell[i] < 0:
         return
-    a = coarse_place(atlas, cell[0], geometry.first[i], spacing)
-    b = coarse_place(atlas, cell[1], geometry.second[i], spacing)
+    a = coarse_place(atlas, geometry.cell[i], part_of(geometry, 0, i), spacing)
+    b = coarse_place(atlas, geometry.cell[geometry.stride + i], part_of(geometry, 1, i), spacing)
     wa = bilinear(fraction(a))
     wb = bilinear(fraction(b))
     na = upper_left(a, columns)
@@ -69,11 +66,11 @@ def add_coarse_diagonal(
 
 
 @wp.kernel
-def divide(diagonal: wp.array(dtype=float), prior: Prior, residual: wp.array(dtype=float), start: int,
-           out: wp.array(dtype=float)):  # fmt: skip
+def divide(diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
     """The finest grid's own correction."""
     i = start + wp.tid()
-    out[i] = residual[i] / (diagonal[i] + prior_diagonal(prior, i))
+    if i < out.shape[0]:
+        out[i] = residual[i] / diagonal[i]
 
 
 @wp.kernel
@@ -83,13 +80,16 @@ def restrict(
     fine_columns: int,
     columns: int,
     diagonal: wp.array(dtype=float),
-    floor: float,
+    prior: Prior,
+    four: float,
     start: int,
     coarse: wp.array(dtype=float),
     correction: wp.array(dtype=float),
 ):
-    """The residual on the next coarser grid, and that grid's correction."""
+    """The residual on the next coarser grid, and that grid's correction; ``four``: 4 to the power of its level."""
     i = start + wp.tid()
+    if i >= coarse.shape[0]:
+        return
     row = 2 * (i / columns)
     column = 2 * (i % columns)
     total = float(0.0)
@@ -100,35 +100,25 @@ def restrict(
             if y >= 0 and y < fine_rows and x >= 0 and x < fine_columns:
                 total += fine[y * fine_columns + x] / float((1 + wp.abs(dy)) * (1 + wp.abs(dx)))
     coarse[i] = total
-    correction[i] = total / (diagonal[i] + floor)
+    correction[i] = total / (diagonal[i] + prior.smooth[0] * HAT + prior.damping * four)
 
 
 @wp.kernel
-def prolong(coarse: wp.array(dtype=float), columns: int, fine_columns: int, start: int, fine: wp.array(dtype=float)):
+def prolong(
+    coarse: wp.array(dtype=float),
+    columns: int,
+    fine_rows: int,
+    fine_columns: int,
+    start: int,
+    fine: wp.array(dtype=float),
+):
     """The coarser grid's correction, interpolated, is added to the finer one's."""
     i = start + wp.tid()
     row = i / fine_columns
     column = i % fine_columns
+    if row >= fine_rows:
+        return
     at = (row / 2) * columns + column / 2
     right = column % 2
     down = (row % 2) * columns
     fine[i] = fine[i] + 0.25 * (coarse[at] + coarse[at + right] + coarse[at + down] + coarse[at + right + down])
-
-
-@wp.kernel
-def dot(a: wp.array(dtype=float), b: wp.array(dtype=float), start: int, partial: wp.array(dtype=wp.float64)):
-    segment = start + wp.tid()
-    total = wp.float64(0.0)
-    for i in range(segment * SEGMENT, wp.min((segment + 1) * SEGMENT, a.shape[0])):
-        total += wp.float64(a[i]) * wp.float64(b[i])
-    partial[segment] = total
-
-
-@wp.kernel
-def turn_to(
-    scalars: wp.array(dtype=wp.float64), z: wp.array(dtype=float), start: int, direction: wp.array(dtype=float)
-):
-    """p = z + b p with b = new r·z / old r·z."""
-    i = start + wp.tid()
-    ratio = float(scalars[2] / wp.max(scalars[0], wp.float64(1.0e-30)))
-    direction[i] = z[i] + ratio * direction[i]

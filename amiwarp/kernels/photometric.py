@@ -1,127 +1,86 @@
 """Device side of the photometric stage: pairs of events as equations in a log-brightness map, and their operator.
 
-The map is a set of rectangular tiles of equal shape, one behind the other, followed by two more unknowns: by how much
-the OFF threshold exceeds the ON threshold, and the leak. Sums are kept in fixed point, as votes are: they do not depend
-on the order of threads.
+The map is a set of rectangular tiles of equal shape, one behind the other, followed by two more unknowns: the leak, and
+by how much the OFF threshold exceeds the ON threshold. Sums are kept in fixed point, as votes are: they do not depend
+on the order of threads. Of what is done often there are two kernels: on CUDA a thread takes one pair, on a CPU a block
+of :data:`BLOCK`, in loops that vectorise.
 """
-
-from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, TurningParams, turn_back
-from amiwarp.kernels.descent import add_fixed
-from amiwarp.kernels.optics import MODEL_STRUCTS, azimuth, compensate
+from amiwarp.kernels.camera import NAN
+from amiwarp.kernels.descent import add_fixed, add_two, to_fixed
+from amiwarp.kernels.native import load_float, load_uint8, store_float
+from amiwarp.kernels.prior import EXTRA
 
 wp.set_module_options({"enable_backward": False})
 
-EXTRA = wp.constant(2)  # unknowns behind the map: leak, OFF threshold
-# What a pair's ``on`` may hold: bit 0, the polarity; bit 1, no event at the second time; bit 2, none at the first.
+BLOCK = wp.constant(64)  # pairs that a CPU takes at a time; their arrays are padded to whole blocks
+# What a pair's ``on`` may hold: bit 0, the polarity; bit 1, no event at the second time; bit 2, none at the first;
+# bit 3, held out: it does not weigh.
 ON = wp.constant(wp.uint8(1))
 QUIET = wp.constant(wp.uint8(2))
+HELD = wp.constant(wp.uint8(8))
 
 
 @wp.struct
 class Pairs:
-    """Two consecutive events of a pixel each: the first sets the reference, the second is fired."""
+    """Two consecutive events of a pixel each: the first sets the reference, the second is fired.
 
+    Flat arrays: ``azimuth`` holds all cosines of the encoder's angle at the first, the sines, and both at the second;
+    ``time`` [s] from the window's middle, and ``slope`` of the angle per unit of the drifting parameter (or empty),
+    all first, then all second ones.
+    """
+
+    count: int
+    stride: int  # length of each of these parts
+    weak: float  # weight of pairs that are not of two events
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
     tile: wp.array(dtype=wp.int32)
-    theta: wp.array(dtype=wp.vec2)  # encoder's angle at either [rad]
-    slope: wp.array(dtype=wp.vec2)  # its change per unit of the drifting parameter
-    time: wp.array(dtype=wp.vec2)  # of either, from the window's middle [s]
     on: wp.array(dtype=wp.uint8)  # polarity of the second, and which of the two is no event
-    weak: float  # weight of pairs that are not of two events
+    azimuth: wp.array(dtype=float)
+    slope: wp.array(dtype=float)
+    time: wp.array(dtype=float)
 
 
 @wp.struct
 class Atlas:
-    """Tiles of the map: ``origin`` is the pixel of a tile's first node, nodes are ``1 / density`` px apart."""
+    """Tiles of the map: ``origin`` (x, y, x, …) is the pixel of a tile's first node, nodes are ``1 / density`` px
+    apart."""
 
-    origin: wp.array(dtype=wp.vec2)
+    origin: wp.array(dtype=float)
     rows: int
     columns: int
     density: float
     with_leak: float
+    with_off: int  # whether the OFF threshold is solved for
 
 
 @wp.struct
 class Geometry:
     """Where either event of a pair falls on the map: index of the upper left node, and the way to the next."""
 
-    cell: wp.array(dtype=wp.vec2i)  # -1: not on its tile
-    first: wp.array(dtype=wp.vec2)
-    second: wp.array(dtype=wp.vec2)
+    stride: int
+    cell: wp.array(dtype=int)  # of all first, then all second events; -1: one of the two is not on its tile
+    part: wp.array(dtype=float)  # all x of the first, y, x of the second, y
+
+
+@wp.func_native("return ((const int32_t*)values.data)[i];")
+def load_int(values: wp.array(dtype=int), i: int) -> int: ...
+
+
+# -- one equation
 
 
 @wp.func
-def node_of(atlas: Atlas, tile: int, xy: wp.vec2) -> wp.vec2:
-    return (xy - atlas.origin[tile]) * atlas.density
-
-
-@wp.func
-def cell_of(atlas: Atlas, tile: int, node: wp.vec2) -> int:
-    """Index of the node to the upper left; -1 off the tile."""
-    inside = node[0] >= 0.0 and node[1] >= 0.0
-    if not (inside and node[0] < float(atlas.columns - 1) and node[1] < float(atlas.rows - 1)):
-        return -1
-    return (tile * atlas.rows + int(node[1])) * atlas.columns + int(node[0])
+def part_of(g: Geometry, k: int, i: int) -> wp.vec2:
+    return wp.vec2(load_float(g.part, 2 * k * g.stride + i), load_float(g.part, (2 * k + 1) * g.stride + i))
 
 
 @wp.func
 def fraction(node: wp.vec2) -> wp.vec2:
     return wp.vec2(node[0] - wp.floor(node[0]), node[1] - wp.floor(node[1]))
-
-
-@wp.func
-def place_of(
-    model: Any, camera: CameraParams, turning: TurningParams, pairs: Pairs, drift: float, i: int, k: int
-) -> wp.vec2:
-    """Compensated place of the first (k = 0) or second event of a pair [px]."""
-    theta = pairs.theta[i][k] + pairs.slope[i][k] * drift
-    xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), azimuth(model, theta))
-    return turn_back(camera, xy, turning, pairs.time[i][k])
-
-
-@wp.kernel
-def find_places(
-    model: Any,
-    camera: CameraParams,
-    pairs: Pairs,
-    drift: float,
-    turning: TurningParams,
-    start: int,
-    places: wp.array(dtype=wp.vec4),
-):
-    """Compensated places of both events of a pair [px]."""
-    i = start + wp.tid()
-    a = place_of(model, camera, turning, pairs, drift, i, 0)
-    b = place_of(model, camera, turning, pairs, drift, i, 1)
-    places[i] = wp.vec4(a[0], a[1], b[0], b[1])
-
-
-@wp.kernel
-def place_pairs(
-    model: Any,
-    camera: CameraParams,
-    pairs: Pairs,
-    atlas: Atlas,
-    drift: float,
-    turning: TurningParams,
-    start: int,
-    geometry: Geometry,
-):
-    """Compensated places of both events of a pair, on the map."""
-    i = start + wp.tid()
-    a = node_of(atlas, pairs.tile[i], place_of(model, camera, turning, pairs, drift, i, 0))
-    b = node_of(atlas, pairs.tile[i], place_of(model, camera, turning, pairs, drift, i, 1))
-    cell = wp.vec2i(cell_of(atlas, pairs.tile[i], a), cell_of(atlas, pairs.tile[i], b))
-    if cell[0] < 0 or cell[1] < 0:
-        cell = wp.vec2i(-1, -1)
-    geometry.cell[i] = cell
-    geometry.first[i] = fraction(a)
-    geometry.second[i] = fraction(b)
 
 
 @wp.func
@@ -131,57 +90,77 @@ def bilinear(f: wp.vec2) -> wp.vec4:
 
 
 @wp.func
-def look_up(image: wp.array(dtype=float), cell: int, columns: int, w: wp.vec4) -> float:
-    upper = image[cell] * w[0] + image[cell + 1] * w[1]
-    return upper + image[cell + columns] * w[2] + image[cell + columns + 1] * w[3]
+def look_up(image: wp.array(dtype=float), g: Geometry, columns: int, k: int, i: int) -> float:
+    """Brightness at the first (k = 0) or second event; that of node 0 for a pair off the map."""
+    cell = wp.max(load_int(g.cell, k * g.stride + i), 0)
+    fx = load_float(g.part, 2 * k * g.stride + i)
+    fy = load_float(g.part, (2 * k + 1) * g.stride + i)
+    upper = load_float(image, cell) * (1.0 - fx) + load_float(image, cell + 1) * fx
+    lower = load_float(image, cell + columns) * (1.0 - fx) + load_float(image, cell + columns + 1) * fx
+    return upper * (1.0 - fy) + lower * fy
 
 
 @wp.func
-def spread(sums: wp.array(dtype=wp.int64), cell: int, columns: int, w: wp.vec4, value: float):
-    """The reverse of :func:`look_up`."""
-    add_fixed(sums, cell, w[0] * value)
-    add_fixed(sums, cell + 1, w[1] * value)
-    add_fixed(sums, cell + columns, w[2] * value)
-    add_fixed(sums, cell + columns + 1, w[3] * value)
+def is_off(pairs: Pairs, i: int) -> float:
+    return wp.where((int(load_uint8(pairs.on, i)) & 3) == 0, 1.0, 0.0)
 
 
 @wp.func
 def difference(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, g: Geometry, i: int) -> float:
     """Left side of a pair's equation: L(second) - L(first) + [OFF] s + leak (t2 - t1)."""
-    cell = g.cell[i]
     extra = image.shape[0] - EXTRA
-    value = look_up(image, cell[1], atlas.columns, bilinear(g.second[i]))
-    value -= look_up(image, cell[0], atlas.columns, bilinear(g.first[i]))
-    value += atlas.with_leak * image[extra] * (pairs.time[i][1] - pairs.time[i][0])
-    if is_off(pairs, i):
-        value += image[extra + 1]
-    return value
+    value = look_up(image, g, atlas.columns, 1, i) - look_up(image, g, atlas.columns, 0, i)
+    elapsed = load_float(pairs.time, pairs.stride + i) - load_float(pairs.time, i)
+    value += atlas.with_leak * load_float(image, extra) * elapsed
+    return value + is_off(pairs, i) * load_float(image, extra + 1)
 
 
 @wp.func
 def right_side(pairs: Pairs, i: int) -> float:
     """In units of the ON threshold: +1 for ON, -1 for OFF, 0 where the pixel kept quiet."""
-    if (pairs.on[i] & QUIET) != wp.uint8(0):
-        return 0.0
-    return wp.where((pairs.on[i] & ON) != wp.uint8(0), 1.0, -1.0)
+    on = int(load_uint8(pairs.on, i))
+    return wp.where((on & 2) != 0, 0.0, wp.where((on & 1) != 0, 1.0, -1.0))
 
 
 @wp.func
-def is_off(pairs: Pairs, i: int) -> bool:
-    return (pairs.on[i] & (ON | QUIET)) == wp.uint8(0)
+def spread(sums: wp.array(dtype=wp.int64), cell: int, columns: int, f: wp.vec2, value: float):
+    """The reverse of :func:`look_up`."""
+    upper = value * (1.0 - f[1])
+    lower = value * f[1]
+    add_two(sums, cell, to_fixed(upper * (1.0 - f[0])), to_fixed(upper * f[0]))
+    add_two(sums, cell + columns, to_fixed(lower * (1.0 - f[0])), to_fixed(lower * f[0]))
 
 
 @wp.func
 def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g: Geometry, i: int, value: float):
-    """The transpose of :func:`difference`."""
-    cell = g.cell[i]
+    """The transpose of :func:`difference`; nothing for a pair off the map."""
+    if g.cell[i] < 0:
+        return
+    spread(sums, g.cell[g.stride + i], atlas.columns, part_of(g, 1, i), value)
+    spread(sums, g.cell[i], atlas.columns, part_of(g, 0, i), -value)
+    add_extra(sums, atlas, pairs, i, value)
+
+
+@wp.func
+def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int, value: float):
+    """To the unknowns behind the map."""
     extra = sums.shape[0] - EXTRA
-    spread(sums, cell[1], atlas.columns, bilinear(g.second[i]), value)
-    spread(sums, cell[0], atlas.columns, bilinear(g.first[i]), -value)
     if atlas.with_leak > 0.0:
-        add_fixed(sums, extra, value * (pairs.time[i][1] - pairs.time[i][0]))
-    if is_off(pairs, i):
-        add_fixed(sums, extra + 1, value)
+        add_fixed(sums, extra, value * (pairs.time[pairs.stride + i] - pairs.time[i]))
+    if atlas.with_off != 0:
+        add_fixed(sums, extra + 1, is_off(pairs, i) * value)
+
+
+@wp.func
+def continues(g: Geometry, i: int) -> bool:
+    """Whether pair i - 1, i > 0, ends where pair i begins: one addition then does for both."""
+    before = g.stride + i - 1
+    if g.cell[i] < 0 or g.cell[i] != g.cell[before]:
+        return False
+    return g.part[i] == g.part[g.stride + before] and g.part[g.stride + i] == g.part[2 * g.stride + before]
+
+
+# -- all equations
 
 
 @wp.kernel
@@ -196,9 +175,34 @@ def apply_normal(
 ):
     """sums += Aᵀ W A vector."""
     i = start + wp.tid()
-    if geometry.cell[i][0] >= 0:
-        value = weight[i] * difference(vector, atlas, pairs, geometry, i)
-        transpose_add(sums, atlas, pairs, geometry, i, value)
+    if geometry.cell[i] < 0:
+        return
+    value = weight[i] * difference(vector, atlas, pairs, geometry, i)
+    add_extra(sums, atlas, pairs, i, value)
+    if i == 0 or not continues(geometry, i):
+        spread(sums, geometry.cell[i], atlas.columns, part_of(geometry, 0, i), -value)
+    if i + 1 < pairs.count and continues(geometry, i + 1):
+        value -= weight[i + 1] * difference(vector, atlas, pairs, geometry, i + 1)
+    spread(sums, geometry.cell[geometry.stride + i], atlas.columns, part_of(geometry, 1, i), value)
+
+
+@wp.kernel
+def apply_normal_blocks(
+    pairs: Pairs,
+    atlas: Atlas,
+    geometry: Geometry,
+    weight: wp.array(dtype=float),
+    vector: wp.array(dtype=float),
+    start: int,
+    sums: wp.array(dtype=wp.int64),
+):
+    """The same, a block a thread."""
+    first = (start + wp.tid()) * BLOCK
+    values = wp.zeros(shape=(64,), dtype=float)
+    for k in range(BLOCK):
+        store_float(values, k, load_float(weight, first + k) * difference(vector, atlas, pairs, geometry, first + k))
+    for k in range(BLOCK):
+        transpose_add(sums, atlas, pairs, geometry, first + k, values[k])
 
 
 @wp.kernel
@@ -213,8 +217,7 @@ def apply_transpose(
 ):
     """sums += Aᵀ W residual."""
     i = start + wp.tid()
-    if geometry.cell[i][0] >= 0:
-        transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
+    transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
 
 
 @wp.kernel
@@ -228,15 +231,9 @@ def subtract(
 ):
     """residual -= A vector; 0 for a pair that is not on the map."""
     i = start + wp.tid()
-    if geometry.cell[i][0] >= 0:
-        residual[i] = residual[i] - difference(vector, atlas, pairs, geometry, i)
-    else:
-        residual[i] = 0.0
-
-
-@wp.func
-def square(w: wp.vec4) -> wp.vec4:
-    return wp.cw_mul(w, w)
+    if i < pairs.count:
+        rest = residual[i] - difference(vector, atlas, pairs, geometry, i)
+        residual[i] = wp.where(geometry.cell[i] >= 0, rest, 0.0)
 
 
 @wp.kernel
@@ -250,15 +247,20 @@ def add_diagonal(
 ):
     """sums += diag(Aᵀ W A), as if the two places of a pair shared no node: the preconditioner."""
     i = start + wp.tid()
-    cell = geometry.cell[i]
+    if geometry.cell[i] < 0:
+        return
     extra = sums.shape[0] - EXTRA
-    if cell[0] >= 0:
-        spread(sums, cell[1], atlas.columns, square(bilinear(geometry.second[i])), weight[i])
-        spread(sums, cell[0], atlas.columns, square(bilinear(geometry.first[i])), weight[i])
-        gap = pairs.time[i][1] - pairs.time[i][0]
-        add_fixed(sums, extra, atlas.with_leak * weight[i] * gap * gap)
-        if is_off(pairs, i):
-            add_fixed(sums, extra + 1, weight[i])
+    for k in range(2):
+        w = bilinear(part_of(geometry, k, i))
+        w = wp.cw_mul(w, w) * weight[i]
+        cell = geometry.cell[k * geometry.stride + i]
+        add_two(sums, cell, to_fixed(w[0]), to_fixed(w[1]))
+        add_two(sums, cell + atlas.columns, to_fixed(w[2]), to_fixed(w[3]))
+    gap = pairs.time[pairs.stride + i] - pairs.time[i]
+    if atlas.with_leak > 0.0:
+        add_fixed(sums, extra, weight[i] * gap * gap)
+    if atlas.with_off != 0:
+        add_fixed(sums, extra + 1, is_off(pairs, i) * weight[i])
 
 
 @wp.kernel
@@ -267,24 +269,21 @@ def weigh(
     atlas: Atlas,
     geometry: Geometry,
     image: wp.array(dtype=float),
-    scale: float,
+    scale: wp.array(dtype=float),
     start: int,
     weight: wp.array(dtype=float),
     residual: wp.array(dtype=float),
 ):
     """Residual of each equation, and Cauchy's weight for it; NaN and 0 for a pair that is not on the map."""
     i = start + wp.tid()
-    weight[i] = 0.0
-    residual[i] = wp.nan
-    if geometry.cell[i][0] >= 0:
-        r = right_side(pairs, i) - difference(image, atlas, pairs, geometry, i)
-        residual[i] = r
-        if pairs.on[i] > ON:
-            weight[i] = pairs.weak / (1.0 + r * r)  # right to within a threshold
-        else:
-            weight[i] = 1.0 / (1.0 + (r / scale) * (r / scale))
-
-
-for _struct in MODEL_STRUCTS:
-    wp.overload(place_pairs, {"model": _struct})
-    wp.overload(find_places, {"model": _struct})
+    if i >= pairs.count:
+        return
+    r = right_side(pairs, i) - difference(image, atlas, pairs, geometry, i)
+    on_map = geometry.cell[i] >= 0
+    residual[i] = wp.where(on_map, r, NAN)
+    cauchy = 1.0 / (1.0 + (r / scale[0]) * (r / scale[0]))
+    if pairs.on[i] > ON:
+        cauchy = pairs.weak / (1.0 + r * r)  # right to within a threshold
+    if (pairs.on[i] & HELD) != wp.uint8(0):
+        cauchy = 0.0
+    weight[i] = wp.where(on_map, cauchy, 0.0)

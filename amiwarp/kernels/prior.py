@@ -5,6 +5,9 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
+EXTRA = wp.constant(2)  # unknowns behind the map: leak, OFF threshold
+
+
 @wp.struct
 class Prior:
     """Cost damping x² + sum over links of weight (xᵢ - xⱼ)²; no link leaves a tile."""
@@ -13,6 +16,7 @@ class Prior:
     linked: int
     columns: int
     held: int  # unknowns from here on keep their values
+    smooth: wp.array(dtype=float)  # one number: weight of a link between equal neighbours
     right: wp.array(dtype=float)  # weight of the link to the next node; 0 in a tile's last column
     down: wp.array(dtype=float)  # to the node below; 0 in a tile's last row
 
@@ -62,18 +66,22 @@ def link_weight(difference: float, smooth: float, edge: float) -> float:
 def link(
     image: wp.array(dtype=float),
     rows: int,
-    columns: int,
-    smooth: float,
     edge: float,
+    prior: Prior,
     start: int,
     right: wp.array(dtype=float),
     down: wp.array(dtype=float),
 ):
-    """Weights of the links from each node of the map."""
+    """Weights of the links from each node of the map, into the prior's arrays."""
     i = start + wp.tid()
+    if i >= right.shape[0]:
+        return
     right[i] = 0.0
     down[i] = 0.0
-    if i % columns < columns - 1:
-        right[i] = link_weight(image[i + 1] - image[i], smooth, edge)
-    if (i / columns) % rows < rows - 1:
-        down[i] = link_weight(image[i + columns] - image[i], smooth, edge)
+    columns = prior.columns
+    row = i / columns
+    if i < image.shape[0] - EXTRA:
+        if i % columns < columns - 1:
+            right[i] = link_weight(image[i + 1] - image[i], prior.smooth[0], edge)
+        if row % rows < rows - 1:
+            down[i] = link_weight(image[i + columns] - image[i], prior.smooth[0], edge)

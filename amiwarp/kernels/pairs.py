@@ -1,0 +1,324 @@
+"""Device side of :mod:`amiwarp.pairs`: from events to the pairs that the equations are made of.
+
+Events are sorted by pixel, and stay in time's order within one. Every event is then a candidate for up to three pairs,
+and every pixel for one in each span of time in which it kept quiet: candidates are marked, counted and written.
+"""
+
+import warp as wp
+
+from amiwarp.kernels.encoder import EncoderParams, piece_at
+from amiwarp.kernels.photometric import Pairs
+
+wp.set_module_options({"enable_backward": False})
+
+TURN = wp.constant(2.0 * 3.141592653589793 / 4294967296.0)  # rad in an angle's unit, 2**-32 turn
+
+
+@wp.struct
+class Sorted:
+    """Events, and their order by span and pixel: ``key`` = span · pixels + pixel; ``order``: index of the event."""
+
+    count: int
+    pixels: int
+    columns: int
+    x: wp.array(dtype=wp.uint16)
+    y: wp.array(dtype=wp.uint16)
+    t: wp.array(dtype=wp.int64)
+    p: wp.array(dtype=wp.uint8)
+    key: wp.array(dtype=int)
+    order: wp.array(dtype=int)
+
+
+@wp.struct
+class Window:
+    """Times [us]: of the window, and of what the sensor does."""
+
+    start: wp.int64
+    stop: wp.int64
+    middle: wp.int64
+    late_first: wp.float64  # added to the time of the event that sets the reference
+    late_second: wp.float64
+    longest: wp.int64  # gap between the two events of a pair
+    shortest: wp.float64
+
+
+@wp.kernel
+def mark_inside(
+    x: wp.array(dtype=wp.uint16),
+    y: wp.array(dtype=wp.uint16),
+    tile_of: wp.array2d(dtype=int),
+    start: int,
+    flag: wp.array(dtype=int),
+):
+    """Events of pixels that belong to a tile."""
+    i = start + wp.tid()
+    flag[i] = wp.where(tile_of[int(y[i]), int(x[i])] >= 0, 1, 0)
+
+
+@wp.kernel
+def fill_keys(
+    x: wp.array(dtype=wp.uint16),
+    y: wp.array(dtype=wp.uint16),
+    tile_of: wp.array2d(dtype=int),
+    place: wp.array(dtype=int),
+    first: wp.array(dtype=int),
+    start: int,
+    key: wp.array(dtype=int),
+    order: wp.array(dtype=int),
+):
+    """Keys of the events that are marked, one behind the other; ``first``: index of each span's first event."""
+    i = start + wp.tid()
+    row = int(y[i])
+    column = int(x[i])
+    if tile_of[row, column] < 0:
+        return
+    span = int(0)
+    while span + 1 < first.shape[0] and first[span + 1] <= i:
+        span += 1
+    at = place[i] - 1
+    key[at] = (span * tile_of.shape[0] + row) * tile_of.shape[1] + column
+    order[at] = i
+
+
+@wp.kernel
+def mark_pairs(s: Sorted, window: Window, start: int, flag: wp.array(dtype=int)):
+    """Neighbours in time of one pixel."""
+    i = start + wp.tid()
+    flag[i] = 0
+    if i + 1 < s.count and s.key[i + 1] == s.key[i]:
+        gap = s.t[s.order[i + 1]] - s.t[s.order[i]]
+        if gap <= window.longest and wp.float64(gap) > window.shortest:
+            flag[i] = 1
+
+
+@wp.kernel
+def mark_ends(s: Sorted, start: int, flag: wp.array(dtype=int)):
+    """Each pixel's first event, behind the candidates of :func:`mark_pairs`, and its last, behind those."""
+    i = start + wp.tid()
+    flag[s.count + i] = wp.where(i == 0 or s.key[wp.max(i - 1, 0)] != s.key[i], 1, 0)
+    flag[2 * s.count + i] = wp.where(i == s.count - 1 or s.key[wp.min(i + 1, s.count - 1)] != s.key[i], 1, 0)
+
+
+@wp.kernel
+def mark_spans(s: Sorted, edges: wp.array(dtype=wp.int64), start: int, fired: wp.array(dtype=wp.uint8)):
+    """Which pixels fire between which two edges."""
+    i = start + wp.tid()
+    t = s.t[i]
+    spans = edges.shape[0] - 1
+    if t < edges[0] or t >= edges[spans]:
+        return
+    low = int(0)
+    high = spans - 1
+    while low < high:
+        middle = (low + high + 1) / 2
+        if edges[middle] <= t:
+            low = middle
+        else:
+            high = middle - 1
+    fired[low * s.pixels + int(s.y[i]) * s.columns + int(s.x[i])] = wp.uint8(1)
+
+
+@wp.kernel
+def mark_quiet(
+    fired: wp.array(dtype=wp.uint8), tile_of: wp.array(dtype=int), at_least: int, base: int, start: int,
+    flag: wp.array(dtype=int),
+):  # fmt: skip
+    """Spans of a pixel that belong to ``at_least`` spans in a row without an event."""
+    pixel = start + wp.tid()
+    pixels = tile_of.shape[0]
+    spans = fired.shape[0] / pixels
+    run = int(0)
+    for k in range(spans + 1):
+        quiet = int(0)
+        if k < spans:
+            quiet = wp.where(tile_of[pixel] >= 0 and fired[k * pixels + pixel] == wp.uint8(0), 1, 0)
+            flag[base + k * pixels + pixel] = 0
+        if quiet == 1:
+            run += 1
+        else:
+            for j in range(k - wp.where(run >= at_least, run, 0), k):
+                flag[base + j * pixels + pixel] = 1
+            run = 0
+
+
+# -- writing
+
+
+@wp.func
+def keep_time(encoder: EncoderParams, window: Window, pairs: Pairs, k: int, i: int, t: wp.int64, late: wp.float64):
+    """Time and azimuth of an event, ``late`` [us] after its stamp, on the piece of the encoder that its stamp is on."""
+    elapsed = t - encoder.origin
+    piece = piece_at(encoder, elapsed)
+    slope = encoder.slope[piece]
+    angle = encoder.angle[piece] + wp.uint64(elapsed - encoder.start[piece]) * slope
+    angle += wp.uint64(wp.int64(wp.float64(wp.int64(slope)) * late))
+    theta = float(wp.float64(wp.int32(wp.uint32(angle >> wp.uint64(32)))) * wp.float64(TURN))
+    pairs.azimuth[2 * k * pairs.stride + i] = wp.cos(theta)
+    pairs.azimuth[(2 * k + 1) * pairs.stride + i] = wp.sin(theta)
+    pairs.time[k * pairs.stride + i] = float(wp.float64(t - window.middle) * wp.float64(1.0e-6))
+
+
+@wp.func
+def keep_pair(encoder: EncoderParams, window: Window, pairs: Pairs, i: int, first: wp.int64, second: wp.int64):
+    keep_time(encoder, window, pairs, 0, i, first, window.late_first)
+    keep_time(encoder, window, pairs, 1, i, second, window.late_second)
+
+
+@wp.kernel
+def write_pairs(
+    s: Sorted, window: Window, encoder: EncoderParams, tile_of: wp.array2d(dtype=int), flag: wp.array(dtype=int),
+    place: wp.array(dtype=int), start: int, pairs: Pairs,
+):  # fmt: skip
+    """The candidates that are marked, of events."""
+    candidate = start + wp.tid()
+    if flag[candidate] == 0:
+        return
+    kind = candidate / s.count
+    at = candidate % s.count
+    event = s.order[at]
+    i = place[candidate] - 1
+    pairs.x[i] = s.x[event]
+    pairs.y[i] = s.y[event]
+    pairs.tile[i] = tile_of[int(s.y[event]), int(s.x[event])]
+    if kind == 0:
+        pairs.on[i] = s.p[s.order[at + 1]]
+        keep_pair(encoder, window, pairs, i, s.t[event], s.t[s.order[at + 1]])
+    elif kind == 1:
+        pairs.on[i] = s.p[event] | wp.uint8(4)
+        keep_pair(encoder, window, pairs, i, window.start, s.t[event])
+    else:
+        pairs.on[i] = wp.uint8(2)
+        keep_pair(encoder, window, pairs, i, s.t[event], window.stop)
+
+
+@wp.kernel
+def write_quiet(
+    edges: wp.array(dtype=wp.int64), window: Window, encoder: EncoderParams, tile_of: wp.array2d(dtype=int), base: int,
+    flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, pairs: Pairs,
+):  # fmt: skip
+    """The candidates that are marked, of silence."""
+    candidate = start + wp.tid()
+    if flag[base + candidate] == 0:
+        return
+    pixels = tile_of.shape[0] * tile_of.shape[1]
+    span = candidate / pixels
+    row = (candidate % pixels) / tile_of.shape[1]
+    column = candidate % tile_of.shape[1]
+    i = place[base + candidate] - 1
+    pairs.x[i] = wp.uint16(column)
+    pairs.y[i] = wp.uint16(row)
+    pairs.tile[i] = tile_of[row, column]
+    pairs.on[i] = wp.uint8(2)
+    keep_pair(encoder, window, pairs, i, edges[span], edges[span + 1])
+
+
+# -- choosing
+
+
+@wp.func
+def tile_at(tile_of: wp.array2d(dtype=int), x: float, y: float) -> int:
+    """The tile of the pixel about a place; -1 outside, and where the place is NaN."""
+    inside = x >= -0.5 and y >= -0.5 and x < float(tile_of.shape[1]) - 0.5 and y < float(tile_of.shape[0]) - 0.5
+    if not inside:
+        return -1
+    return tile_of[int(wp.floor(y + 0.5)), int(wp.floor(x + 0.5))]
+
+
+@wp.kernel
+def mark_same_tile(
+    places: wp.array(dtype=wp.vec4), tile_of: wp.array2d(dtype=int), listed: wp.array(dtype=int), start: int,
+    tile: wp.array(dtype=int), flag: wp.array(dtype=int),
+):  # fmt: skip
+    """Pairs whose events both fall on one tile of those ``listed`` (1, else 0), which becomes theirs."""
+    i = start + wp.tid()
+    a = tile_at(tile_of, places[i][0], places[i][1])
+    b = tile_at(tile_of, places[i][2], places[i][3])
+    tile[i] = a
+    flag[i] = 0
+    if a >= 0 and a == b:
+        flag[i] = listed[a]
+
+
+@wp.kernel
+def mark_listed(tile: wp.array(dtype=int), listed: wp.array(dtype=int), start: int, flag: wp.array(dtype=int)):
+    i = start + wp.tid()
+    flag[i] = listed[tile[i]]
+
+
+@wp.kernel
+def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: wp.array(dtype=int)):
+    i = start + wp.tid()
+    x = int(pairs.x[i]) - left
+    y = int(pairs.y[i]) - top
+    flag[i] = wp.where(x >= 0 and y >= 0 and x < side and y < side, 1, 0)
+
+
+@wp.kernel
+def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs):
+    """The pairs that are marked, one behind the other."""
+    i = start + wp.tid()
+    if flag[i] == 0:
+        return
+    at = place[i] - 1
+    out.x[at] = pairs.x[i]
+    out.y[at] = pairs.y[i]
+    out.tile[at] = pairs.tile[i]
+    out.on[at] = pairs.on[i]
+    for k in range(4):
+        out.azimuth[k * out.stride + at] = pairs.azimuth[k * pairs.stride + i]
+    for k in range(2):
+        out.time[k * out.stride + at] = pairs.time[k * pairs.stride + i]
+        if out.slope.shape[0] > 0:
+            out.slope[k * out.stride + at] = pairs.slope[k * pairs.stride + i]
+
+
+@wp.kernel
+def hold_out(every: int, start: int, on: wp.array(dtype=wp.uint8)):
+    """Marks every so many-th pair of two events, which come first."""
+    i = start + wp.tid()
+    if i % every == 0 and on[i] < wp.uint8(2):
+        on[i] = on[i] | wp.uint8(8)
+
+
+@wp.kernel
+def keep_nodes(nodes: wp.array(dtype=wp.uint8), on: wp.array(dtype=wp.uint8), stride: int, start: int,
+               cell: wp.array(dtype=int)):  # fmt: skip
+    """Leaves out pairs of two events one of which lies off ``nodes``."""
+    i = start + wp.tid()
+    if cell[i] < 0 or on[i] > wp.uint8(1):
+        return
+    if nodes[cell[i]] == wp.uint8(0) or nodes[cell[stride + i]] == wp.uint8(0):
+        cell[i] = -1
+        cell[stride + i] = -1
+
+
+@wp.kernel
+def count_pixels(s: Sorted, start: int, count: wp.array(dtype=int)):
+    i = start + wp.tid()
+    wp.atomic_add(count, int(s.y[i]) * s.columns + int(s.x[i]), 1)
+
+
+@wp.func
+def mirrored(i: int, n: int) -> int:
+    """Reflected about the centres of the outermost pixels."""
+    j = wp.abs(i)
+    return wp.where(j < n, j, 2 * n - 2 - j)
+
+
+@wp.kernel
+def mark_hot(count: wp.array2d(dtype=int), tile: int, start: int, tile_of: wp.array(dtype=int)):
+    """-1 for pixels that fire far more than the third quartile of the 5 x 5 around them, else ``tile``.
+
+    That is so where 19 of the 25 are so low that even they would make this one hot.
+    """
+    i = start + wp.tid()
+    rows = count.shape[0]
+    columns = count.shape[1]
+    own = float(count[i / columns, i % columns])
+    low = int(0)
+    if own > 8.0:
+        for k in range(25):
+            n = float(count[mirrored(i / columns + k / 5 - 2, rows), mirrored(i % columns + k % 5 - 2, columns)])
+            if own > 3.0 * n + 5.0 * wp.sqrt(n) + 8.0:
+                low += 1
+    tile_of[i] = wp.where(low >= 19, -1, tile)

@@ -1,0 +1,145 @@
+"""Device side of :mod:`amiwarp.brightness`: where the events of a pair fall on the map."""
+
+from typing import Any
+
+import warp as wp
+
+from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
+from amiwarp.kernels.native import load_float, load_uint16, store_float, store_int
+from amiwarp.kernels.optics import MODEL_STRUCTS, compensate, place
+from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs, load_int
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def node_at(atlas: Atlas, tile: int, x: float, y: float):
+    """Index of the node to the upper left, -1 off the tile or where the place is NaN; and the way to the next."""
+    u = (x - load_float(atlas.origin, 2 * tile)) * atlas.density
+    v = (y - load_float(atlas.origin, 2 * tile + 1)) * atlas.density
+    inside = wp.where(u >= 0.0, wp.where(u < float(atlas.columns - 1), 1, 0), 0)
+    inside = wp.where(v >= 0.0, wp.where(v < float(atlas.rows - 1), inside, 0), 0)
+    u = wp.where(inside == 1, u, 0.0)
+    v = wp.where(inside == 1, v, 0.0)
+    cell = (tile * atlas.rows + int(v)) * atlas.columns + int(u)
+    return wp.where(inside == 1, cell, -1), u - float(int(u)), v - float(int(v))
+
+
+@wp.func
+def azimuth_of(model: Any, pairs: Pairs, k: int, i: int):
+    """Cosine and sine of the prism's azimuth at the first (k = 0) or second event."""
+    c = load_float(pairs.azimuth, 2 * k * pairs.stride + i)
+    s = load_float(pairs.azimuth, (2 * k + 1) * pairs.stride + i)
+    return c * model.phase_cos - s * model.phase_sin, s * model.phase_cos + c * model.phase_sin
+
+
+@wp.func
+def place_of(
+    model: Any, camera: CameraParams, turning: TurningParams, pairs: Pairs, drift: float, i: int, k: int
+) -> wp.vec2:
+    """Compensated place of the first (k = 0) or second event of a pair [px], whatever moves."""
+    w0, w1 = azimuth_of(model, pairs, k, i)
+    if pairs.slope.shape[0] > 0:
+        angle = pairs.slope[k * pairs.stride + i] * drift
+        c = wp.cos(angle)
+        s = wp.sin(angle)
+        a = w0 * c - w1 * s
+        w1 = w1 * c + w0 * s
+        w0 = a
+    xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), wp.vec2(w0, w1))
+    return turn_back(camera, xy, turning, pairs.time[k * pairs.stride + i])
+
+
+@wp.kernel
+def find_places(
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    drift: float,
+    turning: TurningParams,
+    start: int,
+    places: wp.array(dtype=wp.vec4),
+):
+    """Compensated places of both events of a pair [px]."""
+    i = start + wp.tid()
+    a = place_of(model, camera, turning, pairs, drift, i, 0)
+    b = place_of(model, camera, turning, pairs, drift, i, 1)
+    places[i] = wp.vec4(a[0], a[1], b[0], b[1])
+
+
+@wp.func
+def keep_place(g: Geometry, i: int, a: int, ax: float, ay: float, b: int, bx: float, by: float):
+    store_int(g.cell, i, wp.where(b < 0, -1, a))
+    store_int(g.cell, g.stride + i, wp.where(a < 0, -1, b))
+    store_float(g.part, i, ax)
+    store_float(g.part, g.stride + i, ay)
+    store_float(g.part, 2 * g.stride + i, bx)
+    store_float(g.part, 3 * g.stride + i, by)
+
+
+@wp.kernel
+def place_pairs(
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    drift: float,
+    turning: TurningParams,
+    start: int,
+    geometry: Geometry,
+):
+    """Compensated places of both events of a pair, on the map."""
+    i = start + wp.tid()
+    a = place_of(model, camera, turning, pairs, drift, i, 0)
+    b = place_of(model, camera, turning, pairs, drift, i, 1)
+    tile = pairs.tile[i]
+    cell_a, ax, ay = node_at(atlas, tile, a[0], a[1])
+    cell_b, bx, by = node_at(atlas, tile, b[0], b[1])
+    keep_place(geometry, i, cell_a, ax, ay, cell_b, bx, by)
+
+
+@wp.func
+def node_of(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, k: int, i: int):
+    """Where the first (k = 0) or second event falls, for a camera without distortion that stands still, no drift."""
+    w0, w1 = azimuth_of(model, pairs, k, i)
+    u, v = place(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
+    cell, x, y = node_at(atlas, load_int(pairs.tile, i), u, v)
+    return cell, x, y
+
+
+@wp.kernel
+def place_still(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry):
+    """The same without branches."""
+    i = start + wp.tid()
+    a, ax, ay = node_of(model, camera, pairs, atlas, 0, i)
+    b, bx, by = node_of(model, camera, pairs, atlas, 1, i)
+    keep_place(geometry, i, a, ax, ay, b, bx, by)
+
+
+@wp.kernel
+def place_blocks(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry):
+    """The same, a block a thread."""
+    first = (start + wp.tid()) * BLOCK
+    cells = wp.zeros(shape=(128,), dtype=int)
+    parts = wp.zeros(shape=(256,), dtype=float)
+    for k in range(BLOCK):
+        cell, x, y = node_of(model, camera, pairs, atlas, 0, first + k)
+        store_int(cells, k, cell)
+        store_float(parts, k, x)
+        store_float(parts, 64 + k, y)
+    for k in range(BLOCK):
+        cell, x, y = node_of(model, camera, pairs, atlas, 1, first + k)
+        store_int(cells, 64 + k, cell)
+        store_float(parts, 128 + k, x)
+        store_float(parts, 192 + k, y)
+    for k in range(BLOCK):
+        keep_place(
+            geometry, first + k, cells[k], parts[k], parts[64 + k], cells[64 + k], parts[128 + k], parts[192 + k]
+        )
+
+
+for _struct in MODEL_STRUCTS:
+    wp.overload(place_pairs, {"model": _struct})
+    wp.overload(place_still, {"model": _struct})
+    wp.overload(place_blocks, {"model": _struct})
+    wp.overload(find_places, {"model": _struct})
