@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from amiwarp.calib.speed import estimate_rpm
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents
-from amiwarp.io.chunks import in_order
 from amiwarp.optics import Prism
 
 if TYPE_CHECKING:
@@ -177,24 +175,32 @@ def _middle(recording: Recording) -> int:
 
 
 def thin(recording: Recording, most: int) -> Events:
-    """At most ``most`` events, evenly: every k-th run of the recording's, read in blocks."""
-    step = max(1, -(-len(recording.events) // most))
+    """At most ``most`` events, evenly: every k-th run of the recording's; of a file read in blocks."""
+    source = recording.events
+    step = max(1, -(-len(source) // most))
     if step == 1:
-        return Events.concatenate(list(recording.events.blocks()))
+        return Events.concatenate(list(source.blocks()))
+    if isinstance(source, MemoryEvents):
+        return _runs(source.slice(0, len(source)), step)
     # blocks of whole periods, so that every run but the last is whole
-    blocks = recording.events.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
-    return Events.concatenate(list(in_order(partial(_runs, block, step) for block in blocks)))
+    blocks = source.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
+    return Events.concatenate([_runs(block, step) for block in blocks])
 
 
 def _runs(block: Events, step: int) -> Events:
     """The first of every ``step`` runs, copied, so that the block itself can go."""
+    from amiwarp.kernels.launch import pool
+
     whole = len(block) // (step * RUN) * step * RUN
 
     def pick(values: NDArray[Any]) -> NDArray[Any]:
-        rest = values[whole : whole + RUN]
-        return np.concatenate([values[:whole].reshape(-1, step * RUN)[:, :RUN].ravel(), rest])
+        runs, rest = values[:whole].reshape(-1, step * RUN)[:, :RUN], values[whole : whole + RUN]
+        out = np.empty(runs.size + rest.size, values.dtype)
+        out[: runs.size].reshape(runs.shape)[:] = runs
+        out[runs.size :] = rest
+        return out
 
-    return Events(pick(block.x), pick(block.y), pick(block.t), pick(block.p))
+    return Events(*pool().map(pick, (block.x, block.y, block.t, block.p)))
 
 
 def _space(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 Result = TypeVar("Result")
 
-CHUNK = 1 << 16
+CHUNK = 1 << 18
 """Events per HDF5 chunk. With Blosc's LZ4 and bit shuffle it writes and reads faster than no compression does."""
 
 BLOSC, FLETCHER32 = 32001, 3

@@ -118,7 +118,7 @@ class NativeEvents:
             yield partial(self.slice, start, start + count)
 
     def _pieces_in_order(self) -> Iterator[Events]:
-        with contextlib.closing(in_order(self.pieces(4 * CHUNK))) as pieces:
+        with contextlib.closing(in_order(self.pieces(CHUNK))) as pieces:
             yield from pieces
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:

@@ -96,9 +96,14 @@ def empty_words(
 
 
 @wp.kernel
-def add_totals(more: wp.array(dtype=wp.int64), totals: wp.array(dtype=wp.int64)):
+def add_totals(more: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64), totals: wp.array(dtype=wp.int64)):
+    """Adds, and clears what was added and the batches' counts."""
     i = wp.tid()
-    totals[i] = totals[i] + more[i]
+    if i < totals.shape[0]:
+        totals[i] = totals[i] + more[i]
+        more[i] = wp.int64(0)
+    if i < counts.shape[0]:
+        counts[i] = wp.int64(0)
 
 
 @cache

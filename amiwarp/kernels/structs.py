@@ -39,6 +39,7 @@ def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
     return c
 
 
+@lru_cache(maxsize=16)
 def pinhole_params(camera: Camera) -> "kernels.PinholeParams | None":
     """The camera for kernels without branches; None where its lens distorts."""
     if camera.distortion is not None:
