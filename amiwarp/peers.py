@@ -210,9 +210,8 @@ def _cupy_events(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
 
 
 def with_cupy(events: PeerEvents, device: str) -> Peer:
-    """Arrays, and four ``cupyx.scatter_add``."""
+    """Arrays, and four ``add.at``."""
     cupy, (x, y, angle) = _cupy_events(events, device)
-    scatter_add = library("cupyx").scatter_add
     radius, margin, (rows, columns) = np.float32(events.radius), np.float32(events.margin), events.shape
     image = cupy.zeros(rows * columns, cupy.float32)
 
@@ -223,10 +222,10 @@ def with_cupy(events: PeerEvents, device: str) -> Peer:
         i, j = u.astype(cupy.int32), v.astype(cupy.int32)
         fx, fy = u - i.astype(cupy.float32), v - j.astype(cupy.float32)
         cell = j * columns + i
-        scatter_add(image, cell, (1 - fx) * (1 - fy))
-        scatter_add(image, cell + 1, fx * (1 - fy))
-        scatter_add(image, cell + columns, (1 - fx) * fy)
-        scatter_add(image, cell + columns + 1, fx * fy)
+        cupy.add.at(image, cell, (1 - fx) * (1 - fy))
+        cupy.add.at(image, cell + 1, fx * (1 - fy))
+        cupy.add.at(image, cell + columns, (1 - fx) * fy)
+        cupy.add.at(image, cell + columns + 1, fx * fy)
 
     return Peer(run, lambda: cupy.asnumpy(image), events)
 

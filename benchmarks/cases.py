@@ -94,7 +94,7 @@ PEERS = (
     _peer("Numba, angle table", peers.with_numba_table, "cpu"),
     _peer("PyTorch", peers.with_torch, "cpu", "cuda"),
     _peer("PyTorch, blocks of 65,536", partial(peers.with_torch, block=peers.BLOCK), "cpu", most_repeats=5),
-    _peer("CuPy scatter_add", peers.with_cupy, "cuda"),
+    _peer("CuPy add.at", peers.with_cupy, "cuda"),
     _peer("CuPy, four float atomics", peers.with_cupy_kernel, "cuda"),
     Case(IMAGE, "Warp, four float atomics", ours.warp_atomics, devices=("cuda",),
          bars=image_bars("plane circle", Vote.BILINEAR)),

@@ -14,6 +14,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.camera import CameraParams, solve_ray
 from amiwarp.kernels.structs import camera_params, fold
 
+# as the package's kernels: a GPU would else fuse multiplications and additions here alone
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
 DAVIS = Camera(
     240, 180, 199.092366542, 198.82882047, 132.192071378, 110.712660011,
     RadialTangential(-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0),

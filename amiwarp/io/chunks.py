@@ -26,6 +26,9 @@ BLOSC, FLETCHER32 = 32001, 3
 MOST_THREADS = 16
 """More would wait for each other in Python, and each holds events in memory."""
 
+AHEAD = 4
+"""Jobs beyond one a thread that may be done or under way: what was done out of turn waits in memory."""
+
 ROW = 256
 """Words of a checksum that are summed at a time."""
 
@@ -43,7 +46,7 @@ def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, No
     try:
         for job in jobs:
             waiting.append(pool.submit(job))
-            if len(waiting) > 2 * threads:
+            if len(waiting) > threads + AHEAD:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
