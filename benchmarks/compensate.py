@@ -63,8 +63,8 @@ def half_a_second() -> Events:
     return events[(events.t >= 0) & (events.t < REPEATED_US)]
 
 
-def repeated(events: int) -> Iterator[Events]:
-    once, done = half_a_second(), 0
+def repeated(once: Events, events: int) -> Iterator[Events]:
+    done = 0
     while done < events:
         turn = once[: events - done]
         yield Events(turn.x, turn.y, turn.t + done // len(once) * REPEATED_US, turn.p)
@@ -73,17 +73,18 @@ def repeated(events: int) -> Iterator[Events]:
 
 def make(path: Path, events: int, columns: bool) -> None:
     """The recording: a file of the native layout, or a folder of bare columns."""
-    encoder = Encoder.constant_speed(RPM, 0, (events // 1_000_000 + 2) * REPEATED_US)
+    once = half_a_second()
+    encoder = Encoder.constant_speed(RPM, 0, (events // len(once) + 2) * REPEATED_US)
     if columns:
         path.mkdir()
         with contextlib.ExitStack() as stack:
             files = {name: stack.enter_context((path / name).open("wb")) for name in COLUMNS}
-            for block in repeated(events):
+            for block in repeated(once, events):
                 for name, file in files.items():
                     getattr(block, name).tofile(file)
         return
     with RecordingWriter(path, width=WIDTH, height=HEIGHT, camera=CAMERA, prism=PRISM, encoder=encoder) as writer:
-        for block in repeated(events):
+        for block in repeated(once, events):
             writer.append(block)
 
 
@@ -189,8 +190,8 @@ def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any]:
 
 def stages_alone(recording: Any, mover: Mover, folder: Path) -> dict[str, float]:
     """Million events a second of each stage, over all cores, the others left out."""
-    count = min(ALONE, len(recording.events)) // PIECE * PIECE
-    reads = list(recording.events.pieces(PIECE))[: count // PIECE]
+    reads = list(recording.events.pieces(PIECE))[: ALONE // PIECE]
+    count = min(len(reads) * PIECE, len(recording.events))
     held = [read() for read in reads[:8]]
     moved, inside = mover(held[0])
 

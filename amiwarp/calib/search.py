@@ -64,8 +64,8 @@ class Settings:
     """Of the fine image [px]; the coarse one has 4 px."""
     per_polarity: bool = False
     """ON and OFF events in images of their own."""
-    events: int = 1_000_000
-    """At most so many events, thinned evenly; the global search uses a fifth of them."""
+    events: int = 300_000
+    """At most so many events, thinned evenly; the global search uses a third of them."""
     fold: int = 0
     """Angles a turn into which the events of a pixel are folded, each point then standing for several; 0: none."""
     seed: int = 0
@@ -170,7 +170,7 @@ class Search:
         self.best, self.score = self.space.to_values(best.x), best.score
 
     def _coarse(self, material: Material, space: Space) -> Objective:
-        step = max(1, len(material.events) // (self.settings.events // 5 + 1))
+        step = max(1, len(material.events) // (self.settings.events // 3 + 1))
         return self._objective(material.every(step), 0.5, 4.0, space=space)
 
     def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
