@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 TURNS = 1 << 16
 """Angles of the prism that are told apart: 0.0055 deg, 0.0005 px on an orbit of 10 px."""
-
-
 LARGEST_FOLD = 1 << 16
 LARGEST_WEIGHT = 63
 """Events that a point stands for at most, see :mod:`amiwarp.kernels.tiles`."""
@@ -72,8 +70,7 @@ def upload_events(
     ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events get
     their times from it, so that the camera's turning can be taken back. ``fold``: of a still scene, events of one pixel
     and polarity become one point for each of so many bins of a turn, in its middle, with their number for a weight;
-    without slope and times. Raises :class:`AmiwarpError` where the encoder
-    does not cover the events.
+    without slope and times. Raises :class:`AmiwarpError` where the encoder does not cover the events.
     """
     import warp as wp
 
@@ -146,7 +143,9 @@ def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
     keys, unused = wp.empty(2 * n, dtype=wp.int64, device=device), wp.zeros(2 * n, dtype=int, device=device)
     launch(fold_keys, n, [e.x, e.y, e.layer, e.turn, bins], [keys], device=device)
     wp.utils.radix_sort_pairs(keys, unused, n)
-    key, count = np.unique(keys[:n].numpy(), return_counts=True)
+    every = keys[:n].numpy()
+    first = np.flatnonzero(np.concatenate([[True], every[1:] != every[:-1]])[:n])
+    key, count = every[first], np.diff(np.append(first, n))
     times = -(-count // LARGEST_WEIGHT)  # points that stand for too many events come more than once
     key, weight = np.repeat(key, times), np.minimum(np.repeat(count, times), LARGEST_WEIGHT)
     last = np.cumsum(times) - 1

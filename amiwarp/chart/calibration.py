@@ -82,7 +82,8 @@ def _stages(known: Known) -> Iterator[Setting]:
 def _events() -> Iterator[Setting]:
     for n in EVENTS[:-1]:
         if n != Settings().events:
-            yield from _both(f"{n // 1000} k events", "events", Settings(events=n))
+            name = f"{n // 1000} k" if n < 1_000_000 else f"{n // 1_000_000} M"
+            yield from _both(f"{name} events", "events", Settings(events=n))
     # the photometric stage takes pairs of its own: more events would only take longer to start it
     yield Setting("all events, sharpness", "events", Settings(events=EVENTS[-1], stages=SHARP))
 
