@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from amiwarp.motion import PrismMotion
 from amiwarp.optics import Prism
 from amiwarp.simulate import simulate
 
+# for the benchmarks; last, so that the package that is tested is the one that was installed
+sys.path.append(str(Path(__file__).parents[1]))
 wp.config.log_level = wp.LOG_ERROR
 wp.init()
 
