@@ -120,9 +120,10 @@ class PairSet:
         """Marks every so many-th pair of two events, which must come first, as not to be used; how many."""
         from amiwarp.kernels import pairs as k
         from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.photometric import HELD
 
         launch(k.hold_out, len(self), [every], [self.arrays.on], device=self.device)
-        return int((self.column("on") >= 8).sum())
+        return int(np.count_nonzero(self.column("on") & int(HELD)))
 
     def _select(self, kernel: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> PairSet:
         import warp as wp

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.kernels.cores import cpu_threads
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -146,8 +148,6 @@ def numba_kernels() -> tuple[Any, Any]:
 
 
 def _numba_images(events: PeerEvents) -> tuple[Any, Any]:
-    from amiwarp.kernels.launch import cpu_threads
-
     return np.zeros((cpu_threads(), *events.shape), np.float32), np.zeros(events.shape, np.float32)
 
 

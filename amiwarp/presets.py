@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from amiwarp.calib import Settings
 from amiwarp.calib.parameters import size_name
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import part_path
+from amiwarp.io.files import write_text
 from amiwarp.optics import MODELS
 
 if TYPE_CHECKING:
@@ -43,12 +42,7 @@ class Preset:
         """Writes the JSON file, beside first and then by renaming."""
         data = {"format": FORMAT, "version": VERSION, "kind": self.kind, "settings": dict(self.settings),
                 "measured": dict(self.measured)}  # fmt: skip
-        part = part_path(path)
-        try:
-            part.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: Path, kind: str) -> Preset:

@@ -17,7 +17,6 @@ import importlib.metadata
 import json
 import os
 import platform
-import re
 import subprocess
 import sys
 import time
@@ -27,11 +26,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from amiwarp.chart.make import processor
+from amiwarp.kernels.cores import cpu_threads
 from amiwarp.peers import Missing
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case
 from benchmarks.job import Job
-from benchmarks.scenes import CORES
 
 ROOT = Path(__file__).parents[1]
 LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy")
@@ -118,12 +118,6 @@ def line(row: dict[str, Any]) -> str:
     return f"{start} {rate} {row['median_s'] * 1e3:9.3f} ms [{low * 1e3:.3f}, {high * 1e3:.3f}]  {told}{note}{bad}"
 
 
-def processor() -> str:
-    info = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
-    return (found.group(1) if found else platform.processor() or platform.machine()).strip()
-
-
 def versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     installed = {d.metadata["Name"]: d.version for d in importlib.metadata.distributions() if d.metadata["Name"]}
@@ -145,7 +139,7 @@ def commit() -> str:
 
 def about(device: str) -> dict[str, Any]:
     """The machine and what ran on it."""
-    cpu = f"{processor()}, {CORES} cores"
+    cpu = f"{processor()}, {cpu_threads()} cores"
     return {
         "machine": cpu if device == "cpu" else wp.get_device(device).name, "host": cpu, "device": device,
         "versions": versions(), "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d"), "commit": commit(),

@@ -19,7 +19,6 @@ import contextlib
 import importlib.metadata
 import json
 import math
-import os
 import platform
 import subprocess
 import sys
@@ -39,6 +38,7 @@ from amiwarp.encoder import Encoder
 from amiwarp.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import in_order
+from amiwarp.kernels.cores import cpu_threads
 from amiwarp.optics import MODELS, Model, Prism
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
 
@@ -138,18 +138,11 @@ def seconds(work: Callable[[], Any]) -> float:
 
 def truth(name: str, model: Any, xy: Any, theta: Any) -> Any:
     """Places by the float64 oracle of the tests; for the ellipse, its own tables in float64."""
-    if name == "exact":
-        return reference.move(CAMERA, PRISM, xy, theta, to_scene=True, phase=PHASE)
-    phi = (theta + PHASE)[:, None]
     if name == "ellipse":
+        phi = (theta + PHASE)[:, None]
         at = xy[:, 1].astype(int), xy[:, 0].astype(int)
         return xy + model.offset[at] + model.cosine[at] * np.cos(phi) + model.sine[at] * np.sin(phi)
-    rays = reference.pixels_to_rays(CAMERA, xy)
-    angle: Any = PRISM.deflection
-    if name == "radial":
-        cosine2 = rays[:, 2] ** 2
-        angle = angle * (np.sqrt((INDEX**2 - 1.0 + cosine2) / cosine2) - 1.0) / (INDEX - 1.0)
-    return reference.rays_to_pixels(CAMERA, reference.turn(rays, theta + PHASE, angle))
+    return reference.place(name, CAMERA, PRISM, xy, theta, phase=PHASE)
 
 
 def error_of(name: str, model: Any, encoder: Encoder, raw: Events, moved: Events, inside: Any) -> float:
@@ -282,16 +275,15 @@ def errors(
 
 
 def about(device: str) -> dict[str, Any]:
+    from amiwarp.chart.make import processor  # here: what a row's process loads counts to its memory
+
     wp.init()
     found = {"python": platform.python_version()}
     for name in ("warp-lang", "numpy", "h5py", "hdf5plugin", "numcodecs"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
-    info = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.partition(":")[2].strip() for line in info if line.startswith("model name")]
-    cores = len(os.sched_getaffinity(0))
-    return {"machine": f"{(names or [platform.machine()])[0]}, {cores} cores", "device": wp.get_device(device).name,
-            "versions": found}  # fmt: skip
+    machine = f"{processor()}, {cpu_threads()} cores"
+    return {"machine": machine, "device": wp.get_device(device).name, "versions": found}
 
 
 def arguments() -> argparse.Namespace:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import os
 import shutil
 import tempfile
 import weakref
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from amiwarp.camera import Camera
 from amiwarp.demo import Demo, simulation
 from amiwarp.events import Events, Recording
+from amiwarp.kernels.cores import cpu_threads
 from amiwarp.metrics import truth_model
 from amiwarp.optics import ExactModel, Prism, apex_from_deflection
 from amiwarp.peers import Missing
@@ -44,8 +44,7 @@ PROBES, PROBE_S, DAMPED = 4, 0.1, 0.6
 """To find the contrast at which there are so many: between 1/contrast and its square they fall as it rises."""
 FILTERS = ("hdf5plugin", "numcodecs")
 """Without these the files are bare columns."""
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-threads = ThreadPoolExecutor(CORES)
+threads = ThreadPoolExecutor(cpu_threads())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from amiwarp.iwe import Vote
-from benchmarks.scenes import DEFLECTION, INDEX, MARGIN, PHASE, Array, EventScene, in_chunks
+from benchmarks.scenes import MARGIN, PHASE, Array, EventScene, in_chunks
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import reference
@@ -26,11 +26,8 @@ HARMONIC_ANGLES = 16  # of the ellipse's least squares
 
 def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
     """Where events belong [px], shape (n, 2)."""
-    camera = scene.camera
     if model == "plane circle":
         return xy - scene.radius * np.stack([np.cos(theta), np.sin(theta)], axis=1)
-    if model == "exact":
-        return reference.move(camera, scene.prism, xy, theta, to_scene=True, phase=PHASE)
     if model == "ellipse":
         table = scene.keep("ellipse", lambda: _ellipses(scene))[xy[:, 1].astype(int), xy[:, 0].astype(int)]
         return (
@@ -39,12 +36,7 @@ def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
             + table[:, 1] * np.cos(theta + PHASE)[:, None]
             + table[:, 2] * np.sin(theta + PHASE)[:, None]
         )
-    rays = reference.pixels_to_rays(camera, xy)
-    angle: Array | float = DEFLECTION
-    if model == "radial":
-        cosine2 = rays[:, 2] ** 2
-        angle = DEFLECTION * (np.sqrt((INDEX**2 - 1.0 + cosine2) / cosine2) - 1.0) / (INDEX - 1.0)
-    return reference.rays_to_pixels(camera, reference.turn(rays, theta + PHASE, angle))
+    return reference.place(model, scene.camera, scene.prism, xy, theta, phase=PHASE)
 
 
 def _ellipses(scene: EventScene) -> Array:

@@ -209,3 +209,15 @@ def turn(rays: Array, phi: Array, angle: Array | float) -> Array:
     turned = (c * u + s * z)[:, None] * along + v[:, None] * across
     turned[:, 2] = c * z - s * u
     return turned
+
+
+def place(name: str, camera: Camera, prism: Prism, xy: Array, theta: Array, *, phase: float) -> Array:
+    """Pixels without the prism by a model: ``exact``, ``radial`` or ``circle``; the flat face to the scene."""
+    if name == "exact":
+        return move(camera, prism, xy, theta, to_scene=True, phase=phase)
+    rays = pixels_to_rays(camera, xy)
+    angle: Array | float = prism.deflection
+    if name == "radial":
+        cosine2 = rays[:, 2] ** 2
+        angle = angle * (np.sqrt((prism.index**2 - 1.0 + cosine2) / cosine2) - 1.0) / (prism.index - 1.0)
+    return rays_to_pixels(camera, turn(rays, theta + phase, angle))

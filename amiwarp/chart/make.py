@@ -8,6 +8,7 @@ import json
 import math
 import os
 import platform
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -20,7 +21,8 @@ from amiwarp.chart.drawing import draw
 from amiwarp.chart.rows import Progress, Row, beaten_by, fastest_within, fronts, most_accurate_within
 from amiwarp.chart.truth import Known
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import part_path
+from amiwarp.io.files import write_text
+from amiwarp.kernels.cores import cpu_threads
 from amiwarp.presets import Preset
 from amiwarp.uploads import TURNS
 
@@ -160,8 +162,8 @@ def make(
     files = {"data": out / "chart.json", "table": out / "chart.csv"}
     done = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), _about(known, device))
     # the figures last: they need packages that a machine with a GPU may lack
-    _write(files["data"], json.dumps({**done.about, **_data(done)}, indent=1, allow_nan=False) + "\n")
-    _write(files["table"], _csv([*compensated, *calibrated]))
+    write_text(files["data"], json.dumps({**done.about, **_data(done)}, indent=1, allow_nan=False) + "\n")
+    write_text(files["table"], _csv([*compensated, *calibrated]))
     return done.draw(out)
 
 
@@ -200,21 +202,19 @@ def _about(known: Known, device: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def processor() -> str:
+    """Name of the CPU."""
+    info = Path("/proc/cpuinfo")
+    found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
+    return (found.group(1) if found else platform.processor() or platform.machine()).strip()
+
+
 def machine(device: str) -> str:
     """The GPU's name, or the processor's with the cores that may be used."""
     import warp as wp
 
-    from amiwarp.kernels.launch import cpu_threads
-
     there = wp.get_device(device)
-    if there.is_cuda:
-        return str(there.name)
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return f"{cpu_threads()} cores of {name}"
+    return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
 
 
 def _versions() -> dict[str, str]:
@@ -262,12 +262,3 @@ def _csv(rows: Sequence[Row]) -> str:
     writer.writeheader()
     writer.writerows(flat)
     return text.getvalue()
-
-
-def _write(path: Path, text: str) -> None:
-    part = part_path(path)
-    try:
-        part.write_text(text)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

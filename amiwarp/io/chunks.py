@@ -15,6 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.kernels.cores import cpu_threads
+
 Result = TypeVar("Result")
 
 CHUNK = 1 << 18
@@ -39,8 +41,7 @@ def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, No
     A job's exception is raised in its place. When the iterator is closed, jobs that wait are dropped and those that run
     are waited for.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    threads = min(cores, MOST_THREADS)
+    threads = min(cpu_threads(), MOST_THREADS)
     waiting: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(threads, thread_name_prefix="amiwarp-io")
     try:

@@ -50,6 +50,16 @@ def part_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
 
 
+def write_text(path: Path, text: str) -> None:
+    """Writes a file beside first and then by renaming."""
+    part = part_path(path)
+    try:
+        part.write_text(text)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 @contextlib.contextmanager
 def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
     """Turn whatever a library raises into one :class:`AmiwarpError` line with the file and the ``place``.

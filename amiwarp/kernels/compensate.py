@@ -6,7 +6,15 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, PinholeParams
 from amiwarp.kernels.encoder import EncoderParams, angle_at, angle_on, piece_at
-from amiwarp.kernels.native import load_float, load_uint16
+from amiwarp.kernels.native import (
+    load_float,
+    load_int64,
+    load_uint16,
+    load_uint32,
+    store_float,
+    store_uint8,
+    store_uint32,
+)
 from amiwarp.kernels.optics import MODEL_STRUCTS, place
 
 # without fused multiply-add, which CPUs and GPUs place differently: both give the same bits
@@ -28,34 +36,14 @@ class Columns:
     inside: wp.array(dtype=wp.uint8)  # 1: on a pixel of the image
 
 
-@wp.func_native("((float*)values.data)[i] = value;")
-def store_float(values: wp.array(dtype=float), i: int, value: float): ...
-
-
-@wp.func_native("((uint8_t*)values.data)[i] = (uint8_t)value;")
-def store_byte(values: wp.array(dtype=wp.uint8), i: int, value: int): ...
-
-
-@wp.func_native("return ((const int64_t*)values.data)[i];")
-def load_time(values: wp.array(dtype=wp.int64), i: int) -> wp.int64: ...
-
-
-@wp.func_native("return ((const uint32_t*)values.data)[i];")
-def load_turn(values: wp.array(dtype=wp.uint32), i: int) -> wp.uint32: ...
-
-
-@wp.func_native("((uint32_t*)values.data)[i] = value;")
-def store_turn(values: wp.array(dtype=wp.uint32), i: int, value: wp.uint32): ...
-
-
 @wp.func
 def one_piece(encoder: EncoderParams, t: wp.array(dtype=wp.int64), first: int) -> int:
     """The piece of a block's events where they share one, as almost all blocks do; -1 where not."""
     low = t[first]
     high = low
     for k in range(BLOCK):
-        low = wp.min(low, load_time(t, first + k))
-        high = wp.max(high, load_time(t, first + k))
+        low = wp.min(low, load_int64(t, first + k))
+        high = wp.max(high, load_int64(t, first + k))
     piece = piece_at(encoder, low - encoder.origin)
     return wp.where(piece_at(encoder, high - encoder.origin) == piece, piece, -1)
 
@@ -87,7 +75,7 @@ def store_place(size: wp.vec2, columns: Columns, i: int, x: float, y: float):
     across = wp.where(x >= -0.5, wp.where(x < size[0] - 0.5, 1, 0), 0)
     store_float(columns.out_x, i, x)
     store_float(columns.out_y, i, y)
-    store_byte(columns.inside, i, wp.where(y >= -0.5, wp.where(y < size[1] - 0.5, across, 0), 0))
+    store_uint8(columns.inside, i, wp.where(y >= -0.5, wp.where(y < size[1] - 0.5, across, 0), 0))
 
 
 @wp.kernel
@@ -108,13 +96,13 @@ def compensate_blocks(
     piece = one_piece(encoder, columns.t, first)
     if piece >= 0:
         for k in range(BLOCK):
-            elapsed = load_time(columns.t, first + k) - encoder.origin
-            store_turn(turns, k, angle_on(encoder, piece, elapsed))
+            elapsed = load_int64(columns.t, first + k) - encoder.origin
+            store_uint32(turns, k, angle_on(encoder, piece, elapsed))
     else:
         for k in range(BLOCK):
             turns[k] = angle_at(encoder, columns.t[first + k])
     for k in range(BLOCK):
-        x, y = placed(model, camera, azimuths, columns, load_turn(turns, k), first + k)
+        x, y = placed(model, camera, azimuths, columns, load_uint32(turns, k), first + k)
         store_float(xs, k, x)
         store_float(ys, k, y)
     for k in range(BLOCK):

@@ -1,6 +1,5 @@
 """Launching: one launch on CUDA, slices from a thread pool on the CPU (Warp runs one thread a launch there)."""
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -9,6 +8,8 @@ from typing import Any
 
 import warp as wp
 
+from amiwarp.kernels.cores import cpu_threads
+
 SMALLEST_SLICE = 1 << 15  # below this many threads a slice costs more to launch than to run
 
 
@@ -16,11 +17,6 @@ SMALLEST_SLICE = 1 << 15  # below this many threads a slice costs more to launch
 def pool() -> ThreadPoolExecutor:
     """Threads for launches on the CPU, one a core."""
     return ThreadPoolExecutor(cpu_threads(), thread_name_prefix="amiwarp")
-
-
-def cpu_threads() -> int:
-    """Number of CPU cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:

@@ -17,6 +17,14 @@ def load_uint8(values: wp.array(dtype=wp.uint8), i: int) -> wp.uint8: ...
 def load_uint32(values: wp.array(dtype=wp.uint32), i: int) -> wp.uint32: ...
 
 
+@wp.func_native("return ((const int32_t*)values.data)[i];")
+def load_int(values: wp.array(dtype=int), i: int) -> int: ...
+
+
+@wp.func_native("return ((const int64_t*)values.data)[i];")
+def load_int64(values: wp.array(dtype=wp.int64), i: int) -> wp.int64: ...
+
+
 @wp.func_native("return ((const float*)values.data)[i];")
 def load_float(values: wp.array(dtype=float), i: int) -> float: ...
 
@@ -27,6 +35,14 @@ def load_word(values: wp.array(dtype=wp.uint64), i: int) -> wp.uint64: ...
 
 @wp.func_native("((float*)values.data)[i] = value;")
 def store_float(values: wp.array(dtype=float), i: int, value: float): ...
+
+
+@wp.func_native("((uint8_t*)values.data)[i] = (uint8_t)value;")
+def store_uint8(values: wp.array(dtype=wp.uint8), i: int, value: int): ...
+
+
+@wp.func_native("((uint32_t*)values.data)[i] = value;")
+def store_uint32(values: wp.array(dtype=wp.uint32), i: int, value: wp.uint32): ...
 
 
 @wp.func_native("((int32_t*)values.data)[i] = value;")

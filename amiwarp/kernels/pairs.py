@@ -7,7 +7,7 @@ and every pixel for one in each span of time in which it kept quiet: candidates 
 import warp as wp
 
 from amiwarp.kernels.encoder import EncoderParams, piece_at
-from amiwarp.kernels.photometric import Pairs
+from amiwarp.kernels.photometric import HELD, QUIET, Pairs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -276,8 +276,8 @@ def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), 
 def hold_out(every: int, start: int, on: wp.array(dtype=wp.uint8)):
     """Marks every so many-th pair of two events, which come first."""
     i = start + wp.tid()
-    if i % every == 0 and on[i] < wp.uint8(2):
-        on[i] = on[i] | wp.uint8(8)
+    if i % every == 0 and on[i] < QUIET:
+        on[i] = on[i] | HELD
 
 
 @wp.kernel

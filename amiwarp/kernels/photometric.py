@@ -10,7 +10,7 @@ import warp as wp
 
 from amiwarp.kernels.camera import NAN
 from amiwarp.kernels.descent import add_fixed, add_two, to_fixed
-from amiwarp.kernels.native import load_float, load_uint8, store_float
+from amiwarp.kernels.native import load_float, load_int, load_uint8, store_float
 from amiwarp.kernels.prior import EXTRA
 
 wp.set_module_options({"enable_backward": False})
@@ -64,10 +64,6 @@ class Geometry:
     stride: int
     cell: wp.array(dtype=int)  # of all first, then all second events; -1: one of the two is not on its tile
     part: wp.array(dtype=float)  # all x of the first, y, x of the second, y
-
-
-@wp.func_native("return ((const int32_t*)values.data)[i];")
-def load_int(values: wp.array(dtype=int), i: int) -> int: ...
 
 
 # -- one equation

@@ -5,9 +5,9 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
-from amiwarp.kernels.native import load_float, load_uint16, store_float, store_int
+from amiwarp.kernels.native import load_float, load_int, load_uint16, store_float, store_int
 from amiwarp.kernels.optics import MODEL_STRUCTS, compensate, place
-from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs, load_int
+from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs
 
 wp.set_module_options({"enable_backward": False})
 

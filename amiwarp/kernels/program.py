@@ -5,7 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.launch import SMALLEST_SLICE, cpu_threads, pool, slices
+from amiwarp.kernels.cores import cpu_threads
+from amiwarp.kernels.launch import SMALLEST_SLICE, pool, slices
 
 BLOCK_DIM = 256  # threads of a block on CUDA; sums over blocks count on whole ones
 
