@@ -270,12 +270,13 @@ class EllipseModel(_OnDevice):
         """Tables from any other model: least squares over 16 angles a pixel; NaN where a pixel has no ray."""
         import warp as wp
 
+        from amiwarp.kernels.launch import launch
         from amiwarp.kernels.optics import fit_harmonics
 
-        shape = (model.camera.height, model.camera.width)
-        table = wp.empty((*shape, 6), dtype=float, device=device)
+        height, width = model.camera.height, model.camera.width
+        table = wp.empty((height, width, 6), dtype=float, device=device)
         inputs = [replace(model, phase=0.0).params(device), model_camera(model, device)]
-        wp.launch(fit_harmonics, dim=shape, inputs=inputs, outputs=[table], device=device)
+        launch(fit_harmonics, height * width, inputs, [table], device=device)
         offset, cosine, sine = np.split(table.numpy(), 3, axis=2)
         return cls(model.camera, offset, cosine, sine, model.phase)
 

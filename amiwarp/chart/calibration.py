@@ -143,7 +143,9 @@ def rows(
 
     tell("calibrating", 0.0)
     for s in _kinds(ways):
-        run(s)
+        short = run(_shortened(s))
+        if isinstance(short, AmiwarpError) or (s.stages == STAGES and short.photometric is None):
+            run(s)  # the short one may have ended before it came to every kernel
     tasks = [Task(partial(run, way.settings), len(known.events), way.fields(device)) for way in ways]
 
     def row(t: Timed) -> Row | None:
@@ -162,12 +164,11 @@ def rows(
 
 
 def _kinds(ways: list[Setting]) -> list[Settings]:
-    """One short calibration of each kind: its kernels are compiled off the clock."""
-    short = PhotometricSettings(pairs=20_000)
-    kinds = {}
-    for way in ways:
-        s = way.settings
-        few = replace(s, events=20_000, global_evaluations=20, local_evaluations=10,
-                      photometric=replace(short, algorithm=s.photometric.algorithm))  # fmt: skip
-        kinds[s.model, s.stages, s.fold > 0, s.photometric.algorithm] = few
-    return list(kinds.values())
+    """One setting of each kind: its kernels are compiled off the clock."""
+    every = (way.settings for way in ways)
+    return list({(s.model, s.stages, s.fold > 0, s.photometric.algorithm): s for s in every}.values())
+
+
+def _shortened(s: Settings) -> Settings:
+    few = PhotometricSettings(pairs=20_000, algorithm=s.photometric.algorithm)
+    return replace(s, events=20_000, global_evaluations=20, local_evaluations=10, photometric=few)

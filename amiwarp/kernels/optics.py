@@ -334,10 +334,12 @@ def deflect_points(
 def fit_harmonics(
     model: Any,
     camera: CameraParams,
+    start: int,
     table: wp.array3d(dtype=float),
 ):
     """Least squares of offset and first harmonic over evenly spaced angles (their Fourier sums)."""
-    row, col = wp.tid()
+    pixel = start + wp.tid()
+    row, col = pixel // table.shape[1], pixel % table.shape[1]
     xy = wp.vec2(float(col), float(row))
     mean = wp.vec2(0.0, 0.0)
     c = wp.vec2(0.0, 0.0)
