@@ -88,6 +88,7 @@ def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float
 
     ``truth``: size and phase [rad]. Where there was no global search the samples stand alone.
     """
+    calibration = calibration.exact
     size = size_name(calibration.model_name)
     samples = cost_surface(calibration.stages, size)
     x, y = (np.degrees(samples[:, 0]) * f(samples[:, 1]) for f in (np.cos, np.sin))

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.chart.make import processor
 from amiwarp.kernels.cores import cpu_threads
+from amiwarp.machine import processor
 from amiwarp.peers import Missing
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case

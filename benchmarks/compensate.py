@@ -275,7 +275,7 @@ def errors(
 
 
 def about(device: str) -> dict[str, Any]:
-    from amiwarp.chart.make import processor  # here: what a row's process loads counts to its memory
+    from amiwarp.machine import processor  # here: what a row's process loads counts to its memory
 
     wp.init()
     found = {"python": platform.python_version()}

@@ -18,7 +18,19 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from amiwarp.calib import Calibration
-from amiwarp.cli import calibrate, chart, compensate, convert, demo, info, reconstruct, simulate, translate
+from amiwarp.cli import (
+    calibrate,
+    chart,
+    compensate,
+    convert,
+    demo,
+    design,
+    info,
+    reconstruct,
+    simulate,
+    stability,
+    translate,
+)
 from amiwarp.cli.app import app
 from amiwarp.cli.inputs import number
 from amiwarp.errors import AmiwarpError
@@ -26,8 +38,21 @@ from amiwarp.io import open_recording
 
 COMMANDS = {
     module.__name__.rpartition(".")[2]: module
-    for module in (demo, info, convert, simulate, translate, calibrate, compensate, reconstruct, chart)
-}
+    for module in (
+        demo,
+        design,
+        info,
+        convert,
+        simulate,
+        translate,
+        calibrate,
+        compensate,
+        reconstruct,
+        chart,
+        design,
+        stability,
+    )
+}  # fmt: skip
 
 
 def run(*args: str | Path) -> Result:

@@ -21,7 +21,7 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 ORDER = (
     ("errors",),
     ("kernels", "camera", "multilevel"),
-    ("optics", "events", "encoder", "turning"),
+    ("optics", "events", "encoder", "turning", "machine"),
     ("pictures", "motion", "clouds"),
     ("io", "uploads", "link"),
     ("iwe", "peers"),
@@ -32,7 +32,8 @@ ORDER = (
     ("calib", "engine", "reconstruct"),
     ("picture_files",),
     ("simulate",),
-    ("translate", "stability", "figures", "presets"),
+    ("translate", "figures", "presets"),
+    ("stability", "design"),
     ("chart", "viewer", "demo"),
     ("cli",),
     ("__main__",),

@@ -13,8 +13,9 @@ from amiwarp.calib import checks
 from amiwarp.calib.panning import estimate_rates
 from amiwarp.calib.parameters import MOTION, RATES, Space, make_space, size_name
 from amiwarp.calib.photometric import refine
+from amiwarp.calib.pixels import Masked, strange_pixels, stretch
 from amiwarp.calib.result import Calibration, constant_speed
-from amiwarp.calib.search import Material, Progress, Search, Settings
+from amiwarp.calib.search import AUTO, Material, Progress, Search, Settings
 from amiwarp.calib.speed import estimate_rpm
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
@@ -31,12 +32,16 @@ NOMINAL_PRISM = Prism(math.radians(2.0))
 """What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
 LINEAR = ("off_ratio", "leak")
 """Names that are free in the photometric stage alone: unknowns of its linear equations."""
+STRANGE_SHARE = 0.01
+"""Of the events, that must lie on hot or flickering pixels for these to matter."""
 RUN = 8
 """Events that stay together where a recording is thinned: a cache line of times."""
 MOVING_TURNS, MOVING_US = 2.1, 100_000.0
 """Length of the window where the camera's motion is free: in turns, or without a prism."""
-LEAST_SHARPNESS_KEPT = 0.88
-"""The truth is nearly as sharp as the sharpest (0.93 to 0.99 of the gain, measured); what keeps less is none."""
+LEAST_SHARPNESS_KEPT = 0.7
+"""The truth is nearly as sharp as the sharpest (0.93 to 0.99 of the gain, 0.8 with many hot pixels, measured)."""
+STILL_COST, TURNING_GAIN = 0.2, 0.75
+"""Where more of the cost remains, the camera may turn; it did where its motion brings that down to this share."""
 
 
 def calibrate(
@@ -47,16 +52,122 @@ def calibrate(
     progress: Progress | None = None,
     **changes: Any,
 ) -> Calibration:
-    """Finds the prism's parameters in the recording itself: those that make the IWE sharpest, and from there, unless
-    it cannot be believed, those that make one brightness map explain the events.
+    """Finds the prism's parameters in the recording itself: those that make the IWE sharpest, and from there those
+    that make one brightness map explain the events. Where no map does, the camera may have turned: its motion is then
+    sought too.
 
     ``changes`` are fields of :class:`Settings`, over ``settings``. Raises :class:`AmiwarpError` where the recording
     cannot determine the parameters: too few events, under a quarter turn, encoder not covering the events, no
-    texture, one edge direction.
+    texture, one edge direction, events that no map explains.
     """
     began = time.perf_counter()
     settings = replace(settings or Settings(), **changes)
     settings.check()
+    if settings.model == AUTO:
+        from amiwarp.calib.auto import calibrate_auto  # it calls this function for the exact model
+
+        return calibrate_auto(recording, settings, device=device, progress=progress, budget_px=settings.budget_px)
+    if "photometric" not in settings.stages:
+        return attempt(recording, settings, device, progress)
+    found = _try(recording, settings, device, progress)
+    if recording.encoder is not None and _doubtful(found):
+        recording, found = _without_strange(recording, settings, found, device, progress)
+        if settings.free is None and _doubtful(found):
+            found = _turning(recording, settings, found, device, progress)
+    if isinstance(found, AmiwarpError):
+        raise found
+    _check_confirmed(found, recording.name)
+    if recording.prism is not None and not {"apex", "deflection"} & {*settings.bounds, *settings.start}:
+        checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
+    return replace(found, seconds=time.perf_counter() - began)
+
+
+def _try(
+    recording: Recording, settings: Settings, device: Any, progress: Progress | None
+) -> Calibration | AmiwarpError:
+    try:
+        return attempt(recording, settings, device, progress)
+    except AmiwarpError as error:
+        return error
+
+
+def _without_strange(
+    recording: Recording,
+    settings: Settings,
+    found: Calibration | AmiwarpError,
+    device: Any,
+    progress: Progress | None,
+) -> tuple[Recording, Calibration | AmiwarpError]:
+    """The same without hot and flickering pixels, and the recording without them; where they hardly count, as it is.
+
+    Raises :class:`AmiwarpError` where all of the light flickers.
+    """
+    source, encoder = recording.events, recording.encoder
+    assert encoder is not None
+    mask, summary = strange_pixels(stretch(source, encoder), encoder, source.size)
+    if summary.share < STRANGE_SHARE:
+        return recording, found
+    checks.check_light(mask, summary, recording.name)
+    cleaned = replace(recording, events=Masked(source, mask))
+    again = _try(cleaned, settings, device, progress)
+    if isinstance(again, AmiwarpError):
+        return cleaned, found if _sure(found) else again
+    return cleaned, replace(again, warnings=(*again.warnings, str(summary)))
+
+
+def _sure(found: Calibration | AmiwarpError) -> bool:
+    return not isinstance(found, AmiwarpError) and found.photometric is not None and found.photometric.accepted
+
+
+def _doubtful(found: Calibration | AmiwarpError) -> bool:
+    """Whether a camera that turns could be why the events are not explained."""
+    if isinstance(found, AmiwarpError):
+        return isinstance(found, checks.NotSharp)
+    return found.photometric is not None and found.photometric.cost > STILL_COST
+
+
+def _turning(
+    recording: Recording,
+    settings: Settings,
+    found: Calibration | AmiwarpError,
+    device: Any,
+    progress: Progress | None,
+) -> Calibration | AmiwarpError:
+    """The same with the camera's motion free, where that explains the events so much better; else ``found``."""
+    free = (size_name(settings.model), "phase", "motion")
+    turning = _try(recording, replace(settings, free=free), device, progress)
+    if isinstance(turning, AmiwarpError) or turning.photometric is None or not turning.photometric.accepted:
+        return found
+    still = 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
+    if turning.photometric.cost > TURNING_GAIN * still:
+        return found
+    speed = math.degrees(math.hypot(*(turning.parameters[n] for n in RATES)))
+    # the prism is what the calibration is for; the camera's motion was that of two turns in the middle
+    prism = {n: x for n, x in turning.parameters.items() if n not in MOTION}
+    return replace(
+        turning,
+        parameters=prism,
+        uncertainty={n: x for n, x in turning.uncertainty.items() if n not in MOTION},
+        free=tuple(n for n in turning.free if n not in MOTION),
+        middle_us=None,
+        warnings=(*turning.warnings, f"the camera turned at {speed:.1f} deg/s: found with its motion free"),
+    )
+
+
+def _check_confirmed(found: Calibration, name: str) -> None:
+    """Sharpness alone may be tenths of a pixel off: without the second stage's word there is no answer."""
+    if _sure(found):
+        return
+    reasons = [w for w in found.warnings if "photometric" in w]
+    raise AmiwarpError(
+        f"{name}: {'; '.join(reasons)}; the answer of sharpness alone may be several tenths of a pixel off: "
+        "take it with --stages sharpness, or record a scene that stays still"
+    )
+
+
+def attempt(recording: Recording, settings: Settings, device: Any, progress: Progress | None) -> Calibration:
+    """Both stages once, with what is free as told."""
+    began = time.perf_counter()
     recording = moving_window(recording, settings)
     searches = prepare(recording, settings, device=device, progress=progress)
     for search in searches:
@@ -98,7 +209,7 @@ def _second_stage(recording: Recording, search: Search, result: Calibration, pro
     kept = (after - result.sharpness_before) / max(result.sharpness_after - result.sharpness_before, 1e-12)
     if found.accepted and kept < LEAST_SHARPNESS_KEPT:
         verdict = f"keeps only {100 * kept:.0f} % of what sharpness gained: events are missing, or the scene moved"
-        found = replace(found, accepted=False, verdict=f"{verdict}; kept the answer of sharpness")
+        found = replace(found, accepted=False, verdict=verdict)
     if found.held:
         vain = f"the events do not determine {', '.join(found.held)}: not moved by the photometric stage"
         result = replace(result, warnings=(*result.warnings, vain))

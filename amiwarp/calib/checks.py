@@ -8,19 +8,32 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import ndimage
 
+from amiwarp.calib.parameters import size_name
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
+    from amiwarp.calib.pixels import StrangeSummary
     from amiwarp.encoder import Encoder
+    from amiwarp.optics import Prism
 
 FEWEST_EVENTS = 2000
 SMALLEST_TURN = math.pi / 2
 LEAST_SIGNIFICANCE = 5.0
 """By how many standard deviations the optimum must be sharper than with the phase turned round, and than still."""
+LARGEST_FROM_NOMINAL = 0.18
+"""Relative distance of the prism's size from the nominal one."""
+LARGEST_FLICKER = 0.7
+"""Share of the pixels that may see a lamp."""
 LARGEST_COHERENCE = 0.97
 """Of the edge directions: 0 where all are as frequent, 1 where all edges are parallel."""
+
+
+class NotSharp(AmiwarpError):
+    """No motion of a prism explains the events: what a turning camera looks like too."""
 
 
 def check_events(count: int, name: str) -> None:
@@ -48,6 +61,29 @@ def check_turn(theta: NDArray[np.float64], name: str) -> None:
         )
 
 
+def check_light(mask: NDArray[np.bool_], summary: StrangeSummary, name: str) -> None:
+    """A scene whose light flickers all over shows no edges of its own."""
+    if mask.mean() > LARGEST_FLICKER:
+        at = " and ".join(f"{hz:.0f}" for hz in summary.lamps_hz)
+        raise AmiwarpError(
+            f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {at} Hz; use light that does not, as the day's"
+        )
+
+
+def check_nominal(model: str, parameters: Mapping[str, float], nominal: Prism, name: str) -> None:
+    """A prism is made to a few percent; one far from its data sheet is another, or its motion is not all there is."""
+    size = size_name(model)
+    if size not in parameters:
+        return
+    share = parameters[size] / (nominal.apex if size == "apex" else nominal.deflection)
+    if not abs(share - 1.0) <= LARGEST_FROM_NOMINAL:
+        raise AmiwarpError(
+            f"{name}: the prism seems to have {100 * share:.0f} % of its nominal {size}, "
+            f"{math.degrees(nominal.apex):.4g} deg of apex: the camera shakes with the prism, or the nominal prism or "
+            f"the focal length is wrong; mend these, or give bounds of {size} if it is so"
+        )
+
+
 def significance(best: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """By how many standard deviations the sharpness of disjoint parts of the events is higher at one point."""
     gain = best - other
@@ -64,13 +100,13 @@ def check_texture(
     """
     sure = significance(best, turned)
     if not sure >= LEAST_SIGNIFICANCE:
-        raise AmiwarpError(
+        raise NotSharp(
             f"{name}: no motion of a prism makes the image sharper than chance does ({sure:.1f} standard "
             "deviations): no texture, too few events, or a wrong encoder; show the camera a scene with edges"
         )
     sure = significance(best, still)
     if not sure >= LEAST_SIGNIFICANCE:
-        raise AmiwarpError(
+        raise NotSharp(
             f"{name}: the image is as sharp with no motion taken out ({sure:.1f} standard deviations between them): "
             "no prism turned, its apex is too small for these events, or the encoder is wrong; record more events"
         )

@@ -139,7 +139,9 @@ def padding(space: Space) -> int:
     # a search that goes as far as its bounds is lost anyway: twice the start's motion, and a little, is room enough
     faster = {n: 2.0 * abs(space.start.get(n, 0.0)) for n in MOTION if n in space.start}
     room = MOTION_ROOM_PX if space.moving else 0.0
-    return math.ceil(reach(space, {**space.start, **largest, **faster}) + room) + 2
+    # events that go further are lost to any answer worth having
+    most = max(space.camera.width, space.camera.height)
+    return math.ceil(min(reach(space, {**space.start, **largest, **faster}) + room, most)) + 2
 
 
 def reach(space: Space, values: Mapping[str, float]) -> float:

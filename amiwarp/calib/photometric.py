@@ -18,6 +18,7 @@ from amiwarp.calib.objective import reach
 from amiwarp.calib.parameters import LATE, MOTION
 from amiwarp.calib.result import Photometric, StageSummary
 from amiwarp.calib.solve import Stage, maximise
+from amiwarp.calib.verdict import BESIDE_PX, FAR_PX, verdict
 from amiwarp.errors import AmiwarpError
 from amiwarp.pairs import EventTable, PairSet, Sensor, off_excess
 
@@ -37,21 +38,19 @@ MARGIN_PX, MOVING_MARGIN_PX = 3, 8
 """By which the map of a tile is grown: the parameters may move events so far."""
 LONGEST_GAP_US = 60_000
 """Pairs further apart say little: noise has come between."""
-FEWEST_PAIRS = 5_000
+FEWEST_PAIRS = 1_500
 PAIRS_PER_NODE = 1.5
 """Fewer equations for each unknown of the map fit anything."""
 FEWEST_TURNS = 2
 FEWEST_TILES = 6
 FIRST_SCALE = 1.0
 """Of Cauchy's weights while the map is cold [thresholds]."""
-FAR_PX, FAR_MOVING_PX = 1.0, 4.0
-"""The stage looks no further from the sharpness optimum than this; than the latter in the camera's motion."""
+FAR_MOVING_PX = 4.0
+"""The stage looks no further in the camera's motion from the sharpness optimum than this."""
 FIRST_STEP_PX = 0.2
 POLISH_STEP_PX = 0.05
 SLOPE_PX = 0.02
 """Of the differences that give the residuals' slopes [px]."""
-LARGEST_COST = 0.35
-"""Of the cost with no map at all: above it the equations do not hold, and the scene or camera moved unmodelled."""
 
 
 @dataclass(frozen=True)
@@ -282,10 +281,7 @@ def refine(
         cost.warm_up(v)
     stage = _search(cost, v, settings, progress)
     result = _conclude(cost, stage.x, v, left)
-    found = replace(
-        result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held,
-        off_over_on=1.0 + float(brightness.extra[1]), leak=float(brightness.extra[0]),
-    )  # fmt: skip
+    found = replace(result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held)
     return found, StageSummary.of("photometric", stage, space)
 
 
@@ -346,13 +342,17 @@ def _conclude(
     at_start = cost.mean()
     cost.residuals(best, rounds=2)
     final, residual = cost.mean(), cost.brightness.residuals.median()
-    covariance = cost.slopes(best, with_parts=True).covariance() / left**2
+    slopes = cost.slopes(best, with_parts=True)
+    covariance = slopes.covariance() / left**2
     asked = np.array([n not in LATE for n in space.names])
     near = np.array([n not in (*LATE, *MOTION) for n in space.names])
-    accepted, verdict = _verdict(final, at_start, float(np.linalg.norm((best - v)[near])))
+    leak, excess = (float(x) for x in cost.brightness.extra)  # before the map follows elsewhere
+    rise = min(_beside(cost, best), default=math.inf) - final
+    ahead = float(np.linalg.norm(slopes.step()[near]))
+    accepted, words = verdict(final, rise, float(np.linalg.norm((best - v)[near])), ahead)
     return Photometric(
         accepted=accepted,
-        verdict=verdict,
+        verdict=words,
         parameters=space.to_values(best),
         uncertainty=space.deviations(best, covariance),
         sharpness_parameters={},
@@ -361,18 +361,20 @@ def _conclude(
         cost_at_sharpness=at_start,
         residual=residual,
         pairs=0,
-        off_over_on=1.0,
+        off_over_on=1.0 + excess,
+        leak=leak,
     )
 
 
-def _verdict(cost: float, at_start: float, moved: float) -> tuple[bool, str]:
-    if cost > LARGEST_COST:
-        return False, (
-            f"no map of the scene explains the events ({100 * cost:.0f} % of the residual remains): the scene or the "
-            "camera moved, or light flickered; kept the answer of sharpness"
-        )
-    if moved > 0.95 * FAR_PX:
-        return False, f"the optimum lies over {FAR_PX:g} px from that of sharpness; kept the answer of sharpness"
-    if cost > at_start:
-        return False, "no better than the answer of sharpness, which was kept"
-    return True, f"one map explains the events ({100 * cost:.0f} % of the residual remains)"
+def _beside(cost: Cost, best: NDArray[np.float64]) -> list[float]:
+    """The cost where the orbit is larger, and smaller, by :data:`BESIDE_PX`, the map at its best there."""
+    if cost.space.size_name not in cost.space.names:
+        return []
+    along = np.zeros(len(best))
+    many = 2 if cost.space.cartesian else 1
+    along[:many] = best[:many] / max(float(np.linalg.norm(best[:many])), 1e-9)
+    found = []
+    for side in (BESIDE_PX, -BESIDE_PX):
+        cost.residuals(best + side * along, rounds=2)
+        found.append(cost.mean())
+    return found

@@ -82,6 +82,70 @@ class Photometric:
 
 
 @dataclass(frozen=True)
+class Rung:
+    """One model of the ladder and what was found of it; see :mod:`amiwarp.calib.auto`."""
+
+    model: str
+    numbers: str
+    """How many it has, and which are given."""
+    predicted_px: float
+    """Distance of its best fit from the exact answer, over the events [px rms]."""
+    sharpness: float
+    """On held-out turns."""
+    loss: float
+    """The exact model's sharpness on held-out turns less this one's."""
+    loss_std: float
+    """From its scatter over disjoint parts of these events."""
+    seen_px: tuple[float, float]
+    """What the loss amounts to: the rms displacement that would cost as much, of the loss 2 deviations either way."""
+    cost_ns: float
+    """Angle, displacement and vote of one event, as measured here [ns]."""
+    chosen: bool
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Freed:
+    """One parameter, or a pair, that was held at first: whether it was freed, and why (not)."""
+
+    name: str
+    freed: bool
+    determined: bool
+    std_px: float | None
+    """By how much it is uncertain, in motion of events [px]; None where it hardly moves them."""
+    gain_px: tuple[float, float] | None
+    """What held-out turns gain by it, as :attr:`Rung.seen_px`; None where it is not determined."""
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """How ``auto`` came to its model."""
+
+    budget_px: float
+    timing_px: float
+    """Blur that encoder, clock and latency leave, by estimate [px]."""
+    agreed: bool
+    """Whether neither judge contradicts the other about the model chosen and those below it."""
+    exact: Mapping[str, float]
+    """Parameters of the exact model, from which those of the chosen one were fitted."""
+    exact_uncertainty: Mapping[str, float]
+    rungs: tuple[Rung, ...]
+    parameters: tuple[Freed, ...]
+    seconds: float
+    """Beside the exact model's first calibration."""
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Ladder:
+        rungs = tuple(Rung(**{**rung, "seen_px": tuple(rung["seen_px"])}) for rung in data["rungs"])
+        parameters = tuple(
+            Freed(**{**p, "gain_px": None if p["gain_px"] is None else tuple(p["gain_px"])}) for p in data["parameters"]
+        )
+        exact = {n: _finite(n, x) for n, x in data["exact"].items()}
+        return cls(**{**data, "exact": exact, "rungs": rungs, "parameters": parameters})
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Parameters of one model of one camera and prism. Angles in rad; the JSON file gives degrees beside them."""
 
@@ -110,11 +174,22 @@ class Calibration:
     """What the second stage found; None where it did not run."""
     middle_us: int | None = None
     """Where the camera's motion was free: the time for which its rates hold, on the events' clock."""
+    ladder: Ladder | None = None
+    """How the model was chosen, where that was left to ``auto``."""
 
     @property
     def model(self) -> Model:
         """The calibrated model."""
         return build_model(self.model_name, self.camera, self.prism, self.parameters)
+
+    @property
+    def exact(self) -> Calibration:
+        """The exact model's answer, from which a smaller rung was fitted; itself where there is no ladder."""
+        if self.ladder is None:
+            return self
+        free = tuple("apex" if n == "deflection" else n for n in self.free)
+        found, std = self.ladder.exact, self.ladder.exact_uncertainty
+        return replace(self, model_name="exact", parameters=found, uncertainty=std, free=free, ladder=None)
 
     @property
     def turning(self) -> Turning | None:
@@ -154,6 +229,7 @@ class Calibration:
             "zero_us": self.zero_us,
             "middle_us": self.middle_us,
             "photometric": None if self.photometric is None else asdict(self.photometric),
+            "ladder": None if self.ladder is None else asdict(self.ladder),
             "events": self.events,
             "seconds": self.seconds,
             "warnings": list(self.warnings),
@@ -220,6 +296,7 @@ class Calibration:
             zero_us=None if data["zero_us"] is None else operator.index(data["zero_us"]),
             photometric=_photometric(data["photometric"]),
             middle_us=None if data.get("middle_us") is None else operator.index(data["middle_us"]),
+            ladder=None if data.get("ladder") is None else Ladder.from_json(data["ladder"]),
         )
         _ = replace(result, model_name="exact" if result.model_name == "ellipse" else result.model_name).model
         return result

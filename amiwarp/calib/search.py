@@ -36,6 +36,7 @@ CANDIDATES = 3
 PARTS = 8
 """Disjoint parts of the events that tell chance from signal."""
 
+AUTO = "auto"
 STAGES = ("sharpness", "photometric")
 
 Progress = Callable[[str, int, int], None]
@@ -47,6 +48,9 @@ class Settings:
     """How to calibrate; every default was chosen by measurement, see ``docs/calibration.md``."""
 
     model: str = "exact"
+    """One of the ladder, or ``auto``: the smallest that keeps the budget."""
+    budget_px: float | None = None
+    """For ``auto``: see :func:`amiwarp.calib.auto.calibrate_auto`."""
     sharpness: Sharpness = Sharpness.VARIANCE
     global_algorithm: str | None = "GN_DIRECT_L"
     """None starts the local search at ``start`` at once."""
@@ -74,8 +78,8 @@ class Settings:
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
 
     def check(self) -> None:
-        if self.model not in MODELS:
-            raise AmiwarpError(f"model {self.model!r} is unknown; choose among {', '.join(MODELS)}")
+        if self.model not in (AUTO, *MODELS):
+            raise AmiwarpError(f"model {self.model!r} is unknown; choose among {', '.join((AUTO, *MODELS))}")
         if self.global_algorithm is not None:
             check_algorithm(self.global_algorithm, GLOBAL_ALGORITHMS)
         check_algorithm(self.local_algorithm, LOCAL_ALGORITHMS)

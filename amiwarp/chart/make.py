@@ -7,12 +7,9 @@ import io
 import json
 import math
 import os
-import platform
-import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +19,7 @@ from amiwarp.chart.rows import Progress, Row, beaten_by, fastest_within, fronts,
 from amiwarp.chart.truth import Known
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import write_text
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.machine import machine, versions
 from amiwarp.presets import Preset
 from amiwarp.uploads import TURNS
 
@@ -195,38 +192,11 @@ def _about(known: Known, device: str) -> dict[str, Any]:
         "machine": machine(device),
         "device": device,
         "processor": machine("cpu"),
-        "versions": _versions(),
+        "versions": versions(PACKAGES),
         "recording": {"name": known.recording.name, "events": len(known.events), "width": known.camera.width,
                       "height": known.camera.height, "truth": known.recording.truth.parameters
                       if known.recording.truth else {}},
     }  # fmt: skip
-
-
-def processor() -> str:
-    """Name of the CPU."""
-    info = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
-    return (found.group(1) if found else platform.processor() or platform.machine()).strip()
-
-
-def machine(device: str) -> str:
-    """The GPU's name, or the processor's with the cores that may be used."""
-    import warp as wp
-
-    there = wp.get_device(device)
-    return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
-
-
-def _versions() -> dict[str, str]:
-    from amiwarp import __version__
-
-    out = {"amiwarp": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            out[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return out
 
 
 def _data(charts: Charts) -> dict[str, Any]:

@@ -10,7 +10,19 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from amiwarp.cli import calibrate, chart, compensate, convert, demo, info, reconstruct, simulate, translate
+from amiwarp.cli import (
+    calibrate,
+    chart,
+    compensate,
+    convert,
+    demo,
+    design,
+    info,
+    reconstruct,
+    simulate,
+    stability,
+    translate,
+)
 from amiwarp.cli.options import command
 from amiwarp.errors import AmiwarpError
 
@@ -66,7 +78,7 @@ def _version(ctx: typer.Context, version: bool = typer.Option(False, "--version"
         print(ctx.get_help())
 
 
-for module in (demo, info, convert, simulate, translate, calibrate, compensate, reconstruct, chart):
+for module in (demo, info, convert, simulate, translate, calibrate, compensate, reconstruct, chart, design, stability):
     command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from amiwarp.sharpness import Sharpness
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration, Settings
     from amiwarp.calib.photometric import PhotometricSettings
+    from amiwarp.calib.result import Ladder
     from amiwarp.events import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
@@ -25,12 +27,31 @@ EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.
 _SEARCH, _PARAMETERS = "Search", "Parameters"
 
 
+class Method(enum.Enum):
+    """Whose way to calibrate."""
+
+    AMIWARP = "amiwarp"
+    PAPER = "paper"
+
+
 @dataclass(frozen=True)
 class SearchOptions:
     """How to search; what is left out takes the default of ``amiwarp.calib.Settings``."""
 
     model: Annotated[
-        str | None, typer.Option(help="circle, radial, ellipse or exact (default).", rich_help_panel=_SEARCH)
+        str | None,
+        typer.Option(
+            help="circle, radial, ellipse or exact (default); auto: the smallest that keeps the budget.",
+            rich_help_panel=_SEARCH,
+        ),
+    ] = None
+    budget_px: Annotated[
+        float | None,
+        typer.Option(
+            help="Error of a model that counts as none, for --model auto. Default: a tenth of the blur that "
+            "quantisation and timing leave anyway.",
+            rich_help_panel=_SEARCH,
+        ),
     ] = None
     sharpness: Annotated[
         Sharpness | None, typer.Option(help="What is maximised. Default: variance.", rich_help_panel=_SEARCH)
@@ -167,6 +188,12 @@ def run(
         Path | None, typer.Argument(help="Calibration to write; default: NAME.calibration.json beside the recording.")
     ] = None,
     *,
+    method: Annotated[
+        Method,
+        typer.Option(
+            help="paper: He et al.'s, to compare with: a circle, their cost J, a grid about the nominal prism."
+        ),
+    ] = Method.AMIWARP,
     preset: Annotated[
         Path | None, typer.Option(help="Settings that 'amiwarp chart' chose; options given beside it win.")
     ] = None,
@@ -184,6 +211,7 @@ def run(
 ) -> None:
     """Find the prism's parameters: those that make the image of the events sharpest. No guess is needed."""
     from amiwarp.calib import Settings, calibrate
+    from amiwarp.calib.paper import calibrate_as_paper
     from amiwarp.io import open_recording
     from amiwarp.presets import Preset
 
@@ -195,7 +223,13 @@ def run(
     out = out or recording.with_name(f"{recording.stem}.calibration.json")
     check_outputs(out, figure)
     with progress("calibrating") as advance:
-        found = calibrate(opened, settings, device=device, progress=staged(advance, settings))
+        if method is Method.PAPER:
+            check_paper(search, parameters, preset)
+            found = calibrate_as_paper(
+                opened, start=settings.start, device=device, progress=staged(advance, replace(settings, stages=()))
+            )
+        else:
+            found = calibrate(opened, settings, device=device, progress=staged(advance, settings))
     found.save(out)
     if figure is not None:
         from amiwarp.figures import draw_calibration
@@ -203,6 +237,12 @@ def run(
         draw_calibration(figure, opened, found, device=device)
     data = summary(found) | {"file": str(out), "figure": None if figure is None else str(figure), "device": device}
     report(common, data, lines(found, data))
+
+
+def check_paper(search: SearchOptions, parameters: ParameterOptions, preset: Path | None) -> None:
+    """The paper's method has no settings but where it starts."""
+    if search != SearchOptions() or preset is not None or replace(parameters, start=None) != ParameterOptions():
+        raise AmiwarpError("--method paper takes no settings of the search but --start phase=…; leave the others out")
 
 
 def check_outputs(out: Path, figure: Path | None) -> None:
@@ -271,11 +311,43 @@ def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
         "",
         table(stages, "stage", "algorithm", "evaluations", "time", "sharpness", "ended by"),
         "",
+        *_ladder(c.ladder),
         f"sharpness ({sharp['kind']}): {sharp['before']:.5g} before, {sharp['after']:.5g} after",
         *_photometric(c),
         *(f"warning: {text}" for text in c.warnings),
         f"{data['file']}: {data['model']} model, {c.events:,} events, {c.seconds:.2f} s on {data['device']}",
     ]
+
+
+def _ladder(ladder: Ladder | None) -> list[Any]:
+    """Why this model, and what was freed."""
+    if ladder is None:
+        return []
+    rungs = [
+        (r.model, r.numbers, f"{r.predicted_px:.4f} px", f"{r.sharpness:.5g}", f"{r.loss:.2g} ± {r.loss_std:.1g}",
+         _range(r.seen_px), f"{r.cost_ns:.3g} ns", ("chosen: " if r.chosen else "") + r.verdict)
+        for r in ladder.rungs
+    ]  # fmt: skip
+    freed = [(p.name, "" if p.std_px is None else f"{p.std_px:.2g} px", p.verdict) for p in ladder.parameters]
+    return [
+        table(rungs, "model", "numbers", "predicted", "held out", "loss", "as motion", "per event", "verdict"),
+        f"budget {ladder.budget_px:.3g} px; timing leaves {ladder.timing_px:.2g} px of blur; "
+        f"the judges {'agree' if ladder.agreed else 'do not agree'}",
+        *([table(freed, "parameter", "± std", "freed or why not")] if freed else []),
+        *(_exact(ladder) if not any(r.chosen and r.model == "exact" for r in ladder.rungs) else []),
+        "",
+    ]
+
+
+def _exact(ladder: Ladder) -> list[str]:
+    """The prism itself, where the chosen model does not name its apex."""
+    std = ladder.exact_uncertainty.get("apex", 0.0)
+    return [f"the exact model's apex: {math.degrees(ladder.exact['apex']):.6g} ± {math.degrees(std):.2g} deg"]
+
+
+def _range(px: tuple[float, float]) -> str:
+    low, high = (max(x, 0.0) for x in px)
+    return f"{low:.3f} to {high:.3f} px"
 
 
 def _photometric(c: Calibration) -> list[str]:

@@ -1,0 +1,242 @@
+"""``amiwarp design``: which prism, and how fast, for one's own camera; charted, and chosen with the reasons."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli.console import choose_device, plain, progress, report, table
+from amiwarp.cli.inputs import CameraOptions, numbers
+from amiwarp.cli.options import Common
+from amiwarp.cli.rig import parse_size
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics import FlatSide, Prism
+
+if TYPE_CHECKING:
+    from amiwarp.camera import Camera
+    from amiwarp.design import Choice, Design, Limits, Timing
+
+EXAMPLE = "amiwarp design --size 640x480 --fov-deg 60 --tolerance-px 0.5 --out amiwarp-design"
+FOV_DEG = 60.0
+_LIMITS, _FAULTS, _PRISM = "Limits", "Faults", "Prism"
+
+
+@dataclass(frozen=True)
+class GridOptions:
+    """What there is to choose from."""
+
+    apex_deg: Annotated[
+        str, typer.Option(help="Apex angles to compare (deg).", metavar="A,B,...", rich_help_panel=_PRISM)
+    ] = "0.25,0.5,1,2,4"
+    rpm: Annotated[
+        str, typer.Option(help="Speeds to compare (turns/min).", metavar="A,B,...", rich_help_panel=_PRISM)
+    ] = "180,360,720,1440,2880"
+    index: Annotated[float, typer.Option(help="Refractive index.", rich_help_panel=_PRISM)] = 1.5168
+    flat_side: Annotated[FlatSide, typer.Option(help="Where the flat face looks.", rich_help_panel=_PRISM)] = (
+        FlatSide.SCENE
+    )
+
+    @property
+    def apexes(self) -> list[float]:
+        """[rad]."""
+        return [math.radians(v) for v in _list(self.apex_deg, "--apex-deg")]
+
+    @property
+    def rpms(self) -> list[float]:
+        """[turns/min]."""
+        return list(_list(self.rpm, "--rpm"))
+
+
+@dataclass(frozen=True)
+class LimitOptions:
+    """What a choice must keep."""
+
+    tolerance_px: Annotated[
+        float, typer.Option(help="Largest error across an edge after compensation (px).", rich_help_panel=_LIMITS)
+    ] = 0.5
+    window_ms: Annotated[
+        float,
+        typer.Option(help="Time in which edges of every direction must have been seen (ms).", rich_help_panel=_LIMITS),
+    ] = 33.4
+    bandwidth_mev_s: Annotated[
+        float | None,
+        typer.Option(help="What sensor and cable carry (million events/s). Default: any.", rich_help_panel=_LIMITS),
+    ] = None
+    budget_px: Annotated[
+        float | None,
+        typer.Option(help="What the model may be wrong by (px rms). Default: a tenth of the blur that is there anyway.",
+                     rich_help_panel=_LIMITS),
+    ] = None  # fmt: skip
+
+    def build(self) -> Limits:
+        from amiwarp.design import Limits
+
+        most = None if self.bandwidth_mev_s is None else self.bandwidth_mev_s * 1e6
+        return Limits(self.tolerance_px, self.window_ms, most, self.budget_px)
+
+
+@dataclass(frozen=True)
+class FaultOptions:
+    """What the sensor and the encoder are like."""
+
+    clock_us: Annotated[
+        float,
+        typer.Option(help="Standard deviation of an event's time: readout, jitter (us).", rich_help_panel=_FAULTS),
+    ] = 60.0
+    encoder_deg: Annotated[
+        float, typer.Option(help="Standard deviation of the encoder's angle (deg).", rich_help_panel=_FAULTS)
+    ] = 0.1
+    contrast: Annotated[
+        float, typer.Option(help="Change of log intensity that makes an event.", rich_help_panel=_FAULTS)
+    ] = 0.25
+
+    def timing(self) -> Timing:
+        from amiwarp.design import Timing
+
+        return Timing(self.clock_us, math.radians(self.encoder_deg))
+
+
+def run(
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the chart and the tables.")] = Path("amiwarp-design"),
+    size: Annotated[
+        str | None,
+        typer.Option(help="Pixels of the camera. Default: 640x480, or as --camera says.", metavar="WIDTHxHEIGHT",
+                     rich_help_panel="Camera"),
+    ] = None,
+    camera: CameraOptions,
+    grid: GridOptions,
+    limits: LimitOptions,
+    faults: FaultOptions,
+    picture: Annotated[
+        Path | None, typer.Option(help="Scene that makes the events: any picture. Default: a map of the earth.")
+    ] = None,
+    common: Common,
+) -> None:  # fmt: skip
+    """Compare prisms and speeds for a camera before they are bought, and recommend one with the reasons.
+
+    Events are predicted from small simulated parts of the image; blur, window and models from the optics.
+    """
+    seen = _camera(camera, size)
+    glass = Prism(0.0, grid.index, grid.flat_side)
+    device = choose_device(common.device)
+    from amiwarp.demo import earth
+    from amiwarp.design import design
+    from amiwarp.design.drawing import draw
+    from amiwarp.io.files import write_text
+    from amiwarp.simulate import Scene, SensorModel
+
+    sensor = SensorModel(contrast_on=faults.contrast, contrast_off=faults.contrast)
+    scene = Scene.from_picture(picture or earth())
+    with progress("starting") as advance:
+        made = design(
+            seen, scene, glass, apexes=grid.apexes, rpms=grid.rpms, timing=faults.timing(), limits=limits.build(),
+            sensor=sensor, seed=common.seed, device=device, progress=lambda what, share: advance(share, what),
+        )  # fmt: skip
+    try:
+        os.makedirs(out, exist_ok=True)
+    except OSError as error:
+        raise AmiwarpError(f"{out}: cannot be made a folder: {error.strerror}; choose another --out") from error
+    files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
+    data = summary(made)
+    write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+    write_text(Path(files["csv"]), _csv(data["choices"]))
+    draw(out / "design", made)
+    report(common, {**data, "files": files, "device": device}, lines(made, files))
+
+
+def _camera(options: CameraOptions, size: str | None) -> Camera:
+    from amiwarp.camera import Camera
+
+    width, height = parse_size(size or "640x480")
+    found = options.build(width, height, fixed=size is not None)
+    return found or Camera.from_fov(width, height, math.radians(FOV_DEG))
+
+
+def _list(text: str, name: str) -> tuple[float, ...]:
+    return numbers(text, text.count(",") + 1, name)
+
+
+def summary(design: Design) -> dict[str, Any]:
+    """Everything that was computed; angles in degrees."""
+    from amiwarp.design.words import headline, reasons
+
+    camera, volume = design.camera, design.volume
+    return {
+        "format": "amiwarp-design",
+        "version": 1,
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "prism": {"index": design.glass.index, "flat_side": design.glass.flat_side.value},
+        "limits": {
+            "tolerance_px": design.limits.tolerance_px,
+            "window_ms": design.limits.window_ms,
+            "bandwidth_mev_s": None if design.limits.bandwidth is None else design.limits.bandwidth / 1e6,
+            "budget_px": design.limits.budget_px,
+        },
+        "faults": {"clock_us": design.timing.clock_us, "encoder_deg": math.degrees(design.timing.encoder)},
+        "volume": {
+            "apex_deg": [math.degrees(apex) for apex in volume.apexes],
+            "rpm": volume.rpms.tolist(),
+            "yields": volume.yields.tolist(),
+            "uncertainty": volume.uncertainty,
+            "texture_per_px": volume.texture,
+            "contrast": volume.contrast,
+            "noise_hz": volume.noise_hz,
+            "simulated_pixels": volume.simulated,
+        },
+        "choices": [_fields(c) for c in design.choices],
+        "recommended": None if design.chosen is None else _fields(design.chosen),
+        "headline": headline(design),
+        "reasons": reasons(design),
+    }
+
+
+def _fields(c: Choice) -> dict[str, Any]:
+    return {
+        "apex_deg": math.degrees(c.orbit.apex),
+        "rpm": c.rpm,
+        "deflection_deg": math.degrees(c.orbit.deflection),
+        "radius_px": c.orbit.radius,
+        "smallest_radius_px": c.orbit.smallest,
+        "swing_px": c.orbit.swing,
+        "events_per_s": c.events_per_s,
+        "window_ms": c.window_ms,
+        "clock_px": c.clock_px,
+        "encoder_px": c.encoder_px,
+        "blur_px": c.blur_px,
+        "budget_px": c.budget_px,
+        "model": c.model,
+        "error_px": c.error_px,
+        **{f"{name}_error_px": error for name, error in c.orbit.errors.items()},
+        "misses": list(c.misses),
+    }
+
+
+def _csv(rows: list[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({**row, "misses": "+".join(row["misses"])} for row in rows)
+    return text.getvalue()
+
+
+def lines(design: Design, files: dict[str, str]) -> list[Any]:
+    """The same for people."""
+    from amiwarp.design.words import degrees, headline, rate, reasons
+
+    rows = [
+        (degrees(c.orbit.apex), f"{c.rpm:g}", rate(c.events_per_s), f"{c.orbit.radius:.1f} px", f"{c.error_px:.3f} px",
+         c.model, f"{c.window_ms:.1f} ms", "recommended" if c is design.chosen else ", ".join(c.misses))
+        for c in design.choices
+    ]  # fmt: skip
+    shown = table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
+    said = [tuple(line.split(": ", 1)) for line in reasons(design)]
+    return [shown, "", headline(design), table(said), "", *files.values()]

@@ -1,0 +1,191 @@
+"""``amiwarp stability``: where calibration works and how it fails, on simulated recordings with known truth."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli.console import choose_device, progress, report, table
+from amiwarp.cli.options import Common
+from amiwarp.errors import AmiwarpError
+from amiwarp.kernels.cores import cpu_threads
+
+if TYPE_CHECKING:
+    from amiwarp.stability import Atlas, Axis, Method, Stored
+
+EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
+SEEDS, QUICK_SEEDS, QUICK_MINUTES = 20, 2, 8.0
+PACKAGES = ("warp-lang", "numpy", "scipy", "nlopt", "distributed")
+
+
+def run(
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for cells, figures and tables.")] = Path("amiwarp-atlas"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Three values of each axis, three methods, two seeds: within ten minutes.")
+    ] = False,
+    axes: Annotated[
+        list[str] | None, typer.Option(help="Only this axis; can be given more than once.", metavar="NAME")
+    ] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this method, the default and the paper's; can be given more than once.", metavar="NAME"
+        ),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help=f"Recordings of each value. Default: {SEEDS}, quick {QUICK_SEEDS}.")
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(min=0.0, help=f"End after so long; the same command goes on later. Quick: {QUICK_MINUTES:.0f}."),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler. Default: a process on each core here.")
+    ] = None,
+    redraw: Annotated[bool, typer.Option("--redraw", help="Run nothing: figures and tables from the cells.")] = False,
+    common: Common,
+) -> None:
+    """Calibrate simulated recordings along each axis that breaks calibration, and draw the atlas of failures.
+
+    Each cell, a recording and what the methods make of it, is kept in OUT/cells as it finishes: a run that was
+    stopped goes on with the same command, and a rerun does only what is missing.
+    """
+    device = choose_device(common.device)
+    from amiwarp.stability import aggregate, draw, identity, load
+
+    chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
+    cells_in = out / "cells"
+    _make(cells_in)
+    began = time.perf_counter()
+    new = left = 0
+    if redraw:
+        cells = load(cells_in)
+    else:
+        of_each = seeds or (QUICK_SEEDS if quick else SEEDS)
+        limit = QUICK_MINUTES if quick and minutes is None else minutes
+        cells, new = _run(chosen_axes, of_each, chosen_methods, cells_in, device, scheduler, limit, common.seed)
+        left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
+    took = time.perf_counter() - began
+    atlas = aggregate(cells, chosen_axes, chosen_methods, _about(device))
+    with progress("drawing"):
+        files = atlas.write(out) | draw(atlas, out)
+    speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
+    data = {"aims": atlas.aims.to_json(), "files": {name: str(path) for name, path in files.items()}, **speed}
+    report(common, data | {"device": device}, lines(atlas, files, new, left, took))
+
+
+def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
+    from amiwarp.stability import AXES, quick_axes
+
+    known = quick_axes() if quick else AXES
+    _check("axis", names, [a.name for a in known])
+    return tuple(a for a in known if not names or a.name in names)
+
+
+def _methods(names: Sequence[str], quick: bool) -> tuple[Method, ...]:
+    from amiwarp.stability import METHODS, QUICK_METHODS, chosen
+
+    _check("method", names, [m.name for m in METHODS])
+    return chosen(QUICK_METHODS if quick and not names else names)
+
+
+def _check(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise AmiwarpError(f"no {what} {name!r} is here; choose among {', '.join(known)}")
+
+
+def _make(folder: Path) -> None:
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError as error:
+        raise AmiwarpError(f"{folder}: cannot be made a folder: {error.strerror}; choose another --out") from error
+
+
+def _run(
+    axes: Sequence[Axis], seeds: int, methods: Sequence[Method], folder: Path, device: str, scheduler: str | None,
+    minutes: float | None, first: int,
+) -> tuple[list[Stored], int]:  # fmt: skip
+    """All cells, and how many of them were not there before."""
+    from amiwarp.stability import run
+
+    end = None if minutes is None else time.monotonic() + 60.0 * minutes
+    new = 0
+
+    def tell(finished: int, of: int) -> None:
+        nonlocal new
+        new += 1
+        advance(finished / of, f"{finished:,} of {of:,} cells")
+
+    try:
+        with progress("starting workers") as advance, _executor(scheduler, device) as executor:
+            cells = run(axes, seeds, methods, folder, executor, device=device, first=first, progress=tell,
+                        until=None if end is None else lambda: time.monotonic() > end)  # fmt: skip
+    except KeyboardInterrupt:
+        print(f"amiwarp: what is finished is kept in {folder}; the same command goes on from there", file=sys.stderr)
+        raise
+    return cells, new
+
+
+@contextlib.contextmanager
+def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
+    """Of the scheduler's workers, or of one process a core here. Raises :class:`AmiwarpError` where it is not there."""
+    distributed: Any = importlib.import_module("distributed")  # loaded only here, and without types
+    with contextlib.ExitStack() as stack:
+        where: Any = scheduler
+        if scheduler is None:
+            where = stack.enter_context(distributed.LocalCluster(
+                n_workers=cpu_threads(), threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=None,
+                silence_logs=logging.ERROR,
+            ))  # fmt: skip
+        try:
+            client = stack.enter_context(distributed.Client(where, timeout=20))
+        except (OSError, ValueError) as error:
+            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); "
+                               "start one with: dask scheduler") from error  # fmt: skip
+        client.register_worker_callbacks(functools.partial(_prepare, device, scheduler is None))
+        try:
+            yield stack.enter_context(client.get_executor())
+        except distributed.KilledWorker as error:
+            raise AmiwarpError(f"workers died over a cell ({error}): out of memory, or ended from outside; "
+                               "the same command goes on from there") from error  # fmt: skip
+
+
+def _prepare(device: str, here: bool) -> None:
+    """Of each worker: Warp quiet, and Ctrl-C left to the process that started it."""
+    if here:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    choose_device(device)
+
+
+def _about(device: str) -> dict[str, Any]:
+    from amiwarp.machine import machine, versions
+
+    return {"date": time.strftime("%Y-%m-%d"), "machine": machine(device), "device": device,
+            "versions": versions(PACKAGES)}  # fmt: skip
+
+
+def lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, took: float) -> list[Any]:
+    """For people: where each method works, the aims, the files and the speed."""
+    from amiwarp.stability import summary
+
+    shown: list[Any] = [table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
+    named = ("overview", "pages", "summary", "data", "table")
+    shown += [f"{name}: {files[name]}" for name in named]
+    speed = f"{new:,} cells in {took:,.0f} s, {new / took:.3g} a second; " if new else ""
+    if left:
+        shown.append(f"{left:,} cells are left, for want of time; the same command goes on from there")
+    return [*shown, f"{speed}{atlas.cells:,} cells in all, in {files['data'].parent / 'cells'}"]

@@ -1,0 +1,78 @@
+"""Cells of the atlas of failures on a machine that has Python and a GPU but no Dask: a pool of processes.
+
+    python -m benchmarks.atlas --out FOLDER [--device cuda:0] [--seeds 20] [--limit-s 500] [--quick] [--axes NAME …]
+
+Writes FOLDER/cells.tar, to be unpacked into the folder of ``amiwarp stability --out``, which then draws them and runs
+what is missing. Cells that an earlier run left in FOLDER/cells are taken from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import tarfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import warp as wp
+
+from amiwarp.stability.cells import Cell, run_cell
+from amiwarp.stability.conditions import AXES
+from amiwarp.stability.run import QUICK_METHODS, chosen, quick_axes, run
+
+_started = multiprocessing.get_context("spawn").Value("i", 0)
+
+
+def quiet(counter: object) -> None:
+    """Each process on a core of its own: work is in many processes, not in many threads."""
+    wp.config.log_level = wp.LOG_ERROR
+    with counter.get_lock():  # type: ignore[attr-defined]
+        number = counter.value  # type: ignore[attr-defined]
+        counter.value += 1  # type: ignore[attr-defined]
+    if hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[number % len(cores)]})
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--limit-s", type=float, default=500.0)
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--axes", nargs="+")
+    parser.add_argument("--methods", nargs="+", default=[])
+    args = parser.parse_args()
+    axes = [a for a in (quick_axes() if args.quick else AXES) if not args.axes or a.name in args.axes]
+    methods = chosen(args.methods or (QUICK_METHODS if args.quick else ()))
+    cells = args.out / "cells"
+    cells.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    said = 0
+
+    def tell(done: int, of: int) -> None:
+        nonlocal said
+        if done * 20 // of > said:
+            said = done * 20 // of
+            print(f"{time.perf_counter() - began:6.0f} s  {done} of {of} cells", flush=True)
+
+    start = {"initializer": quiet, "initargs": (_started,), "mp_context": multiprocessing.get_context("spawn")}
+    with ProcessPoolExecutor(1, **start) as one:  # compiles kernels once, for all
+        one.submit(run_cell, Cell(axes[0].conditions()[0], 0), methods, args.device).result()
+    print(f"{time.perf_counter() - began:6.0f} s  compiled", flush=True)
+    with ProcessPoolExecutor(args.workers, **start) as pool:
+        run(axes, args.seeds, methods, cells, pool, device=args.device, progress=tell,
+            until=lambda: time.perf_counter() - began > args.limit_s)  # fmt: skip
+    with tarfile.open(args.out / "cells.tar", "w") as tar:
+        tar.add(cells, arcname="cells")
+    print(f"{time.perf_counter() - began:6.0f} s  {len(list(cells.glob('*.json')))} cells in {args.out / 'cells.tar'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,248 @@
+"""The atlas' output: rates and aims from cells, files, figures, and the command from one end to the other."""
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import distributed
+import numpy as np
+import pytest
+from matplotlib.text import Text
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+import amiwarp.stability
+from amiwarp.cli.app import app
+from amiwarp.errors import AmiwarpError
+from amiwarp.stability import METHODS, Atlas, Axis, Cell, Condition, Outcome, Store, Stored, aggregate, identity, load
+from amiwarp.stability import Result as Found
+from amiwarp.stability.figures import OVERVIEW, _overview, _page, draw
+from amiwarp.stability.report import Rate, most_said, words_of
+
+METHOD = {m.name: m for m in METHODS}
+NOISE = Axis("background noise", "noise", (0.0, 0.25, 0.5, 0.8), "of all events")
+SCENE = Axis("scene", "scene", ("dense texture", "one edge direction", "blank wall"))
+AXES = (NOISE, SCENE)
+
+
+def run(*args: str | Path) -> Result:
+    return CliRunner().invoke(app, ["stability", *(str(arg) for arg in args)])
+
+
+def fails(*args: str | Path) -> str:
+    result = run(*args)
+    assert result.exit_code == 1, result.output
+    assert result.stderr.count("\n") == 1, result.stderr
+    return str(result.stderr)
+
+
+def found(outcome: Outcome, error: float | None = 0.02, said: str = "", limit: float = 0.1) -> Found:
+    return Found(outcome, None if outcome is Outcome.REFUSAL else error, limit, 1.5, said)
+
+
+def good(hard: float) -> Found:
+    return found(Outcome.SUCCESS) if hard < 0.7 else found(Outcome.REFUSAL, said=f"simulation: too hard by {hard:.2f}")
+
+
+def poor(hard: float) -> Found:
+    return found(Outcome.SUCCESS, 0.2, limit=0.3) if hard < 0.3 else found(Outcome.SILENT, 3.0 * hard)
+
+
+def cells(make: dict[str, Callable[[float], Found]], *, seeds: int = 8, events: int = 100_000) -> list[Stored]:
+    """Every cell of :data:`AXES`, with results by how hard its value is."""
+    hard: dict[Condition, float] = {}
+    for axis in AXES:
+        for k, condition in enumerate(axis.conditions()):
+            hard.setdefault(condition, k / (len(axis.values) - 1))
+    return [
+        Stored(Cell(c, seed), events, {identity(METHOD[name]): f(h) for name, f in make.items()})
+        for c, h in hard.items()
+        for seed in range(seeds)
+    ]
+
+
+@pytest.fixture(scope="module")
+def atlas() -> Atlas:
+    return aggregate(cells({"default": good, "paper": poor, "circle": poor}), AXES, METHODS, {"machine": "this one"})
+
+
+def test_rates_have_wilsons_interval() -> None:
+    """Against its formula: Wilson, "Probable inference", JASA 1927."""
+    k, n, z = 7, 20, 1.959963984540054
+    middle = (k / n + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(k / n * (1 - k / n) / n + z * z / (4 * n * n))
+    assert Rate(k, n).interval == pytest.approx((middle - half, middle + half), abs=1e-12)
+    assert Rate(20, 20).interval[1] == pytest.approx(1.0, abs=1e-12)
+    assert str(Rate(0, 0)) == "0 of 0"
+    assert Rate(0, 0).to_json()["share"] is None
+
+
+def test_spots_count_what_the_cells_hold(atlas: Atlas) -> None:
+    assert (atlas.cells, atlas.methods) == (6 * 8, ["default", "paper", "circle"])
+    spot = atlas.of(NOISE)["default", 0.8]
+    assert [spot.rate(o).count for o in Outcome] == [0, 8, 0]
+    assert (spot.errors, spot.quantiles, spot.said(Outcome.REFUSAL)) == ([], {}, "too hard by 1.00")
+    silent = atlas.of(SCENE)["paper", "one edge direction"]
+    assert silent.rate(Outcome.SILENT) == Rate(8, 8)
+    assert silent.quantiles[50] == pytest.approx(1.5, abs=1e-12)
+    assert silent.said(Outcome.REFUSAL, Outcome.SILENT) == ""
+    assert [s.value for s in atlas.failing(Outcome.REFUSAL)] == [0.8, "blank wall"]
+
+
+def test_summary_names_the_values_that_work(atlas: Atlas) -> None:
+    assert (atlas.works(NOISE, "default"), atlas.works(NOISE, "paper")) == ("0 % to 50 %", "0 %")
+    assert atlas.works(SCENE, "default") == "dense texture, one edge direction"
+    never = aggregate(cells({"default": lambda h: found(Outcome.SILENT)}), AXES, METHODS, {})
+    assert (never.works(NOISE, "default"), never.works(NOISE, "paper")) == ("nowhere", "nowhere")
+    gap = aggregate(cells({"default": lambda h: good(0.0 if h in (0.0, 1.0) else 1.0)}), AXES, METHODS, {})
+    assert gap.works(NOISE, "default") == "0 %, 80 %"
+
+
+def test_aims_look_inside_and_outside_of_the_sensible_region(atlas: Atlas) -> None:
+    aims = atlas.aims
+    # noise up to a half and a dense texture are sensible; the harmless end belongs to both axes
+    assert (aims.inside, aims.outside) == (Rate(24, 24), Rate(0, 24))
+    assert (set(aims.holds.values()), aims.worse) == ({True}, ())
+    few = aggregate(cells({"default": good, "paper": poor}, events=1000), AXES, METHODS, {}).aims
+    assert (few.inside, few.outside) == (Rate(0, 0), Rate(0, 48))
+    assert not few.holds["success inside"]
+    swapped = aggregate(cells({"default": poor, "paper": good}), AXES, METHODS, {}).aims
+    assert (swapped.inside, swapped.outside) == (Rate(8, 24), Rate(24, 24))
+    assert set(swapped.holds.values()) == {False}
+    assert all("MISSED" in line for line in swapped.lines())
+
+
+def test_worse_than_the_paper_is_told_by_the_same_recordings() -> None:
+    """McNemar's exact test: of 2^-n where all n that differ speak for the paper."""
+    swapped = aggregate(cells({"default": poor, "paper": good}), AXES, METHODS, {}).aims
+    assert [(w.axis.name, w.value) for w in swapped.worse] == [
+        ("background noise", 0.25), ("background noise", 0.5), ("scene", "one edge direction"),
+    ]  # fmt: skip
+    assert [w.p_value for w in swapped.worse] == pytest.approx([2.0**-8] * 3, abs=1e-12)
+    once = cells({"default": good, "paper": good})
+    once[0].results[identity(METHOD["default"])] = found(Outcome.SILENT, 5.0)
+    (first, second) = aggregate(once, AXES, METHODS, {}).aims.worse
+    assert (first.p_value, first.significant, first.default) == (0.5, False, Rate(7, 8))
+    assert second.value == "dense texture"
+
+
+def test_messages_that_differ_in_numbers_are_one() -> None:
+    said = ["simulation: 1000 events are too few", "no edges", "simulation: 1,200 events are too few", ""]
+    assert most_said(said) == "1000 events are too few"
+    assert most_said(["", ""]) == ""
+
+
+def test_values_read_as_people_write_them() -> None:
+    assert words_of(Axis("events", "window_events", (0,)), 0) == "all"
+    assert words_of(Axis("events", "window_events", (0,)), 300_000) == "300,000"
+    assert words_of(Axis("hot pixels", "hot", (), "of all pixels"), 0.0002) == "0.02 %"
+    assert words_of(Axis("direction", "backwards", ()), True) == "wrong"
+
+
+def test_files_hold_every_spot(atlas: Atlas, tmp_path: Path) -> None:
+    files = atlas.write(tmp_path)
+    data = json.loads(files["data"].read_text())
+    lines = list(csv.DictReader(files["table"].read_text().splitlines()))
+    assert len(data["spots"]) == len(lines) == 7 * 3
+    assert (data["machine"], data["cells"], data["aims"]["holds"]["success inside"]) == ("this one", 48, True)
+    spot = next(s for s in data["spots"] if (s["value"], s["method"]) == (0.5, "paper"))
+    assert (spot["silent"]["count"], spot["error_px"]["50 %"]) == (8, 2.0)
+    line = next(each for each in lines if (each["value"], each["method"]) == ("0.5", "paper"))
+    assert (line["silent"], line["error_px_50"], line["n"]) == ("8", "2", "8")
+    text = files["summary"].read_text()
+    assert "| background noise [of all events] | 0 % to 50 % | 0 % | 0 % |" in text
+    assert "| scene | blank wall | 100 % (67.6 % to 100 %; 8 of 8) | too hard by 1.00 |" in text
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["atlas.csv", "atlas.json", "summary.md"]
+
+
+def test_nothing_to_report_is_an_error() -> None:
+    with pytest.raises(AmiwarpError, match="no cell of these axes"):
+        aggregate(cells({"gradient": good}), AXES, METHODS[:2], {})
+
+
+def test_cells_are_loaded_and_those_of_other_versions_left_out(tmp_path: Path) -> None:
+    some = cells({"default": good}, seeds=2)
+    for stored in some:
+        Store(tmp_path).save(stored)
+    old = json.loads((tmp_path / f"{some[0].cell.name}.json").read_text())
+    (tmp_path / "old_0.json").write_text(json.dumps({**old, "condition": {"colour": "red"}}))
+    (tmp_path / "renamed_0.json").write_text(json.dumps(old))
+    assert {s.cell.name: s.results for s in load(tmp_path)} == {s.cell.name: s.results for s in some}
+    (tmp_path / "renamed_0.json").write_text("{")
+    with pytest.raises(AmiwarpError, match=r"renamed_0\.json: damaged cell"):
+        load(tmp_path)
+    with pytest.raises(AmiwarpError, match="no cells of this version"):
+        load(tmp_path / "empty")
+
+
+def test_pages_show_every_share_and_nothing_overlaps(atlas: Atlas, tmp_path: Path) -> None:
+    for figure, methods in ((_page(atlas, SCENE), atlas.methods), (_overview(atlas), OVERVIEW[:2])):
+        figure.draw_without_rendering()
+        heat = figure.axes[0]
+        assert [t.get_text() for t in heat.get_yticklabels()] == [*methods]
+        boxes = [t.get_window_extent() for ax in figure.axes for t in _texts(ax)]
+        crossed = [(a, b) for k, a in enumerate(boxes) for b in boxes[:k] if a.shrunk(0.9, 0.9).overlaps(b)]
+        assert crossed == []
+    shares = [t.get_text() for t in _page(atlas, SCENE).axes[0].texts]
+    assert [shares.count(s) for s in ("100 %", "0 %", "8/8, 1.5 s", "0/8, 1.5 s")] == [4, 5, 4, 5]
+
+
+def _texts(ax: Any) -> list[Text]:
+    return [t for t in (*ax.texts, *ax.get_xticklabels(), *ax.get_yticklabels()) if t.get_text() and t.get_visible()]
+
+
+def test_figures_are_written_with_a_page_for_each_axis(atlas: Atlas, tmp_path: Path) -> None:
+    files = draw(atlas, tmp_path)
+    assert set(files) == {"overview", "pages", "background noise", "scene"}
+    assert files["pages"].read_bytes().count(b"/Type /Page ") == 3
+    page = np.asarray(Image.open(files["scene"]).convert("RGB")).reshape(-1, 3)
+    for colour in ((0x56, 0xB4, 0xE9), (0xD0, 0xD0, 0xD0), (0xE6, 0x70, 0x2E)):
+        near = np.abs(page.astype(np.int16) - colour).max(axis=1) <= 8
+        assert near.mean() > 0.02
+    assert {p.suffix for p in tmp_path.iterdir()} == {".png", ".pdf"}
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
+    """The command has one axis with two small cameras."""
+    axis = Axis("width", "width", (48, 64), "px", (("height", 48), ("turns", 1.0)))
+    monkeypatch.setattr(amiwarp.stability, "AXES", (axis,))
+    monkeypatch.setattr(amiwarp.stability, "quick_axes", lambda: (replace(axis, values=(48,)),))
+    return axis
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
+def test_command_runs_goes_on_and_redraws(tiny: Axis, tmp_path: Path) -> None:
+    words = ("--out", tmp_path, "--methods", "sharpness", "--seeds", "1", "--device", "cpu", "--json")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        first = run("--quick", "--scheduler", cluster.scheduler_address, *words)
+        assert first.exit_code == 0, first.output
+        second = run("--scheduler", cluster.scheduler_address, *words)
+        assert second.exit_code == 0, second.output
+    one, two = json.loads(first.stdout), json.loads(second.stdout)
+    assert [(d["new_cells"], d["cells"], d["cells_left"]) for d in (one, two)] == [(1, 1, 0), (1, 2, 0)]
+    assert len(list((tmp_path / "cells").iterdir())) == 2
+    assert {s["method"] for s in json.loads((tmp_path / "atlas.json").read_text())["spots"]} == {
+        "default", "paper", "sharpness",
+    }  # fmt: skip
+    before = (tmp_path / "atlas.csv").read_text()
+    (tmp_path / "atlas.csv").unlink()
+    third = run("--redraw", "--out", tmp_path, "--device", "cpu")
+    assert third.exit_code == 0, third.output
+    assert "2 cells in all" in third.stdout
+    assert (tmp_path / "atlas.csv").read_text() == before
+
+
+def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:
+    words = ("--out", tmp_path, "--device", "cpu")
+    assert "no axis 'colour' is here; choose among width" in fails("--axes", "colour", *words)
+    assert "no method 'magic' is here; choose among default, paper" in fails("--methods", "magic", *words)
+    assert "no cells of this version" in fails("--redraw", *words)
+    (tmp_path / "file").write_text("")
+    assert "cannot be made a folder" in fails("--out", tmp_path / "file" / "deeper", "--device", "cpu")
