@@ -14,7 +14,6 @@ from amiwarp.kernels.camera import (
     CameraParams,
     PinholeParams,
     invalid_pixel,
-    invalid_ray,
     pixel_to_ray,
     ray_to_pixel,
 )
@@ -110,59 +109,54 @@ def sine_versine(a: float):
 
 
 @wp.func
-def rotate_towards(ray: wp.vec3, w: wp.vec2, angle: float) -> wp.vec3:
-    sine, versine = sine_versine(angle)
-    x, y, z = turned(ray[0], ray[1], ray[2], w[0], w[1], sine, versine)
-    return wp.vec3(x, y, z)
-
-
-@wp.func
-def radial_deflection(model: RadialCircleParams, ray: wp.vec3) -> float:
-    """delta(phi) = delta_0 (sqrt(n^2 - sin^2 phi) / cos phi - 1) / (n - 1), for a thin prism."""
-    cos2 = ray[2] * ray[2]
+def radial_deflection(model: RadialCircleParams, z: float) -> float:
+    """delta(phi) = delta_0 (sqrt(n^2 - sin^2 phi) / cos phi - 1) / (n - 1), for a thin prism; z is cos phi."""
+    cos2 = z * z
     growth = wp.sqrt((model.index * model.index - 1.0 + cos2) / wp.max(cos2, 1.0e-4)) - 1.0
-    return model.deflection * growth / (model.index - 1.0)
+    return wp.abs(model.deflection * growth / (model.index - 1.0))
 
 
 @wp.func
-def turn_from_tilted_side(model: RadialCircleParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
+def turn_from_tilted_side(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
     """From the bearing on the tilted face's side, to which the angle belongs, to the one on the flat face's side."""
-    return rotate_towards(ray, w, wp.abs(radial_deflection(model, ray)))
+    sine, versine = sine_versine(radial_deflection(model, z))
+    return turned(x, y, z, w0, w1, sine, versine)
 
 
 @wp.func
-def turn_from_flat_side(model: RadialCircleParams, ray: wp.vec3, w: wp.vec2) -> wp.vec3:
+def turn_from_flat_side(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
     """The reverse: the angle belongs to the bearing that is sought; a contraction, solved by iteration."""
-    found = ray
-    step = wp.length(ray)
+    a, b, c = x, y, z
+    step = float(1.0)
     for _ in range(INVERSION_STEPS):
-        better = rotate_towards(ray, w, -wp.abs(radial_deflection(model, found)))
-        step = wp.length(better - found)
-        found = better
-        if step < 2.0e-7:  # as near as float32 comes
-            break
-    if not (step < 1.0e-4):
-        return invalid_ray()
-    return found
+        sine, versine = sine_versine(-radial_deflection(model, c))
+        before = c
+        a, b, c = turned(x, y, z, w0, w1, sine, versine)
+        step = wp.abs(c - before)
+    scale = wp.where(step < 1.0e-4, 1.0, NAN)
+    return a * scale, b * scale, c * scale
 
 
 @wp.func
 def moved(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
-    ray = wp.vec3(x, y, z)
-    ray = ray / wp.length(ray)
+    length = wp.sqrt(x * x + y * y + z * z)
+    a, b, c = x / length, y / length, z / length
     if model.deflection < 0.0:
-        found = turn_from_flat_side(model, ray, wp.vec2(w0, w1))
-        return found[0], found[1], found[2]
-    ahead = turn_from_tilted_side(model, ray, wp.vec2(w0, w1))
-    return ahead[0], ahead[1], ahead[2]
+        a, b, c = turn_from_flat_side(model, a, b, c, w0, w1)
+    else:
+        a, b, c = turn_from_tilted_side(model, a, b, c, w0, w1)
+    return a, b, c
 
 
 @wp.func
 def deflect(model: RadialCircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
     ray = pixel_to_ray(camera, xy)
+    a, b, c = ray[0], ray[1], ray[2]
     if model.deflection < 0.0:
-        return ray_to_pixel(camera, turn_from_tilted_side(model, ray, w))
-    return ray_to_pixel(camera, turn_from_flat_side(model, ray, w))
+        a, b, c = turn_from_tilted_side(model, a, b, c, w[0], w[1])
+    else:
+        a, b, c = turn_from_flat_side(model, a, b, c, w[0], w[1])
+    return ray_to_pixel(camera, wp.vec3(a, b, c))
 
 
 # -- exact: both faces in closed form
