@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
 SEEDS, QUICK_SEEDS, QUICK_MINUTES = 20, 2, 8.0
-PACKAGES = ("warp-lang", "numpy", "scipy", "nlopt", "distributed")
 
 
 def run(
@@ -79,7 +78,7 @@ def run(
         cells, new = _run(chosen_axes, of_each, chosen_methods, cells_in, device, scheduler, limit, common.seed)
         left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
     took = time.perf_counter() - began
-    atlas = aggregate(cells, chosen_axes, chosen_methods, _about(device))
+    atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
     with progress("drawing"):
         files = atlas.write(out) | draw(atlas, out)
     speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
@@ -171,11 +170,11 @@ def _prepare(device: str, here: bool) -> None:
     choose_device(device)
 
 
-def _about(device: str) -> dict[str, Any]:
-    from amiwarp.machine import machine, versions
+def _about(cells: Sequence[Stored]) -> dict[str, Any]:
+    from amiwarp.machine import versions
 
-    return {"date": time.strftime("%Y-%m-%d"), "machine": machine(device), "device": device,
-            "versions": versions(PACKAGES)}  # fmt: skip
+    machines = sorted({r.machine for c in cells for r in c.results.values() if r.machine})
+    return {"date": time.strftime("%Y-%m-%d"), "machine": ", ".join(machines), "versions": versions(())}
 
 
 def lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, took: float) -> list[Any]:

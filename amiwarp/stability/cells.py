@@ -22,6 +22,7 @@ from amiwarp.calib.parameters import build_model, size_name
 from amiwarp.calib.search import STAGES
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import write_text
+from amiwarp.machine import machine
 from amiwarp.metrics import model_error
 from amiwarp.optics import ExactModel, predicted_error
 from amiwarp.presets import settings_to
@@ -101,6 +102,8 @@ class Result:
     seconds: float
     message: str = ""
     """The refusal, or the answer's warnings."""
+    machine: str = ""
+    """On which it was run."""
 
     def to_json(self) -> dict[str, Any]:
         return {**asdict(self), "outcome": self.outcome.value}
@@ -142,8 +145,9 @@ def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
     """Makes the recording and runs the methods on it."""
     sample = make(cell.condition, cell.seed, device)
     done = Stored(cell, len(sample.recording.events))
+    where = machine(device)
     for method in methods:
-        done.results[identity(method)] = _judge(cell, method, sample, device)
+        done.results[identity(method)] = replace(_judge(cell, method, sample, device), machine=where)
     return done
 
 
