@@ -360,5 +360,5 @@ def _photometric(c: Calibration) -> list[str]:
 def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:
     angle = entry["unit"].startswith("rad")
     scale = 180.0 / math.pi if angle else 1.0
-    std = f"{entry['std'] * scale:.2g}" if "std" in entry else "given"
+    std = f"{entry['std'] * scale:.2g}" if "std" in entry else "" if entry["free"] else "given"
     return f"{entry['value'] * scale:.6g}", std, entry["unit"].replace("rad", "deg")
