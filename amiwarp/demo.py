@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,9 +17,9 @@ from amiwarp.calib.calibrate import thin
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.camera import Camera
 from amiwarp.compensate import compensate, compensate_events
-from amiwarp.errors import AmiwarpError
 from amiwarp.figures import Reconstructed, draw_demo
 from amiwarp.io import open_recording
+from amiwarp.io.files import make_folder
 from amiwarp.motion import PrismMotion
 from amiwarp.optics import Prism
 from amiwarp.pairs import Sensor
@@ -160,10 +159,7 @@ def sharpest(found: Calibration) -> Calibration:
 
 
 def _files(out: Path) -> dict[str, Path]:
-    try:
-        os.makedirs(out, exist_ok=True)
-    except OSError as error:
-        raise AmiwarpError(f"{out}: cannot be made a folder: {error.strerror}; choose another --out") from error
+    make_folder(out)
     names = {
         "recording": "recording.h5",
         "calibration": "calibration.json",

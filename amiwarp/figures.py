@@ -14,6 +14,7 @@ from amiwarp import clouds
 from amiwarp.calib.calibrate import thin
 from amiwarp.calib.parameters import size_name
 from amiwarp.calib.result import cost_surface
+from amiwarp.io.files import write_text
 from amiwarp.iwe import iwe
 from amiwarp.iwe_files import PERCENTILE, save_png
 from amiwarp.picture_files import Tone, limits, tones
@@ -318,6 +319,13 @@ def save(figure: Any, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
     save_png(path, indexed(np.asarray(Image.open(buffer).convert("RGB"))))
+
+
+def save_svg(figure: Any, path: Path) -> None:
+    """Writes a figure as an SVG without its date; whole or not at all."""
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None})
+    write_text(path, text.getvalue())
 
 
 def indexed(rgb: NDArray[np.uint8]) -> Any:

@@ -13,8 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import platform
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -31,6 +29,7 @@ from amiwarp.calib.rungs import Places, fit, rung_space
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
+from amiwarp.machine import machine
 from amiwarp.metrics import model_error, truth_model
 from amiwarp.motion import EncoderModel, PrismMotion
 from amiwarp.optics import MODELS, EllipseModel, FlatSide, Prism
@@ -200,7 +199,7 @@ def main() -> int:
     for row in runs[args.what](args):
         rows.append(row)
         print(table_row(row), flush=True)
-        found = {"machine": platform.machine(), "cores": os.cpu_count(), "device": args.device,
+        found = {"machine": machine(args.device), "device": args.device,
                  "summary": summary(rows), "rows": rows}  # fmt: skip
         args.out.write_text(json.dumps(found, indent=1) + "\n")
     print(json.dumps(summary(rows), indent=1))

@@ -20,7 +20,7 @@ from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
 from amiwarp.design import Design, Limits, Timing, design
-from amiwarp.design.choose import ACROSS, LEAST_SWING, QUANTISATION
+from amiwarp.design.choose import ACROSS, LEAST_SWING, QUANTISATION_PX
 from amiwarp.design.drawing import chart
 from amiwarp.design.orbit import QUARTER_SWING, orbit_of
 from amiwarp.design.volume import TILE, filled, measure, tiles
@@ -163,7 +163,7 @@ def test_speed_costs_events_and_blur_and_shortens_the_window(made: Design) -> No
         assert row[0].events_per_s < row[1].events_per_s < row[2].events_per_s
         # dead time: in proportion or less
         assert row[2].events_per_s < 4.0 * row[1].events_per_s * 1.02
-        assert QUANTISATION < row[0].blur_px < row[1].blur_px < row[2].blur_px
+        assert QUANTISATION_PX < row[0].blur_px < row[1].blur_px < row[2].blur_px
 
 
 def test_the_choice_keeps_all_limits_with_the_fewest_events(made: Design) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.curvature import STEP_PX, differences
 from amiwarp.calib.objective import padding
 from amiwarp.iwe import CanvasShape, Votes
 from amiwarp.sharpness import Sharpness, SharpnessMeter
@@ -31,7 +32,6 @@ SPANS = 32
 """Under two turns: alternate spans of so many are held out."""
 SMOOTHING_PX = 0.6
 """Of the images: less than calibration's, since small differences between good models are to be seen."""
-STEP_PX = 0.25
 LONGEST_STEP_PX = 0.5
 LEAST_CURVED = 1e-2
 """Of the largest curvature: along less, no step is taken."""
@@ -104,21 +104,7 @@ class Quadratic:
     @classmethod
     def about(cls, half: Half, space: Space, v: Vector, directions: Vector) -> Quadratic:
         """``directions``: rows of vectors that each move events by a pixel, shape (n, entries of the space)."""
-        n = len(directions)
-        steps = STEP_PX * directions
-
-        def at(shift: Vector) -> Vector:
-            return half.each(space, space.to_values(v + shift))
-
-        centre, up, down = at(np.zeros_like(v)), [at(h) for h in steps], [at(-h) for h in steps]
-        hessian = np.zeros((n, n))
-        for i in range(n):
-            hessian[i, i] = np.mean(up[i] - 2.0 * centre + down[i]) / STEP_PX**2
-            for j in range(i):
-                both = at(steps[i] + steps[j]) + at(-steps[i] - steps[j])
-                mixed = both - up[i] - up[j] - down[i] - down[j] + 2.0 * centre
-                hessian[i, j] = hessian[j, i] = np.mean(mixed) / (2.0 * STEP_PX**2)
-        return cls((np.array(up) - np.array(down)) / (2.0 * STEP_PX), hessian)
+        return cls(*differences(lambda shift: half.each(space, space.to_values(v + shift)), directions))
 
     def of(self, which: list[int]) -> Quadratic:
         return Quadratic(self.slopes[which], self.hessian[np.ix_(which, which)])

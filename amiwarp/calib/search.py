@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib import checks
+from amiwarp.calib.curvature import differences
 from amiwarp.calib.gauss_newton import GAUSS_NEWTON
 from amiwarp.calib.objective import Objective
 from amiwarp.calib.parameters import LATE, MOTION, UNITS
@@ -265,29 +266,14 @@ def distinct_optima(stage: Stage, most: int, apart: float = 6.0) -> list[NDArray
     return chosen
 
 
-def scatter(
-    parts: Objective, v: NDArray[np.float64], step: float = 0.25
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+def scatter(parts: Objective, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Covariance of the optimum [px²]: the cost's curvature, and the scatter of its slope over parts of the events.
 
     H⁻¹ cov(g) H⁻¹, the sandwich estimate, g being a part's slope at the whole's optimum and H the mean curvature of
     the parts; the whole has as many times the events. A direction without curvature is named in a warning.
     """
-    n = len(v)
-
-    def at(*shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-        return parts.each(parts.space.to_values(v + sum(shifts)))
-
-    steps = np.eye(n) * step
-    centre, up, down = at(), [at(h) for h in steps], [at(-h) for h in steps]
-    gradients = (np.array(up) - np.array(down)).T / (2.0 * step)
-    hessian = np.zeros((n, n))
-    for i in range(n):
-        hessian[i, i] = np.mean(up[i] - 2.0 * centre + down[i]) / step**2
-        for j in range(i):
-            both = at(steps[i], steps[j]) + at(-steps[i], -steps[j])
-            mixed = both - up[i] - up[j] - down[i] - down[j] + 2.0 * centre
-            hessian[i, j] = hessian[j, i] = np.mean(mixed) / (2.0 * step**2)
+    slopes, hessian = differences(lambda shift: parts.each(parts.space.to_values(v + shift)), np.eye(len(v)))
+    gradients = slopes.T
     values, vectors = np.linalg.eigh(-hessian)
     largest = max(float(values.max()), 1e-12)
     weak = values < 1e-3 * largest

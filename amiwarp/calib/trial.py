@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.held_out import STEP_PX, Half, Quadratic, halves
+from amiwarp.calib.curvature import STEP_PX
+from amiwarp.calib.held_out import Half, Quadratic, halves
 from amiwarp.calib.parameters import LATE
 from amiwarp.calib.rungs import QUANTISATION_PX, SHARE, Places, apart, rung_space, timing_blur
 from amiwarp.calib.search import Material, Settings

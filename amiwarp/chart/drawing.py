@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,6 @@ import numpy as np
 
 from amiwarp import figures
 from amiwarp.chart.rows import Row, beaten_by, fronts, told_apart
-from amiwarp.io.files import part_path
 from amiwarp.uploads import TURNS
 
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 11.0, 4.4, 0.85, 0.3, 0.3
@@ -247,7 +244,7 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
                   borderpad=0.0, borderaxespad=0.2, columnspacing=1.6, labelspacing=0.45)  # fmt: skip
     figure.text(LEFT / WIDTH, 0.08 / height, note, fontsize=TINY, color="#404040")
     figures.save(figure, path.with_suffix(".png"))
-    _save_svg(figure, path.with_suffix(".svg"))
+    figures.save_svg(figure, path.with_suffix(".svg"))
 
 
 def _panels(figure: Any, rows: Sequence[Row], height: float, top: float) -> list[Panel]:
@@ -339,14 +336,3 @@ def _keys(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) -> l
                label="Pareto front" if len(lines) == 1 else f"front, {job}") for job, _, style in lines
     ]  # fmt: skip
     return handles
-
-
-def _save_svg(figure: Any, path: Path) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    part = part_path(path)
-    try:
-        part.write_bytes(buffer.getvalue())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -18,7 +17,7 @@ from amiwarp.chart.drawing import draw
 from amiwarp.chart.rows import Progress, Row, beaten_by, fastest_within, fronts, most_accurate_within
 from amiwarp.chart.truth import Known
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import write_text
+from amiwarp.io.files import make_folder, write_text
 from amiwarp.machine import machine, versions
 from amiwarp.presets import Preset
 from amiwarp.uploads import TURNS
@@ -143,10 +142,7 @@ def make(
     cannot be made, and an image that is wrong.
     """
     known = Known.of(recording)
-    try:
-        os.makedirs(out, exist_ok=True)
-    except OSError as error:
-        raise AmiwarpError(f"{out}: cannot be made a folder: {error.strerror}; choose another --out") from error
+    make_folder(out)
     tell = progress or (lambda what, share: None)
     repeats = dict.fromkeys(REPEATS, 1) if quick else REPEATS
     compensated, notes = compensation.rows(

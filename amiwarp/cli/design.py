@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +16,6 @@ from amiwarp.cli.console import choose_device, plain, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, numbers
 from amiwarp.cli.options import Common
 from amiwarp.cli.rig import parse_size
-from amiwarp.errors import AmiwarpError
 from amiwarp.optics import FlatSide, Prism
 
 if TYPE_CHECKING:
@@ -131,7 +129,7 @@ def run(
     from amiwarp.demo import earth
     from amiwarp.design import design
     from amiwarp.design.drawing import draw
-    from amiwarp.io.files import write_text
+    from amiwarp.io.files import make_folder, write_text
     from amiwarp.simulate import Scene, SensorModel
 
     sensor = SensorModel(contrast_on=faults.contrast, contrast_off=faults.contrast)
@@ -141,10 +139,7 @@ def run(
             seen, scene, glass, apexes=grid.apexes, rpms=grid.rpms, timing=faults.timing(), limits=limits.build(),
             sensor=sensor, seed=common.seed, device=device, progress=lambda what, share: advance(share, what),
         )  # fmt: skip
-    try:
-        os.makedirs(out, exist_ok=True)
-    except OSError as error:
-        raise AmiwarpError(f"{out}: cannot be made a folder: {error.strerror}; choose another --out") from error
+    make_folder(out)
     files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
     data = summary(made)
     write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")

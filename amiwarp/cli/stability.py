@@ -6,7 +6,6 @@ import contextlib
 import functools
 import importlib
 import logging
-import os
 import signal
 import sys
 import time
@@ -63,11 +62,12 @@ def run(
     stopped goes on with the same command, and a rerun does only what is missing.
     """
     device = choose_device(common.device)
+    from amiwarp.io.files import make_folder
     from amiwarp.stability import aggregate, draw, identity, load
 
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
-    _make(cells_in)
+    make_folder(cells_in)
     began = time.perf_counter()
     new = left = 0
     if redraw:
@@ -105,13 +105,6 @@ def _check(what: str, names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             raise AmiwarpError(f"no {what} {name!r} is here; choose among {', '.join(known)}")
-
-
-def _make(folder: Path) -> None:
-    try:
-        os.makedirs(folder, exist_ok=True)
-    except OSError as error:
-        raise AmiwarpError(f"{folder}: cannot be made a folder: {error.strerror}; choose another --out") from error
 
 
 def _run(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
+from amiwarp.calib.rungs import QUANTISATION_PX, SHARE
 from amiwarp.design.orbit import Orbit, orbit_of
 from amiwarp.design.volume import Progress, Volume, filled, measure
 from amiwarp.errors import AmiwarpError
@@ -17,14 +18,10 @@ from amiwarp.simulate import Scene, SensorModel, Simulation
 if TYPE_CHECKING:
     from amiwarp.camera import Camera
 
-QUANTISATION = 1.0 / math.sqrt(12.0)
-"""Standard deviation of the rounding to whole pixels, across an edge of any direction [px]."""
 ACROSS = math.sqrt(2.0 / 3.0)
 """Share of an error along the orbit that lies across the edges that fire: √⟨cos²⟩, weighted by their rate, |cos|."""
 LEAST_SWING = 1.0
 """An edge that moves by less than this across itself finds pixels on neither side that see it pass [px]."""
-SHARE = 0.1
-"""Of the blur that is there anyway, what a model may add."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +87,7 @@ class Choice:
     @property
     def blur_px(self) -> float:
         """What compensation leaves across an edge without the model's own error [px]."""
-        return math.sqrt(QUANTISATION**2 + self.clock_px**2 + self.encoder_px**2)
+        return math.sqrt(QUANTISATION_PX**2 + self.clock_px**2 + self.encoder_px**2)
 
     @property
     def error_px(self) -> float:
@@ -125,7 +122,7 @@ class Design:
 
     def _choice(self, orbit: Orbit, rpm: float) -> Choice:
         limits, blurs = self.limits, self.timing.blur(orbit.radius, rpm)
-        budget = limits.budget_px or SHARE * math.hypot(QUANTISATION, *blurs)
+        budget = limits.budget_px or SHARE * math.hypot(QUANTISATION_PX, *blurs)
         model = next(name for name in MODELS if orbit.errors[name] <= budget)
         made = Choice(orbit, rpm, self.volume.events_per_s(orbit, rpm), *blurs, model, budget, ())
         kept = {
@@ -151,7 +148,7 @@ class Design:
         Radii are taken as proportional to the apex. The first may be above the second: then none does.
         """
         orbit = min(self.orbits, key=lambda o: abs(math.log(o.swing / LEAST_SWING)))
-        room = self.limits.tolerance_px**2 - QUANTISATION**2
+        room = self.limits.tolerance_px**2 - QUANTISATION_PX**2
         added = math.hypot(*self.timing.blur(orbit.radius, rpm))
         largest = math.inf if added == 0.0 else math.sqrt(max(room, 0.0)) / added
         return orbit.apex * LEAST_SWING / orbit.swing, orbit.apex * largest

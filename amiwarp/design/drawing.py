@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 from amiwarp import figures
 from amiwarp.design.choose import LEAST_SWING
 from amiwarp.design.words import degrees, headline
-from amiwarp.io.files import write_text
 
 if TYPE_CHECKING:
     from amiwarp.design.choose import Choice, Design
@@ -41,9 +39,7 @@ def draw(path: Path, design: Design) -> None:
     """Writes ``path`` with the endings .png and .svg, each whole or not at all."""
     figure = chart(design)
     figures.save(figure, path.with_suffix(".png"))
-    text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None})
-    write_text(path.with_suffix(".svg"), text.getvalue())
+    figures.save_svg(figure, path.with_suffix(".svg"))
 
 
 def chart(design: Design) -> Any:

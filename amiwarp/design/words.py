@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from amiwarp.design.choose import LEAST_SWING, QUANTISATION
+from amiwarp.calib.rungs import QUANTISATION_PX
+from amiwarp.design.choose import LEAST_SWING
 
 if TYPE_CHECKING:
     from amiwarp.design.choose import Choice, Design
@@ -33,7 +34,7 @@ def reasons(design: Design) -> list[str]:
         f"window: a quarter turn takes {chosen.window_ms:.1f} ms, of {design.limits.window_ms:.1f} allowed"
         + _slower(design, chosen),
         f"blur: {chosen.error_px:.3f} px across an edge, of {design.limits.tolerance_px:g} tolerated: pixels "
-        f"{QUANTISATION:.2f}, clock {chosen.clock_px:.3f}, encoder {chosen.encoder_px:.3f}",
+        f"{QUANTISATION_PX:.2f}, clock {chosen.clock_px:.3f}, encoder {chosen.encoder_px:.3f}",
         f"model: {chosen.model}, wrong by {_px(chosen.orbit.errors[chosen.model])}, "
         f"of {_px(chosen.budget_px)} allowed" + _simpler(chosen),
     ]
@@ -87,8 +88,8 @@ def _refusals(design: Design) -> list[str]:
         "allowed; a faster prism, or a longer --window-ms",
         "blur": f"the least blur is {least:.3f} px, {limits.tolerance_px:g} is tolerated; "
         + (
-            f"pixels alone leave {QUANTISATION:.2f}, so only a larger --tolerance-px"
-            if limits.tolerance_px <= QUANTISATION
+            f"pixels alone leave {QUANTISATION_PX:.2f}, so only a larger --tolerance-px"
+            if limits.tolerance_px <= QUANTISATION_PX
             else "a better clock or encoder, a slower prism, or a larger --tolerance-px"
         ),
         "bandwidth": f"the fewest events are {rate(fewest)}, {rate(limits.bandwidth or math.inf)} fit; "

@@ -50,6 +50,14 @@ def part_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
 
 
+def make_folder(path: Path) -> None:
+    """Makes a folder and those above it; :class:`AmiwarpError` where it cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AmiwarpError(f"{path}: cannot be made a folder: {error.strerror}; choose another --out") from error
+
+
 def write_text(path: Path, text: str) -> None:
     """Writes a file beside first and then by renaming."""
     part = part_path(path)

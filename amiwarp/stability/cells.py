@@ -213,9 +213,8 @@ class Store:
         except (ValueError, KeyError, TypeError) as error:
             raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to have it done again") from error
 
-    def save(self, done: Stored) -> None:
-        known = self.load(done.cell)
-        results = {**known.results, **done.results}
-        data = {"condition": asdict(done.cell.condition), "seed": done.cell.seed, "events": done.events,
-                "results": {name: r.to_json() for name, r in sorted(results.items())}}  # fmt: skip
-        write_text(self.folder / f"{done.cell.name}.json", json.dumps(data, indent=1) + "\n")
+    def save(self, known: Stored) -> None:
+        """All that is known of a cell."""
+        data = {"condition": asdict(known.cell.condition), "seed": known.cell.seed, "events": known.events,
+                "results": {name: r.to_json() for name, r in sorted(known.results.items())}}  # fmt: skip
+        write_text(self.folder / f"{known.cell.name}.json", json.dumps(data, indent=1) + "\n")

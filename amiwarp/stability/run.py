@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,9 +22,9 @@ QUICK_METHODS = ("default", "paper", "sharpness")
 def quick_axes() -> tuple[Axis, ...]:
     """Of each axis the ends and what lies between them, three values at most."""
     return tuple(
-        Axis(a.name, a.field, tuple(dict.fromkeys(a.values[i] for i in (0, len(a.values) // 2, -1))), a.unit, a.also)
+        replace(a, values=tuple(dict.fromkeys(a.values[i] for i in (0, len(a.values) // 2, -1))))
         for a in AXES
-        if a.name not in ("many events",)
+        if a.name != "many events"
     )
 
 
@@ -59,9 +60,9 @@ def run(
         for cell, missing in todo:
             waiting[executor.submit(run_cell, cell, missing, device)] = cell
         for future in as_completed(waiting):
-            found = future.result()
-            store.save(found)
-            known[waiting[future]] = store.load(waiting[future])
+            found, cell = future.result(), waiting[future]
+            known[cell] = replace(found, results={**known[cell].results, **found.results})
+            store.save(known[cell])
             done += 1
             if progress is not None:
                 progress(done, len(cells))

@@ -96,17 +96,10 @@ def _levels(share: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lamp:
-    """A still of which a square flickers: its luminance falls by ``depth`` and rises again, ``LAMP_HZ`` times a second.
-
-    Satisfies :class:`amiwarp.simulate.Frames`.
-    """
+class _Changing:
+    """A still that something is done to, picture by picture."""
 
     light: NDArray[np.float32]
-    share: float
-    """Of the picture's area that the lamp lights."""
-    duration_us: int
-    depth: float = 0.7
 
     @property
     def size(self) -> tuple[int, int]:
@@ -115,6 +108,19 @@ class Lamp:
     @property
     def interval_us(self) -> float:
         return float(FRAME_US)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lamp(_Changing):
+    """A still of which a square flickers: its luminance falls by ``depth`` and rises again, ``LAMP_HZ`` times a second.
+
+    Satisfies :class:`amiwarp.simulate.Frames`.
+    """
+
+    share: float
+    """Of the picture's area that the lamp lights."""
+    duration_us: int
+    depth: float = 0.7
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
         height, width = self.light.shape
@@ -128,24 +134,15 @@ class Lamp:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Passing:
+class Passing(_Changing):
     """A still in front of which a textured disc passes. Satisfies :class:`amiwarp.simulate.Frames`."""
 
-    light: NDArray[np.float32]
     share: float
     """Of the picture's area that the disc hides."""
     widths_per_s: float
     """Its speed, in widths of the picture."""
     duration_us: int
     seed: int
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.light.shape[1], self.light.shape[0]
-
-    @property
-    def interval_us(self) -> float:
-        return float(FRAME_US)
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
         height, width = self.light.shape
