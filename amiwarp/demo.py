@@ -118,7 +118,7 @@ def run_demo(demo: Demo, progress: Progress | None = None) -> Outcome:
     before, after, with_truth = blurs(recording, found, truth, demo.device)
     values: dict[str, Any] = {
         "events": done.events,
-        "apex_deg": math.degrees(found.parameters["apex"]),
+        "apex_deg": math.degrees(found.exact.parameters["apex"]),
         "apex_true_deg": math.degrees(truth.prism.apex),
         "sharpness_model_error_px": metrics.model_error(sharpest(found).model, truth).rms,
         "model_error_px": metrics.model_error(found.model, truth).rms,
@@ -155,7 +155,8 @@ def middle_turn(recording: Recording, found: Calibration, device: Any) -> Pictur
 
 def sharpest(found: Calibration) -> Calibration:
     """The answer of the first stage alone."""
-    return found if found.photometric is None else replace(found, parameters=found.photometric.sharpness_parameters)
+    exact = found.exact
+    return exact if exact.photometric is None else replace(exact, parameters=exact.photometric.sharpness_parameters)
 
 
 def _files(out: Path) -> dict[str, Path]:

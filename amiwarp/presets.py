@@ -126,6 +126,7 @@ def simplified(calibration: Calibration, model: str) -> Calibration:
     """
     if model == calibration.model_name:
         return calibration
+    calibration = calibration.exact
     found, known = calibration.parameters, size_name(calibration.model_name)
     if size_name(model) == "apex" == known:
         return replace(calibration, model_name=model)

@@ -142,7 +142,7 @@ def judged(recording: Recording, c: Calibration, device: str) -> dict[str, Any]:
 def row_of(recording: Recording, device: str) -> dict[str, Any]:
     """One recording calibrated by the defaults, judged; a refusal is a row that misses its bar."""
     try:
-        c = calibrate(recording, device=device, stages=STAGES[:1])
+        c = calibrate(recording, model="exact", device=device, stages=STAGES[:1])
     except AmiwarpError as error:
         return {"refused": str(error), "ok": False}
     search = prepare(recording, Settings(), device=device)[0]
@@ -178,7 +178,7 @@ def photometric_row(recording: Recording, settings: PhotometricSettings, device:
     assert recording.camera is not None
     assert recording.truth is not None
     try:
-        c = calibrate(recording, device=device, photometric=settings)
+        c = calibrate(recording, model="exact", device=device, photometric=settings)
     except AmiwarpError as error:
         return {"refused": str(error), "ok": False}
     if c.photometric is None:
@@ -230,7 +230,7 @@ def moving_row(recording: Recording, rate: np.ndarray, device: str) -> dict[str,
     assert recording.camera is not None
     assert recording.truth is not None
     try:
-        c = calibrate(recording, free=("apex", "phase", "motion"), device=device, photometric=KNOWN)
+        c = calibrate(recording, model="exact", free=("apex", "phase", "motion"), device=device, photometric=KNOWN)
     except AmiwarpError as error:
         return {"refused": str(error), "ok": False}
     if c.photometric is None:
@@ -327,6 +327,7 @@ def run_costs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                     try:
                         c = calibrate(
                             recording,
+                            model="exact",
                             sharpness=kind,
                             smoothing_px=smoothing,
                             per_polarity=per_polarity,

@@ -11,7 +11,8 @@ true, on_the_sheet = amiwarp.Prism(math.radians(2.0)), amiwarp.Prism(math.radian
 recording = amiwarp.simulate(mapfile, camera, true, duration_s=0.2, motion=720.0, nominal_prism=on_the_sheet)
 
 calibration = amiwarp.calibrate(recording)
-print(f"apex {math.degrees(calibration.parameters['apex']):.3f} deg, true {math.degrees(true.apex):.3f} deg")
+apex = calibration.exact.parameters["apex"]
+print(f"{calibration.model_name} model; apex {math.degrees(apex):.3f} deg, true {math.degrees(true.apex):.3f} deg")
 print(f"sharpness {calibration.sharpness_before:.2f} -> {calibration.sharpness_after:.2f}")
 
 done = amiwarp.compensate(recording, calibration, "compensated.h5")

@@ -20,7 +20,7 @@ from amiwarp.calib.search import Progress, Settings
 from amiwarp.calib.trial import FACTOR, Trial, by_sharpness, make_trial
 from amiwarp.errors import AmiwarpError
 from amiwarp.iwe import CanvasShape, Votes
-from amiwarp.optics import MODELS
+from amiwarp.optics import MODELS, predicted_error
 from amiwarp.sharpness import Sharpness, SharpnessMeter
 
 if TYPE_CHECKING:
@@ -83,12 +83,23 @@ def calibrate_auto(
         parameters=parameters,
         seconds=whole - first.seconds,
     )
-    warnings = tuple(
+    warnings = (*_elsewhere(trial, chosen), *(
         f"the judges do not agree on the {j.rung.model} model: {j.rung.verdict}"
         for j in judged[: pick + 1]
         if not _agree(trial, j.rung)
-    )
+    ))  # fmt: skip
     return replace(chosen, ladder=ladder, seconds=whole, warnings=(*chosen.warnings, *warnings))
+
+
+def _elsewhere(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
+    """A word of caution where a model keeps the budget only because the events are where they are."""
+    away = predicted_error(chosen.model, trial.exact.model).rms
+    if away <= FACTOR * trial.budget_px:
+        return ()
+    return (
+        f"the {chosen.model_name} model is enough where this recording has events, but {away:.2f} px off over the "
+        "whole image: for other recordings take --model exact",
+    )
 
 
 @dataclass(frozen=True)

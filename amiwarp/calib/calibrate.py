@@ -110,8 +110,10 @@ def _without_strange(
     checks.check_light(mask, summary, recording.name)
     cleaned = replace(recording, events=Masked(source, mask))
     again = _try(cleaned, settings, device, progress)
+    if _sure(found) and not _sure(again):
+        return cleaned, found
     if isinstance(again, AmiwarpError):
-        return cleaned, found if _sure(found) else again
+        return cleaned, again
     return cleaned, replace(again, warnings=(*again.warnings, str(summary)))
 
 
@@ -222,7 +224,12 @@ def _second_stage(recording: Recording, search: Search, result: Calibration, pro
 def prepare(
     recording: Recording, settings: Settings, *, device: Any = "cpu", progress: Progress | None = None
 ) -> list[Search]:
-    """The search that the recording asks for; two, one each way round, where the prism's speed is unknown."""
+    """The search that the recording asks for; two, one each way round, where the prism's speed is unknown.
+
+    For ``auto``, that of the exact model: its answer is what the smaller ones are fitted to.
+    """
+    if settings.model == AUTO:
+        settings = replace(settings, model="exact")
     name, camera = recording.name, _camera(recording)
     checks.check_events(len(recording.events), name)
     encoders, free = _encoders(recording, settings)

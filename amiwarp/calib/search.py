@@ -48,7 +48,7 @@ Progress = Callable[[str, int, int], None]
 class Settings:
     """How to calibrate; every default was chosen by measurement, see ``docs/calibration.md``."""
 
-    model: str = "exact"
+    model: str = AUTO
     """One of the ladder, or ``auto``: the smallest that keeps the budget."""
     budget_px: float | None = None
     """For ``auto``: see :func:`amiwarp.calib.auto.calibrate_auto`."""

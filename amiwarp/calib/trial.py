@@ -104,6 +104,9 @@ def make_trial(
     events = thin(moving_window(recording, settings), settings.events)
     first, last = int(events.t[0]), int(events.t[-1])
     encoder = exact.encoder_for(recording.encoder, first, last)
+    if not encoder.covers(first, last):  # a clock offset was found: the first or last events are before or after it
+        events = events[slice(*np.searchsorted(events.t, encoder.coverage))]
+        first, last = int(events.t[0]), int(events.t[-1])
     drifts = "clock_offset" in names
     material = Material(events, encoder, (lambda t: encoder.speed_at(t) * 1e-6) if drifts else None)
     duration = float(max(last - first, 1))

@@ -16,6 +16,7 @@ from amiwarp.chart.rows import Row, Task, Timed, measure, near_front
 from amiwarp.chart.truth import Known
 from amiwarp.errors import AmiwarpError
 from amiwarp.metrics import model_error
+from amiwarp.optics import MODELS
 from amiwarp.presets import settings_to
 
 JOB = "calibration"
@@ -72,7 +73,7 @@ def _both(label: str, family: str, s: Settings) -> Iterator[Setting]:
 
 def _stages(known: Known) -> Iterator[Setting]:
     yield from _both("default", "default", Settings())
-    for model in ("circle", "radial", "ellipse"):
+    for model in MODELS:
         yield from _both(model, "model", Settings(model=model))
     guess = Settings(global_algorithm=None, start={"phase": known.model.phase + GUESS})
     for way in _both("local search from a guess", "algorithms", guess):

@@ -41,7 +41,7 @@ class SearchOptions:
     model: Annotated[
         str | None,
         typer.Option(
-            help="circle, radial, ellipse or exact (default); auto: the smallest that keeps the budget.",
+            help="circle, exact, radial or ellipse; auto (default): the smallest that keeps the budget.",
             rich_help_panel=_SEARCH,
         ),
     ] = None

@@ -64,16 +64,12 @@ def orbit_radii(camera: Camera, prism: Prism) -> tuple[float, float]:
 
 def _model_errors(exact: ExactModel, device: str) -> dict[str, float]:
     """Of the best fit of each rung [px rms]; circles are given the deflection that suits the image best."""
-    errors = {}
-    for kind in (CircleModel, RadialCircleModel):
-        errors[_name(kind)] = predicted_error(_fitted(kind, exact), exact, remove_lag=True).rms
-    ellipse = EllipseModel.from_model(exact, device)
-    errors[_name(EllipseModel)] = predicted_error(ellipse, exact, remove_lag=True).rms
-    return {**errors, _name(ExactModel): 0.0}
-
-
-def _name(kind: type) -> str:
-    return next(name for name, model in MODELS.items() if model is kind)
+    fitted = {
+        "circle": _fitted(CircleModel, exact),
+        "radial": _fitted(RadialCircleModel, exact),
+        "ellipse": EllipseModel.from_model(exact, device),
+    }
+    return {n: predicted_error(fitted[n], exact, remove_lag=True).rms if n in fitted else 0.0 for n in MODELS}
 
 
 def _fitted(kind: type[CircleModel | RadialCircleModel], exact: ExactModel) -> CircleModel | RadialCircleModel:

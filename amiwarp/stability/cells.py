@@ -19,7 +19,7 @@ from amiwarp import __version__
 from amiwarp.calib import Settings, calibrate
 from amiwarp.calib.paper import calibrate_as_paper
 from amiwarp.calib.parameters import build_model, size_name
-from amiwarp.calib.search import STAGES
+from amiwarp.calib.search import AUTO, STAGES
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import write_text
 from amiwarp.machine import machine
@@ -59,7 +59,10 @@ class Method:
 
     @property
     def model(self) -> str:
-        return "circle" if self.settings is None else self.settings.model
+        """The largest that an answer can be of."""
+        if self.settings is None:
+            return "circle"
+        return "exact" if self.settings.model == AUTO else self.settings.model
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -77,7 +80,7 @@ class Method:
         return calibrate(sample.recording, replace(self.settings, seed=seed, start=known), device=device)
 
 
-_SHARP = Settings(stages=STAGES[:1])
+_SHARP = Settings(model="exact", stages=STAGES[:1])
 METHODS = (
     Method("default", Settings()),
     Method("paper", None),
@@ -153,7 +156,7 @@ def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
 
 def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
     truth = _truth(cell.condition, sample)
-    limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
+    limit = limit_px(cell.condition, method.model)
     began = time.perf_counter()
     try:
         found = method.run(sample, cell.condition, cell.seed, device)
@@ -166,6 +169,7 @@ def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
         error_px = model_error(found.model, truth).rms
     except AmiwarpError:
         error_px = math.inf
+    limit = limit_px(cell.condition, found.model_name)
     outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
     return Result(outcome, float(min(error_px, 1e3)), limit, took, "; ".join(found.warnings))
 
@@ -173,6 +177,11 @@ def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
 def _truth(condition: Condition, sample: Sample) -> ExactModel:
     assert sample.recording.truth is not None
     return ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
+
+
+def limit_px(condition: Condition, model: str) -> float:
+    """Model error [px rms] under which an answer by this model is a success."""
+    return max(LIMIT_PX, BEST_FIT * best_fit(condition, model))
 
 
 @cache
