@@ -221,6 +221,14 @@ def test_what_is_given_is_left_alone(wide: Recording) -> None:
     assert c.ladder.parameters == ()
 
 
+def test_a_lag_is_no_error_of_the_model(found: Calibration, wide: Recording) -> None:
+    places, exact = places_of(wide), found.exact
+    late = replace(exact, parameters={**exact.parameters, "phase": exact.parameters["phase"] + 0.05}).model
+    apart = places.distance(late, exact.model)
+    assert apart > 0.1
+    assert places.distance(late, exact.model, remove_lag=True) < 0.02 * apart
+
+
 def test_halves_are_alternate_turns() -> None:
     t = np.arange(0, 1_000_000, 100, dtype=np.int64)
     zero = np.zeros(len(t), np.uint16)

@@ -98,7 +98,7 @@ def _elsewhere(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
         return ()
     return (
         f"the {chosen.model_name} model is enough where this recording has events, but {away:.2f} px off over the "
-        "whole image: for other recordings take --model exact",
+        "whole image: for other recordings take calibration.exact, or calibrate with --model exact",
     )
 
 

@@ -19,6 +19,7 @@ from amiwarp import __version__
 from amiwarp.calib import Settings, calibrate
 from amiwarp.calib.paper import calibrate_as_paper
 from amiwarp.calib.parameters import build_model, size_name
+from amiwarp.calib.rungs import Places
 from amiwarp.calib.search import AUTO, STAGES
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import write_text
@@ -156,7 +157,7 @@ def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
 
 def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
     truth = _truth(cell.condition, sample)
-    limit = limit_px(cell.condition, method.model)
+    limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
     began = time.perf_counter()
     try:
         found = method.run(sample, cell.condition, cell.seed, device)
@@ -165,23 +166,27 @@ def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
     except Exception as error:  # a crash says nothing that helps: no refusal
         return Result(Outcome.SILENT, None, limit, time.perf_counter() - began, f"crashed: {error!r}")
     took = time.perf_counter() - began
-    try:
-        error_px = model_error(found.model, truth).rms
-    except AmiwarpError:
-        error_px = math.inf
-    limit = limit_px(cell.condition, found.model_name)
+    error_px = _error_px(found, sample, truth)
     outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
     return Result(outcome, float(min(error_px, 1e3)), limit, took, "; ".join(found.warnings))
+
+
+def _error_px(found: Calibration, sample: Sample, truth: ExactModel) -> float:
+    """Over the image; of a model that was taken because it does where the events are, over these."""
+    if found.ladder is not None and found.model_name != "exact":
+        recording = sample.recording
+        assert recording.encoder is not None
+        events = recording.events.slice(0, len(recording.events))
+        return Places.of(events, recording.encoder).distance(found.model, truth, remove_lag=True)
+    try:
+        return model_error(found.model, truth).rms
+    except AmiwarpError:
+        return math.inf
 
 
 def _truth(condition: Condition, sample: Sample) -> ExactModel:
     assert sample.recording.truth is not None
     return ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
-
-
-def limit_px(condition: Condition, model: str) -> float:
-    """Model error [px rms] under which an answer by this model is a success."""
-    return max(LIMIT_PX, BEST_FIT * best_fit(condition, model))
 
 
 @cache
