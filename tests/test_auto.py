@@ -226,7 +226,7 @@ def test_a_lag_is_no_error_of_the_model(found: Calibration, wide: Recording) -> 
     late = replace(exact, parameters={**exact.parameters, "phase": exact.parameters["phase"] + 0.05}).model
     apart = places.distance(late, exact.model)
     assert apart > 0.1
-    assert places.distance(late, exact.model, remove_lag=True) < 0.02 * apart
+    assert places.distance(late, exact.model, remove_lag=True) < 0.05 * apart
 
 
 def test_halves_are_alternate_turns() -> None:

@@ -138,13 +138,12 @@ def _refined(trial: Trial, space: Space, sharp: Vector) -> Vector:
 
 
 def _as_ellipse(trial: Trial, top: Mapping[str, float]) -> tuple[dict[str, float], float, Vector]:
-    """The ellipse follows the exact model: its parameters are the same."""
+    """The ellipse follows the exact model: its parameters are the same, its error that beside the exact sharpest."""
     space = replace(trial.space, model="ellipse")
-    values = dict(trial.exact.parameters)
-    predicted = trial.places.distance(space.build(values), trial.exact.model)
     model = space.build(top)
+    predicted = trial.places.distance(model, trial.space.build(top))
     trial.train.each(space, top, model)  # for its time
-    return values, predicted, trial.test.each(space, top, model)
+    return dict(trial.exact.parameters), predicted, trial.test.each(space, top, model)
 
 
 def _rung(trial: Trial, name: str, predicted: float, reference: Vector, held_out: Vector, *, found: bool) -> Rung:
