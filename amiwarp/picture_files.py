@@ -116,23 +116,35 @@ def save_video(
     pictures: Iterable[Picture], path: Path, *, fps: float, tone: Tone = Tone.MAPPED, contrast: float = CONTRAST
 ) -> int:
     """Writes an MP4 (H.264) and returns how many frames it has. Black and white follow the scene slowly."""
-    import av
 
-    check_path(path, (VIDEO,))
-    between: tuple[float, float] | None = None
-    count = 0
-    with written(path) as part, av.open(str(part), "w", format="mp4") as container:
-        stream: Any = None
+    def frames() -> Iterator[NDArray[np.uint8]]:
+        between: tuple[float, float] | None = None
         for picture in pictures:
             dark, bright = limits(picture, contrast)
             if between is not None:
                 dark = between[0] + STEADY * (dark - between[0])
                 bright = between[1] + STEADY * (bright - between[1])
             between = (dark, bright)
-            value = even(np.rint(255.0 * tones(picture, tone, contrast=contrast, between=between)).astype(np.uint8))
+            yield np.rint(255.0 * tones(picture, tone, contrast=contrast, between=between)).astype(np.uint8)
+
+    return save_film(frames(), path, fps=fps)
+
+
+def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) -> int:
+    """Writes frames, shape (height, width) or (height, width, 3) each, as MP4 (H.264) or, if ``path`` ends so, GIF.
+
+    Returns how many there were. Raises :class:`AmiwarpError` for none, another ending, or where there is no folder.
+    """
+    import av
+
+    check_path(path, (VIDEO, ".gif"))
+    count, kind = 0, path.suffix.lower().removeprefix(".")
+    with written(path) as part, av.open(str(part), "w", format=kind) as container:
+        stream: Any = None
+        for value in map(even, frames):
             if stream is None:
-                stream = add_stream(container, fps, value.shape)
-            frame = av.VideoFrame.from_ndarray(value, format="gray")
+                stream = add_stream(container, fps, value.shape[:2], kind)
+            frame = av.VideoFrame.from_ndarray(value, format="gray" if value.ndim == 2 else "rgb24")
             container.mux(stream.encode(frame))
             count += 1
         if stream is None:
@@ -141,20 +153,22 @@ def save_video(
     return count
 
 
-def add_stream(container: Any, fps: float, shape: tuple[int, ...]) -> Any:
+def add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -> Any:
     from fractions import Fraction
 
-    stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
+    rate = Fraction(fps).limit_denominator(1000)
+    stream = container.add_stream("gif" if kind == "gif" else "libx264", rate=rate)
     stream.height, stream.width = shape
-    stream.pix_fmt = "yuv420p"
-    stream.options = {"crf": "16", "preset": "fast"}
+    stream.pix_fmt = "rgb8" if kind == "gif" else "yuv420p"
+    if kind != "gif":
+        stream.options = {"crf": "16", "preset": "fast"}
     return stream
 
 
 def even(value: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Grown by a repeated row and column to even sizes, which the codec needs."""
-    rows, columns = value.shape
-    return np.pad(value, ((0, rows % 2), (0, columns % 2)), mode="edge")
+    rows, columns = value.shape[:2]
+    return np.pad(value, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (value.ndim - 2)), mode="edge")
 
 
-__all__ = ["Tone", "check_path", "limits", "save_mask", "save_picture", "save_video", "tones"]
+__all__ = ["Tone", "check_path", "limits", "save_film", "save_mask", "save_picture", "save_video", "tones"]

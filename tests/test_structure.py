@@ -13,7 +13,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 KERNEL_LINES, KERNEL_PARAMETERS, FILE_LINES = 25, 10, 400
 FUNC_LINES = 18
 """Aim at 12. A bilinear vote and the steps of the pixel model are one thought each and would not gain by a cut."""
-HEAVY = ("warp", "nlopt", "h5py", "hdf5plugin", "pyvista", "serial", "faery", "av", "matplotlib", "scipy")
+HEAVY = ("warp", "nlopt", "h5py", "hdf5plugin", "pyvista", "serial", "faery", "av", "matplotlib", "scipy", "trame", "aiohttp")
 
 KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 """Kernels turn host objects to structs, so they know the camera; nothing of files, users or recordings."""

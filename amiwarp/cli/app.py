@@ -22,6 +22,7 @@ from amiwarp.cli import (
     simulate,
     stability,
     translate,
+    view,
 )
 from amiwarp.cli.options import command
 from amiwarp.errors import AmiwarpError
@@ -78,7 +79,9 @@ def _version(ctx: typer.Context, version: bool = typer.Option(False, "--version"
         print(ctx.get_help())
 
 
-for module in (demo, info, convert, simulate, translate, calibrate, compensate, reconstruct, chart, design, stability):
+for module in (
+    demo, info, view, convert, simulate, translate, calibrate, compensate, reconstruct, chart, design, stability,
+):  # fmt: skip
     command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import Advance, choose_device, progress, report, table
-from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, number
+from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, number, span
 from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.sharpness import Sharpness
@@ -264,18 +264,12 @@ def cut(recording: Recording, window: str) -> Recording:
     from amiwarp.events import MemoryEvents
 
     first, last = recording.events.t_first, recording.events.t_last
-    start, colon, end = window.partition(":")
-    try:
-        low = first + round(float(start) * 1e6) if start.strip() else first
-        high = first + round(float(end) * 1e6) if end.strip() else last + 1
-    except (ValueError, OverflowError):
-        low, high = 0, 0
-    if not colon or not low < high:
-        raise AmiwarpError(f"--window {window!r} is no span of time; write START:END in seconds, as 0.5:2")
+    low, high = span(window, first, last)
     events = recording.events.between(low, high)
     if not len(events):
-        span = (last - first) * 1e-6
-        raise AmiwarpError(f"{recording.name}: no events in the window {window} s; the recording has {span:.6g} s")
+        raise AmiwarpError(
+            f"{recording.name}: no events in the window {window} s; the recording has {(last - first) * 1e-6:.6g} s"
+        )
     return replace(recording, events=MemoryEvents(events, *recording.events.size))
 
 

@@ -161,3 +161,19 @@ def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
     if len(values) != count or not all(map(math.isfinite, values)):
         raise AmiwarpError(f"{name}: {text!r} is not {count} numbers separated by commas")
     return values
+
+
+def span(text: str, first: int, last: int) -> tuple[int, int]:
+    """``START:END`` seconds after ``first`` as times on its clock [us]; either may be left out. ``last``: the end.
+
+    Raises :class:`AmiwarpError` for what is no span of time.
+    """
+    start, colon, end = text.partition(":")
+    try:
+        low = first + round(float(start) * 1e6) if start.strip() else first
+        high = first + round(float(end) * 1e6) if end.strip() else last + 1
+    except (ValueError, OverflowError):
+        low, high = 0, 0
+    if not colon or not low < high:
+        raise AmiwarpError(f"--window {text!r} is no span of time; write START:END in seconds, as 0.5:2")
+    return low, high

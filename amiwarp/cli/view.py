@@ -1,0 +1,127 @@
+"""``amiwarp view``: event clouds before and after compensation, in a window, in a browser or as a picture."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli.console import choose_device, report
+from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
+from amiwarp.cli.options import Common
+from amiwarp.cli.rig import parse_size
+from amiwarp.errors import AmiwarpError
+from amiwarp.viewer.scene import Axis, Colour, Look, View
+
+if TYPE_CHECKING:
+    from amiwarp.viewer.inspector import Inspector
+
+EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
+
+_PICTURE = "Picture"
+
+
+def run(
+    recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    *,
+    calibration: Annotated[Path | None, typer.Option(help="What 'amiwarp calibrate' wrote.")] = None,
+    web: Annotated[bool, typer.Option("--web", help="Serve the page and print its address; open no window.")] = False,
+    host: Annotated[str, typer.Option(help="Interface to serve on; the address carries a secret token.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve on; 0: a free one.")] = 0,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Write a picture of both clouds (.png) and end.", rich_help_panel=_PICTURE)
+    ] = None,
+    view: Annotated[View, typer.Option(help="Where the camera stands.", rich_help_panel=_PICTURE)] = View.FREE,
+    window: Annotated[
+        str | None,
+        typer.Option(help="Only these seconds of the recording. Default: one turn in its middle.", metavar="START:END"),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="circle, exact, radial or ellipse. Default: as calibrated, or exact.")
+    ] = None,
+    colour: Annotated[Colour, typer.Option(help="What colours tell.", rich_help_panel=_PICTURE)] = Colour.POLARITY,
+    axis: Annotated[
+        Axis | None, typer.Option(help="Third axis. Default: the angle, where there is one.", rich_help_panel=_PICTURE)
+    ] = None,
+    dark: Annotated[bool, typer.Option("--dark", help="On a dark ground.", rich_help_panel=_PICTURE)] = False,
+    overlaid: Annotated[bool, typer.Option("--overlaid", help="Both in one frame.", rich_help_panel=_PICTURE)] = False,
+    size: Annotated[str, typer.Option(help="Of the picture [px].", rich_help_panel=_PICTURE)] = "1400x620",
+    camera: CameraOptions,
+    prism: NominalPrismOptions,
+    common: Common,
+) -> None:
+    """Look at events in x, y and prism angle, as recorded and compensated, and turn the prism's knobs."""
+    from amiwarp.viewer.app import has_display, open_window, save_screenshot, serve_panel
+    from amiwarp.viewer.scene import check_display
+
+    device = choose_device(common.device)
+    check_display()
+
+    def make() -> Inspector:
+        return inspector(recording, calibration, window, model, camera, prism, device)
+
+    first = make()  # what is wrong is said here, not in the page
+    if screenshot is not None:
+        if screenshot.suffix.lower() != ".png":
+            raise AmiwarpError(f"{screenshot}: pictures are written as .png")
+        third = axis or (Axis.ANGLE if first.has_encoder or first.knobs.rpm else Axis.TIME)
+        look = Look(colour, third, dark=dark, overlaid=overlaid)
+        save_screenshot(first, screenshot, view=view, look=look, size=parse_size(size))
+        shown = first.show()
+        data: dict[str, Any] = {
+            "file": str(screenshot), "events": shown.span.count, "drawn": len(shown.events),
+            "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
+            "notes": list(first.notes), "device": device,
+        }  # fmt: skip
+        report(common, data, _lines(data))
+        return
+    served = [first]
+
+    def ready(url: str) -> None:
+        report(common, {"url": url}, [f"{recording.name}: {url}", "Ctrl-C ends it"])
+        if host not in ("127.0.0.1", "localhost"):
+            print(f"served on {host}: whoever has this address can see the recording", file=sys.stderr)
+
+    def tab() -> Inspector:
+        return served.pop() if served else make()
+
+    if web or not has_display():
+        serve_panel(tab, host=host, port=port, ready=ready)
+    else:
+        open_window(tab, ready)
+
+
+def inspector(
+    path: Path,
+    calibration: Path | None,
+    window: str | None,
+    model: str | None,
+    camera: CameraOptions,
+    prism: NominalPrismOptions,
+    device: str,
+) -> Inspector:
+    """The recording with what the options add, at its first window."""
+    from amiwarp.calib import Calibration
+    from amiwarp.io import open_recording
+    from amiwarp.optics import MODELS
+    from amiwarp.viewer.inspector import Inspector
+
+    found = None if calibration is None else Calibration.load(calibration)
+    made = Inspector(complete(open_recording(path), camera, prism), found, device=device)
+    if model is not None:
+        if model not in MODELS:
+            raise AmiwarpError(f"--model {model!r} is unknown; choose among {', '.join(MODELS)}")
+        made.set(replace(made.knobs, model=model))
+    if window is not None:
+        first, last = made.recording.events.t_first, made.recording.events.t_last
+        low, high = span(window, first, last)
+        made.window = low, high - low
+    return made
+
+
+def _lines(d: dict[str, Any]) -> list[str]:
+    gain = f"sharpness {d['sharpness_before']:.3f} as recorded, {d['sharpness_after']:.3f} compensated"
+    return [*d["notes"], f"{d['file']}: {d['events']:,} events, {d['drawn']:,} drawn; {gain}"]

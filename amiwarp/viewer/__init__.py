@@ -1,0 +1,1 @@
+"""The interactive viewer: recordings, events and their compensation in a browser."""

@@ -1,0 +1,118 @@
+"""The inspector's fronts: in a browser, in a window of its own, in a notebook, and as a picture without any of them.
+
+The window is the same page in a browser's own window without tabs: one panel to keep, nothing more to install than what
+every desktop has, and the same over SSH.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.scene import Look, Scene, View
+
+if TYPE_CHECKING:
+    from amiwarp.calib import Calibration
+    from amiwarp.events import Recording
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge", "brave-browser")
+"""Those that open a page in a window of its own."""
+HERE = "127.0.0.1"
+
+
+def has_display() -> bool:
+    """Whether a window can open."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def serve_panel(
+    make: Callable[[], Inspector], *, host: str = HERE, port: int = 0, ready: Callable[[str], None]
+) -> None:
+    """Serves the panel until interrupted, each tab with an inspector of its own; ``ready`` is told its address."""
+    with suppress(KeyboardInterrupt):
+        asyncio.run(_serve(make, host, port, ready))
+
+
+async def _serve(make: Callable[[], Inspector], host: str, port: int, ready: Callable[[str], None]) -> None:
+    from amiwarp.viewer.serve import serve
+
+    await serve(partial(_tab, make), host=host, port=port, token=secrets.token_urlsafe(16), ready=ready)
+
+
+def _tab(make: Callable[[], Inspector], server: Any) -> Callable[[], None]:
+    from amiwarp.viewer.panel import Panel
+
+    return Panel(server, make(), Path.cwd()).close
+
+
+def open_window(make: Callable[[], Inspector], ready: Callable[[str], None]) -> None:
+    """Opens the panel in a window and serves it until that is closed; in a tab where no browser has such windows."""
+
+    async def both() -> None:
+        found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        serving: asyncio.Future[Any] = asyncio.create_task(_serve(make, HERE, 0, found.set_result))
+        await asyncio.wait([serving, found], return_when=asyncio.FIRST_COMPLETED)
+        if serving.done():
+            serving.result()
+        url = found.result()
+        ready(url)
+        browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+        if browser is None:
+            webbrowser.open(url)
+            await serving
+            return
+        with tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True) as profile:
+            options = [f"--app={url}", f"--user-data-dir={profile}", "--no-first-run", "--window-size=1366,768"]
+            if hasattr(os, "geteuid") and os.geteuid() == 0:
+                options.append("--no-sandbox")  # browsers refuse to run as root otherwise
+            window = await asyncio.create_subprocess_exec(browser, *options, stderr=subprocess.DEVNULL)
+            await window.wait()
+        serving.cancel()
+        with suppress(asyncio.CancelledError):
+            await serving
+
+    with suppress(KeyboardInterrupt):
+        asyncio.run(both())
+
+
+def view(
+    recording: Recording, calibration: Calibration | None = None, *, device: Any = "cpu", height: int = 700
+) -> Any:
+    """The panel below a notebook's cell, served by the notebook's own loop until the kernel ends.
+
+    ``height`` [px]. Raises :class:`AmiwarpError` where the recording holds no events, or for another camera's
+    calibration.
+    """
+    from IPython.display import IFrame, display
+
+    Inspector(recording, calibration, device=device)  # what is wrong is said here
+    make = partial(Inspector, recording, calibration, device=device)
+    show = _serve(make, HERE, 0, lambda url: display(IFrame(url, "100%", height)))
+    return asyncio.get_running_loop().create_task(show)
+
+
+def save_screenshot(
+    inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
+) -> None:
+    """Writes both clouds as PNG; ``size``: of the picture [px]."""
+    from amiwarp.io.files import part_path
+
+    part_path(path)
+    look = look or Look()
+    scene = Scene(size)
+    scene.show(inspector.show(), look)
+    scene.look_from(view, look)
+    scene.save(path)
+    scene.close()

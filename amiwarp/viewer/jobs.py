@@ -1,0 +1,147 @@
+"""What a panel does for longer: a calibration that can be cancelled, a recording that plays, films."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.errors import AmiwarpError
+from amiwarp.picture_files import save_film
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from amiwarp.viewer.panel import Panel
+
+FRAMES, FPS = 90, 25.0
+"""Of a film."""
+LEAST_S = 0.05
+"""Between the pictures of a recording that is played."""
+
+
+class Cancelled(Exception):
+    """Raised inside a calibration that nobody waits for any more."""
+
+
+class Calibrating:
+    """A calibration of the panel's recording, in a thread."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel, self._cancelled = panel, False
+        self.found: Calibration | None = None
+        """What waits to be accepted."""
+
+    def toggle(self) -> None:
+        """Starts it, or cancels the one that runs."""
+        state = self._panel.state
+        if state.busy:
+            self._cancelled = True
+            return
+        self._cancelled, self.found = False, None
+        state.update({"busy": "calibrating", "progress": 0, "found": ""})
+        self._panel.begin(self._run())
+
+    def cancel(self) -> None:
+        self._cancelled = True
+
+    async def _run(self) -> None:
+        panel, inspector, loop = self._panel, self._panel.inspector, asyncio.get_running_loop()
+
+        def tell(stage: str, done: int, budget: int) -> None:
+            if self._cancelled:
+                raise Cancelled
+            loop.call_soon_threadsafe(self._progress, stage, done / max(budget, 1))
+
+        rpm = inspector.knobs.rpm
+        settings = Settings(start={} if inspector.has_encoder or not rpm else {"rpm": rpm})
+        try:
+            async with panel.warp:
+                found = await asyncio.to_thread(
+                    calibrate, inspector.recording, settings, device=inspector.device, progress=tell
+                )
+            self.found = found
+            with panel.state:
+                panel.state.found = summary(found)
+        except Cancelled:
+            panel.say("calibration cancelled", "info")
+        except AmiwarpError as error:
+            panel.say(str(error), "error")
+        finally:
+            with panel.state:
+                panel.state.busy = ""
+
+    def _progress(self, stage: str, share: float) -> None:
+        with self._panel.state:
+            self._panel.state.update({"busy": f"calibrating, {stage}", "progress": round(100 * min(share, 1.0))})
+
+
+def summary(c: Calibration) -> str:
+    """A calibration in a line."""
+    p, exact = c.parameters, c.exact.parameters
+    warnings = "".join(f"; {text}" for text in c.warnings)
+    apex, phase = (math.degrees(x) for x in (exact.get("apex", 0.0), p["phase"]))
+    return (
+        f"{c.model_name} model, apex {apex:.4g}°, phase {phase:.4g}°; "
+        f"sharpness {c.sharpness_before:.3g} to {c.sharpness_after:.3g}; {c.seconds:.1f} s{warnings}"
+    )
+
+
+class Playing:
+    """The panel's window moving through the recording, on the page or into a film."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+
+    def toggle(self) -> None:
+        """Runs through the recording from here, or stops."""
+        state = self._panel.state
+        state.playing = not state.playing
+        if state.playing:
+            self._panel.begin(self._run())
+
+    async def _run(self) -> None:
+        panel, state, loop = self._panel, self._panel.state, asyncio.get_running_loop()
+        took = LEAST_S
+        while state.playing:
+            began = loop.time()
+            with state:
+                if panel.move(float(state.start_ms) + 1e3 * took * float(state.speed)):
+                    state.playing = False
+                panel.ask("window")
+            await panel.settled()
+            await asyncio.sleep(max(0.0, LEAST_S - (loop.time() - began)))
+            took = loop.time() - began
+
+    def turntable(self) -> None:
+        """Writes a film of one turn about the clouds."""
+        self._panel.begin(self._film("turntable", lambda: self._panel.scene.turntable(FRAMES)))
+
+    def film(self) -> None:
+        """Writes a film of the recording from here on."""
+        self._panel.begin(self._film("film", self._frames))
+
+    async def _film(self, what: str, frames: Callable[[], Iterator[NDArray[np.uint8]]]) -> None:
+        panel, state = self._panel, self._panel.state
+        with state:
+            state.update({"busy": f"writing the {what}", "progress": 0})
+        await asyncio.sleep(LEAST_S)  # so that the page says so
+        async with panel.warp:
+            with state, panel.reported():
+                path = panel.path(f".{what}.mp4")
+                count = save_film(frames(), path, fps=FPS)
+                panel.say(f"{path}: {count} frames written", "success")
+                panel.server.controller.view_update()
+        with state:
+            state.busy = ""
+
+    def _frames(self) -> Iterator[Any]:
+        panel = self._panel
+        for _ in range(FRAMES):
+            yield panel.scene.picture()
+            if panel.move(float(panel.state.start_ms) + 1e3 / FPS * float(panel.state.speed)):
+                return
+            panel.open_window()

@@ -1,0 +1,74 @@
+"""From numbers to what a page shows: pictures' addresses, curves' points, words."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.viewer.scene import Axis, Colour, View
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.viewer.inspector import Inspector, Shown
+
+JPEG_QUALITY = 90
+
+
+def first_values(inspector: Inspector) -> dict[str, Any]:
+    """The page's state before anything was touched; the knobs come on top."""
+    source, recording = inspector.recording.events, inspector.recording
+    start, length = inspector.window or inspector.first_window()
+    times, rates = inspector.rate
+    turning = math.isfinite(inspector.turn_us)
+    return {
+        "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "size": list(source.size),
+        "whole_ms": (source.t_last - source.t_first + 1) * 1e-3, "start_ms": round((start - source.t_first) * 1e-3, 3),
+        "length_ms": round(length * 1e-3, 3), "turn_ms": inspector.turn_us * 1e-3 if turning else 0.0,
+        "playing": False, "speed": 0.1, "polarity": "both", "hide_hot": False, "region_x": [0, source.size[0]],
+        "region_y": [0, source.size[1]], "colour": Colour.POLARITY.value, "point_size": 2.0, "opacity": 1.0,
+        "axis": (Axis.ANGLE if turning else Axis.TIME).value, "dark": False, "overlaid": False, "view": View.FREE.value,
+        "knob": "apex", "has_encoder": inspector.has_encoder, "orbit_shown": True, "help_shown": False, "out": "",
+        "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "events": "", "sharpness": "",
+        "before": "", "after": "", "picture": "", "picture_note": "", "curve": "", "curve_mark": 0.0, "curve_text": "",
+        "curve_low": 0.0, "curve_high": 1.0, "rate": polyline(times[:-1], rates), "shown_from": 0.0, "shown_part": 1.0,
+        "rate_top": f"{rates.max() * 1e-6:.3g} Mev/s" if len(rates) else "", "message": "; ".join(inspector.notes),
+        "severity": "info", "busy": "", "progress": 0, "found": "", "picked": "",
+    }  # fmt: skip
+
+
+def event_text(shown: Shown, k: int) -> str:
+    """All that is known of a point."""
+    e, (x, y) = shown.events, shown.after[k]
+    return (
+        f"x {e.x[k]}, y {e.y[k]} px; t {e.t[k]} µs; θ {math.degrees(shown.theta[k]):.2f}°; "
+        f"{'ON' if e.p[k] else 'OFF'}; compensated {x:.2f}, {y:.2f} px"
+    )
+
+
+def jpeg(values: NDArray[Any]) -> str:
+    """Values 0 .. 1, shape (height, width), as a picture's address."""
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray((255.0 * values).astype(np.uint8)).save(data, "JPEG", quality=JPEG_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(data.getvalue()).decode()
+
+
+def polyline(x: NDArray[Any], y: NDArray[Any]) -> str:
+    """A curve in a box of 100 x 40, as SVG's points."""
+    if not len(x):
+        return ""
+    across = 100.0 * (x - x[0]) / max(float(x[-1] - x[0]), 1e-12)
+    low, high = float(np.min(y)), float(np.max(y))
+    up = 38.0 - 36.0 * (y - low) / max(high - low, 1e-12)
+    return " ".join(f"{a:.2f},{b:.2f}" for a, b in zip(across, up, strict=True))
+
+
+def share(value: float, low: float, high: float) -> float:
+    """Where a value stands in a range, 0 .. 100."""
+    return min(max(100.0 * (value - low) / max(high - low, 1e-12), 0.0), 100.0)

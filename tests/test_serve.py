@@ -1,0 +1,212 @@
+"""The viewer's server, in a real browser: tabs apart, tabs closed, failures shown, strangers refused."""
+
+import asyncio
+import gc
+import os
+import shutil
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.viewer.serve import Session, serve
+
+pytest.importorskip("trame_vuetify")
+TOKEN = "s3cret & more"
+WAIT_S = 10.0
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A headless Chromium; its tests are skipped, visibly, where there is none."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium on PATH")
+    arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=chromium, args=arguments)
+        yield started
+        started.close()
+
+
+@contextmanager
+def served(build: Session) -> Iterator[tuple[str, asyncio.AbstractEventLoop]]:
+    """Serves in a thread; gives the URL and the event loop."""
+    urls: list[str] = []
+    started: list[tuple[asyncio.AbstractEventLoop, asyncio.Task[None]]] = []
+    listening = threading.Event()
+
+    async def main() -> None:
+        task = asyncio.ensure_future(serve(build, token=TOKEN, ready=lambda url: (urls.append(url), listening.set())))
+        started.append((asyncio.get_running_loop(), task))
+        await asyncio.wait([task])
+
+    thread = threading.Thread(target=asyncio.run, args=(main(),))
+    thread.start()
+    try:
+        assert listening.wait(WAIT_S)
+        yield urls[0], started[0][0]
+    finally:
+        started[0][0].call_soon_threadsafe(started[0][1].cancel)
+        thread.join()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def get(url: str, path: str) -> tuple[int, str, str | None]:
+    """Status, text and cookie of ``path``, which is sent as it is."""
+    connection = HTTPConnection(urlsplit(url).netloc, timeout=WAIT_S)
+    try:
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode(), answer.getheader("Set-Cookie")
+    finally:
+        connection.close()
+
+
+class Counters:
+    """A button that counts in the browser, and twice the count from the server."""
+
+    def __init__(self) -> None:
+        self.servers: list[weakref.ref[Any]] = []
+        self.closed = 0
+
+    def __call__(self, server: Any) -> Callable[[], None]:
+        from trame.ui.vuetify3 import VAppLayout
+        from trame.widgets import html, vtk, vuetify3
+
+        vtk.initialize(server)  # it keeps what it makes for a server
+        self.servers.append(weakref.ref(server))
+        server.state.count = 0
+
+        @server.state.change("count")
+        def _(count: int, **_: Any) -> None:
+            server.state.double = 2 * count
+
+        with VAppLayout(server):
+            vuetify3.VBtn("{{ count }}", click="count += 1")
+            html.Div("{{ double }}", id="double")
+        return self.close
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def forgotten(self) -> bool:
+        gc.collect()
+        return all(server() is None for server in self.servers)
+
+
+def test_without_the_token_nothing_is_given(capfd: pytest.CaptureFixture[str]) -> None:
+    environment = dict(os.environ)
+    with served(Counters()) as (url, _):
+        query = urlsplit(url).query
+        for path in ("/", "/index.html", "/vue.global.js", "/ws", "/?token=", "/?token=s3cret", "/?token=%ff"):
+            status, text, cookie = get(url, path)
+            assert (status, cookie) == (403, None)
+            assert "open the URL" in text
+        status, text, cookie = get(url, f"/?{query}")
+        assert status == 200
+        assert 'id="app"' in text
+        assert cookie is not None
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+    assert dict(os.environ) == environment
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("path", ["/../vue3.py", "/%2e%2e/vue3.py", "/..%2fvue3.py", "//etc/passwd", "/assets", "/%00"])
+def test_files_outside_are_not_found(path: str) -> None:
+    with served(Counters()) as (url, _):
+        assert get(url, f"{path}?{urlsplit(url).query}")[0] == 404
+
+
+def test_an_empty_token_is_refused() -> None:
+    with pytest.raises(AmiwarpError, match="token is empty"):
+        asyncio.run(serve(Counters(), token=""))
+
+
+def test_tabs_have_states_of_their_own_and_are_forgotten(browser: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    from playwright.sync_api import expect
+
+    build = Counters()
+    environment = dict(os.environ)
+    with served(build) as (url, _), browser.new_context() as context:
+        first, second = context.new_page(), context.new_page()
+        for page, clicks in ((first, 1), (second, 3)):
+            page.goto(url)
+            for _ in range(clicks):
+                page.get_by_role("button").click()
+        for page, clicks in ((first, 1), (second, 3)):
+            expect(page.get_by_role("button")).to_have_text(str(clicks))
+            expect(page.locator("#double")).to_have_text(str(2 * clicks))
+        assert len(build.servers) == 2
+
+        first.goto(url.partition("?")[0])  # the cookie is enough
+        expect(first.get_by_role("button")).to_have_text("0")
+        until(lambda: build.closed == 1)
+        first.close()
+        until(lambda: build.closed == 2)
+        expect(second.get_by_role("button")).to_have_text("3")
+        second.get_by_role("button").click()
+        expect(second.locator("#double")).to_have_text("8")
+    assert build.closed == len(build.servers) == 3
+    until(build.forgotten)
+    assert dict(os.environ) == environment
+    assert capfd.readouterr().out == ""
+
+
+def test_ending_closes_open_tabs(browser: Any) -> None:
+    build = Counters()
+    with browser.new_context() as context:
+        page = context.new_page()
+        with served(build) as (url, _):
+            page.goto(url)
+            page.get_by_role("button").wait_for()
+            ending = time.monotonic()
+        assert time.monotonic() - ending < 2.0
+        assert build.closed == 1
+
+
+@pytest.mark.parametrize("error", [AmiwarpError("no events in <b>x.raw</b>"), RuntimeError()])
+def test_failures_are_shown(browser: Any, error: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(server: Any) -> None:
+        raise error
+
+    with served(fail) as (url, _), browser.new_context() as context:
+        page = context.new_page()
+        page.goto(url)
+        page.get_by_text(str(error) or "RuntimeError").wait_for()
+    assert bool(caplog.records) == isinstance(error, RuntimeError)  # a traceback for what nobody foresaw
+
+
+@pytest.mark.parametrize("origin", ["http://example.org", "null", None])
+def test_sockets_of_other_sites_are_refused(origin: str | None) -> None:
+    import aiohttp
+
+    async def connect(url: str, origin: str | None) -> int:
+        headers = {} if origin is None else {"Origin": origin}
+        async with aiohttp.ClientSession() as client:
+            try:
+                async with client.ws_connect(url.replace("/?", "/ws?"), headers=headers):
+                    return 101
+            except aiohttp.WSServerHandshakeError as error:
+                return error.status
+
+    build = Counters()
+    with served(build) as (url, loop):
+        for given, status in ((origin, 403), (url.partition("/?")[0], 101)):
+            assert asyncio.run_coroutine_threadsafe(connect(url, given), loop).result(WAIT_S) == status
+    assert len(build.servers) == build.closed == 1
