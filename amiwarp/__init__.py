@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from amiwarp.sharpness import Sharpness, sharpness
     from amiwarp.simulate import Scene, SensorModel, Simulation, simulate
     from amiwarp.translate import translate
+    from amiwarp.viewer.app import view
 
 _PUBLIC = {
     "calib": ("Calibration", "Settings", "calibrate"),
@@ -42,6 +43,7 @@ _PUBLIC = {
     "sharpness": ("Sharpness", "sharpness"),
     "simulate": ("Scene", "SensorModel", "Simulation", "simulate"),
     "translate": ("translate",),
+    "viewer.app": ("view",),
 }
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names}
 __all__ = ["__version__", *_HOME]

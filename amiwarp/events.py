@@ -166,6 +166,9 @@ class EventSource(Protocol):
     def slice(self, start: int, stop: int) -> Events:
         """Events ``start <= index < stop``, clipped to those there are."""
 
+    def find(self, t: int) -> int:
+        """Index of the first event at or after ``t`` [us]; ``len`` where there is none."""
+
     def between(self, t_start: int, t_end: int) -> Events:
         """Events with ``t_start <= t < t_end`` [us]."""
 
@@ -206,6 +209,10 @@ class MemoryEvents:
     def slice(self, start: int, stop: int) -> Events:
         """Events ``start <= index < stop``, as views."""
         return self._events[max(start, 0) : max(stop, 0)]
+
+    def find(self, t: int) -> int:
+        """See :meth:`EventSource.find`."""
+        return int(np.searchsorted(self._events.t, t))
 
     def between(self, t_start: int, t_end: int) -> Events:
         """Events with ``t_start <= t < t_end`` [us], as views."""

@@ -30,6 +30,7 @@ from amiwarp.cli import (
     simulate,
     stability,
     translate,
+    view,
 )
 from amiwarp.cli.app import app
 from amiwarp.cli.inputs import number
@@ -42,6 +43,7 @@ COMMANDS = {
         demo,
         design,
         info,
+        view,
         convert,
         simulate,
         translate,

@@ -6,14 +6,25 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).parents[1] / "amiwarp"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 KERNEL_LINES, KERNEL_PARAMETERS, FILE_LINES = 25, 10, 400
 FUNC_LINES = 18
 """Aim at 12. A bilinear vote and the steps of the pixel model are one thought each and would not gain by a cut."""
-HEAVY = ("warp", "nlopt", "h5py", "hdf5plugin", "pyvista", "serial", "faery", "av", "matplotlib", "scipy", "trame", "aiohttp")
+HEAVY = (
+    "warp",
+    "nlopt",
+    "h5py",
+    "hdf5plugin",
+    "pyvista",
+    "serial",
+    "faery",
+    "av",
+    "matplotlib",
+    "scipy",
+    "trame",
+    "aiohttp",
+)
 
 KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 """Kernels turn host objects to structs, so they know the camera; nothing of files, users or recordings."""
@@ -160,8 +171,3 @@ def test_every_module_has_its_place() -> None:
 def test_imports_run_one_way() -> None:
     wrong = [f"{user} imports {used}" for user, used in inner_imports() if rank(used) > rank(user)]
     assert wrong == []
-
-
-@pytest.mark.parametrize(("one", "other"), [("amiwarp.calib", "amiwarp.viewer"), ("amiwarp.viewer", "amiwarp.calib")])
-def test_calibration_and_viewer_do_not_meet(one: str, other: str) -> None:
-    assert [pair for pair in inner_imports() if pair[0].startswith(one) and pair[1].startswith(other)] == []

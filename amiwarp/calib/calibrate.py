@@ -11,7 +11,7 @@ import numpy as np
 
 from amiwarp.calib import checks
 from amiwarp.calib.panning import estimate_rates
-from amiwarp.calib.parameters import MOTION, RATES, Space, make_space, size_name
+from amiwarp.calib.parameters import MOTION, NOMINAL_PRISM, RATES, Space, make_space, size_name
 from amiwarp.calib.photometric import refine
 from amiwarp.calib.pixels import Masked, strange_pixels, stretch
 from amiwarp.calib.result import Calibration, constant_speed
@@ -20,7 +20,6 @@ from amiwarp.calib.speed import estimate_rpm
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents
-from amiwarp.optics import Prism
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from amiwarp.camera import Camera
     from amiwarp.events import Recording
 
-NOMINAL_PRISM = Prism(math.radians(2.0))
-"""What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
 LINEAR = ("off_ratio", "leak")
 """Names that are free in the photometric stage alone: unknowns of its linear equations."""
 STRANGE_SHARE = 0.01

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
 
 from amiwarp.calib.parameters import size_name
 from amiwarp.errors import AmiwarpError
@@ -117,7 +116,9 @@ def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
 
     Noise has no direction of its own and lowers it, so gradients weaker than the median are left out.
     """
-    slopes: Any = np.gradient(ndimage.gaussian_filter(image.astype(np.float32), smoothing))
+    from scipy.ndimage import gaussian_filter
+
+    slopes: Any = np.gradient(gaussian_filter(image.astype(np.float32), smoothing))
     energy = slopes[0] ** 2 + slopes[1] ** 2
     strong = energy > 0.1 * energy.max()
     gy, gx = (slope[strong].astype(np.float64) for slope in slopes)

@@ -10,9 +10,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage
-from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,6 +31,10 @@ ROLLS = tuple(range(-60, 61, 12))
 
 def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> tuple[float, float, float]:
     """The camera's mean angular velocity [rad/s] from two turns of ``events`` or a little more; zeros from fewer."""
+    from scipy.ndimage import map_coordinates
+    from scipy.optimize import minimize
+    from scipy.spatial.transform import Rotation
+
     angle = encoder.angle_at(events.t)
     way = math.copysign(1.0, float(angle[-1] - angle[0]))
     turned = way * (angle - angle[0])
@@ -55,8 +56,7 @@ def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> tuple[fl
         if not np.isfinite(way).all() or np.abs(way).max() > max(surfaces.shape[1:]) / 2:
             return 0.0
         return sum(
-            float(ndimage.map_coordinates(s, way[k, ::-1, None], order=1, mode="grid-wrap")[0])
-            for k, s in enumerate(surfaces)
+            float(map_coordinates(s, way[k, ::-1, None], order=1, mode="grid-wrap")[0]) for k, s in enumerate(surfaces)
         )
 
     unit = 1.0 / (camera.fx * seconds)  # moves the image by about a pixel in a turn
@@ -107,9 +107,9 @@ def correlations(
         spectrum = np.fft.rfft2(after, size)
         for k, view in enumerate(views):
             total[k] += np.conj(np.fft.rfft2(before * view, size)) * spectrum
-    surfaces = np.array(
-        [ndimage.gaussian_filter(np.fft.irfft2(part, size), SMOOTHING_PX / 2.0, mode="wrap") for part in total]
-    )
+    from scipy.ndimage import gaussian_filter
+
+    surfaces = np.array([gaussian_filter(np.fft.irfft2(part, size), SMOOTHING_PX / 2.0, mode="wrap") for part in total])
     high = np.maximum(surfaces.max(axis=(1, 2), keepdims=True), 1e-12)
     return 2.0 * np.array(centres) + 0.5, np.maximum(surfaces, 0.0) / high
 

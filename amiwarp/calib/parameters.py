@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from amiwarp.camera import Camera
     from amiwarp.optics import Model
 
+NOMINAL_PRISM = Prism(math.radians(2.0))
+"""What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
 UNITS = {
     "apex": "rad",
     "deflection": "rad",

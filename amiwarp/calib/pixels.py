@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage
 
 from amiwarp.encoder import TURN
 
@@ -149,6 +148,9 @@ class Masked:
     def slice(self, start: int, stop: int) -> Events:
         """Of those ``start <= index < stop`` of the source, what is left."""
         return keep(self.source.slice(start, stop), self.mask)
+
+    def find(self, t: int) -> int:
+        return self.source.find(t)
 
     def between(self, t_start: int, t_end: int) -> Events:
         return keep(self.source.between(t_start, t_end), self.mask)
@@ -294,9 +296,11 @@ def _signals(
 
 def _largest_near(amplitude: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
     """The largest of the spectrum two bins off to ``reach`` bins off, either way: a line alone is two bins wide."""
+    from scipy.ndimage import maximum_filter1d
+
     window = (reach - 1) | 1  # odd, so that it has a middle
     off = 2 + window // 2
-    padded = np.pad(ndimage.maximum_filter1d(amplitude, window, axis=1, mode="constant"), ((0, 0), (off, off)))
+    padded = np.pad(maximum_filter1d(amplitude, window, axis=1, mode="constant"), ((0, 0), (off, off)))
     n = amplitude.shape[1]
     return np.maximum(padded[:, :n], padded[:, 2 * off : 2 * off + n])
 
@@ -305,6 +309,8 @@ def _patch(
     events: Events, pixel: NDArray[np.int32], hz: float, cells: NDArray[np.bool_], without: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Pixels whose events rise and fall at a frequency [Hz], where the cells that see the lamp begin it."""
+    from scipy import ndimage
+
     height, width = without.shape
 
     def around(weights: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -95,7 +95,7 @@ class NominalPrismOptions:
         changes = {name: value for name, value in changes.items() if value is not None}
         if not changes:
             return known
-        from amiwarp.calib.calibrate import NOMINAL_PRISM
+        from amiwarp.calib.parameters import NOMINAL_PRISM
 
         return replace(known or NOMINAL_PRISM, **changes)
 

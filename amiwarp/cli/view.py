@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
 _PICTURE = "Picture"
+LEAST_PX, MOST_PX = 100, 8000
 
 
 def run(
@@ -68,8 +69,11 @@ def run(
         if screenshot.suffix.lower() != ".png":
             raise AmiwarpError(f"{screenshot}: pictures are written as .png")
         third = axis or (Axis.ANGLE if first.has_encoder or first.knobs.rpm else Axis.TIME)
+        width, height = parse_size(size)
+        if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
+            raise AmiwarpError(f"--size {size!r}: pictures have {LEAST_PX} to {MOST_PX} pixels a side")
         look = Look(colour, third, dark=dark, overlaid=overlaid)
-        save_screenshot(first, screenshot, view=view, look=look, size=parse_size(size))
+        save_screenshot(first, screenshot, view=view, look=look, size=(width, height))
         shown = first.show()
         data: dict[str, Any] = {
             "file": str(screenshot), "events": shown.span.count, "drawn": len(shown.events),

@@ -103,10 +103,23 @@ class NativeEvents:
         with errors_name(self.path, lambda: f"events/inside {start} .. {stop}"):
             return np.asarray(self._read("inside", max(start, 0), min(max(stop, 0), self._count)), np.bool_)
 
+    def find(self, t: int) -> int:
+        """See :meth:`amiwarp.events.EventSource.find`; the file's millisecond index helps."""
+        if not self._count or t <= self.t_first:
+            return 0
+        if t > self.t_last:
+            return self._count
+        low, high = self._bracket(t)
+        at = low + int(np.searchsorted(self._times(low, high), t))
+        around = self._times(at - 1, at + 1) if 0 < at < self._count else np.zeros(0, np.int64)
+        if around.size != 2 or not around[0] < t <= around[1]:
+            raise AmiwarpError(f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it")
+        return at
+
     def between(self, t_start: int, t_end: int) -> Events:
         """Events with ``t_start <= t < t_end`` [us]; the file's millisecond index finds them."""
         with errors_name(self.path, lambda: f"events between {t_start} and {t_end} us"):
-            return self.slice(self._find(t_start), self._find(t_end))
+            return self.slice(self.find(t_start), self.find(t_end))
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
         """See :meth:`amiwarp.events.EventSource.blocks`."""
@@ -133,19 +146,6 @@ class NativeEvents:
                 return values
         # HDF5 reads any layout, and says what is wrong with a damaged one.
         return np.asarray(self._columns[name][start:stop])
-
-    def _find(self, t: int) -> int:
-        """Index of the first event at or after ``t``."""
-        if not self._count or t <= self.t_first:
-            return 0
-        if t > self.t_last:
-            return self._count
-        low, high = self._bracket(t)
-        at = low + int(np.searchsorted(self._times(low, high), t))
-        around = self._times(at - 1, at + 1) if 0 < at < self._count else np.zeros(0, np.int64)
-        if around.size != 2 or not around[0] < t <= around[1]:
-            raise AmiwarpError(f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it")
-        return at
 
     def _bracket(self, t: int) -> tuple[int, int]:
         """A short range of indices in which ``t`` falls: from the index, or by bisection without one."""

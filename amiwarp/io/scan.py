@@ -132,6 +132,15 @@ class FileEvents:
             seen += len(block)
         return Events.concatenate([block for block in found if len(block)])
 
+    def find(self, t: int) -> int:
+        """See :meth:`amiwarp.events.EventSource.find`."""
+        seen = 0
+        for block in self._all():
+            if block.t[-1] >= t:
+                return seen + int(np.searchsorted(block.t, t))
+            seen += len(block)
+        return seen
+
     def between(self, t_start: int, t_end: int) -> Events:
         """Events with ``t_start <= t < t_end`` [us]."""
         found: list[Events] = []

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.calibrate import NOMINAL_PRISM
-from amiwarp.calib.parameters import build_model
-from amiwarp.calib.pixels import strange_pixels, stretch
+from amiwarp.calib.parameters import NOMINAL_PRISM, build_model
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
@@ -53,7 +51,7 @@ class Knobs:
     phase: float = 0.0
     """[rad]"""
     clock_offset: float = 0.0
-    """[us]"""
+    """Between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
     tilt_x: float = 0.0
     """[rad]"""
     tilt_y: float = 0.0
@@ -85,6 +83,8 @@ class Shown:
     """A window under the knobs: every event in the images, evenly thinned ones as points."""
 
     span: Span
+    region: tuple[int, int, int, int]
+    """What of the image is shown: left, top, right, bottom [px], the latter two not included."""
     selected: int
     """Events in the images."""
     events: Events
@@ -111,15 +111,20 @@ class Inspector:
         if not len(source):
             raise AmiwarpError(f"{recording.name}: holds no events; there is nothing to see")
         self.notes: tuple[str, ...] = ()
+        if recording.encoder is None and calibration is None:
+            self.notes = ("no encoder: set the speed (rpm) of the prism, or calibrate, to take its motion out",)
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
-            self.notes = (f"camera unknown: {FOV_DEG:g}° field of view assumed; tell it with --fov-deg or --camera",)
+            self.notes = (
+                *self.notes,
+                f"camera unknown: {FOV_DEG:g}° field of view assumed; tell it with --fov-deg or --camera",
+            )
         self.recording, self.device = recording, device
         self.prism = recording.prism or NOMINAL_PRISM
         """The nominal one."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Where there is no encoder: when the angle is 0."""
-        self.knobs = Knobs(apex=self.prism.apex)
+        self.knobs = Knobs(apex=self.prism.apex, clock_offset=self._own_offset)
         self.window: tuple[int, int] | None = None
         """Start and length of what is shown; None: :meth:`first_window`."""
         self.selection = Selection()
@@ -155,7 +160,7 @@ class Inspector:
     def set_encoder(self) -> Encoder:
         """With the knob's clock offset."""
         encoder = self.encoder
-        return encoder.with_clock_offset(encoder.clock_offset_us + self.knobs.clock_offset)
+        return encoder.with_clock_offset(self.knobs.clock_offset) if self.has_encoder else encoder
 
     @property
     def model(self) -> Model:
@@ -170,6 +175,8 @@ class Inspector:
     @cached_property
     def hot(self) -> NDArray[np.bool_]:
         """Hot and flickering pixels of the recording, shape (height, width)."""
+        from amiwarp.calib.pixels import strange_pixels, stretch
+
         source, encoder = self.recording.events, self.encoder
         return strange_pixels(stretch(source, encoder), encoder, source.size)[0]
 
@@ -194,8 +201,8 @@ class Inspector:
         )
         self.recording = replace(self.recording, camera=calibration.camera)
         self.zero_us = self.zero_us if calibration.zero_us is None else calibration.zero_us
-        self.set(Knobs(calibration.model_name, apex, p["phase"], p.get("clock_offset", 0.0), p.get("tilt_x", 0.0),
-                       p.get("tilt_y", 0.0), p.get("rpm", 0.0)))  # fmt: skip
+        offset, tilts = p.get("clock_offset", self._own_offset), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
+        self.set(Knobs(calibration.model_name, apex, p["phase"], offset, *tilts, p.get("rpm", 0.0)))
         self._found = self.knobs, calibration
 
     def as_calibration(self) -> Calibration:
@@ -229,10 +236,12 @@ class Inspector:
     def show(self) -> Shown:
         """The window under the knobs."""
         w = self._opened
-        image, sharpness = self._shutter.take(self.model, w.on_device, self.knobs.clock_offset)
-        theta = w.theta + w.speed * self.knobs.clock_offset
+        late = self.knobs.clock_offset - self._own_offset
+        image, sharpness = self._shutter.take(self.model, w.on_device, late)
+        theta = w.theta + w.speed * late
         after = np.asarray(self.model.compensate_points(w.xy, theta.astype(np.float32)), np.float32)
-        return Shown(w.span, w.on_device.count, w.drawn, w.xy, after, np.mod(theta, math.tau), w.image, image,
+        region = self.selection.region or (0, 0, *self.recording.events.size)
+        return Shown(w.span, region, w.on_device.count, w.drawn, w.xy, after, np.mod(theta, math.tau), w.image, image,
                      w.sharpness, sharpness)  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -246,7 +255,7 @@ class Inspector:
         for value in values:
             knobs = replace(set_to, **{name: float(value)})  # type: ignore[arg-type]
             few = self._upload(w.few, knobs) if name == "rpm" else w.few_on_device
-            scores.append(self._curve_shutter.take(self._model(knobs), few, knobs.clock_offset)[1])
+            scores.append(self._curve_shutter.take(self._model(knobs), few, knobs.clock_offset - self._own_offset)[1])
         return values, np.array(scores)
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -255,6 +264,11 @@ class Inspector:
         theta = np.linspace(0.0, math.tau, ORBIT_POINTS)
         point = np.broadcast_to(np.array([[x, y]], np.float32), (len(theta), 2))
         return theta, self.model.deflect_points(point, theta.astype(np.float32))
+
+    @property
+    def _own_offset(self) -> float:
+        """The clock offset with which the recording came [us]."""
+        return 0.0 if self.recording.encoder is None else self.recording.encoder.clock_offset_us
 
     @property
     def _opened(self) -> _Window:
@@ -270,9 +284,10 @@ class Inspector:
         return {n: x for n, x in found.items() if n in ("index", "focal_length")}
 
     def _values(self, knobs: Knobs) -> dict[str, float]:
-        """Parameters of every rung of the ladder."""
-        prism = replace(self.prism, apex=knobs.apex, index=self._other.get("index", self.prism.index))
-        return {**self._other, "apex": knobs.apex, "deflection": prism.deflection, "phase": knobs.phase,
+        """Parameters of every rung of the ladder; a prism that does not turn takes nothing out."""
+        apex = knobs.apex if self.has_encoder or knobs.rpm else 0.0
+        prism = replace(self.prism, apex=apex, index=self._other.get("index", self.prism.index))
+        return {**self._other, "apex": apex, "deflection": prism.deflection, "phase": knobs.phase,
                 "tilt_x": knobs.tilt_x, "tilt_y": knobs.tilt_y}  # fmt: skip
 
     def _model(self, knobs: Knobs) -> Model:
@@ -326,10 +341,10 @@ class _Shutter:
         self._votes = Votes(canvas, device)
         self._meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device)
 
-    def take(self, model: Model, events: DeviceEvents, clock_offset: float) -> tuple[NDArray[np.float32], float]:
-        """Image [events per pixel], shape (height, width), and its sharpness."""
+    def take(self, model: Model, events: DeviceEvents, late: float) -> tuple[NDArray[np.float32], float]:
+        """Image [events per pixel], shape (height, width), and its sharpness; ``late``: the encoder, by more [us]."""
         self._votes.clear()
-        self._votes.add_events(model, events, drift=clock_offset)
+        self._votes.add_events(model, events, drift=late)
         self._votes.read(self._meter.image)
         return self._meter.image.numpy()[0], self._meter.measure()
 

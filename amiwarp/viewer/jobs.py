@@ -24,7 +24,7 @@ LEAST_S = 0.05
 
 
 class Cancelled(Exception):
-    """Raised inside a calibration that nobody waits for any more."""
+    """Raised inside work that nobody waits for any more."""
 
 
 class Calibrating:
@@ -39,7 +39,9 @@ class Calibrating:
         """Starts it, or cancels the one that runs."""
         state = self._panel.state
         if state.busy:
-            self._cancelled = True
+            if state.busy.startswith("calibrating"):
+                self._cancelled = True
+                state.busy = "calibrating: about to be cancelled"
             return
         self._cancelled, self.found = False, None
         state.update({"busy": "calibrating", "progress": 0, "found": ""})
@@ -63,6 +65,8 @@ class Calibrating:
                 found = await asyncio.to_thread(
                     calibrate, inspector.recording, settings, device=inspector.device, progress=tell
                 )
+            if self._cancelled:
+                raise Cancelled
             self.found = found
             with panel.state:
                 panel.state.found = summary(found)
@@ -75,6 +79,8 @@ class Calibrating:
                 panel.state.busy = ""
 
     def _progress(self, stage: str, share: float) -> None:
+        if self._cancelled:
+            return
         with self._panel.state:
             self._panel.state.update({"busy": f"calibrating, {stage}", "progress": round(100 * min(share, 1.0))})
 
@@ -94,13 +100,19 @@ class Playing:
     """The panel's window moving through the recording, on the page or into a film."""
 
     def __init__(self, panel: Panel) -> None:
-        self._panel = panel
+        self._panel, self._ended = panel, False
+
+    def end(self) -> None:
+        """Also of a film that is being written."""
+        self._ended = True
 
     def toggle(self) -> None:
         """Runs through the recording from here, or stops."""
         state = self._panel.state
         state.playing = not state.playing
         if state.playing:
+            if self._panel.move(float(state.start_ms)):  # at the end: from the beginning
+                self._panel.move(0.0)
             self._panel.begin(self._run())
 
     async def _run(self) -> None:
@@ -115,6 +127,7 @@ class Playing:
             await panel.settled()
             await asyncio.sleep(max(0.0, LEAST_S - (loop.time() - began)))
             took = loop.time() - began
+        panel.released()
 
     def turntable(self) -> None:
         """Writes a film of one turn about the clouds."""
@@ -125,23 +138,39 @@ class Playing:
         self._panel.begin(self._film("film", self._frames))
 
     async def _film(self, what: str, frames: Callable[[], Iterator[NDArray[np.uint8]]]) -> None:
-        panel, state = self._panel, self._panel.state
+        """Drawn one by one in this loop, which serves the pages in between, and written in a thread."""
+        panel, state, loop, pictures = self._panel, self._panel.state, asyncio.get_running_loop(), frames()
+
+        async def draw() -> NDArray[np.uint8] | None:
+            await panel.settled()
+            if self._ended:
+                raise Cancelled
+            with state:
+                state.progress += 100.0 / FRAMES
+                return next(pictures, None)
+
+        def drawn() -> Iterator[NDArray[np.uint8]]:
+            while (picture := asyncio.run_coroutine_threadsafe(draw(), loop).result()) is not None:
+                yield picture
+
         with state:
             state.update({"busy": f"writing the {what}", "progress": 0})
-        await asyncio.sleep(LEAST_S)  # so that the page says so
-        async with panel.warp:
-            with state, panel.reported():
+        try:
+            with panel.reported("export"):
                 path = panel.path(f".{what}.mp4")
-                count = save_film(frames(), path, fps=FPS)
+                count = await asyncio.to_thread(save_film, drawn(), path, fps=FPS)
                 panel.say(f"{path}: {count} frames written", "success")
-                panel.server.controller.view_update()
-        with state:
-            state.busy = ""
+            panel.server.controller.view_update()
+        finally:
+            with state:
+                state.busy = ""
 
     def _frames(self) -> Iterator[Any]:
         panel = self._panel
         for _ in range(FRAMES):
-            yield panel.scene.picture()
-            if panel.move(float(panel.state.start_ms) + 1e3 / FPS * float(panel.state.speed)):
+            picture = panel.scene.picture()
+            ended = panel.move(float(panel.state.start_ms) + 1e3 / FPS * float(panel.state.speed))
+            panel.ask("window")  # drawn when the next picture is asked for
+            yield picture
+            if ended:
                 return
-            panel.open_window()

@@ -37,7 +37,7 @@ KEYS = (
     ("t", ("toggle_axis",), "third axis: angle or time"),
     ("o", ("toggle", "overlaid"), "side by side or overlaid"),
     ("d", ("toggle", "dark"), "light or dark"),
-    ("c", ("calibrate",), "calibrate from here, or cancel"),
+    ("c", ("calibrate",), "calibrate, or cancel"),
     ("a", ("accept",), "accept what calibration found"),
     ("s", ("save",), "save the calibration"),
     ("p", ("save_picture",), "save the picture"),
@@ -55,7 +55,7 @@ html { overflow: hidden !important; }
 .cloud { position: relative; }
 .said { position: absolute; left: 10px; right: 10px; bottom: 8px; z-index: 5; }
 .hint { position: absolute; left: 12px; bottom: 6px; font-size: 12px; opacity: 0.75; pointer-events: none; }
-.side { grid-row: 2 / 4; grid-column: 2; overflow-y: auto; border-left: 1px solid #8884; padding: 4px 12px 12px; }
+.side { grid-row: 2 / 4; grid-column: 2; overflow: hidden auto; border-left: 1px solid #8884; padding: 4px 12px 12px; }
 .side h4 { font-size: 12px; text-transform: uppercase; letter-spacing: 0.06em; opacity: 0.7; margin: 9px 0 1px; }
 .strip { display: grid; grid-template: minmax(0, 1fr) / repeat(4, minmax(0, 1fr)); gap: 8px; padding: 6px 8px;
   border-top: 1px solid #8884; }
@@ -64,11 +64,12 @@ html { overflow: hidden !important; }
 .tile svg { flex: 1; min-height: 0; width: 100%; background: #8881; }
 .tile .empty { flex: 1; display: flex; align-items: center; justify-content: center; text-align: center;
   background: #8881; padding: 8px; }
-.knob { display: grid; grid-template-columns: 1fr 84px; align-items: center; column-gap: 8px; }
+.knob { display: grid; grid-template-columns: 1fr 92px; align-items: center; column-gap: 8px; }
 .knob label { grid-column: 1 / 3; font-size: 12px; margin-bottom: -4px; }
 .row { display: flex; gap: 6px; flex-wrap: wrap; align-items: center; }
 .small { font-size: 12px; opacity: 0.8; }
 .v-input { font-size: 13px; }
+.knob .v-field__input { padding: 4px 8px; font-size: 13px; min-height: 32px; }
 """
 LISTEN = """
 window.addEventListener('keydown', (e) => {
@@ -143,8 +144,8 @@ def _window(panel: Panel, html: Any, v: Any) -> None:
     v.VSlider(v_model=("start_ms",), min=0, max=("whole_ms",), step=0.1, hide_details=True, density="compact",
               id="start", update_modelValue="playing = false", end=(panel.released,))  # fmt: skip
     with html.Div(classes="row"):
-        _number(v, "start_ms", "from [ms]", 108)
-        _number(v, "length_ms", "length [ms]", 108)
+        _number(panel, v, "start_ms", "from [ms]", 108)
+        _number(panel, v, "length_ms", "length [ms]", 108)
         html.Span("{{ turn_ms ? (length_ms / turn_ms).toFixed(2) + ' turns' : '' }}", classes="small")
     with html.Div(classes="row", style="margin-top: 6px"):
         _button(v, "◀ turn", (panel.step, "[-1]"), "back", disabled=("!turn_ms",))
@@ -161,12 +162,13 @@ def _window(panel: Panel, html: Any, v: Any) -> None:
         with html.Div(style="display: grid; grid-template-columns: 84px 1fr; align-items: center"):
             html.Span(f"{axis} {{{{ region_{axis}[0] }}}} to {{{{ region_{axis}[1] }}}}", classes="small")
             v.VRangeSlider(v_model=(f"region_{axis}",), min=0, max=(f"size[{k}]",), step=1, strict=True,
-                           density="compact", hide_details=True)  # fmt: skip
+                           density="compact", hide_details=True, end=(panel.released,))  # fmt: skip
 
 
-def _number(v: Any, name: str, label: str, width: int) -> None:
-    v.VTextField(model_value=(name,), change=f"{name} = Number($event.target.value)", type="number", label=label,
-                 density="compact", hide_details=True, style=f"max-width: {width}px", id=f"field-{name}")  # fmt: skip
+def _number(panel: Panel, v: Any, name: str, label: str, width: int) -> None:
+    v.VTextField(model_value=(name,), change=(panel.typed, f"['{name}', $event.target.value]"), type="number",
+                 label=label, density="compact", hide_details=True, style=f"max-width: {width}px",
+                 id=f"field-{name}")  # fmt: skip
 
 
 def _prism(panel: Panel, html: Any, v: Any) -> None:
@@ -179,14 +181,14 @@ def _prism(panel: Panel, html: Any, v: Any) -> None:
             v.VSlider(v_model=(name,), min=(least,), max=(most,), step=step, hide_details=True, density="compact",
                       id=f"slider-{name}", start=(panel.moved, f"['{name}']"), end=(panel.released,),
                       focus=(panel.moved, f"['{name}']"))  # fmt: skip
-            _number(v, name, "", 84)
+            _number(panel, v, name, "", 92)
 
 
 def _calibration(panel: Panel, html: Any, v: Any) -> None:
     html.H4("calibration")
     with html.Div(classes="row"):
         calibrating = "busy.startsWith('calibrating')"
-        _button(v, f"{{{{ {calibrating} ? 'cancel' : 'calibrate from here' }}}}", panel.calibrate, "calibrate",
+        _button(v, f"{{{{ {calibrating} ? 'cancel' : 'calibrate' }}}}", panel.calibrate, "calibrate",
                 color="primary", disabled=(f"!!busy && !{calibrating}",))  # fmt: skip
         _button(v, "save", panel.save, "save")
     with html.Div(v_if="busy", style="margin-top: 4px"):

@@ -51,14 +51,16 @@ class Panel:
         self._tasks: set[asyncio.Task[None]] = set()
         self._shown: Shown | None = None
         self._picked: int | None = None
-        self._press = (0, 0)
+        self._press: tuple[int, int] | None = None
+        self._wrong = ""
         self.state.update(first_values(inspector))
         self._show_knobs()
         self.open_window()
         build(server, self)
         mouse = self.scene.plotter.iren.interactor
         mouse.AddObserver("LeftButtonPressEvent", self._pressed)
-        mouse.AddObserver("LeftButtonReleaseEvent", self._released)
+        # the release itself goes to none but the style, which took the mouse when it was pressed
+        mouse.GetInteractorStyle().AddObserver("EndInteractionEvent", self._released)
         for what, names in {
             "knobs": NAMES, "view": ("view",), "window": ("start_ms", "length_ms", "polarity", "region_x", "region_y",
             "hide_hot"), "look": ("colour", "axis", "point_size", "opacity", "dark", "overlaid", "orbit_shown"),
@@ -70,6 +72,7 @@ class Panel:
     def close(self) -> None:
         """Ends what is going on."""
         self.calibrating.cancel()
+        self.playing.end()
         for task in [*self._tasks, *filter(None, [self._quick, self._slow])]:
             task.cancel()
         self.scene.close()
@@ -79,6 +82,16 @@ class Panel:
     def released(self) -> None:
         """A slider came to rest."""
         self.later("curve", "picture")
+
+    def typed(self, name: str, text: str) -> None:
+        """A number was entered in a field."""
+        self.state[name] = float(text or 0.0)
+        if name in NAMES:
+            self.moved(name)
+            self.ask("knobs")
+        else:
+            self.ask("window")
+        self.released()
 
     def moved(self, name: str) -> None:
         """Of which knob the curve is drawn."""
@@ -107,6 +120,8 @@ class Panel:
         """Moves the window on by turns, or by its own length where no prism turns."""
         turn = self.inspector.turn_us * 1e-3
         self.move(float(self.state.start_ms) + turns * (turn if math.isfinite(turn) else float(self.state.length_ms)))
+        self.ask("window")
+        self.released()
 
     def play(self) -> None:
         self.playing.toggle()
@@ -117,7 +132,7 @@ class Panel:
     def accept(self) -> None:
         """Takes over what calibration found."""
         if self.calibrating.found is not None:
-            with self.reported():
+            with self.reported("knobs"):
                 self.inspector.accept(self.calibrating.found)
             self.discard()
             self._show_knobs()
@@ -129,14 +144,14 @@ class Panel:
 
     def save(self) -> None:
         """Writes the calibration as it is set."""
-        with self.reported():
+        with self.reported("export"):
             path = self.path(".calibration.json")
             self.inspector.as_calibration().save(path)
             self.say(f"{path}: written", "success")
 
     def save_picture(self) -> None:
         """Writes what is seen."""
-        with self.reported():
+        with self.reported("export"):
             path = self.path(".png")
             self.scene.save(path)
             self.say(f"{path}: written", "success")
@@ -171,14 +186,15 @@ class Panel:
             self.state.update({"message": text, "severity": severity})
 
     @contextlib.contextmanager
-    def reported(self) -> Iterator[None]:
-        """What goes wrong is said in the interface; what is right again no longer."""
+    def reported(self, what: str) -> Iterator[None]:
+        """What goes wrong is said in the interface until the same is right again."""
         try:
             yield
         except (AmiwarpError, OSError) as error:
+            self._wrong = what
             self.state.update({"message": str(error), "severity": "error"})
         else:
-            if self.state.severity == "error":
+            if self.state.severity == "error" and self._wrong == what:
                 self.state.update({"message": "", "severity": "info"})
 
     def move(self, start_ms: float) -> bool:
@@ -195,8 +211,8 @@ class Panel:
     def open_window(self) -> None:
         """Reads and draws what the page's window and selection say."""
         s, source = self.state, self.inspector.recording.events
-        with self.reported():
-            start, length = float(s.start_ms), float(s.length_ms)
+        with self.reported("window"):
+            start, length = float(s.start_ms), min(float(s.length_ms), float(s.whole_ms))
             if not length > 0.0:
                 raise AmiwarpError(f"a window of {length:g} ms; give a length above 0")
             (left, right), (top, bottom) = (sorted(map(int, s[n])) for n in ("region_x", "region_y"))
@@ -207,6 +223,7 @@ class Panel:
             self.inspector.open(source.t_first + round(start * 1e3), max(1, round(length * 1e3)), selection)
             s.update({"shown_from": start / s.whole_ms, "shown_part": length / s.whole_ms})
             self._picked = None
+        with self.reported("knobs"):
             self._draw()
 
     # inside
@@ -230,9 +247,11 @@ class Panel:
         if "window" in todo:
             self.open_window()
             self.later("curve")
-        with self.reported() if "window" not in todo else contextlib.nullcontext():
+        with self.reported("knobs"):
             if "knobs" in todo:
-                values = {name: float(self.state[name]) * scale for name, scale in UNITS.items()}
+                rounded = self._knobs()
+                values = {name: float(self.state[name]) * UNITS[name] for name in NAMES
+                          if self.state[name] != rounded[name]}  # fmt: skip
                 self.inspector.set(replace(self.inspector.knobs, model=self.state.model, **values))
             if todo & {"knobs", "look"}:
                 self._draw()
@@ -247,29 +266,36 @@ class Panel:
                 name = min(self._waiting)  # the curve first
                 self._waiting.discard(name)
                 async with self.warp:
-                    with self.reported():
+                    with self.reported(name):
                         await (self._curve() if name == "curve" else self._reconstruct())
                 self.state.flush()
         finally:
             self._slow = None
 
+    def _knobs(self) -> dict[str, float]:
+        """As the page shows them."""
+        return {name: round(getattr(self.inspector.knobs, name) / scale, 4) for name, scale in UNITS.items()}
+
     def _show_knobs(self) -> None:
-        knobs = self.inspector.knobs
-        self.state.update({name: round(getattr(knobs, name) / scale, 4) for name, scale in UNITS.items()})
-        self.state.model = knobs.model
+        self.state.update({**self._knobs(), "model": self.inspector.knobs.model})
 
     def _draw(self) -> None:
         shown = self._shown = self.inspector.show()
         self.scene.show(shown, self._look)
         self._mark(shown)
         s, span = self.state, shown.span
-        images = Images(shown.image_before, shown.image_after)
+        left, top, right, bottom = shown.region
+        images = Images(*(i[top:bottom, left:right] for i in (shown.image_before, shown.image_after)))
         s.before, s.after = (jpeg(np.sqrt(np.clip(i / images.top, 0.0, 1.0))) for i in (images.before, images.after))
         read = "" if shown.selected == span.count else f", {shown.selected:,} in the images"
         s.events = f"{span.count:,} events{read}, {len(shown.events):,} drawn"
         gain = shown.sharpness_after / max(shown.sharpness_before, 1e-12)
         s.sharpness = f"{shown.sharpness_before:.3f} → {shown.sharpness_after:.3f} (×{gain:.2f})"
         s.curve_mark = share(float(s[s.knob]), float(s.curve_low), float(s.curve_high))
+        turn = self.inspector.turn_us
+        s.turn_ms = turn * 1e-3 if math.isfinite(turn) else 0.0
+        if s.picked:
+            s.picked = "" if self._picked is None else event_text(shown, self._picked)
 
     @property
     def _look(self) -> Look:
@@ -278,12 +304,13 @@ class Panel:
         return Look(Colour(s.colour), Axis(s.axis), *points, dark=bool(s.dark), overlaid=bool(s.overlaid))
 
     def _mark(self, shown: Shown) -> None:
-        """The orbit of the scene point under the event that was picked, or of the middle of the image."""
+        """The orbit of the scene point under the event that was picked, or of the middle of what is shown."""
         if not self.state.orbit_shown or self.state.axis != Axis.ANGLE.value:
             self.scene.mark([])
             return
-        camera = self.inspector.camera
-        point = np.array([camera.width, camera.height]) / 2.0 if self._picked is None else shown.after[self._picked]
+        left, top, right, bottom = shown.region
+        middle = np.array([left + right, top + bottom]) / 2.0
+        point = middle if self._picked is None else shown.after[self._picked]
         theta, xy = self.inspector.orbit(float(point[0]), float(point[1]))
         still = np.broadcast_to(point, xy.shape)
         orbit, column = (self.scene.box.places(each, np.degrees(theta)) for each in (xy, still))
@@ -292,6 +319,8 @@ class Panel:
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
         values, scores = await asyncio.to_thread(self.inspector.curve, name)
+        if not len(values):
+            return
         x = values / UNITS[name]
         s.curve, s.curve_low, s.curve_high = polyline(x, scores), float(x[0]), float(x[-1])
         s.curve_mark = share(float(s[name]), s.curve_low, s.curve_high)
@@ -309,15 +338,17 @@ class Panel:
         except AmiwarpError as error:
             s.update({"picture": "", "picture_note": str(error)})
             return
-        s.picture = jpeg(tones(picture, Tone.MAPPED))
+        left, top, right, bottom = shown.region
+        s.picture = jpeg(tones(picture, Tone.MAPPED)[top:bottom, left:right])
         s.picture_note = f"{picture.pairs:,} pairs, residual {picture.residual:.2f}"
 
     def _pressed(self, interactor: Any, _event: str) -> None:
         self._press = interactor.GetEventPosition()
 
-    def _released(self, interactor: Any, _event: str) -> None:
-        x, y = interactor.GetEventPosition()
-        if math.dist((x, y), self._press) > CLICK_PX or self._shown is None:
+    def _released(self, style: Any, _event: str) -> None:
+        press, self._press = self._press, None
+        x, y = style.GetInteractor().GetEventPosition()
+        if press is None or math.dist((x, y), press) > CLICK_PX or self._shown is None:
             return
         width, height = self.scene.plotter.window_size
         k = self.scene.pick(x / width, 1.0 - y / height)

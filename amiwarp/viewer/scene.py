@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 from ctypes.util import find_library
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,17 +88,28 @@ class Look:
 
 @dataclass(frozen=True)
 class Box:
-    """The frame of both clouds: x, y and the third axis from 0 on."""
+    """The frame of both clouds: part of the image, and the third axis from 0 on."""
 
-    width: int
-    height: int
+    left: int
+    top: int
+    right: int
+    bottom: int
     depth: float
     """Length of the third axis in its unit."""
 
     @property
+    def width(self) -> int:
+        return self.right - self.left
+
+    @property
+    def tall(self) -> float:
+        """Of the third axis in the scene [px]."""
+        return HEIGHT * self.width
+
+    @property
     def stretch(self) -> float:
         """Of the third axis [px per unit]: x and y keep their proportion."""
-        return HEIGHT * self.width / self.depth
+        return self.tall / self.depth
 
     def places(self, xy: NDArray[Any], third: NDArray[Any]) -> NDArray[np.float32]:
         """In the scene, where y points up as in the image, shape (n, 3)."""
@@ -138,15 +149,14 @@ class Scene:
         self._marks: list[tuple[int, Any]] = []
         self._frame: list[tuple[int, Any]] = []
         self._framed: tuple[Any, ...] | None = None
-        self.box = Box(1, 1, 1.0)
+        self.box = Box(0, 0, 1, 1, 1.0)
         self._points: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)] * 2
 
     def show(self, shown: Shown, look: Look) -> None:
         """Draws a window; the camera stays."""
-        height, width = shown.image_after.shape
-        first = not self._clouds
+        before = self.box
         depth = 360.0 if look.axis is Axis.ANGLE else shown.span.length_us * 1e-3
-        self.box = Box(width, height, depth)
+        self.box = Box(*shown.region, depth)
         third = third_axis(shown, look.axis)
         self._points = [self.box.places(xy, third) for xy in (shown.before, shown.after)]
         for k, points in enumerate(self._points):
@@ -154,19 +164,20 @@ class Scene:
             valid = np.isfinite(points).all(axis=1)
             self._cloud(k, points[valid], colours[valid], look)
         self._draw_frame(look)
-        if first:
-            self.look_from(View.FREE, look)
+        if replace(before, depth=depth) != self.box:  # another part of the image
+            self.look_from(self.view, look)
 
     def look_from(self, view: View, look: Look) -> None:
         """Moves the camera, both clouds in sight."""
         self.view = view
         self._draw_frame(look)
-        w, h, d = self.box.width, self.box.height, HEIGHT * self.box.width
+        b = self.box
         away, up = (np.array(v) for v in STANDS[view])
         away = away / np.linalg.norm(away)
         right = np.cross(up, away) / np.linalg.norm(np.cross(up, away))
         up = np.cross(away, right)
-        low, high = np.array([0.0, -h, 0.0]) - MARGIN * w, np.array([w, 0.0, d]) + MARGIN * w
+        margin = MARGIN * b.width
+        low, high = np.array([b.left, -b.bottom, 0.0]) - margin, np.array([b.right, -b.top, b.tall]) + margin
         middle = (low + high) / 2.0
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - middle
         wide, tall, near = (np.abs(corners @ right), np.abs(corners @ up), corners @ away)
@@ -280,20 +291,22 @@ class Scene:
     def _axes(self, k: int, look: Look, ink: str, title: str) -> list[Any]:
         import pyvista
 
-        b, d = self.box, HEIGHT * self.box.width
-        actors = [self._add(k, pyvista.Box((0, b.width, -b.height, 0, 0, d)).outline(), color=ink, line_width=1.0)]
+        b = self.box
+        frame = pyvista.Box((b.left, b.right, -b.bottom, -b.top, 0, b.tall)).outline()
+        actors = [self._add(k, frame, color=ink, line_width=1.0)]
         unit, third = ("θ [°]", (0.0, 360.0)) if look.axis is Axis.ANGLE else ("t [ms]", (0.0, b.depth))
-        gap, low = 0.05 * b.width, -b.height - 0.05 * b.width
+        gap = 0.05 * b.width
+        front, middle = -b.bottom - gap, ((b.left + b.right) / 2.0, -(b.top + b.bottom) / 2.0)
         labels: list[tuple[str, tuple[float, float, float]]] = []
         if self.view is not View.Y_AXIS:
-            labels += [(f"{v:g}", (v, low, -gap)) for v in ticks(0.0, b.width)]
-            labels.append(("x [px]", (b.width / 2.0, low - gap, -2.5 * gap)))
+            labels += [(f"{v:g}", (v, front, -gap)) for v in ticks(b.left, b.right)]
+            labels.append(("x [px]", (middle[0], front - gap, -2.5 * gap)))
         if self.view is not View.X_AXIS:
-            labels += [(f"{v:g}", (b.width + gap, -v, -gap)) for v in ticks(0.0, b.height)]
-            labels.append(("y [px]", (b.width + 3.0 * gap, -b.height / 2.0, -2.5 * gap)))
+            labels += [(f"{v:g}", (b.right + gap, -v, -gap)) for v in ticks(b.top, b.bottom)]
+            labels.append(("y [px]", (b.right + 2.5 * gap, middle[1], -2.5 * gap)))
         if self.view is not View.XY:
-            labels += [(f"{v:g}", (-gap, low + gap, v * b.stretch)) for v in ticks(*third)]
-            labels.append((unit, (-gap, low + gap, d + 1.5 * gap)))
+            labels += [(f"{v:g}", (b.left - gap, front + gap, v * b.stretch)) for v in ticks(*third)]
+            labels.append((unit, (b.left - gap, front + gap, b.tall + 1.5 * gap)))
         for text, place in labels:
             label = pyvista.Label(text, position=place, size=13)
             label.prop.color, label.prop.justification_horizontal = ink, "center"
@@ -333,7 +346,10 @@ def colours_of(shown: Shown, look: Look, *, after: bool) -> NDArray[np.uint8]:
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
     value, name = _measure(shown, look.colour, after=after)
-    table = (255.0 * colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+    table = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
+    if name == "twilight":  # neither white on white nor black on black
+        table = 1.0 - 0.8 * (1.0 - table) if look.dark else 0.8 * table
+    table = (255.0 * table).astype(np.uint8)
     return np.asarray(table[np.clip(np.nan_to_num(value) * 255.0, 0, 255).astype(np.uint8)])
 
 

@@ -1,0 +1,157 @@
+"""How fast the inspector is: frames a second while its clouds turn, a knob's way to the picture, opening a long file.
+
+    python -m benchmarks.view [--device cuda:0] [--events 100_000_000] [--out FILE.json]
+
+Each figure is checked in the same run: the frames differ, the compensated places are those of ``compensate_events``,
+the count is that of the file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.camera import Camera
+from amiwarp.compensate import compensate_events
+from amiwarp.encoder import Encoder
+from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.io import RecordingWriter
+from amiwarp.machine import machine
+from amiwarp.optics import Prism
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.scene import Look, Scene, View
+from amiwarp.viewer.values import jpeg
+
+SIZE, WIDTH, HEIGHT = (1048, 514), 640, 480
+"""Of the clouds' picture in a window of 1366 x 768; of the sensor."""
+REPEATS = 20
+LEAST_FPS, MOST_CPU_MS, MOST_CUDA_MS, MOST_S, MOST_GIB = 10.0, 150.0, 50.0, 3.0, 1.0
+OPENED = """
+import sys, time
+began = time.perf_counter()
+from amiwarp.io import open_recording
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.scene import Look, Scene
+import pyvista, warp
+pyvista.Plotter
+imported = time.perf_counter() - began
+opened = Inspector(open_recording(sys.argv[1]), device=sys.argv[2])
+scene = Scene(({}, {}))
+scene.show(opened.show(), Look())
+scene.picture()
+opened.rate
+most = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+print(time.perf_counter() - began, imported, int(most.split()[1]) / 2**20, opened.show().span.count,
+      len(opened.recording.events))
+""".format(*SIZE)
+
+
+def made(n: int, seconds: float, seed: int = 0) -> Events:
+    """Events at random places and times."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, round(seconds * 1e6), n))
+    x, y = rng.integers(0, WIDTH, n).astype(np.uint16), rng.integers(0, HEIGHT, n).astype(np.uint16)
+    return Events(x, y, t, rng.integers(0, 2, n).astype(np.uint8))
+
+
+def recorded(events: Events) -> Recording:
+    encoder = Encoder.constant_speed(720.0, 0, int(events.t[-1]))
+    camera = Camera.from_fov(WIDTH, HEIGHT, 1.0)
+    return Recording(MemoryEvents(events, WIDTH, HEIGHT), camera, encoder, Prism(0.02), name="made")
+
+
+def orbiting(device: str) -> dict[str, Any]:
+    """200,000 points of two clouds, the camera turning, the picture read back."""
+    inspector, scene = Inspector(recorded(made(1_000_000, 0.2)), device=device), Scene(SIZE)
+    inspector.open(0, 200_000)
+    shown = inspector.show()
+    scene.show(shown, Look())
+    scene.picture()
+    began, frames = time.perf_counter(), []
+    for _ in range(REPEATS):
+        scene.plotter.renderers[0].camera.Azimuth(3.0)
+        frames.append(scene.picture())
+    fps = REPEATS / (time.perf_counter() - began)
+    differ = all((a != b).any() for a, b in itertools.pairwise(frames))
+    return {"points": 2 * len(shown.events), "fps": fps, "ok": differ and fps >= LEAST_FPS}
+
+
+def knob(device: str) -> dict[str, Any]:
+    """From a knob's new value to the cloud drawn, both images encoded and the sharpness, a window of 1 M events."""
+    inspector, scene = Inspector(recorded(made(1_000_000, 0.2)), device=device), Scene(SIZE)
+    inspector.open(0, 200_000)
+    scene.show(inspector.show(), Look())
+    scene.look_from(View.FREE, Look())
+    scene.picture()
+    times = []
+    for k in range(REPEATS):
+        began = time.perf_counter()
+        inspector.set(replace(inspector.knobs, apex=0.01 + 0.0005 * k))
+        shown = inspector.show()
+        scene.show(shown, Look())
+        scene.picture()
+        for image in (shown.image_before, shown.image_after):
+            jpeg(np.sqrt(np.clip(image / image.max(), 0.0, 1.0)))
+        times.append(1e3 * (time.perf_counter() - began))
+    expected = compensate_events(shown.events, inspector.model, inspector.encoder)
+    error = float(np.nanmax(np.abs(expected - shown.after)))
+    most = MOST_CUDA_MS if "cuda" in device else MOST_CPU_MS
+    median = float(np.median(times))
+    return {"events": shown.selected, "ms": median, "ms_slowest": max(times), "error_px": error,
+            "ok": error < 0.01 and median <= most}  # fmt: skip
+
+
+def opening(device: str, n: int) -> dict[str, Any]:
+    """A process of its own from its start to the first picture, the event rate read too; the median of three."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "long.h5"
+        block, seconds = 5_000_000, 0.5
+        camera = Camera.from_fov(WIDTH, HEIGHT, 1.0)
+        encoder = Encoder.constant_speed(720.0, 0, round(n / block * seconds * 1e6))
+        with RecordingWriter(
+            path, width=WIDTH, height=HEIGHT, camera=camera, encoder=encoder, prism=Prism(0.02)
+        ) as writer:
+            for k in range(n // block):
+                e = made(block, seconds, k)
+                writer.append(Events(e.x, e.y, e.t + round(k * seconds * 1e6), e.p))
+        os.sync()  # what was just written is on the disk before it is read
+        command = [sys.executable, "-c", OPENED, str(path), device]
+        runs = [
+            subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-5:] for _ in range(3)
+        ]
+        size = path.stat().st_size
+    took, imports, gib, shown, count = (float(np.median(v)) for v in np.array(runs, float).T)
+    return {"events": int(count), "file_mb": size * 1e-6, "s": took, "imports_s": imports, "gib": gib,
+            "window_events": int(shown),
+            "ok": count == n and took <= MOST_S and gib <= MOST_GIB}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--events", type=int, default=100_000_000)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    found = {"machine": machine(args.device), "device": args.device, "orbiting": orbiting(args.device),
+             "knob": knob(args.device), "opening": opening(args.device, args.events)}  # fmt: skip
+    print(json.dumps(found, indent=1))
+    if args.out:
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+    return int(not all(found[name]["ok"] for name in ("orbiting", "knob", "opening")))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,157 @@
+"""``amiwarp view`` on the command line: pictures without a window, and what is said of bad input."""
+
+import asyncio
+import json
+import math
+import sys
+import types
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+import amiwarp
+from amiwarp.calib import Calibration
+from amiwarp.camera import Camera
+from amiwarp.cli.app import app
+from amiwarp.io import open_recording, save_recording
+from amiwarp.optics import Prism
+from amiwarp.simulate import simulate
+from amiwarp.viewer.app import BROWSERS, has_display, open_window
+from amiwarp.viewer.inspector import Inspector
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> Path:
+    """A recording, and its calibration by the truth."""
+    folder = tmp_path_factory.mktemp("view")
+    camera, prism = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(1.0))
+    recording = simulate(texture, camera, prism, duration_s=0.2, seed=1, nominal_prism=Prism(math.radians(1.3)))
+    save_recording(folder / "recording.h5", recording)
+    assert recording.truth is not None
+    found = {"apex": prism.apex, "phase": recording.truth.parameters["phase"]}
+    Calibration("exact", camera, prism, found, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(folder / "c.json")
+    return folder
+
+
+def view(*args: str | Path) -> tuple[int, str, str]:
+    done = CliRunner().invoke(app, ["view", *map(str, args)])
+    return done.exit_code, done.stdout, done.stderr
+
+
+def test_a_picture_without_a_window(files: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.png"
+    options = ["--view", "x-y", "--colour", "density", "--dark", "--size", "400x200", "--json"]
+    code, said, _ = view(files / "recording.h5", "--calibration", files / "c.json", "--screenshot", out, *options)
+    assert code == 0
+    data = json.loads(said)
+    assert data["sharpness_after"] > 1.1 * data["sharpness_before"]
+    assert data["events"] == data["drawn"] > 10_000
+    picture = np.asarray(Image.open(out).convert("RGB"))
+    assert picture.shape == (200, 400, 3)
+    assert np.median(picture) < 60  # dark
+    assert picture.std() > 10
+
+
+def test_window_model_and_axis(files: Path, tmp_path: Path) -> None:
+    one, two = tmp_path / "1.png", tmp_path / "2.png"
+    wide = json.loads(view(files / "recording.h5", "--screenshot", one, "--json")[1])
+    options = ["--window", "0.05:0.07", "--axis", "time", "--model", "circle", "--overlaid", "--json"]
+    cut = json.loads(view(files / "recording.h5", "--screenshot", two, *options)[1])
+    assert 0 < cut["events"] < 0.5 * wide["events"]
+    assert one.read_bytes() != two.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--screenshot", "out.jpg"], "written as .png"),
+        (["--screenshot", "nowhere/out.png"], "nowhere"),
+        (["--screenshot", "out.png", "--window", "5:2"], "--window '5:2' is no span of time"),
+        (["--screenshot", "out.png", "--window", "50:60"], "take another window"),
+        (["--screenshot", "out.png", "--model", "sphere"], "choose among circle, exact, radial, ellipse"),
+        (["--screenshot", "out.png", "--size", "9x9"], "--size"),
+        (["--calibration", "none.json"], "none.json"),
+    ],
+    ids=lambda v: str(v)[:40],
+)
+def test_bad_input_is_said_in_a_line(files: Path, args: list[str], says: str, tmp_path: Path,
+                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    code, said, error = view(files / "recording.h5", *args)
+    assert (code, said) == (1, "")
+    assert error.count("\n") == 1
+    assert says in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unreadable_and_an_empty_file(tmp_path: Path) -> None:
+    (tmp_path / "noise.h5").write_bytes(b"not at all")
+    assert view(tmp_path / "noise.h5")[0] == 1
+    code, _, error = view(tmp_path / "missing.h5", "--screenshot", tmp_path / "o.png")
+    assert code == 1
+    assert "missing.h5" in error
+
+
+def test_another_camera_s_calibration(files: Path, tmp_path: Path) -> None:
+    data = json.loads((files / "c.json").read_text())
+    data["camera"] |= {"width": 60, "height": 40}
+    (tmp_path / "other.json").write_text(json.dumps(data))
+    code, _, error = view(files / "recording.h5", "--calibration", tmp_path / "other.json")
+    assert code == 1
+    assert "60x40 pixels, the events are of 120x90" in error
+
+
+def test_a_window_opens_only_where_there_is_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert not has_display()
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert has_display()
+    monkeypatch.setattr("sys.platform", "darwin")
+    monkeypatch.delenv("DISPLAY")
+    assert has_display()
+    assert "chromium" in BROWSERS
+
+
+def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The browser is one that writes down how it was called, asks for the page and closes."""
+    browser = tmp_path / BROWSERS[0]
+    browser.write_text(
+        f"#!{sys.executable}\n"
+        "import sys, urllib.request\n"
+        "url = next(a for a in sys.argv if a.startswith('--app=')).removeprefix('--app=')\n"
+        f"open({str(tmp_path / 'page')!r}, 'wb').write(urllib.request.urlopen(url).read())\n"
+    )
+    browser.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    said: list[str] = []
+    open_window(lambda: Inspector(open_recording(files / "recording.h5")), said.append)
+    assert said[0].startswith("http://127.0.0.1:")
+    assert b"<html" in (tmp_path / "page").read_bytes().lower()
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(said[0])
+
+
+def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its display is one that fetches the page."""
+    pages: list[bytes] = []
+    shown = types.ModuleType("IPython.display")
+    vars(shown).update(IFrame=lambda url, width, height: url, display=pages.append)
+    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
+    monkeypatch.setitem(sys.modules, "IPython.display", shown)
+
+    async def cell() -> bytes:
+        task = amiwarp.view(open_recording(files / "recording.h5"))
+        while not pages:
+            await asyncio.sleep(0.01)
+        page = await asyncio.to_thread(lambda: urllib.request.urlopen(str(pages[0])).read())
+        task.cancel()
+        await asyncio.wait([task])
+        return bytes(page)
+
+    assert b"<html" in asyncio.run(cell()).lower()

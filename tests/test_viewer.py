@@ -1,0 +1,386 @@
+"""What the inspector shows, and how its clouds are drawn; without a browser."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from amiwarp.calib import Calibration
+from amiwarp.calib.parameters import build_model
+from amiwarp.calib.pixels import Masked
+from amiwarp.camera import Camera
+from amiwarp.compensate import compensate_events
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.io import open_recording, save_recording
+from amiwarp.iwe import iwe
+from amiwarp.optics import MODELS, Prism
+from amiwarp.simulate import simulate
+from amiwarp.viewer import inspector as viewer
+from amiwarp.viewer.inspector import Inspector, Knobs, Selection
+from amiwarp.viewer.scene import Axis, Colour, Look, Scene, View, colours_of, residual
+from amiwarp.viewer.timeline import event_rate, read_span
+
+TRUE = Prism(math.radians(1.0))
+PICTURES = Path(__file__).parent / "pictures"
+SIZE = (480, 220)
+
+
+@pytest.fixture(scope="module")
+def recording(texture: np.ndarray) -> Recording:
+    camera = Camera.from_fov(160, 120, math.radians(60))
+    nominal = Prism(math.radians(1.2))
+    return simulate(texture, camera, TRUE, duration_s=0.34, seed=1, nominal_prism=nominal)
+
+
+@pytest.fixture
+def inspector(recording: Recording) -> Inspector:
+    return Inspector(recording)
+
+
+def true_knobs(recording: Recording) -> Knobs:
+    assert recording.truth is not None
+    return Knobs(apex=TRUE.apex, phase=recording.truth.parameters["phase"])
+
+
+def without_encoder(recording: Recording) -> Recording:
+    return replace(recording, encoder=None)
+
+
+def calibration_of(recording: Recording, **parameters: float) -> Calibration:
+    assert recording.camera is not None
+    values = {"apex": TRUE.apex, "phase": 0.2, **parameters}
+    return Calibration("exact", recording.camera, TRUE, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+
+
+class Counted:
+    """A source that counts the events that were read."""
+
+    def __init__(self, source: MemoryEvents) -> None:
+        self.source, self.read, self.find = source, 0, source.find
+        self.size, self.t_first, self.t_last = source.size, source.t_first, source.t_last
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def slice(self, start: int, stop: int) -> Events:
+        out = self.source.slice(start, stop)
+        self.read += len(out)
+        return out
+
+
+@pytest.fixture(scope="module")
+def million() -> MemoryEvents:
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, 1_000_000, 1_000_000)) + np.arange(1_000_000) // 2
+    zero = np.zeros(len(t), np.uint16)
+    return MemoryEvents(Events(zero, zero, t, zero.astype(np.uint8)), 4, 4)
+
+
+def test_every_source_finds_a_moment(million: MemoryEvents, tmp_path: Path) -> None:
+    some = million.slice(0, 5000)
+    text = "\n".join(f"{t * 1e-6:.6f} {x} {y} {p}" for t, x, y, p in zip(some.t, some.x, some.y, some.p, strict=True))
+    (tmp_path / "events.txt").write_text(text + "\n")
+    save_recording(tmp_path / "events.h5", Recording(MemoryEvents(some, 4, 4)))
+    hidden = Masked(MemoryEvents(some, 4, 4), np.zeros((4, 4), np.bool_))
+    sources = [open_recording(tmp_path / name).events for name in ("events.txt", "events.h5")] + [hidden]
+    for moment in (-5, int(some.t[0]), 3_456, int(some.t[-1]), 10_000_000):
+        assert {source.find(moment) for source in sources} == {int(np.searchsorted(some.t, moment))}
+    runs = [read_span(source, 1000, 5000, most=640).events for source in (*sources, MemoryEvents(some, 4, 4))]
+    assert len(runs[0]) == 640
+    assert all(np.array_equal(run.t, runs[0].t) for run in runs)
+
+
+def test_a_long_window_is_thinned_evenly_and_its_true_count_is_told(million: MemoryEvents) -> None:
+    source = Counted(million)
+    span = read_span(source, 200_000, 1_000_000, most=64_000)  # type: ignore[arg-type]
+    t = million.slice(0, len(million)).t
+    inside = t[(t >= 200_000) & (t < 1_200_000)]
+    assert span.count == len(inside)
+    assert len(span.events) == 64_000
+    assert source.read == 64_000
+    assert (np.diff(span.events.t) >= 0).all()
+    shares = np.histogram(span.events.t, 8, (200_000, 1_200_000))[0] / np.histogram(inside, 8, (200_000, 1_200_000))[0]
+    assert shares.max() < 1.3 * shares.min()
+    whole = read_span(million, 200_000, 10_000, most=64_000)
+    assert np.array_equal(whole.events.t, t[(t >= 200_000) & (t < 210_000)])
+
+
+def test_the_rate_is_that_of_the_events(million: MemoryEvents) -> None:
+    source = Counted(million)
+    times, rates = event_rate(source)  # type: ignore[arg-type]
+    assert source.read == 0
+    assert len(rates) == 128
+    assert np.sum(rates * np.diff(times)) * 1e-6 == pytest.approx(len(million), abs=2)
+    assert np.abs(rates - len(million) / 1.5).max() < 0.1 * len(million)
+
+
+def test_the_first_window_is_one_turn_in_the_middle(inspector: Inspector, recording: Recording) -> None:
+    start, length = inspector.first_window()
+    assert length == pytest.approx(60e6 / 720, rel=0.01)
+    middle = (recording.events.t_first + recording.events.t_last) / 2
+    assert start + length / 2 == pytest.approx(middle, abs=2)
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recording: Recording, model: str) -> None:
+    inspector.set(replace(true_knobs(recording), model=model, clock_offset=300.0))
+    inspector.open(*inspector.first_window())
+    shown = inspector.show()
+    encoder = inspector.set_encoder
+    events = recording.events.between(shown.span.start_us, shown.span.start_us + shown.span.length_us)
+    assert shown.span.count == shown.selected == len(events)
+    expected = compensate_events(shown.events, inspector.model, encoder)
+    np.testing.assert_allclose(shown.after, expected, atol=2e-3)  # the knob's offset is linear in the angle
+    image = iwe(events, *recording.events.size, model=inspector.model, encoder=encoder)
+    raw = iwe(events, *recording.events.size)
+    for ours, plain in ((shown.image_after, image), (shown.image_before, raw)):  # but for the dither of the votes
+        ours, plain = (gaussian_filter(each, 2.0)[6:-6, 6:-6] for each in (ours, plain))
+        assert np.abs(ours - plain).max() < 0.05 * plain.max()
+
+
+def test_points_are_thinned_evenly(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer, "DRAWN", 1000)
+    shown = inspector.show()
+    assert len(shown.events) == len(shown.after) == 1000
+    parts = np.histogram(shown.events.t, 4, (shown.span.start_us, shown.span.start_us + shown.span.length_us))[0]
+    assert parts.sum() == 1000
+    assert shown.selected > 10_000
+
+
+def test_sharpness_has_its_top_at_the_true_prism(inspector: Inspector, recording: Recording) -> None:
+    inspector.set(true_knobs(recording))
+    shown = inspector.show()
+    assert shown.sharpness_after > 1.2 * shown.sharpness_before
+    for name, tolerance in (("apex", math.radians(0.1)), ("phase", math.radians(8.0))):  # sharpness is biased
+        values, scores = inspector.curve(name)
+        at = getattr(inspector.knobs, name)
+        assert values[0] < at < values[-1]
+        assert values[np.argmax(scores)] == pytest.approx(at, abs=tolerance)
+
+
+def test_an_orbit_is_where_the_model_sees_a_point(inspector: Inspector, recording: Recording) -> None:
+    inspector.set(true_knobs(recording))
+    theta, xy = inspector.orbit(80.0, 60.0)
+    back = inspector.model.compensate_points(xy, theta.astype(np.float32))
+    np.testing.assert_allclose(back, [[80.0, 60.0]] * len(theta), atol=1e-3)
+    assert np.ptp(theta) == pytest.approx(math.tau)
+
+
+def test_a_selection_leaves_events_out(inspector: Inspector) -> None:
+    start, length = inspector.first_window()
+    inspector.open(start, length, Selection(polarity=1, region=(20, 10, 90, 50)))
+    shown = inspector.show()
+    e = shown.events
+    assert (e.p == 1).all()
+    assert 20 <= e.x.min() <= e.x.max() < 90
+    assert 10 <= e.y.min() <= e.y.max() < 50
+    assert 0 < shown.selected < shown.span.count
+
+
+def test_hot_pixels_are_hidden(recording: Recording) -> None:
+    events = recording.events.slice(0, len(recording.events))
+    t = np.arange(recording.events.t_first, recording.events.t_last, 50)
+    hot = Events(np.full(len(t), 33, np.uint16), np.full(len(t), 44, np.uint16), t, np.zeros(len(t), np.uint8))
+    both = Events.concatenate([events, hot])
+    both = both[np.argsort(both.t, kind="stable")]
+    inspector = Inspector(replace(recording, events=MemoryEvents(both, *recording.events.size)))
+    start, length = inspector.first_window()
+    inspector.open(start, length, Selection(hide_hot=True))
+    assert not ((inspector.show().events.x == 33) & (inspector.show().events.y == 44)).any()
+    assert inspector.show().selected > 0.9 * (inspector.show().span.count - length / 50)
+
+
+def test_without_an_encoder_the_speed_is_a_knob(recording: Recording) -> None:
+    inspector = Inspector(without_encoder(recording))
+    assert "no encoder" in inspector.notes[0]
+    assert math.isinf(inspector.turn_us)
+    still = inspector.show()
+    np.testing.assert_allclose(still.after, still.before, atol=1e-3)
+    assert still.sharpness_after == pytest.approx(still.sharpness_before)
+    assert recording.encoder is not None
+    zero = float(recording.encoder.angle_at(np.array([inspector.zero_us]))[0])
+    knobs = true_knobs(recording)
+    inspector.set(replace(knobs, rpm=720.0, phase=knobs.phase + zero))
+    assert inspector.show().sharpness_after > 1.2 * inspector.show().sharpness_before
+    values, scores = inspector.curve("rpm")
+    assert values[np.argmax(scores)] == pytest.approx(720.0, abs=3.0)
+
+
+def test_an_unknown_camera_is_assumed_and_said(recording: Recording) -> None:
+    inspector = Inspector(replace(recording, camera=None))
+    assert "60° field of view assumed" in inspector.notes[-1]
+    assert inspector.show().selected > 0
+
+
+def test_a_calibration_sets_the_knobs_and_comes_back(recording: Recording) -> None:
+    found = calibration_of(recording, clock_offset=120.0, tilt_x=0.01)
+    inspector = Inspector(recording, found)
+    assert inspector.knobs == Knobs("exact", TRUE.apex, 0.2, 120.0, 0.01, 0.0, 0.0)
+    assert inspector.as_calibration() is found
+    inspector.set(replace(inspector.knobs, apex=0.02, model="circle"))
+    moved = inspector.as_calibration()
+    assert moved.model_name == "circle"
+    assert moved.warnings == ("set by hand in the inspector",)
+    assert moved.parameters["deflection"] == pytest.approx(replace(TRUE, apex=0.02).deflection)
+    assert moved.parameters["clock_offset"] == 120.0
+
+
+def test_an_encoder_s_own_clock_offset_counts_once(recording: Recording) -> None:
+    assert recording.encoder is not None
+    late = replace(recording, encoder=recording.encoder.with_clock_offset(2500.0))
+    inspector = Inspector(late)
+    assert inspector.knobs.clock_offset == 2500.0
+    inspector.set(replace(true_knobs(recording), clock_offset=0.0))
+    punctual = Inspector(recording)
+    punctual.set(true_knobs(recording))
+    for each in (inspector, punctual):
+        each.open(*punctual.first_window())
+    np.testing.assert_allclose(inspector.show().after, punctual.show().after, atol=0.01)
+    assert inspector.set_encoder.clock_offset_us == 0.0
+    found = calibration_of(recording, clock_offset=700.0)
+    assert Inspector(late, found).set_encoder.clock_offset_us == 700.0
+
+
+def test_what_was_set_by_hand_can_be_saved_and_opened(
+    inspector: Inspector, recording: Recording, tmp_path: Path
+) -> None:
+    inspector.set(true_knobs(recording))
+    inspector.as_calibration().save(tmp_path / "c.json")
+    again = Inspector(recording, Calibration.load(tmp_path / "c.json"))
+    assert again.knobs == inspector.knobs
+    assert again.show().sharpness_after == inspector.show().sharpness_after
+
+
+def test_a_circle_s_calibration_gives_its_apex(recording: Recording) -> None:
+    assert recording.camera is not None
+    values = {"deflection": TRUE.deflection, "phase": 0.0}
+    circle = replace(calibration_of(recording), model_name="circle", parameters=values)
+    inspector = Inspector(recording, circle)
+    assert inspector.knobs.apex == pytest.approx(TRUE.apex, rel=1e-6)
+    assert inspector.model == build_model("circle", recording.camera, TRUE, values)
+
+
+def test_what_cannot_be_shown_is_said(inspector: Inspector, recording: Recording) -> None:
+    zero = np.zeros(0, np.uint16)
+    nothing = MemoryEvents(Events(zero, zero, zero.astype(np.int64), zero.astype(np.uint8)), 8, 8)
+    with pytest.raises(AmiwarpError, match="holds no events"):
+        Inspector(replace(recording, events=nothing))
+    with pytest.raises(AmiwarpError, match="take another window"):
+        inspector.open(recording.events.t_last + 10, 1000)
+    with pytest.raises(AmiwarpError, match="none of them selected"):
+        inspector.open(*inspector.first_window(), Selection(region=(5, 5, 5, 9)))
+    other = replace(calibration_of(recording), camera=Camera.from_fov(64, 48, 1.0))
+    with pytest.raises(AmiwarpError, match="64x48 pixels, the events are of 160x120"):
+        Inspector(recording, other)
+
+
+def test_events_before_the_encoder_are_left_out(recording: Recording) -> None:
+    assert recording.encoder is not None
+    middle = (recording.events.t_first + recording.events.t_last) // 2
+    later = recording.encoder.t > middle
+    late = Encoder(recording.encoder.t[later], recording.encoder.angle[later])
+    inspector = Inspector(replace(recording, encoder=late))
+    inspector.open(recording.events.t_first, recording.events.t_last - recording.events.t_first)
+    assert inspector.show().events.t.min() >= late.coverage[0] > recording.events.t_first + 100_000
+    assert inspector.show().selected < inspector.show().span.count
+
+
+# the scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Iterator[Scene]:
+    made = Scene(SIZE)
+    yield made
+    made.close()
+
+
+LOOKS = {
+    "polarity": (Look(point_size=1.5), View.FREE),
+    "dark": (Look(Colour.ANGLE, Axis.TIME, point_size=3.0, dark=True), View.FREE),
+    "image": (Look(Colour.DENSITY), View.XY),
+    "side": (Look(Colour.RESIDUAL), View.X_AXIS),
+    "overlaid": (Look(overlaid=True, opacity=0.5), View.Y_AXIS),
+}
+
+
+def away(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean difference of two pictures, single pixels smoothed: renderers differ in which one a point takes."""
+    return float(
+        np.abs(gaussian_filter(a.astype(float), (2, 2, 0)) - gaussian_filter(b.astype(float), (2, 2, 0))).mean()
+    )
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_pictures_are_as_they_were(scene: Scene, inspector: Inspector, recording: Recording, name: str) -> None:
+    """Beside the committed ones; every other of these differs by much more."""
+    inspector.set(true_knobs(recording))
+    look, view = LOOKS[name]
+    scene.show(inspector.show(), look)
+    scene.look_from(view, look)
+    picture = scene.picture()
+    assert picture.shape == (SIZE[1], SIZE[0], 3)
+    known = {n: np.asarray(Image.open(PICTURES / f"view_{n}.png").convert("RGB")) for n in LOOKS}
+    assert away(picture, known[name]) < 1.0
+    assert all(away(picture, known[n]) > 4.0 for n in LOOKS if n != name)
+
+
+def test_the_model_s_orbit_is_drawn_in_front(scene: Scene, inspector: Inspector) -> None:
+    look, view = LOOKS["image"]
+    scene.show(inspector.show(), look)
+    scene.look_from(view, look)
+    before = scene.picture()
+    theta, xy = inspector.orbit(80.0, 60.0)
+    scene.mark([(0, scene.box.places(xy, np.degrees(theta)), "#009e73")])
+    after = scene.picture()
+    green = (np.abs(after.astype(int) - [0, 158, 115]).max(axis=2) < 12).sum()
+    assert green > 20
+    scene.mark([])
+    assert away(scene.picture(), before) < 0.05
+
+
+def test_an_event_is_picked_where_it_is_seen(scene: Scene, inspector: Inspector) -> None:
+    look, view = LOOKS["image"]
+    shown = inspector.show()
+    scene.show(shown, look)
+    scene.look_from(view, look)
+    k = scene.pick(0.25, 0.5)
+    assert k is not None
+    x, y = shown.before[k]
+    assert (x, y) == pytest.approx((80.0, 60.0), abs=6.0)  # the image's middle is that of the left half
+    right = scene.pick(0.75, 0.5)
+    assert right is not None
+    assert tuple(shown.after[right]) == pytest.approx((80.0, 60.0), abs=6.0)
+    assert scene.pick(0.001, 0.001) is None
+
+
+def test_a_turntable_ends_where_it_began(scene: Scene, inspector: Inspector) -> None:
+    look = Look()
+    scene.show(inspector.show(), look)
+    scene.look_from(View.FREE, look)
+    frames = list(scene.turntable(4))
+    assert len(frames) == 4
+    assert away(frames[0], frames[1]) > 1.0
+    assert away(frames[0], scene.picture()) < 0.2
+
+
+def test_colours_tell_what_they_say(inspector: Inspector, recording: Recording) -> None:
+    inspector.set(true_knobs(recording))
+    shown = inspector.show()
+    on = colours_of(shown, Look(), after=True)
+    assert len({tuple(c) for c in on}) == 2
+    assert np.array_equal(on[shown.events.p == 1][0], on[shown.events.p == 1][-1])
+    sharp, raw = (residual(image, xy).mean() for image, xy in (
+        (shown.image_after, shown.after), (shown.image_before, shown.before)))  # fmt: skip
+    assert sharp != raw
+    spike = np.zeros((20, 30), np.float32)
+    spike[10, 12] = 5.0
+    near = residual(spike, np.array([[12.0, 10.0], [13.0, 10.0], [12.0, 12.0]], np.float32))
+    np.testing.assert_allclose(near, [0.0, 1.0, 2.0], atol=0.01)
