@@ -521,6 +521,12 @@ def test_keys(page: Any) -> None:
     page.locator("#help").wait_for(state="hidden")
 
 
+def test_a_window_is_told_in_turns_too(page: Any) -> None:
+    enter(page, "turns", 0.5)
+    until(lambda: field(page, "length_ms") == pytest.approx(30e3 / RPM, abs=0.01))
+    assert field(page, "turns") == 0.5
+
+
 def test_keys_typed_into_a_field_do_nothing_else(page: Any) -> None:
     page.locator("#out").click()
     page.keyboard.type("2do t?acsp")
@@ -530,7 +536,7 @@ def test_keys_typed_into_a_field_do_nothing_else(page: Any) -> None:
     page.keyboard.press("ArrowRight")
     page.locator("#field-length_ms").fill("50")  # the server answers in order
     page.keyboard.press("Enter")
-    page.get_by_text("0.60 turns").wait_for()
+    until(lambda: field(page, "turns") == 0.6)
     assert field(page, "start_ms") == start
     assert [page.locator(name).count() for name in (".v-theme--dark", "#help", "#message")] == [0, 0, 0]
     assert page.locator("#do-overlaid").inner_text().lower() == "overlaid"
@@ -636,7 +642,7 @@ def test_without_encoder_and_prism_the_speed_that_is_set_brings_the_angle(opened
     events = recording.events
     enter(page, "rpm", RPM)
     page.locator("#do-step:enabled").wait_for()
-    page.get_by_text("1.20 turns").wait_for()
+    until(lambda: field(page, "turns") == 1.2)
     enter(page, "apex", APEX_DEG)
     enter(page, "phase", round(true_phase(recording, (events.t_first + events.t_last) // 2), 2))
     until(lambda: sharpness(page)[1] > 1.15 * before[0])

@@ -144,9 +144,10 @@ def _window(panel: Panel, html: Any, v: Any) -> None:
     v.VSlider(v_model=("start_ms",), min=0, max=("whole_ms",), step=0.1, hide_details=True, density="compact",
               id="start", update_modelValue="playing = false", end=(panel.released,))  # fmt: skip
     with html.Div(classes="row"):
-        _number(panel, v, "start_ms", "from [ms]", 108)
-        _number(panel, v, "length_ms", "length [ms]", 108)
-        html.Span("{{ turn_ms ? (length_ms / turn_ms).toFixed(2) + ' turns' : '' }}", classes="small")
+        _number(panel, v, "start_ms", "from [ms]", 102)
+        _number(panel, v, "length_ms", "length [ms]", 102)
+        turns = "turn_ms ? Number((length_ms / turn_ms).toFixed(3)) : ''"
+        _number(panel, v, "turns", "turns", 76, shown=turns, disabled=("!turn_ms",))
     with html.Div(classes="row", style="margin-top: 6px"):
         _button(v, "◀ turn", (panel.step, "[-1]"), "back", disabled=("!turn_ms",))
         _button(v, "{{ playing ? 'stop' : 'play' }}", panel.play, "play")
@@ -165,10 +166,11 @@ def _window(panel: Panel, html: Any, v: Any) -> None:
                            density="compact", hide_details=True, end=(panel.released,))  # fmt: skip
 
 
-def _number(panel: Panel, v: Any, name: str, label: str, width: int) -> None:
-    v.VTextField(model_value=(name,), change=(panel.typed, f"['{name}', $event.target.value]"), type="number",
+def _number(panel: Panel, v: Any, name: str, label: str, width: int, *, shown: str = "", **more: Any) -> None:
+    """A field for a number; ``shown``: what stands in it, if not the state of its name."""
+    v.VTextField(model_value=(shown or name,), change=(panel.typed, f"['{name}', $event.target.value]"), type="number",
                  label=label, density="compact", hide_details=True, style=f"max-width: {width}px",
-                 id=f"field-{name}")  # fmt: skip
+                 id=f"field-{name}", **more)  # fmt: skip
 
 
 def _prism(panel: Panel, html: Any, v: Any) -> None:

@@ -85,7 +85,9 @@ class Panel:
 
     def typed(self, name: str, text: str) -> None:
         """A number was entered in a field."""
-        self.state[name] = float(text or 0.0)
+        value = float(text or 0.0)
+        name, value = ("length_ms", value * float(self.state.turn_ms)) if name == "turns" else (name, value)
+        self.state[name] = round(value, 4)
         if name in NAMES:
             self.moved(name)
             self.ask("knobs")
