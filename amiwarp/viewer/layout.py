@@ -69,6 +69,7 @@ html { overflow: hidden !important; }
 .row { display: flex; gap: 6px; flex-wrap: wrap; align-items: center; }
 .small { font-size: 12px; opacity: 0.8; }
 .v-input { font-size: 13px; }
+.side .v-field { --v-field-padding-start: 9px; --v-field-padding-end: 4px; }
 .knob .v-field__input { padding: 4px 8px; font-size: 13px; min-height: 32px; }
 """
 LISTEN = """

@@ -303,7 +303,9 @@ class Scene:
             labels.append(("x [px]", (middle[0], front - gap, -2.5 * gap)))
         if self.view is not View.X_AXIS:
             labels += [(f"{v:g}", (b.right + gap, -v, -gap)) for v in ticks(b.top, b.bottom)]
-            labels.append(("y [px]", (b.right + 2.5 * gap, middle[1], -2.5 * gap)))
+            flat = self.view is View.XY  # there is no room to the right
+            place = (b.right + gap, -b.top + 1.2 * gap, 0.0) if flat else (b.right + 2.5 * gap, middle[1], -2.5 * gap)
+            labels.append(("y [px]", place))
         if self.view is not View.XY:
             labels += [(f"{v:g}", (b.left - gap, front + gap, v * b.stretch)) for v in ticks(*third)]
             labels.append((unit, (b.left - gap, front + gap, b.tall + 1.5 * gap)))
