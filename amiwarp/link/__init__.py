@@ -1,0 +1,1 @@
+"""The link to the controller of the prism's motor and encoder."""
