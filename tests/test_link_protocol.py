@@ -164,6 +164,18 @@ def test_a_frame_with_a_line_feed_in_it_is_no_line() -> None:
     assert Decoder().feed(frame) == [(0x0A0A, Ping(0x0A0A0A0A))]
 
 
+def test_a_frame_that_begins_with_a_line_feed_is_no_line() -> None:
+    """The first byte of COBS says where the first zero was: here the tenth."""
+    message = Sync(0x01010101, 0x01010001)
+    frame = encode(message, 0x0101)
+    assert frame[0] == 10
+    assert Decoder().feed(frame) == [(0x0101, message)]
+
+
+def test_empty_lines_do_no_harm() -> None:
+    assert [m for _, m in Decoder().feed(b"\n\nt,c\n\n1,2\n\n3,4\n")] == [Samples((1,), (2,)), Samples((3,), (4,))]
+
+
 def test_what_does_not_fit_is_not_sent() -> None:
     for message in (
         Ping(1 << 32),

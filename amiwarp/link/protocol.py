@@ -227,7 +227,7 @@ class Decoder:
         yield sequence, message
 
     def _line(self, byte: int) -> Iterator[tuple[None, Message]]:
-        match = _LINE.fullmatch(bytes(self._held)) if self._whole or self._text else None
+        match = _LINE.fullmatch(bytes(self._held).lstrip(b"\n")) if self._whole or self._text else None
         t, count = (int(match[1]), int(match[2])) if match else (1 << 32, 0)
         if t < 1 << 32 and -(1 << 31) <= count < 1 << 31:
             self._text = True
@@ -237,11 +237,11 @@ class Decoder:
         elif self._text:
             self.received.damaged += 1
             self._held.clear()
-        elif all(32 <= b < 127 or b in b"\r\t" for b in self._held):
+        elif self._held and all(32 <= b < 127 or b in b"\r\n\t" for b in self._held):
             self._held.clear()  # a heading, or the rest of a first line
             self._whole = True
         else:
-            self._hold(byte)  # inside a frame
+            self._hold(byte)  # inside a frame, or its first byte
 
 
 def _checked(held: bytes) -> bytes | None:
