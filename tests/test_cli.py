@@ -403,13 +403,17 @@ def test_a_turning_camera_without_a_prism(place: Path, data_dir: Path) -> None:
     assert picture["residual"] < 0.3
 
 
+INTERRUPTIBLE = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+"""A shell's job in the background ignores Ctrl-C, and so would its children."""
+
+
 @pytest.mark.parametrize("command", ["simulate", "calibrate"])
 def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
     args = {
         "simulate": ["simulate", "long.h5", "--picture", "photo.jpg", "--duration", "60"],
         "calibrate": ["calibrate", "recording.h5", "long.json", "--global-evaluations", "1000000"],
     }[command]
-    script = "import sys; sys.argv[0] = 'amiwarp'; from amiwarp.cli.app import main; print('up', flush=True); main()"
+    script = f"{INTERRUPTIBLE}; sys.argv[0] = 'amiwarp'; from amiwarp.cli.app import main; print('up', flush=True); main()"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     process = subprocess.Popen(
         [sys.executable, "-c", script, *args], cwd=place, env=environment, text=True,
@@ -433,8 +437,9 @@ def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
 
 def test_interrupt_inside_a_finaliser_is_not_lost(place: Path) -> None:
     """Python drops an exception there; the command must end all the same."""
-    script = """
-import signal, sys, time
+    script = f"""
+{INTERRUPTIBLE}
+import time
 import amiwarp.io
 from amiwarp.cli import app
 
