@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from amiwarp.calib import Calibration, Settings, calibrate
     from amiwarp.camera import Camera, Fisheye, RadialTangential
     from amiwarp.compensate import compensate, compensate_events
-    from amiwarp.encoder import Encoder
+    from amiwarp.compensator import Compensated, Compensator
+    from amiwarp.encoder import Encoder, EncoderStream
     from amiwarp.errors import AmiwarpError
     from amiwarp.events import Events, MemoryEvents, Recording, Truth
     from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
@@ -31,7 +32,8 @@ _PUBLIC = {
     "calib": ("Calibration", "Settings", "calibrate"),
     "camera": ("Camera", "Fisheye", "RadialTangential"),
     "compensate": ("compensate", "compensate_events"),
-    "encoder": ("Encoder",),
+    "compensator": ("Compensated", "Compensator"),
+    "encoder": ("Encoder", "EncoderStream"),
     "errors": ("AmiwarpError",),
     "events": ("Events", "MemoryEvents", "Recording", "Truth"),
     "io": ("RecordingWriter", "convert", "open_recording", "save_recording"),

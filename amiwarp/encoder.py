@@ -189,6 +189,124 @@ class Encoder:
         return elapsed, sampled, self.angle[start:stop]
 
 
+class EncoderStream:
+    """Encoder samples as they come, the last of them kept, in memory allocated once; an angle after them is guessed.
+
+    ``clock_offset_us`` as of :class:`Encoder`. Raises :class:`AmiwarpError` for a capacity under 16.
+    """
+
+    KEEPS_SPEED_US = 50_000
+    """The speed of so much of the last samples goes on where there are none [us]."""
+    HOLE_US = 20_000
+    """Samples further apart leave a hole: angles in it are guessed, if from both sides [us]."""
+    MOST_HOLES = 64
+    """That are remembered, the last ones."""
+
+    def __init__(self, clock_offset_us: float = 0.0, *, capacity: int = 1 << 16) -> None:
+        if capacity < 16:
+            raise AmiwarpError(f"capacity = {capacity} samples; give 16 or more")
+        self.clock_offset_us = clock_offset_us
+        self.dropped = 0
+        """Samples that came late: not after those before."""
+        self._t, self._angle = np.zeros(2 * capacity, np.int64), np.zeros(2 * capacity, np.float64)
+        self._stop = 0
+        self._holes: list[tuple[int, int]] = []
+        self._fresh = False
+
+    def __len__(self) -> int:
+        return self._stop
+
+    @property
+    def first(self) -> int | None:
+        """First event time [us] with an angle, an interval before the samples; None while there are fewer than two."""
+        if len(self) < 2:
+            return None
+        return math.ceil(int(2 * self._t[0] - self._t[1]) - self.clock_offset_us)
+
+    @property
+    def last(self) -> int | None:
+        """Last event time [us] with an angle of the samples; None while there are fewer than two."""
+        return None if len(self) < 2 else math.floor(int(self._t[self._stop - 1]) - self.clock_offset_us)
+
+    def restart(self) -> None:
+        """What follows does not go on from what came: another zero, after a controller's reset, say."""
+        self._fresh = len(self) > 0
+
+    def append(self, t_us: ArrayLike, angle: ArrayLike) -> None:
+        """Samples, shape ``(n,)`` each [us, rad, unwrapped]; those that are not later than the last are left out."""
+        t, angles = as_times(t_us), np.asarray(angle, np.float64)
+        if t.shape != angles.shape or t.ndim != 1:
+            raise AmiwarpError(f"encoder samples have shapes t {t.shape}, angle {angles.shape}; expected one length")
+        if not np.isfinite(angles).all():
+            raise AmiwarpError(f"encoder angle {angles[~np.isfinite(angles)][0]}; expected finite numbers")
+        before = int(self._t[self._stop - 1]) if len(self) else -(2**62)
+        later = t > np.maximum.accumulate(np.concatenate([[before], t]))[:-1]
+        if not later.all():
+            self.dropped += int(np.count_nonzero(~later))
+            t, angles = t[later], angles[later]
+        if not t.size:
+            return
+        if len(self) and (self._fresh or int(t[0]) - before > self.HOLE_US):
+            if self._fresh and int(t[0]) - 1 > before:
+                self._put(t[:1] - 1, np.array([self._guess(int(t[0]) - 1)]))
+            self._holes.append((before, int(t[0])))
+        inner = np.flatnonzero(np.diff(t) > self.HOLE_US)
+        self._holes = [*self._holes, *((int(t[i]), int(t[i + 1])) for i in inner)][-self.MOST_HOLES :]
+        self._fresh = False
+        self._put(t, angles)
+
+    def _put(self, t: NDArray[np.int64], angle: NDArray[np.float64]) -> None:
+        capacity = self._t.size // 2
+        t, angle = t[-capacity:], angle[-capacity:]
+        if self._stop + t.size > self._t.size:  # once in so many samples
+            kept = capacity - t.size
+            for column in (self._t, self._angle):
+                column[:kept] = column[self._stop - kept : self._stop]
+            self._stop = kept
+            self._holes = [hole for hole in self._holes if kept and hole[1] > self._t[0]]
+        self._t[self._stop : self._stop + t.size] = t
+        self._angle[self._stop : self._stop + t.size] = angle
+        self._stop += t.size
+
+    def _guess(self, t: int) -> float:
+        """The angle after the last sample, at the speed of those before."""
+        times, angles = self._t[: self._stop], self._angle[: self._stop]
+        begins = max([int(times[-1]) - self.KEEPS_SPEED_US, *(end for _, end in self._holes[-1:])])
+        since = min(int(np.searchsorted(times, begins)), times.size - 1)
+        span = float(times[-1] - times[since])
+        speed = float(angles[-1] - angles[since]) / span if span else 0.0
+        return float(angles[-1]) + speed * float(t - times[-1])
+
+    def over(self, t_first: int, t_last: int) -> Encoder:
+        """The samples about the events of ``t_first`` .. ``t_last`` [us]; where none is later, a guess ends them.
+
+        Raises :class:`AmiwarpError` while there are fewer than two samples.
+        """
+        if len(self) < 2:
+            raise AmiwarpError("the encoder has given fewer than two samples yet")
+        times, angles = self._t[: self._stop], self._angle[: self._stop]
+        low = int(np.searchsorted(times, math.floor(t_first + self.clock_offset_us), side="right")) - 1
+        low = min(max(low, 0), times.size - 2)
+        end = math.ceil(t_last + self.clock_offset_us)
+        high = min(max(int(np.searchsorted(times, end)) + 1, low + 2), times.size)
+        t, angle = times[low:high].copy(), angles[low:high].copy()
+        if end > t[-1]:
+            t, angle = np.append(t, end + 1), np.append(angle, self._guess(end + 1))
+        return Encoder(t, angle, self.clock_offset_us)
+
+    def guessed(self, t: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which event times, sorted, shape ``(n,)`` [us], lie in holes, before the first sample or after the last."""
+        out = np.zeros(t.size, np.bool_)
+        if len(self) < 2:
+            return ~out
+        begins, ends = int(self._t[0]), int(self._t[self._stop - 1])
+        for low, high in ((-(2**62), begins), *self._holes, (ends, 2**62)):
+            low_t, high_t = low - self.clock_offset_us, high - self.clock_offset_us
+            if low_t < t[-1] and high_t > t[0]:
+                out[int(np.searchsorted(t, low_t, side="right")) : int(np.searchsorted(t, high_t))] = True
+        return out
+
+
 def unwrap(t: NDArray[np.int64], value: NDArray[np.float64], period: float) -> NDArray[np.float64]:
     """Unwrap samples of a periodic value; samples that span more than one period count as unwrapped already.
 

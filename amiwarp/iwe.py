@@ -211,18 +211,25 @@ class Votes:
         else:
             self._exactly(vote_events, inputs, events.count)
 
-    def add_points(self, xy: Any, layer: Any) -> None:
-        """Votes points as they are: ``xy`` a Warp array of vec2 [px], ``layer`` of uint8, the image each goes to."""
-        from amiwarp.kernels.votes import vote_points
+    def add_points(self, x: Any, y: Any, layer: Any, count: int | None = None) -> None:
+        """Votes points as they are: ``x``, ``y`` Warp arrays of float [px], ``layer`` of uint8, the image each goes to.
 
-        self._exactly(vote_points, [xy, layer, self._params], len(xy))
+        ``count``: so many of them, all without.
+        """
+        from amiwarp.kernels.launch import launch_slices
+        from amiwarp.kernels.votes import BLOCK, vote_point_blocks, vote_points
+
+        inputs, count = [x, y, layer, self._params], len(x) if count is None else count
+        blocks = count // int(BLOCK) if self.device.is_cpu else 0
+        launch_slices(vote_point_blocks, blocks, inputs, self._cells, device=self.device, smallest=8192)
+        self._exactly(vote_points, inputs, count - blocks * int(BLOCK), blocks * int(BLOCK))
 
     def add_as_they_are(self, events: Events) -> None:
         """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""
         import warp as wp
 
-        xy = wp.array(np.stack([events.x, events.y], axis=1).astype(np.float32), dtype=wp.vec2, device=self.device)
-        self.add_points(xy, wp.array(events.p, dtype=wp.uint8, device=self.device))
+        x, y = (wp.array(v.astype(np.float32), dtype=float, device=self.device) for v in (events.x, events.y))
+        self.add_points(x, y, wp.array(events.p, dtype=wp.uint8, device=self.device))
 
     def _exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
         """Every event looks at what its word held."""

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amiwarp.encoder import TURN, Encoder
+from amiwarp.encoder import TURN, Encoder, EncoderStream
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import read_encoder_csv
 
@@ -145,6 +145,54 @@ def test_a_gap_at_the_end_is_not_extrapolated_over():
 def test_refuses(make, message):
     with pytest.raises(AmiwarpError, match=message):
         make()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=60), st.integers(0, 10**15), st.floats(-3e6, 3e6))
+def test_a_stream_is_the_encoder_of_its_last_samples(sizes, origin, offset):
+    n = sum(sizes) + 2
+    t = origin + np.cumsum(np.random.default_rng(n).integers(1, 2000, n))
+    encoder, stream = Encoder(t, SPEED * (t - origin), offset), EncoderStream(offset, capacity=64)
+    stream.append(t[:2], encoder.angle[:2])
+    start = 2
+    for size in sizes:
+        stream.append(t[start : start + size], encoder.angle[start : start + size])
+        start += size
+    assert len(stream) >= min(n, 64)
+    low, high = stream.first + 2000, stream.last
+    asked = np.linspace(low, high, 50).astype(np.int64) if low < high else np.array([high])
+    np.testing.assert_array_equal(stream.over(int(asked[0]), high).angle_at(asked), encoder.angle_at(asked))
+    assert not stream.guessed(asked).any()
+    after = np.array([high + 1, high + 5000])
+    assert stream.guessed(after).all()
+    expected = SPEED * (after + offset - origin)
+    np.testing.assert_allclose(stream.over(high, high + 5000).angle_at(after), expected, rtol=0, atol=1e-6)
+
+
+def test_a_stream_leaves_out_what_comes_late():
+    stream = EncoderStream()
+    stream.append([0, 1000, 900, 1000, 2000], [0.0, 1.0, 7.0, 7.0, 2.0])
+    stream.append([1500, 2000, 3000], [7.0, 7.0, 3.0])
+    assert stream.dropped == 4
+    np.testing.assert_allclose(stream.over(0, 3000).angle, [0.0, 1.0, 2.0, 3.0])
+
+
+def test_a_stream_that_stood_still_is_guessed_to_stand():
+    stream = EncoderStream()
+    stream.append(np.arange(0, 200_000, 1000), np.minimum(np.arange(200), 100) * 0.075)
+    assert stream.over(199_000, 250_000).angle_at(250_000) == pytest.approx(7.5)
+
+
+def test_a_stream_refuses_what_is_no_angle():
+    stream = EncoderStream()
+    with pytest.raises(AmiwarpError, match="finite"):
+        stream.append([0, 1], [0.0, np.nan])
+    with pytest.raises(AmiwarpError, match="one length"):
+        stream.append([0, 1], [0.0])
+    with pytest.raises(AmiwarpError, match="two samples"):
+        stream.over(0, 1)
+    with pytest.raises(AmiwarpError, match="16 or more"):
+        EncoderStream(capacity=3)
 
 
 def test_arrays_given_are_not_changed():

@@ -82,10 +82,14 @@ def test_order_does_not_matter(device: str) -> None:
     np.testing.assert_array_equal(*images)
 
 
+def columns(xy: np.ndarray, device: str) -> list[wp.array]:
+    return [wp.array(values, dtype=float, device=device) for values in xy.T.astype(np.float32)]
+
+
 def test_nan_and_far_points_vote_nowhere(device: str) -> None:
     votes = Votes(CanvasShape(8, 6), device)
     xy = np.array([[np.nan, 2], [2, np.nan], [1e9, 2], [-1e9, 2], [np.inf, 2], [3, 2]], dtype=np.float32)
-    votes.add_points(wp.array(xy, dtype=wp.vec2, device=device), wp.zeros(6, dtype=wp.uint8, device=device))
+    votes.add_points(*columns(xy, device), wp.zeros(6, dtype=wp.uint8, device=device))
     image = votes.take()[0]
     assert image[2, 3] == 1.0
     assert image.sum() == 1.0
@@ -108,7 +112,7 @@ def test_a_full_cell_loses_nothing(n: int, device: str) -> None:
     xy = (np.random.default_rng(0).integers(256, 512, (n, 2)) / 256.0).astype(np.float32)
     xy[: n // 2] = 511 / 256  # nearly a whole vote for the next pixel: the fields fill up as fast as they can
     votes = Votes(CanvasShape(5, 4), device)
-    votes.add_points(wp.array(xy, dtype=wp.vec2, device=device), wp.zeros(n, dtype=wp.uint8, device=device))
+    votes.add_points(*columns(xy, device), wp.zeros(n, dtype=wp.uint8, device=device))
     image = Image(CanvasShape(5, 4), 1, device)
     votes.read(image)
     expected = fixed_point(xy, 4, 5)
@@ -130,7 +134,7 @@ def test_events_are_voted_as_their_points_are(name: str, vote: Vote, device: str
     fused, points = Votes(canvas, device), Votes(canvas, device)
     fused.add_events(model, upload_events(events, theta, device))
     xy = model.compensate_points(np.stack([events.x, events.y], axis=1).astype(np.float32), theta)
-    points.add_points(wp.array(xy, dtype=wp.vec2, device=device), wp.array(events.p, device=device))
+    points.add_points(*columns(xy, device), wp.array(events.p, device=device))
     image, expected = fused.take(), points.take()
     assert image.sum(dtype=np.float64) == pytest.approx(expected.sum(dtype=np.float64), abs=2)
     # places differ by float32 rounding, which may move a nearest vote to the next pixel
@@ -160,8 +164,7 @@ def test_cpu_and_cuda_agree_bit_for_bit(name: str, vote: Vote, points: int) -> N
 def test_scaled_canvas_keeps_places() -> None:
     votes = Votes(CanvasShape(8, 8, pad=2, scale=0.5), "cpu")
     # the 2 x 2 block of sensor pixels (2..3, 4..5) is one canvas pixel; its middle is (2.5, 4.5)
-    xy = wp.array([[2.5, 4.5]], dtype=wp.vec2, device="cpu")
-    votes.add_points(xy, wp.zeros(1, dtype=wp.uint8, device="cpu"))
+    votes.add_points(*columns(np.array([[2.5, 4.5]]), "cpu"), wp.zeros(1, dtype=wp.uint8, device="cpu"))
     image = votes.take()[0]
     assert image.shape == (6, 6)
     assert image[3, 2] == 1.0

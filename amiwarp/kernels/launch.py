@@ -19,6 +19,12 @@ def pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(cpu_threads(), thread_name_prefix="amiwarp")
 
 
+@cache
+def beside() -> ThreadPoolExecutor:
+    """One thread, for what may go on beside and must keep its order."""
+    return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-beside")
+
+
 def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:
     """At most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``, none much below ``smallest``."""
     parts = max(1, min(parts, n // smallest))
@@ -33,9 +39,10 @@ def launch(
     outputs: Sequence[Any],
     *,
     device: Any,
+    first: int = 0,
     smallest: int = SMALLEST_SLICE,
 ) -> None:
-    """Run a kernel whose last input is ``start: int`` over ``range(n)``, on all cores of a CPU.
+    """Run a kernel whose last input is ``start: int`` over ``range(first, first + n)``, on all cores of a CPU.
 
     Each thread of the kernel must write places of its own: slices run at the same time.
     """
@@ -43,13 +50,13 @@ def launch(
     if n == 0:
         return
     if not device.is_cpu:
-        wp.launch(kernel, dim=n, inputs=[*inputs, 0], outputs=list(outputs), device=device)
+        wp.launch(kernel, dim=n, inputs=[*inputs, first], outputs=list(outputs), device=device)
         return
     ranges = slices(n, cpu_threads(), smallest)
     kernel.module.load(device, block_dim=1)  # once, before the threads would each try
 
     def run(span: tuple[int, int]) -> None:
-        inputs_ = [*inputs, span[0]]
+        inputs_ = [*inputs, first + span[0]]
         wp.launch(kernel, dim=span[1] - span[0], inputs=inputs_, outputs=list(outputs), device=device)
 
     list(pool().map(run, ranges)) if len(ranges) > 1 else run(ranges[0])

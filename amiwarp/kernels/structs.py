@@ -64,6 +64,21 @@ def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -
     Raises :class:`AmiwarpError` as :meth:`Encoder.angle_at` does, where the encoder does not cover that span.
     """
     encoder.angle_at(np.array([t_first, t_last], np.int64))
+    origin, start, angle, slope = encoder_pieces(encoder, t_first, t_last)
+    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1  # a bucket is no longer than pieces are on average
+    edges = np.arange((int(start[-1]) >> shift) + 1, dtype=np.int64) << shift
+    first = np.append(np.searchsorted(start, edges, side="right") - 1, start.size - 1)
+    p = EncoderParams()
+    p.origin, p.shift = origin, shift
+    p.first = wp.array(first.astype(np.int32), dtype=int, device=device)
+    p.start = wp.array(start, dtype=wp.int64, device=device)
+    p.angle = wp.array(angle, dtype=wp.uint64, device=device)
+    p.slope = wp.array(slope, dtype=wp.uint64, device=device)
+    return p
+
+
+def encoder_pieces(encoder: "Encoder", t_first: int, t_last: int) -> tuple[int, Any, Any, Any]:
+    """Origin, starts, angles and slopes of :class:`EncoderParams`, of an encoder that covers the span."""
     # Whole and fractional offset: a piece starts at the first whole event time at or after its sample.
     whole = math.floor(encoder.clock_offset_us)
     begins = encoder.t - whole
@@ -72,17 +87,8 @@ def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -
     turns = encoder.angle[low : high + 1] / (2.0 * math.pi)
     slope = np.diff(turns) / np.diff(encoder.t[low : high + 1])
     origin = int(begins[low])
-    start = begins[low:high] - origin
-    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1  # a bucket is no longer than pieces are on average
-    edges = np.arange((int(start[-1]) >> shift) + 1, dtype=np.int64) << shift
-    first = np.append(np.searchsorted(start, edges, side="right") - 1, start.size - 1)
-    p = EncoderParams()
-    p.origin, p.shift = origin, shift
-    p.first = wp.array(first.astype(np.int32), dtype=int, device=device)
-    p.start = wp.array(start, dtype=wp.int64, device=device)
-    p.angle = wp.array(_wrapped(turns[:-1] + slope * (encoder.clock_offset_us - whole)), dtype=wp.uint64, device=device)
-    p.slope = wp.array(_wrapped(slope), dtype=wp.uint64, device=device)
-    return p
+    angle = _wrapped(turns[:-1] + slope * (encoder.clock_offset_us - whole))
+    return origin, begins[low:high] - origin, angle, _wrapped(slope)
 
 
 def _wrapped(turns: Any) -> Any:

@@ -99,6 +99,14 @@ def cast_vote(cells: Cells, cell: int, width: int, word: wp.uint64):
 
 
 @wp.func
+def add_vote(cells: Cells, cell: int, width: int, word: wp.uint64):
+    """The same where no other thread adds to these words."""
+    carry = add_word(cells.words, cell, word) & CARRIES
+    if carry != wp.uint64(0):
+        take_down(cells, cell, width, carry)
+
+
+@wp.func
 def somewhere(i: int):
     """A place in the pixel, even over it, the same for event ``i`` at every call (MurmurHash3's finaliser)."""
     h = wp.uint32(i + 1)
@@ -168,9 +176,7 @@ def vote_blocks(
         store_int(places, k, cell)
         store_word(words, k, wp.where(first + k < count, word, wp.uint64(0)))
     for k in range(BLOCK):
-        carry = add_word(cells.words, places[k], weighted(events, first + k, words[k])) & CARRIES
-        if carry != wp.uint64(0):
-            take_down(cells, places[k], canvas.columns, carry)
+        add_vote(cells, places[k], canvas.columns, weighted(events, first + k, words[k]))
 
 
 @wp.kernel
@@ -265,12 +271,39 @@ def unfold_keys(keys: wp.array(dtype=wp.int64), bins: int, start: int, events: E
 
 @wp.kernel
 def vote_points(
-    xy: wp.array(dtype=wp.vec2), layers: wp.array(dtype=wp.uint8), canvas: Canvas, start: int, cells: Cells
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+    layers: wp.array(dtype=wp.uint8),
+    canvas: Canvas,
+    start: int,
+    cells: Cells,
 ):
     i = start + wp.tid()
     layer = int(layers[i]) * canvas.layer
-    _inside, cell, word = vote_at(canvas, xy[i][0], xy[i][1], layer)
+    _inside, cell, word = vote_at(canvas, x[i], y[i], layer)
     cast_vote(cells, cell, canvas.columns, word)
+
+
+@wp.kernel
+def vote_point_blocks(
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+    layers: wp.array(dtype=wp.uint8),
+    canvas: Canvas,
+    start: int,
+    cells: Cells,
+):
+    """For CPUs: a whole block of them."""
+    first = (start + wp.tid()) * BLOCK
+    places = wp.zeros(shape=(64,), dtype=int)
+    words = wp.zeros(shape=(64,), dtype=wp.uint64)
+    for k in range(BLOCK):
+        layer = int(load_uint8(layers, first + k)) * canvas.layer
+        _inside, cell, word = vote_at(canvas, load_float(x, first + k), load_float(y, first + k), layer)
+        store_int(places, k, cell)
+        store_word(words, k, word)
+    for k in range(BLOCK):
+        add_vote(cells, places[k], canvas.columns, words[k])
 
 
 @wp.kernel

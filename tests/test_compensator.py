@@ -1,0 +1,240 @@
+"""Compensation of streams: the same as of recordings, every event once and in order, what is guessed is marked."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from amiwarp.camera import Camera, RadialTangential
+from amiwarp.compensate import compensate_events
+from amiwarp.compensator import GUESSED, OUTSIDE, UNKNOWN, Compensated, Compensator
+from amiwarp.encoder import Encoder, EncoderStream
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events
+from amiwarp.iwe import iwe
+from amiwarp.optics import MODELS, ExactModel, Prism
+
+WIDTH, HEIGHT = 64, 48
+CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(60))
+MODEL = ExactModel.from_prism(CAMERA, Prism(math.radians(2.0)), 0.4)
+ENCODER = Encoder.constant_speed(720.0, 0, 100_000)
+
+
+def random_events(n: int, seconds: float = 0.1, seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n)
+    return Events.from_arrays(x, y, np.sort(rng.integers(0, round(seconds * 1e6), n)), rng.integers(0, 2, n))
+
+
+def streamed(encoder: Encoder = ENCODER) -> EncoderStream:
+    stream = EncoderStream(encoder.clock_offset_us)
+    stream.append(encoder.t, encoder.angle)
+    return stream
+
+
+def joined(packets: list[Compensated]) -> tuple[Events, np.ndarray]:
+    return Events.concatenate([p.events for p in packets]), np.concatenate([p.marks for p in packets])
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+@pytest.mark.parametrize("distorted", [False, True])
+def test_a_stream_comes_out_as_its_recording_does(name: str, distorted: bool, device: str) -> None:
+    """Bit for bit, in packets of any size, some longer than a batch, with a clock offset."""
+    camera = replace(CAMERA, distortion=RadialTangential(-0.2, 0.05, 0.001, -0.001, 0.0)) if distorted else CAMERA
+    model, events = MODELS[name].from_prism(camera, Prism(math.radians(2.0)), 0.4), random_events(30_000)
+    encoder = Encoder.constant_speed(720.0, -5000, 110_000).with_clock_offset(123.4)
+    compensator = Compensator(model, streamed(encoder), batch=4000, device=device)
+    out, start = [], 0
+    for n in (1, 0, 63, 64, 65, 9000, 777, 30_000):
+        compensator.put(events[start : start + n], 0)
+        out += compensator.take(0)
+        start += n
+    found, marks = joined(out)
+    expected = compensate_events(events, model, encoder, device=device)
+    np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
+    np.testing.assert_array_equal(found.t, events.t)
+    np.testing.assert_array_equal(found.p, events.p)
+    inside = (found.x >= -0.5) & (found.x < WIDTH - 0.5) & (found.y >= -0.5) & (found.y < HEIGHT - 0.5)
+    np.testing.assert_array_equal(marks, np.where(inside, 0, OUTSIDE))
+    assert 0 < np.count_nonzero(marks) < len(events) / 2
+    assert compensator.waiting == 0
+
+
+def test_the_running_image_is_that_of_the_events_taken(device: str) -> None:
+    events = random_events(50_000)
+    compensator = Compensator(MODEL, streamed(), batch=2048, device=device)
+    images = []
+    for start in range(0, 50_000, 1000):
+        compensator.put(events[start : start + 1000], 0)
+        compensator.take(0)
+        if start == 20_000:
+            images.append(compensator.image())
+    images.append(compensator.image())
+    for image, part in zip(images, (events[:21_000], events[21_000:]), strict=True):
+        expected = iwe(part, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, device=device)
+        assert image.sum() == pytest.approx(expected.sum(), rel=1e-3)
+        assert np.abs(image - np.squeeze(expected)).max() < 0.3  # angles of 16 bits there, of 32 here
+    assert compensator.image().sum() == 0.0
+
+
+def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
+    events, stream = random_events(3000, 0.03), EncoderStream()
+    compensator = Compensator(MODEL, stream, wait_us=10_000, start_us=500_000)
+    early, middle, late = (events[k : k + 1000] for k in (0, 1000, 2000))
+    compensator.put(early, 0)
+    assert compensator.take(499_999) == []  # nothing is known of the encoder yet
+    known = int(np.searchsorted(ENCODER.t, early.t[-1])) + 1
+    stream.append(ENCODER.t[:known], ENCODER.angle[:known])
+    assert not joined(compensator.take(499_999))[1].astype(bool).all()
+    compensator.put(middle, 500_000)
+    compensator.put(late, 504_000)
+    assert compensator.take(509_999) == []
+    first = compensator.take(510_000)
+    assert [len(p.events) for p in first] == [1000]
+    assert (first[0].marks[-1] & GUESSED) == GUESSED
+    assert first[0].put_us == 500_000
+    assert compensator.waiting == 1000
+    stream.append(ENCODER.t[known:], ENCODER.angle[known:])
+    last = compensator.take(510_000)
+    assert not (joined(last)[1] & GUESSED).any()  # the samples came in time for it
+    # a constant speed is guessed right
+    found, _ = joined([*first, *last])
+    expected = compensate_events(events[1000:], MODEL, ENCODER)
+    np.testing.assert_allclose(np.stack([found.x, found.y], axis=1), expected, atol=2e-3)
+
+
+def test_too_many_that_wait_are_guessed_at_once() -> None:
+    events, stream = random_events(5000, 0.05), EncoderStream()
+    stream.append([0, 1000], [0.0, 0.0754])
+    compensator = Compensator(MODEL, stream, wait_us=10**9, most_waiting=2500)
+    sizes = []
+    for start in range(0, 5000, 500):
+        compensator.put(events[start : start + 500], 0)
+        sizes.append(sum(len(p.events) for p in compensator.take(0)))
+        assert compensator.waiting <= 2500
+    assert sum(sizes) == 2500
+    assert sum(len(p.events) for p in compensator.flush()) == 2500
+
+
+def test_without_any_angle_there_is_no_place() -> None:
+    events = random_events(1000)
+    compensator = Compensator(MODEL, EncoderStream(), start_us=1000)
+    compensator.put(events, 0)
+    assert compensator.take(999) == []
+    found, marks = joined(compensator.take(1000))
+    assert np.isnan(found.x).all()
+    assert np.isnan(found.y).all()
+    assert (marks == OUTSIDE | UNKNOWN).all()
+    assert compensator.image().sum() == 0.0
+
+
+def test_events_before_the_first_sample_have_no_place(device: str) -> None:
+    stream, events = EncoderStream(), random_events(10_000)
+    late = ENCODER.t >= 50_000
+    stream.append(ENCODER.t[late], ENCODER.angle[late])
+    compensator = Compensator(MODEL, stream, device=device)
+    compensator.put(events, 0)
+    found, marks = joined(compensator.take(0))
+    before = events.t < 49_000  # as in a recording, one interval before the samples is still known
+    np.testing.assert_array_equal((marks & UNKNOWN) > 0, before)
+    np.testing.assert_array_equal((marks & GUESSED) > 0, (events.t < 50_000) & ~before)
+    np.testing.assert_array_equal(np.isnan(found.x), before)
+    expected = compensate_events(events[~before], MODEL, ENCODER)
+    np.testing.assert_array_equal(found.x[~before], expected[:, 0])
+    assert compensator.image().sum() == pytest.approx(((marks & OUTSIDE) == 0).sum(), rel=0.02)
+
+
+def test_a_hole_in_the_samples_is_marked() -> None:
+    stream, events = EncoderStream(), random_events(10_000)
+    kept = (ENCODER.t <= 30_000) | (ENCODER.t >= 60_000)
+    stream.append(ENCODER.t[kept], ENCODER.angle[kept])
+    compensator = Compensator(MODEL, stream)
+    compensator.put(events, 0)
+    marks = joined(compensator.take(0))[1]
+    np.testing.assert_array_equal((marks & GUESSED) > 0, (events.t > 30_000) & (events.t < 60_000))
+
+
+def test_nothing_is_interpolated_from_one_zero_to_another() -> None:
+    """After a reset the angle goes on at constant speed up to the first new sample, in one step."""
+    stream, events = EncoderStream(), random_events(10_000)
+    before, after = ENCODER.t <= 40_000, ENCODER.t >= 50_000
+    stream.append(ENCODER.t[before], ENCODER.angle[before])
+    stream.restart()
+    stream.append(ENCODER.t[after], ENCODER.angle[after] + 1.0)
+    compensator = Compensator(MODEL, stream)
+    compensator.put(events, 0)
+    found, marks = joined(compensator.take(0))
+    between = (events.t > 40_000) & (events.t < 50_000)
+    np.testing.assert_array_equal((marks & GUESSED) > 0, between)
+    expected = compensate_events(events, MODEL, ENCODER)
+    xy = np.stack([found.x, found.y], axis=1)
+    np.testing.assert_allclose(xy[events.t < 49_999], expected[events.t < 49_999], atol=2e-3)
+    shifted = compensate_events(events, replace(MODEL, phase=MODEL.phase + 1.0), ENCODER)
+    np.testing.assert_allclose(xy[events.t >= 50_000], shifted[events.t >= 50_000], atol=2e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 400), st.integers(0, 9), st.integers(0, 30_000)), max_size=30))
+def test_every_event_comes_out_once_and_in_order(steps: list[tuple[int, int, int]]) -> None:
+    """Whatever comes when: packets of any size, samples in any number, any time between."""
+    events, stream = random_events(sum(n for n, _, _ in steps)), EncoderStream()
+    compensator = Compensator(MODEL, stream, wait_us=20_000, start_us=50_000, most_waiting=2000, batch=300)
+    out: list[Compensated] = []
+    start = sample = now = 0
+    for n, samples, pause in steps:
+        compensator.put(events[start : start + n], now)
+        stream.append(ENCODER.t[sample : sample + samples], ENCODER.angle[sample : sample + samples])
+        start, sample, now = start + n, sample + samples, now + pause
+        out += compensator.take(now)
+    out += compensator.flush()
+    assert compensator.waiting == 0
+    found = Events.concatenate([p.events for p in out]) if out else Events.empty()
+    np.testing.assert_array_equal(found.t, events.t)
+    np.testing.assert_array_equal(found.p, events.p)
+    assert all(len(p.marks) == len(p.events) for p in out)
+    known = np.concatenate([(p.marks & UNKNOWN) == 0 for p in out]) if out else np.zeros(0, bool)
+    np.testing.assert_array_equal(np.isfinite(found.x), known)
+
+
+def test_pixels_outside_the_sensor_are_placed_as_in_a_recording(device: str) -> None:
+    """Between packets without any: the quick way of placing is for those."""
+    events = random_events(9000)
+    x = events.x.copy()
+    x[3000:6000:7] = 300
+    events = replace(events, x=x)
+    compensator = Compensator(MODEL, streamed(), device=device)
+    out = []
+    for start in range(0, 9000, 3000):
+        compensator.put(events[start : start + 3000], 0)
+        out += compensator.take(0)
+    found, _ = joined(out)
+    expected = compensate_events(events, MODEL, ENCODER, device=device)
+    np.testing.assert_allclose(np.stack([found.x, found.y], axis=1), expected, atol=2e-3)
+
+
+def test_bad_packets_are_refused_and_nothing_is_put() -> None:
+    events = random_events(100)
+    compensator = Compensator(MODEL, streamed())
+    compensator.put(events[50:], 0)
+    with pytest.raises(AmiwarpError, match="sort it first"):
+        compensator.put(events[:50], 0)
+    with pytest.raises(AmiwarpError, match="sort it first"):
+        compensator.put(replace(events, t=events.t[::-1] + 10**6), 0)
+    with pytest.raises(AmiwarpError, match="already compensated"):
+        compensator.put(Events(events.x.astype(np.float32), events.y.astype(np.float32), events.t, events.p), 0)
+    assert compensator.waiting == 50
+
+
+def test_what_is_put_stays_as_it_is() -> None:
+    events = random_events(1000)
+    kept = Events(*(getattr(events, name).copy() for name in ("x", "y", "t", "p")))
+    compensator = Compensator(MODEL, streamed())
+    compensator.put(events, 0)
+    compensator.take(0)
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(events, name), getattr(kept, name))
