@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from amiwarp.encoder import Encoder, EncoderStream
     from amiwarp.optics import Model
 
-OUTSIDE, GUESSED, UNKNOWN = 1, 2, 4
-"""Marks of an event: its place lies outside the image; no encoder sample came in time, so its angle goes on at constant
+OUTSIDE, EXTRAPOLATED, NO_ANGLE = 1, 2, 4
+"""Flags of an event: its place lies outside the image; no encoder sample came in time, so its angle goes on at constant
 speed; there is no angle at all, and so no place (NaN)."""
 AHEAD_US = 100_000
 """Of encoder samples that are put on the device at once, where there are so many [us]."""
@@ -42,10 +42,10 @@ class Compensated:
 
     events: Events
     """Places without the prism, float32 [px]; NaN where there is none."""
-    marks: NDArray[np.uint8]
-    """Shape ``(n,)``: sum of :data:`OUTSIDE`, :data:`GUESSED`, :data:`UNKNOWN`."""
-    put_us: int
-    """When it was put [us]."""
+    flags: NDArray[np.uint8]
+    """Shape ``(n,)``: sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED`, :data:`NO_ANGLE`."""
+    put_us: int = 0
+    """When it was put, by the caller's clock [us]."""
 
 
 class Compensator:
@@ -140,13 +140,13 @@ class Compensator:
             unknown = 0 if first >= begins else sum(int(np.searchsorted(e.t, begins)) for e, _ in packets)
         if unknown < n:
             self._cover(max(first, begins or first), last, ends or last)
-        x, y, t, marks = self._work.move([events for events, _ in packets], n, unknown)
-        marks[self.encoder.guessed(t)] |= GUESSED
-        marks[:unknown] = OUTSIDE | UNKNOWN
+        x, y, t, flags = self._work.move([events for events, _ in packets], n, unknown)
+        flags[self.encoder.guessed(t)] |= EXTRAPOLATED
+        flags[:unknown] = OUTSIDE | NO_ANGLE
         out, start = [], 0
         for given, put_us in packets:
             here = slice(start, start := start + len(given))
-            out.append(Compensated(Events(x[here], y[here], given.t, given.p), marks[here], put_us))
+            out.append(Compensated(Events(x[here], y[here], given.t, given.p), flags[here], put_us))
         return out
 
     def _cover(self, first: int, last: int, ends: int) -> None:
@@ -218,7 +218,7 @@ class _Work:
             command.set_param_at_index(3, p)
 
     def move(self, parts: list[Events], n: int, unknown: int) -> tuple[NDArray[Any], ...]:
-        """Of all the parts x, y [px], t [us] (valid until the next call) and marks: outside the image or not.
+        """Of all the parts x, y [px], t [us] (valid until the next call) and flags: outside the image or not.
 
         The first ``unknown`` get no place.
         """

@@ -232,8 +232,11 @@ class EncoderStream:
         """What follows does not go on from what came: another zero, after a controller's reset, say."""
         self._fresh = len(self) > 0
 
-    def append(self, t_us: ArrayLike, angle: ArrayLike) -> None:
-        """Samples, shape ``(n,)`` each [us, rad, unwrapped]; those that are not later than the last are left out."""
+    def append(self, t_us: ArrayLike, angle: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Samples, shape ``(n,)`` each [us, rad, unwrapped]; those that are not later than the last are left out.
+
+        Returns what was kept, with one that ends what came before where it began anew.
+        """
         t, angles = as_times(t_us), np.asarray(angle, np.float64)
         if t.shape != angles.shape or t.ndim != 1:
             raise AmiwarpError(f"encoder samples have shapes t {t.shape}, angle {angles.shape}; expected one length")
@@ -245,15 +248,18 @@ class EncoderStream:
             self.dropped += int(np.count_nonzero(~later))
             t, angles = t[later], angles[later]
         if not t.size:
-            return
-        if len(self) and (self._fresh or int(t[0]) - before > self.HOLE_US):
-            if self._fresh and int(t[0]) - 1 > before:
-                self._put(t[:1] - 1, np.array([self._guess(int(t[0]) - 1)]))
-            self._holes.append((before, int(t[0])))
+            return t, angles
         inner = np.flatnonzero(np.diff(t) > self.HOLE_US)
-        self._holes = [*self._holes, *((int(t[i]), int(t[i + 1])) for i in inner)][-self.MOST_HOLES :]
+        holes = [(int(t[i]), int(t[i + 1])) for i in inner]
+        if len(self) and (self._fresh or int(t[0]) - before > self.HOLE_US):
+            holes.insert(0, (before, int(t[0])))
+            if self._fresh and int(t[0]) - 1 > before:
+                last = self._guess(int(t[0]) - 1)
+                t, angles = np.append(t[:1] - 1, t), np.append(last, angles)
         self._fresh = False
         self._put(t, angles)
+        self._holes = [*self._holes, *holes][-self.MOST_HOLES :]
+        return t, angles
 
     def _put(self, t: NDArray[np.int64], angle: NDArray[np.float64]) -> None:
         capacity = self._t.size // 2
@@ -268,14 +274,22 @@ class EncoderStream:
         self._angle[self._stop : self._stop + t.size] = angle
         self._stop += t.size
 
-    def _guess(self, t: int) -> float:
-        """The angle after the last sample, at the speed of those before."""
+    @property
+    def rpm(self) -> float | None:
+        """Speed of the last samples [turns/min], negative where the angle falls; None with fewer than two."""
+        return None if len(self) < 2 else self._speed() * 60e6 / TURN
+
+    def _speed(self) -> float:
+        """[rad/us]"""
         times, angles = self._t[: self._stop], self._angle[: self._stop]
         begins = max([int(times[-1]) - self.KEEPS_SPEED_US, *(end for _, end in self._holes[-1:])])
         since = min(int(np.searchsorted(times, begins)), times.size - 1)
         span = float(times[-1] - times[since])
-        speed = float(angles[-1] - angles[since]) / span if span else 0.0
-        return float(angles[-1]) + speed * float(t - times[-1])
+        return float(angles[-1] - angles[since]) / span if span else 0.0
+
+    def _guess(self, t: int) -> float:
+        """The angle after the last sample, at the speed of those before."""
+        return float(self._angle[self._stop - 1]) + self._speed() * float(t - self._t[self._stop - 1])
 
     def over(self, t_first: int, t_last: int) -> Encoder:
         """The samples about the events of ``t_first`` .. ``t_last`` [us]; where none is later, a guess ends them.

@@ -25,8 +25,12 @@ from amiwarp.cli import (
     convert,
     demo,
     design,
+    emulate,
     info,
+    live,
+    motor,
     reconstruct,
+    record,
     simulate,
     stability,
     translate,
@@ -41,8 +45,11 @@ COMMANDS = {
     module.__name__.rpartition(".")[2]: module
     for module in (
         demo,
-        design,
+        emulate,
         info,
+        live,
+        motor,
+        record,
         view,
         convert,
         simulate,
@@ -413,7 +420,8 @@ def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
         "simulate": ["simulate", "long.h5", "--picture", "photo.jpg", "--duration", "60"],
         "calibrate": ["calibrate", "recording.h5", "long.json", "--global-evaluations", "1000000"],
     }[command]
-    script = f"{INTERRUPTIBLE}; sys.argv[0] = 'amiwarp'; from amiwarp.cli.app import main; print('up', flush=True); main()"
+    script = f"{INTERRUPTIBLE}; sys.argv[0] = 'amiwarp'; from amiwarp.cli.app import main"
+    script += "; print('up', flush=True); main()"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     process = subprocess.Popen(
         [sys.executable, "-c", script, *args], cwd=place, env=environment, text=True,

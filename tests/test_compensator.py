@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from amiwarp.camera import Camera, RadialTangential
 from amiwarp.compensate import compensate_events
-from amiwarp.compensator import GUESSED, OUTSIDE, UNKNOWN, Compensated, Compensator
+from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.encoder import Encoder, EncoderStream
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
@@ -38,7 +38,7 @@ def streamed(encoder: Encoder = ENCODER) -> EncoderStream:
 
 
 def joined(packets: list[Compensated]) -> tuple[Events, np.ndarray]:
-    return Events.concatenate([p.events for p in packets]), np.concatenate([p.marks for p in packets])
+    return Events.concatenate([p.events for p in packets]), np.concatenate([p.flags for p in packets])
 
 
 @pytest.mark.parametrize("name", list(MODELS))
@@ -54,14 +54,14 @@ def test_a_stream_comes_out_as_its_recording_does(name: str, distorted: bool, de
         compensator.put(events[start : start + n], 0)
         out += compensator.take(0)
         start += n
-    found, marks = joined(out)
+    found, flags = joined(out)
     expected = compensate_events(events, model, encoder, device=device)
     np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
     np.testing.assert_array_equal(found.t, events.t)
     np.testing.assert_array_equal(found.p, events.p)
     inside = (found.x >= -0.5) & (found.x < WIDTH - 0.5) & (found.y >= -0.5) & (found.y < HEIGHT - 0.5)
-    np.testing.assert_array_equal(marks, np.where(inside, 0, OUTSIDE))
-    assert 0 < np.count_nonzero(marks) < len(events) / 2
+    np.testing.assert_array_equal(flags, np.where(inside, 0, OUTSIDE))
+    assert 0 < np.count_nonzero(flags) < len(events) / 2
     assert compensator.waiting == 0
 
 
@@ -96,12 +96,12 @@ def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
     assert compensator.take(509_999) == []
     first = compensator.take(510_000)
     assert [len(p.events) for p in first] == [1000]
-    assert (first[0].marks[-1] & GUESSED) == GUESSED
+    assert (first[0].flags[-1] & EXTRAPOLATED) == EXTRAPOLATED
     assert first[0].put_us == 500_000
     assert compensator.waiting == 1000
     stream.append(ENCODER.t[known:], ENCODER.angle[known:])
     last = compensator.take(510_000)
-    assert not (joined(last)[1] & GUESSED).any()  # the samples came in time for it
+    assert not (joined(last)[1] & EXTRAPOLATED).any()  # the samples came in time for it
     # a constant speed is guessed right
     found, _ = joined([*first, *last])
     expected = compensate_events(events[1000:], MODEL, ENCODER)
@@ -126,10 +126,10 @@ def test_without_any_angle_there_is_no_place() -> None:
     compensator = Compensator(MODEL, EncoderStream(), start_us=1000)
     compensator.put(events, 0)
     assert compensator.take(999) == []
-    found, marks = joined(compensator.take(1000))
+    found, flags = joined(compensator.take(1000))
     assert np.isnan(found.x).all()
     assert np.isnan(found.y).all()
-    assert (marks == OUTSIDE | UNKNOWN).all()
+    assert (flags == OUTSIDE | NO_ANGLE).all()
     assert compensator.image().sum() == 0.0
 
 
@@ -139,14 +139,14 @@ def test_events_before_the_first_sample_have_no_place(device: str) -> None:
     stream.append(ENCODER.t[late], ENCODER.angle[late])
     compensator = Compensator(MODEL, stream, device=device)
     compensator.put(events, 0)
-    found, marks = joined(compensator.take(0))
+    found, flags = joined(compensator.take(0))
     before = events.t < 49_000  # as in a recording, one interval before the samples is still known
-    np.testing.assert_array_equal((marks & UNKNOWN) > 0, before)
-    np.testing.assert_array_equal((marks & GUESSED) > 0, (events.t < 50_000) & ~before)
+    np.testing.assert_array_equal((flags & NO_ANGLE) > 0, before)
+    np.testing.assert_array_equal((flags & EXTRAPOLATED) > 0, (events.t < 50_000) & ~before)
     np.testing.assert_array_equal(np.isnan(found.x), before)
     expected = compensate_events(events[~before], MODEL, ENCODER)
     np.testing.assert_array_equal(found.x[~before], expected[:, 0])
-    assert compensator.image().sum() == pytest.approx(((marks & OUTSIDE) == 0).sum(), rel=0.02)
+    assert compensator.image().sum() == pytest.approx(((flags & OUTSIDE) == 0).sum(), rel=0.02)
 
 
 def test_a_hole_in_the_samples_is_marked() -> None:
@@ -155,8 +155,8 @@ def test_a_hole_in_the_samples_is_marked() -> None:
     stream.append(ENCODER.t[kept], ENCODER.angle[kept])
     compensator = Compensator(MODEL, stream)
     compensator.put(events, 0)
-    marks = joined(compensator.take(0))[1]
-    np.testing.assert_array_equal((marks & GUESSED) > 0, (events.t > 30_000) & (events.t < 60_000))
+    flags = joined(compensator.take(0))[1]
+    np.testing.assert_array_equal((flags & EXTRAPOLATED) > 0, (events.t > 30_000) & (events.t < 60_000))
 
 
 def test_nothing_is_interpolated_from_one_zero_to_another() -> None:
@@ -168,9 +168,9 @@ def test_nothing_is_interpolated_from_one_zero_to_another() -> None:
     stream.append(ENCODER.t[after], ENCODER.angle[after] + 1.0)
     compensator = Compensator(MODEL, stream)
     compensator.put(events, 0)
-    found, marks = joined(compensator.take(0))
+    found, flags = joined(compensator.take(0))
     between = (events.t > 40_000) & (events.t < 50_000)
-    np.testing.assert_array_equal((marks & GUESSED) > 0, between)
+    np.testing.assert_array_equal((flags & EXTRAPOLATED) > 0, between)
     expected = compensate_events(events, MODEL, ENCODER)
     xy = np.stack([found.x, found.y], axis=1)
     np.testing.assert_allclose(xy[events.t < 49_999], expected[events.t < 49_999], atol=2e-3)
@@ -196,8 +196,8 @@ def test_every_event_comes_out_once_and_in_order(steps: list[tuple[int, int, int
     found = Events.concatenate([p.events for p in out]) if out else Events.empty()
     np.testing.assert_array_equal(found.t, events.t)
     np.testing.assert_array_equal(found.p, events.p)
-    assert all(len(p.marks) == len(p.events) for p in out)
-    known = np.concatenate([(p.marks & UNKNOWN) == 0 for p in out]) if out else np.zeros(0, bool)
+    assert all(len(p.flags) == len(p.events) for p in out)
+    known = np.concatenate([(p.flags & NO_ANGLE) == 0 for p in out]) if out else np.zeros(0, bool)
     np.testing.assert_array_equal(np.isfinite(found.x), known)
 
 

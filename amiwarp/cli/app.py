@@ -17,8 +17,12 @@ from amiwarp.cli import (
     convert,
     demo,
     design,
+    emulate,
     info,
+    live,
+    motor,
     reconstruct,
+    record,
     simulate,
     stability,
     translate,
@@ -28,6 +32,7 @@ from amiwarp.cli.options import command
 from amiwarp.errors import AmiwarpError
 
 BAD_INPUT, USAGE, INTERRUPTED = 1, 2, 130
+STOPPED = "interrupted; nothing was left half-written"
 
 _UsageError: Any = typer.BadParameter.__base__
 """Typer carries its own copy of click since 0.2x, and used the real one before: this is either's."""
@@ -48,7 +53,7 @@ class _Group(TyperGroup):
         except (KeyboardInterrupt, typer.Abort):
             code = INTERRUPTED
         if code == INTERRUPTED:
-            _fail(INTERRUPTED, "interrupted; nothing was left half-written")
+            _fail(INTERRUPTED, STOPPED)
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -81,6 +86,7 @@ def _version(ctx: typer.Context, version: bool = typer.Option(False, "--version"
 
 for module in (
     demo, info, view, convert, simulate, translate, calibrate, compensate, reconstruct, chart, design, stability,
+    motor, record, live, emulate,
 ):  # fmt: skip
     command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 
@@ -88,7 +94,10 @@ for module in (
 def main() -> None:
     """Run the command line; ends the process."""
     sys.unraisablehook = _interrupt_again
-    app(prog_name="amiwarp")
+    try:
+        app(prog_name="amiwarp")
+    except KeyboardInterrupt:  # before a command began, or after it ended
+        _fail(INTERRUPTED, STOPPED)
 
 
 def _interrupt_again(dropped: Any) -> None:

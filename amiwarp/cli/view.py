@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +19,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.scene import Axis, Colour, Look, View
 
 if TYPE_CHECKING:
+    from amiwarp.events import Recording
     from amiwarp.viewer.inspector import Inspector
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
@@ -26,8 +29,16 @@ LEAST_PX, MOST_PX = 100, 8000
 
 
 def run(
-    recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    recording: Annotated[
+        Path,
+        typer.Argument(help="Recording of any format that can be read; with --live a source as of 'amiwarp live'."),
+    ],
     *,
+    live: Annotated[bool, typer.Option("--live", help="Follow a stream: its last two seconds.")] = False,
+    controller: Annotated[
+        str | None,
+        typer.Option(help="With --live: serial port of the prism's controller, USB id, or 'find'. Default: none."),
+    ] = None,
     calibration: Annotated[Path | None, typer.Option(help="What 'amiwarp calibrate' wrote.")] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve the page and print its address; open no window.")] = False,
     host: Annotated[str, typer.Option(help="Interface to serve on; the address carries a secret token.")] = "127.0.0.1",
@@ -61,41 +72,44 @@ def run(
     device = choose_device(common.device)
     check_display()
 
-    def make() -> Inspector:
-        return inspector(recording, calibration, window, model, camera, prism, device)
+    with contextlib.ExitStack() as held:
+        latest = held.enter_context(_following(str(recording), controller)) if live else None
 
-    first = make()  # what is wrong is said here, not in the page
-    if screenshot is not None:
-        if screenshot.suffix.lower() != ".png":
-            raise AmiwarpError(f"{screenshot}: pictures are written as .png")
-        third = axis or (Axis.ANGLE if first.has_encoder or first.knobs.rpm else Axis.TIME)
-        width, height = parse_size(size)
-        if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
-            raise AmiwarpError(f"--size {size!r}: pictures have {LEAST_PX} to {MOST_PX} pixels a side")
-        look = Look(colour, third, dark=dark, overlaid=overlaid)
-        save_screenshot(first, screenshot, view=view, look=look, size=(width, height))
-        shown = first.show()
-        data: dict[str, Any] = {
-            "file": str(screenshot), "events": shown.span.count, "drawn": len(shown.events),
-            "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
-            "notes": list(first.notes), "device": device,
-        }  # fmt: skip
-        report(common, data, _lines(data))
-        return
-    served = [first]
+        def make() -> Inspector:
+            return inspector(recording, calibration, window, model, camera, prism, device, latest)
 
-    def ready(url: str) -> None:
-        report(common, {"url": url}, [f"{recording.name}: {url}", "Ctrl-C ends it"])
-        if host not in ("127.0.0.1", "localhost"):
-            print(f"served on {host}: whoever has this address can see the recording", file=sys.stderr)
+        first = make()  # what is wrong is said here, not in the page
+        if screenshot is not None:
+            if screenshot.suffix.lower() != ".png":
+                raise AmiwarpError(f"{screenshot}: pictures are written as .png")
+            third = axis or (Axis.ANGLE if first.has_encoder or first.knobs.rpm else Axis.TIME)
+            width, height = parse_size(size)
+            if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
+                raise AmiwarpError(f"--size {size!r}: pictures have {LEAST_PX} to {MOST_PX} pixels a side")
+            look = Look(colour, third, dark=dark, overlaid=overlaid)
+            save_screenshot(first, screenshot, view=view, look=look, size=(width, height))
+            shown = first.show()
+            data: dict[str, Any] = {
+                "file": str(screenshot), "events": shown.span.count, "drawn": len(shown.events),
+                "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
+                "notes": list(first.notes), "device": device,
+            }  # fmt: skip
+            report(common, data, _lines(data))
+            return
+        served = [first]
 
-    def tab() -> Inspector:
-        return served.pop() if served else make()
+        def ready(url: str) -> None:
+            report(common, {"url": url}, [f"{recording.name}: {url}", "Ctrl-C ends it"])
+            if host not in ("127.0.0.1", "localhost"):
+                print(f"served on {host}: whoever has this address can see the recording", file=sys.stderr)
 
-    if web or not has_display():
-        serve_panel(tab, host=host, port=port, ready=ready)
-    else:
-        open_window(tab, ready)
+        def tab() -> Inspector:
+            return served.pop() if served else make()
+
+        if web or not has_display():
+            serve_panel(tab, host=host, port=port, ready=ready)
+        else:
+            open_window(tab, ready)
 
 
 def inspector(
@@ -106,6 +120,7 @@ def inspector(
     camera: CameraOptions,
     prism: NominalPrismOptions,
     device: str,
+    latest: Callable[[], Recording] | None = None,
 ) -> Inspector:
     """The recording with what the options add, at its first window."""
     from amiwarp.calib import Calibration
@@ -114,7 +129,8 @@ def inspector(
     from amiwarp.viewer.inspector import Inspector
 
     found = None if calibration is None else Calibration.load(calibration)
-    made = Inspector(complete(open_recording(path), camera, prism), found, device=device)
+    opened = open_recording(path) if latest is None else latest()
+    made = Inspector(complete(opened, camera, prism), found, device=device, latest=latest)
     if model is not None:
         if model not in MODELS:
             raise AmiwarpError(f"--model {model!r} is unknown; choose among {', '.join(MODELS)}")
@@ -124,6 +140,26 @@ def inspector(
         low, high = span(window, first, last)
         made.window = low, high - low
     return made
+
+
+@contextlib.contextmanager
+def _following(spec: str, controller: str | None) -> Iterator[Callable[[], Recording]]:
+    """What a stream's last seconds are by now; waits for the first turn."""
+    from amiwarp.cli.streams import SourceOptions, check_angles
+    from amiwarp.stream.ring import Ring, followed
+    from amiwarp.stream.sources import open_source
+
+    def say(message: str) -> None:
+        print(message, file=sys.stderr, flush=True)
+
+    with SourceOptions(port=controller).link() as link:
+        source = open_source(spec)
+        check_angles(source, link)
+        ring = Ring(source)
+        with followed(source, link, ring, say):
+            recording = ring.recording()
+            assert recording is not None
+            yield lambda: ring.recording() or recording
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import DEFAULT_BLOCK, Events, MetadataValue, Recording, Truth, as_times, check_events, regroup
+from amiwarp.io.attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32, StoredColumn, in_order
 from amiwarp.io.files import errors_name, register_reader
 from amiwarp.io.native_writer import FORMAT, FORMAT_VERSION
 from amiwarp.io.scan import smallest_sensor
 
-if TYPE_CHECKING:
-    from amiwarp.optics import Prism
+ATTEMPTS = 24
+"""To read what is being written: from 1 ns between two on, each twice as long, 17 ms in all."""
 
 DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px]; its files do not tell."""
@@ -31,20 +32,23 @@ DSEC_SIZE = (640, 480)
 class NativeEvents:
     """Events of an HDF5 recording, read only where asked for. Raises :class:`AmiwarpError` for a damaged file."""
 
-    def __init__(self, path: Path, file: Any) -> None:
+    def __init__(self, path: Path, file: Any, *, unfinished: bool = False) -> None:
+        """``unfinished``: its writer is at work, or was cut off; the events that are whole now are taken."""
         self.path = path
         self._file = file
         self._columns = {name: _dataset(file, f"events/{name}", "iub") for name in ("t", "p")}
         self._columns |= {name: _dataset(file, f"events/{name}", "iuf") for name in ("x", "y")}
-        if "inside" in file["events"]:
-            self._columns["inside"] = _dataset(file, "events/inside", "iub")
-        lengths = {name: int(column.shape[0]) for name, column in self._columns.items()}
-        if len(set(lengths.values())) != 1:
+        for name in ("inside", "extrapolated"):
+            if name in file["events"]:
+                self._columns[name] = _dataset(file, f"events/{name}", "iub")
+        lengths = {name: _length(column, unfinished) for name, column in self._columns.items()}
+        if len(set(lengths.values())) != 1 and not unfinished:
             raise AmiwarpError(f"{path}: events differ in length: {lengths}; the file is damaged")
-        self._count = lengths["t"]
+        self._count = min(lengths.values())
         self._stored = {name: StoredColumn.of(column) for name, column in self._columns.items()}
         self._offset = as_times(file["t_offset"][()]).item() if "t_offset" in file else 0
-        self._ms_to_idx = _dataset(file, "ms_to_idx", "iu") if "ms_to_idx" in file else None
+        # Of an unfinished file it may end anywhere: bisection does without.
+        self._ms_to_idx = _dataset(file, "ms_to_idx", "iu") if "ms_to_idx" in file and not unfinished else None
         self._size = self._find_size()
         self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
         register_reader(self)
@@ -98,10 +102,17 @@ class NativeEvents:
 
     def inside(self, start: int, stop: int) -> NDArray[np.bool_] | None:
         """Of compensated events, which lie on the picture: shape ``(n,)``, or None where the file does not tell."""
-        if "inside" not in self._columns:
+        return self._flags("inside", start, stop)
+
+    def extrapolated(self, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """Of events compensated live, which had an angle beyond the encoder's samples, as :meth:`inside`."""
+        return self._flags("extrapolated", start, stop)
+
+    def _flags(self, name: str, start: int, stop: int) -> NDArray[np.bool_] | None:
+        if name not in self._columns:
             return None
-        with errors_name(self.path, lambda: f"events/inside {start} .. {stop}"):
-            return np.asarray(self._read("inside", max(start, 0), min(max(stop, 0), self._count)), np.bool_)
+        with errors_name(self.path, lambda: f"events/{name} {start} .. {stop}"):
+            return np.asarray(self._read(name, max(start, 0), min(max(stop, 0), self._count)), np.bool_)
 
     def find(self, t: int) -> int:
         """See :meth:`amiwarp.events.EventSource.find`; the file's millisecond index helps."""
@@ -175,20 +186,38 @@ class _StoredPoints:
 
 def open_native(path: Path) -> Recording:
     """Open a native recording or a DSEC event file. Raises :class:`AmiwarpError` for anything else."""
-    # Imported for its effect: it registers the Blosc filter.
-    import h5py
-    import hdf5plugin  # noqa: F401
-
     with errors_name(path, lambda: "opening HDF5"):
-        file = h5py.File(path, "r")
+        file, unfinished = _open(path)
         try:
-            return _read_recording(path, file)
+            return _read_recording(path, file, unfinished)
         except BaseException:
             file.close()
             raise
 
 
-def _read_recording(path: Path, file: Any) -> Recording:
+def _open(path: Path) -> tuple[Any, bool]:
+    """The file, and whether its writer is still at work or was cut off: HDF5 opens only a live recording then."""
+    # Imported for its effect: it registers the Blosc filter.
+    import h5py
+    import hdf5plugin  # noqa: F401
+
+    try:
+        return h5py.File(path, "r"), False
+    except OSError:
+        access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+        access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+        # HDF5 reads what does not match its checksum again, after twice the time: 100 times, for ever. h5py has no name
+        # for this setting.
+        with contextlib.suppress(AttributeError):
+            attempts = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
+            attempts(ctypes.c_int64(access.id), ctypes.c_uint(ATTEMPTS))
+        with contextlib.suppress(OSError):
+            how = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
+            return h5py.File(h5py.h5f.open(os.fsencode(path), how, fapl=access)), True
+        raise
+
+
+def _read_recording(path: Path, file: Any, unfinished: bool) -> Recording:
     import h5py
 
     version = _attribute(file, "format_version", int, FORMAT_VERSION)
@@ -196,22 +225,28 @@ def _read_recording(path: Path, file: Any) -> Recording:
         raise AmiwarpError(f"{path}: format_version {version} is newer than {FORMAT_VERSION}; update amiwarp")
     if not isinstance(file.get("events"), h5py.Group):
         raise AmiwarpError(f"{path}: HDF5 without a group 'events'; expected events/x, y, t, p")
-    events = NativeEvents(path, file)
+    events = NativeEvents(path, file, unfinished=unfinished)
     stored = file["metadata"].attrs.items() if "metadata" in file else ()
     metadata: dict[str, MetadataValue] = {name: _plain(value) for name, value in stored}
     metadata["format"] = "native" if _attribute(file, "format", str, "") == FORMAT else "dsec"
-    camera = _read_camera(file["camera"]) if "camera" in file else None
+    camera = read_camera(file["camera"].attrs, _named(file["camera"])) if "camera" in file else None
     if camera is not None and (camera.width, camera.height) != events.size:
         raise AmiwarpError(f"{path}: camera is {camera.width}x{camera.height}, events are {events.size}; give one size")
     return Recording(
         events=events,
         camera=camera,
-        encoder=_read_encoder(file) if "encoder" in file else None,
-        prism=_read_prism(file["prism"]) if "prism" in file else None,
+        encoder=_read_encoder(file, unfinished) if "encoder" in file else None,
+        prism=read_prism(file["prism"].attrs, _named(file["prism"])) if "prism" in file else None,
         truth=_read_truth(path, file, len(events)) if "truth" in file else None,
         metadata=metadata,
         name=path.stem,
     )
+
+
+def _length(column: Any, unfinished: bool) -> int:
+    """Elements of a column; of one that was growing those whose chunks are there."""
+    count = int(column.shape[0])
+    return min(count, column.id.get_num_chunks() * column.chunks[0]) if unfinished and column.chunks else count
 
 
 def _dataset(file: Any, name: str, kinds: str) -> Any:
@@ -259,16 +294,11 @@ def _chunks_are_damaged(dataset: Any) -> bool:
 
 
 def _attribute(group: Any, name: str, kind: type[Any], default: Any = None) -> Any:
-    if name not in group.attrs and default is None:
-        raise AmiwarpError(f"{group.file.filename}: {group.name} has no attribute '{name}'; add it")
-    value = group.attrs.get(name, default)
-    try:
-        return kind(value.decode() if isinstance(value, bytes) else value)
-    except (TypeError, ValueError) as error:
-        expected = f"expected {kind.__name__}"
-        raise AmiwarpError(
-            f"{group.file.filename}: {group.name} attribute '{name}' is {value!r}; {expected}"
-        ) from error
+    return attribute(group.attrs, _named(group), name, kind, default)
+
+
+def _named(group: Any) -> str:
+    return f"{group.file.filename}: {group.name}"
 
 
 def _plain(value: Any) -> MetadataValue:
@@ -277,37 +307,17 @@ def _plain(value: Any) -> MetadataValue:
     return plain if isinstance(plain, (str, int, float, bool)) else str(plain)
 
 
-def _read_camera(group: Any) -> Camera:
-    model = _attribute(group, "distortion_model", str, "none")
-    kinds: dict[str, tuple[type[RadialTangential] | type[Fisheye], int]]
-    kinds = {"radial_tangential": (RadialTangential, 5), "fisheye": (Fisheye, 4)}
-    distortion: Distortion | None = None
-    if model in kinds:
-        kind, length = kinds[model]
-        coefficients = np.asarray(group.attrs.get("distortion", ()), np.float64)
-        if coefficients.shape != (length,) or not np.isfinite(coefficients).all():
-            raise AmiwarpError(f"camera distortion is {coefficients.tolist()}; expected {length} numbers for {model}")
-        distortion = kind(*coefficients.tolist())
-    elif model != "none":
-        raise AmiwarpError(f"camera distortion_model '{model}'; expected none, radial_tangential or fisheye")
-    width, height = (_attribute(group, name, int) for name in ("width", "height"))
-    fx, fy, cx, cy = (_attribute(group, name, float) for name in ("fx", "fy", "cx", "cy"))
-    return Camera(width, height, fx, fy, cx, cy, distortion)
-
-
-def _read_prism(group: Any) -> Prism:
-    from amiwarp.optics import FlatSide, Prism
-
-    side = _attribute(group, "flat_side", str, FlatSide.SCENE.value)
-    if side not in {member.value for member in FlatSide}:
-        raise AmiwarpError(f"prism flat_side '{side}'; expected {' or '.join(member.value for member in FlatSide)}")
-    return Prism(_attribute(group, "apex", float), _attribute(group, "index", float), flat_side=FlatSide(side))
-
-
-def _read_encoder(file: Any) -> Encoder:
+def _read_encoder(file: Any, unfinished: bool) -> Encoder | None:
     t = as_times(_dataset(file, "encoder/t", "iu")[:])
     angle = _dataset(file, "encoder/angle", "f")[:].astype(np.float64)
     index_t = as_times(_dataset(file, "encoder/index_t", "iu")[:]) if "index_t" in file["encoder"] else None
+    if unfinished:
+        count = min(t.size, angle.size)
+        t, angle = t[:count], angle[:count]
+        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])] if index_t is not None and count else None
+    # A live recording has room for an encoder before it is known whether there is one.
+    if t.size < 2 and (unfinished or t.size == angle.size == 0):
+        return None
     return Encoder(t, angle, _attribute(file["encoder"], "clock_offset_us", float, 0.0), index_t)
 
 

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.camera import Camera, Fisheye, RadialTangential
+from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MetadataValue, Recording, check_events
+from amiwarp.io.attributes import camera_attributes, prism_attributes
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name, part_path, refuse_overwriting, same_file
 
@@ -59,11 +60,7 @@ class RecordingWriter:
         metadata: Mapping[str, MetadataValue] | None = None,
     ) -> None:
         self.path = Path(path)
-        if not (1 <= width <= 65536 and 1 <= height <= 65536):
-            raise AmiwarpError(f"{self.path}: size {width}x{height}; expected 1 .. 65536 pixels each way")
-        if camera is not None and (camera.width, camera.height) != (width, height):
-            given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
-            raise AmiwarpError(f"{self.path}: {given}; give both one size")
+        check_frame(self.path, width, height, camera)
         self._size = (int(width), int(height))
         self._camera, self._prism, self._encoder = camera, prism, encoder
         self._truth_parameters = truth_parameters
@@ -114,10 +111,18 @@ class RecordingWriter:
             self._discard()
             raise
 
-    def append(self, events: Events, *, truth_points: ArrayLike | None = None, inside: ArrayLike | None = None) -> None:
+    def append(
+        self,
+        events: Events,
+        *,
+        truth_points: ArrayLike | None = None,
+        inside: ArrayLike | None = None,
+        extrapolated: ArrayLike | None = None,
+    ) -> None:
         """Add events, with their scene points ``(n, 2)`` [px] and their flags ``(n,)`` where the first call had them.
 
         ``inside`` tells of compensated (float32) events whether they still lie on the picture; NaN needs it.
+        ``extrapolated`` tells whether the prism's angle was one beyond the encoder's samples.
         """
         if self._file is None:
             raise AmiwarpError(f"{self.path}: append outside the writer's with block")
@@ -132,7 +137,7 @@ class RecordingWriter:
         if not len(events):
             return
         with errors_name(self.path, lambda: f"after {len(self)} events"):
-            columns = self._as_columns(events, truth_points, inside)
+            columns = self._as_columns(events, truth_points, {"inside": inside, "extrapolated": extrapolated})
             self._index(events.t)
             columns["events/t"] = events.t - self._t_offset
             self._pending.append(columns)
@@ -167,26 +172,25 @@ class RecordingWriter:
         events, inside = piece()
         columns = {"events/x": events.x, "events/y": events.y, "events/t": events.t - self._t_offset}
         columns |= {"events/p": events.p, "events/inside": inside}
-        return events, inside, columns, [encode(part) for part in _chunks(columns)]
+        return events, inside, columns, [encode(part) for part in chunks_of(columns)]
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder that is written at the end."""
         self._encoder = encoder
 
     def _as_columns(
-        self, events: Events, truth_points: ArrayLike | None, inside: ArrayLike | None
-    ) -> dict[str, NDArray[Any]]:
-        columns: dict[str, NDArray[Any]] = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
-        if inside is not None:
-            columns["events/inside"] = np.asarray(inside).astype(np.uint8)
+        self, events: Events, truth_points: ArrayLike | None, flags: Mapping[str, ArrayLike | None]
+    ) -> Columns:
+        columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
+        for name, flag in flags.items():
+            if flag is not None:
+                columns[f"events/{name}"] = np.asarray(flag).astype(np.uint8)
         if truth_points is not None:
             points = np.asarray(truth_points, np.float32)
             if points.shape != (len(events), 2):
                 raise AmiwarpError(f"truth points have shape {points.shape}; expected ({len(events)}, 2)")
             columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
-        for name, column in columns.items():
-            if column.shape != (len(events),):
-                raise AmiwarpError(f"{name} has shape {column.shape}; expected ({len(events)},)")
+        check_lengths(columns, len(events))
         dtypes = {name: column.dtype for name, column in columns.items()}
         if self._columns is None:
             self._columns = dtypes
@@ -197,17 +201,12 @@ class RecordingWriter:
 
     def _index(self, t: NDArray[np.int64]) -> None:
         """Extend ms_to_idx: entry m is the first event at or after m milliseconds."""
-        last_ms = (int(t[-1]) - self._t_offset) // 1000
-        if last_ms > MAX_MS:
-            span = f"{self._t_offset} .. {int(t[-1])} us"
-            raise AmiwarpError(f"events span {span}, beyond {MAX_MS // 3_600_000} h; a timestamp is damaged")
-        relative = t - self._t_offset
-        for first in range(self._next_ms, last_ms + 1, 1 << 20):
-            ms = np.arange(first, min(first + (1 << 20), last_ms + 1), dtype=np.int64)
-            self._ms.append(np.searchsorted(relative, ms * 1000) + len(self))
-            self._ms_count += ms.size
+        for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
+            self._ms.append(entries)
+            self._ms_count += entries.size
+            self._next_ms += entries.size
             self._write_index(CHUNK)
-        self._next_ms, self._t_last = last_ms + 1, int(t[-1])
+        self._t_last = int(t[-1])
 
     def _write_index(self, least: int) -> None:
         if self._ms_count >= least:
@@ -220,7 +219,7 @@ class RecordingWriter:
             return
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
         begun = {name: column[:whole] for name, column in joined.items()}
-        with contextlib.closing(in_order(partial(encode, part) for part in _chunks(begun))) as encoded:
+        with contextlib.closing(in_order(partial(encode, part) for part in chunks_of(begun))) as encoded:
             self._store(begun, encoded)
         self._written += whole
         self._pending_count -= whole
@@ -243,27 +242,15 @@ class RecordingWriter:
 
     def _dataset(self, name: str, dtype: np.dtype[Any]) -> Any:
         if name not in self._datasets:
-            self._datasets[name] = _make(self._file, name, dtype)
+            self._datasets[name] = make_dataset(self._file, name, dtype)
         return self._datasets[name]
 
     def _write_header(self) -> None:
-        file = self._file
-        file.attrs["format"] = FORMAT
-        file.attrs["format_version"] = FORMAT_VERSION
-        file.attrs["width"], file.attrs["height"] = self._size
-        if self._camera is not None:
-            _write_camera(file.create_group("camera"), self._camera)
-        if self._prism is not None:
-            group = file.create_group("prism")
-            group.attrs["apex"], group.attrs["index"] = float(self._prism.apex), float(self._prism.index)
-            group.attrs["flat_side"] = self._prism.flat_side.value
+        write_header(self._file, self._size, self._camera, self._prism, self._metadata)
         if self._truth_parameters is not None:
-            group = file.create_group("truth")
+            group = self._file.create_group("truth")
             for name, value in self._truth_parameters.items():
                 group.attrs[name] = float(value)
-        group = file.create_group("metadata")
-        for name, item in self._metadata.items():
-            group.attrs[name] = item
 
     def _finish(self) -> None:
         self._flush(whole=self._pending_count)
@@ -289,7 +276,34 @@ class RecordingWriter:
             self._part.unlink()
 
 
-def _chunks(columns: Columns) -> Iterator[NDArray[Any]]:
+def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
+    """Raises :class:`AmiwarpError` for a size that no sensor has, or that is not the camera's."""
+    if not (1 <= width <= 65536 and 1 <= height <= 65536):
+        raise AmiwarpError(f"{path}: size {width}x{height}; expected 1 .. 65536 pixels each way")
+    if camera is not None and (camera.width, camera.height) != (width, height):
+        given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
+        raise AmiwarpError(f"{path}: {given}; give both one size")
+
+
+def check_lengths(columns: Columns, count: int) -> None:
+    """Raises :class:`AmiwarpError` for a column that has not one element per event."""
+    for name, column in columns.items():
+        if column.shape != (count,):
+            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
+
+
+def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) -> Iterator[NDArray[np.int64]]:
+    """Entries of ms_to_idx, from ``first_ms`` on, that events at ``t`` [us] tell, which follow ``before`` others."""
+    last_ms = (int(t[-1]) - t_offset) // 1000
+    if last_ms > MAX_MS:
+        span = f"{t_offset} .. {int(t[-1])} us"
+        raise AmiwarpError(f"events span {span}, beyond {MAX_MS // 3_600_000} h; a timestamp is damaged")
+    for first in range(first_ms, last_ms + 1, 1 << 20):
+        ms = np.arange(first, min(first + (1 << 20), last_ms + 1), dtype=np.int64)
+        yield np.searchsorted(t, ms * 1000 + t_offset) + before
+
+
+def chunks_of(columns: Columns) -> Iterator[NDArray[Any]]:
     """All chunks of the first column, then of the next."""
     for column in columns.values():
         for at in range(0, column.size, CHUNK):
@@ -300,7 +314,8 @@ def _listed(columns: Mapping[str, np.dtype[Any]]) -> str:
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
 
 
-def _make(file: Any, name: str, dtype: np.dtype[Any]) -> Any:
+def make_dataset(file: Any, name: str, dtype: Any) -> Any:
+    """A dataset without elements yet, of the native layout."""
     import hdf5plugin
 
     # The checksum lies on the compressed bytes: it costs nothing measurable and LZ4 alone misses most damage.
@@ -315,19 +330,24 @@ def _make(file: Any, name: str, dtype: np.dtype[Any]) -> Any:
     )
 
 
-def _write_camera(group: Any, camera: Camera) -> None:
-    for name in ("width", "height", "fx", "fy", "cx", "cy"):
-        group.attrs[name] = getattr(camera, name)
-    distortion = camera.distortion
-    if isinstance(distortion, RadialTangential):
-        group.attrs["distortion_model"] = "radial_tangential"
-        coefficients = [distortion.k1, distortion.k2, distortion.p1, distortion.p2, distortion.k3]
-        group.attrs["distortion"] = np.array(coefficients, np.float64)
-    elif isinstance(distortion, Fisheye):
-        group.attrs["distortion_model"] = "fisheye"
-        group.attrs["distortion"] = np.array([distortion.k1, distortion.k2, distortion.k3, distortion.k4], np.float64)
-    else:
-        group.attrs["distortion_model"] = "none"
+def write_header(
+    file: Any,
+    size: tuple[int, int],
+    camera: Camera | None,
+    prism: Prism | None,
+    metadata: Mapping[str, MetadataValue],
+) -> None:
+    """All that is known before the first event."""
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = FORMAT_VERSION
+    file.attrs["width"], file.attrs["height"] = size
+    if camera is not None:
+        file.create_group("camera").attrs.update(camera_attributes(camera))
+    if prism is not None:
+        file.create_group("prism").attrs.update(prism_attributes(prism))
+    group = file.create_group("metadata")
+    for name, item in metadata.items():
+        group.attrs[name] = item
 
 
 def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
@@ -353,12 +373,13 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
 def copy_events(recording: Recording, writer: RecordingWriter, progress: Progress | None = None) -> None:
     """Append all events with the points and flags that belong to them."""
     source, truth = recording.events, recording.truth
-    flags = getattr(source, "inside", None)
+    flags = {name: getattr(source, name, None) for name in ("inside", "extrapolated")}
     start = 0
     for block in source.blocks():
         stop = start + len(block)
         points = None if truth is None else truth.points(start, stop)
-        writer.append(block, truth_points=points, inside=None if flags is None else flags(start, stop))
+        marks = {name: None if flag is None else flag(start, stop) for name, flag in flags.items()}
+        writer.append(block, truth_points=points, **marks)
         start = stop
         if progress is not None:
             progress(start, len(source))

@@ -12,6 +12,8 @@ TOLERANCE = 0.01
 """Of a turn: the index pulse has a width, and its count was latched a little late."""
 BACK = 0.1
 """Of a turn: counts that went back by so much were turned back; less is a slip, or an encoder on an edge."""
+GAP = 0.5
+"""Of a turn: after counts so far apart nothing is said of the index pulse, it may have been in between."""
 LATE = 1.5
 """Turns after the last index pulse when the next was missed."""
 
@@ -37,7 +39,7 @@ class Report:
 
 
 class Angles:
-    """Counts to angles [rad] that go on over turns; 0 at the first index pulse, or at the first count until then."""
+    """Counts to angles [rad] that go on over turns: whole turns at index pulses, 0 at the first count until one."""
 
     def __init__(self, counts_per_turn: int) -> None:
         """Raises :class:`AmiwarpError` for a turn of no counts."""
@@ -49,6 +51,7 @@ class Angles:
         self._zero: int | None = None
         self._index: int | None = None
         self._furthest: int | None = None
+        self._last = 0
         self._way = 0
         self._missed = False
 
@@ -56,6 +59,9 @@ class Angles:
         """The angle at a count, and what was found out by it."""
         if self._zero is None:
             self._zero = count
+        if self._index is not None and abs(count - self._last) > GAP * self.counts_per_turn:
+            self._index = count
+        self._last = count
         reports = []
         if self._furthest is None or (count - self._furthest) * self._way >= 0:
             self._way = self._way or (
@@ -70,21 +76,21 @@ class Angles:
         if abs(since) > LATE * self.counts_per_turn and not self._missed:
             self._missed = True
             reports.append(Report(Fault.MISSED_INDEX, t_us, since))
-        return self._angle(count), tuple(reports)
+        return self.angle(count), tuple(reports)
 
     def index(self, t_us: int, count: int) -> tuple[Report, ...]:
         """The index pulse at a count: tells the zero, or whether it was right; angles after it are mended."""
-        self._index, self._missed = count, False
-        if not self.absolute:
-            self.absolute, self._zero = True, count
-            return ()
-        assert self._zero is not None
+        self._index, self._last, self._missed = count, count, False
+        known, self.absolute = self.absolute, True
+        if self._zero is None:
+            self._zero = count
         away = (count - self._zero + self.counts_per_turn // 2) % self.counts_per_turn - self.counts_per_turn // 2
-        if abs(away) <= TOLERANCE * self.counts_per_turn:
+        if known and abs(away) <= TOLERANCE * self.counts_per_turn:
             return ()
         self._zero += away
-        return (Report(Fault.SLIP, t_us, away),)
+        return (Report(Fault.SLIP, t_us, away),) if known else ()
 
-    def _angle(self, count: int) -> float:
+    def angle(self, count: int) -> float:
+        """At a count, by what is known now. There must have been a count or an index pulse."""
         assert self._zero is not None
         return math.tau * (count - self._zero) / self.counts_per_turn

@@ -25,16 +25,17 @@ class Unwrapped:
     """A clock of 32 bits [us] as one that goes on."""
 
     def __init__(self) -> None:
-        self._last: int | None = None
+        self.last: int | None = None
+        """The latest so far [us]."""
+
+    def ahead(self, t: int) -> int:
+        """By how much a time is after the last [us], over a wrap too; negative for one that comes late."""
+        return 0 if self.last is None else (t - self.last + WRAP // 2) % WRAP - WRAP // 2
 
     def __call__(self, t: int) -> int:
         """The time that is nearest to the last: forwards over a wrap, backwards for what comes late."""
-        if self._last is None:
-            self._last = t
-            return t
-        step = (t - self._last + WRAP // 2) % WRAP - WRAP // 2
-        now = self._last + step
-        self._last = max(self._last, now)
+        now = t if self.last is None else self.last + self.ahead(t)
+        self.last = now if self.last is None else max(self.last, now)
         return now
 
 

@@ -17,6 +17,12 @@ VERSION = 1
 LONGEST = 512
 """Bytes of a frame, zero included: more without one is garbage."""
 MOST_SAMPLES = 32
+STATES = ("stopped", "at speed", "on the way to its speed", "fault")
+"""What :attr:`Status.state` counts."""
+FAULTS = ("stall", "over-current", "encoder lost", "index missed", "host lost")
+"""The bits of :attr:`Status.faults`, from the lowest."""
+REFUSALS = ("accepted", "unknown to it", "out of its range", "not possible now")
+"""What :attr:`Answer.refused` counts."""
 _HEADER = struct.Struct("<BBH")
 _CRC = struct.Struct("<I")
 _SAMPLE = struct.Struct("<Ii")
@@ -62,9 +68,9 @@ class Status:
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<IBHffI")
     t_us: int
     state: int
-    """0 stopped, 1 at speed, 2 on the way to it, 3 fault."""
+    """Of :data:`STATES`."""
     faults: int
-    """Bits: 0 stall, 1 over-current, 2 encoder lost, 3 index missed, 4 host lost."""
+    """Bits of :data:`FAULTS`."""
     rpm: float
     target_rpm: float
     counts_per_turn: int
@@ -89,7 +95,7 @@ class Answer:
     sequence: int
     """Of the command."""
     refused: int
-    """0: accepted; 1: unknown, 2: out of range, 3: not now."""
+    """Of :data:`REFUSALS`: 0 is accepted."""
 
 
 @dataclass(frozen=True, slots=True)

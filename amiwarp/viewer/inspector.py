@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -105,8 +105,18 @@ class Shown:
 class Inspector:
     """See the module. Times are on the events' clock [us]."""
 
-    def __init__(self, recording: Recording, calibration: Calibration | None = None, *, device: Any = "cpu") -> None:
-        """Raises :class:`AmiwarpError` where there are no events, or for another camera's calibration."""
+    def __init__(
+        self,
+        recording: Recording,
+        calibration: Calibration | None = None,
+        *,
+        device: Any = "cpu",
+        latest: Callable[[], Recording] | None = None,
+    ) -> None:
+        """``latest``: of a live stream what is there by now, see :meth:`renew`.
+
+        Raises :class:`AmiwarpError` where there are no events, or for another camera's calibration.
+        """
         source = recording.events
         if not len(source):
             raise AmiwarpError(f"{recording.name}: holds no events; there is nothing to see")
@@ -119,7 +129,7 @@ class Inspector:
                 *self.notes,
                 f"camera unknown: {FOV_DEG:g}° field of view assumed; tell it with --fov-deg or --camera",
             )
-        self.recording, self.device = recording, device
+        self.recording, self.device, self.latest = recording, device, latest
         self.prism = recording.prism or NOMINAL_PRISM
         """The nominal one."""
         self.zero_us = (source.t_first + source.t_last) // 2
@@ -186,6 +196,14 @@ class Inspector:
         whole = source.t_last - source.t_first + 1
         length = min(round(self.turn_us) if math.isfinite(self.turn_us) else WINDOW_US, whole)
         return source.t_first + (whole - length) // 2, length
+
+    def renew(self) -> None:
+        """Takes over what a live stream has become; the window is to be opened anew. Raises as ``latest`` does."""
+        if self.latest is not None:
+            recording = self.latest()
+            self.recording = replace(self.recording, events=recording.events, encoder=recording.encoder)
+            for name in ("rate", "hot"):
+                self.__dict__.pop(name, None)
 
     def accept(self, calibration: Calibration) -> None:
         """Sets the knobs to what was found. Raises :class:`AmiwarpError` for another camera's calibration."""

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 FRAMES, FPS = 90, 25.0
 """Of a film."""
-LEAST_S = 0.05
-"""Between the pictures of a recording that is played."""
+LEAST_S, LIVE_S = 0.05, 0.25
+"""Between the pictures of a recording that is played, and of a live stream."""
 
 
 class Cancelled(Exception):
@@ -107,10 +107,12 @@ class Playing:
         self._ended = True
 
     def toggle(self) -> None:
-        """Runs through the recording from here, or stops."""
+        """Runs through the recording from here, or follows a live stream, or stops."""
         state = self._panel.state
         state.playing = not state.playing
-        if state.playing:
+        if state.playing and self._panel.inspector.latest is not None:
+            self._panel.begin(self._follow())
+        elif state.playing:
             if self._panel.move(float(state.start_ms)):  # at the end: from the beginning
                 self._panel.move(0.0)
             self._panel.begin(self._run())
@@ -127,6 +129,15 @@ class Playing:
             await panel.settled()
             await asyncio.sleep(max(0.0, LEAST_S - (loop.time() - began)))
             took = loop.time() - began
+        panel.released()
+
+    async def _follow(self) -> None:
+        panel, state = self._panel, self._panel.state
+        while state.playing:
+            with state:
+                panel.renew()
+            await panel.settled()
+            await asyncio.sleep(LIVE_S)
         panel.released()
 
     def turntable(self) -> None:

@@ -29,7 +29,7 @@ SLIDERS = (
 KEYS = (
     ("ArrowRight", ("step", 1.0), "on by one turn"),
     ("ArrowLeft", ("step", -1.0), "back by one turn"),
-    (" ", ("play",), "play or stop"),
+    (" ", ("play",), "play, or follow a live stream, or stop"),
     ("1", ("look_from", View.FREE.value), "look at the cloud from the corner"),
     ("2", ("look_from", View.XY.value), "straight down θ: x-y, the image"),
     ("3", ("look_from", View.X_AXIS.value), "straight down y: x-θ"),
@@ -151,10 +151,10 @@ def _window(panel: Panel, html: Any, v: Any) -> None:
         _number(panel, v, "turns", "turns", 76, shown=turns, disabled=("!turn_ms",))
     with html.Div(classes="row", style="margin-top: 6px"):
         _button(v, "◀ turn", (panel.step, "[-1]"), "back", disabled=("!turn_ms",))
-        _button(v, "{{ playing ? 'stop' : 'play' }}", panel.play, "play")
+        _button(v, "{{ playing ? 'stop' : live ? 'follow' : 'play' }}", panel.play, "play")
         _button(v, "turn ▶", (panel.step, "[1]"), "step", disabled=("!turn_ms",))
         v.VSelect(v_model=("speed",), items=("[0.01, 0.1, 0.5, 1]",), density="compact", hide_details=True,
-                  style="max-width: 100px; min-width: 100px", label="speed ×")  # fmt: skip
+                  style="max-width: 100px; min-width: 100px", label="speed ×", v_show="!live")  # fmt: skip
     with html.Div(classes="row"):
         with v.VBtnToggle(v_model=("polarity",), density="compact", mandatory=True, variant="outlined", id="polarity"):
             for name in ("both", "ON", "OFF"):

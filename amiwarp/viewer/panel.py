@@ -24,7 +24,7 @@ from amiwarp.viewer.inspector import Selection
 from amiwarp.viewer.jobs import Calibrating, Playing
 from amiwarp.viewer.layout import KEYS, NAMES, UNITS, build
 from amiwarp.viewer.scene import ORBIT_COLOUR, Axis, Colour, Look, Scene, View
-from amiwarp.viewer.values import event_text, first_values, jpeg, polyline, share
+from amiwarp.viewer.values import event_text, first_values, jpeg, of_source, polyline, share
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector, Shown
@@ -68,6 +68,8 @@ class Panel:
             self.state.change(*names)(lambda what=what, **_: self.ask(what))
         self.state.change("model")(self._model_changed)
         self.later("curve", "picture")
+        if inspector.latest is not None:
+            self.playing.toggle()
 
     def close(self) -> None:
         """Ends what is going on."""
@@ -204,6 +206,14 @@ class Panel:
         last = max(0.0, float(self.state.whole_ms) - float(self.state.length_ms))
         self.state.start_ms = round(min(max(start_ms, 0.0), last), 3)
         return start_ms >= last
+
+    def renew(self) -> None:
+        """Takes over what a live stream has become, the window at its end."""
+        with self.reported("stream"):
+            self.inspector.renew()
+        self.state.update(of_source(self.inspector))
+        self.move(float(self.state.whole_ms))
+        self.ask("window")
 
     def path(self, ending: str) -> Path:
         """Where an export goes: what the field says, or the recording's name."""

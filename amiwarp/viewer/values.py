@@ -23,11 +23,11 @@ def first_values(inspector: Inspector) -> dict[str, Any]:
     """The page's state before anything was touched; the knobs come on top."""
     source, recording = inspector.recording.events, inspector.recording
     start, length = inspector.window or inspector.first_window()
-    times, rates = inspector.rate
     turning = math.isfinite(inspector.turn_us)
     return {
+        **of_source(inspector), "live": inspector.latest is not None,
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "size": list(source.size),
-        "whole_ms": (source.t_last - source.t_first + 1) * 1e-3, "start_ms": round((start - source.t_first) * 1e-3, 3),
+        "start_ms": round((start - source.t_first) * 1e-3, 3),
         "length_ms": round(length * 1e-3, 3), "turn_ms": inspector.turn_us * 1e-3 if turning else 0.0,
         "playing": False, "speed": 0.1, "polarity": "both", "hide_hot": False, "region_x": [0, source.size[0]],
         "region_y": [0, source.size[1]], "colour": Colour.POLARITY.value, "point_size": 2.0, "opacity": 1.0,
@@ -35,9 +35,17 @@ def first_values(inspector: Inspector) -> dict[str, Any]:
         "knob": "apex", "has_encoder": inspector.has_encoder, "orbit_shown": True, "help_shown": False, "out": "",
         "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "events": "", "sharpness": "",
         "before": "", "after": "", "picture": "", "picture_note": "", "curve": "", "curve_mark": 0.0, "curve_text": "",
-        "curve_low": 0.0, "curve_high": 1.0, "rate": polyline(times[:-1], rates), "shown_from": 0.0, "shown_part": 1.0,
-        "rate_top": f"{rates.max() * 1e-6:.3g} Mev/s" if len(rates) else "", "message": "; ".join(inspector.notes),
-        "severity": "info", "busy": "", "progress": 0, "found": "", "picked": "",
+        "curve_low": 0.0, "curve_high": 1.0, "shown_from": 0.0, "shown_part": 1.0, "severity": "info",
+        "message": "; ".join(inspector.notes), "busy": "", "progress": 0, "found": "", "picked": "",
+    }  # fmt: skip
+
+
+def of_source(inspector: Inspector) -> dict[str, Any]:
+    """What of the state follows from the events: of a live stream it changes."""
+    source, (times, rates) = inspector.recording.events, inspector.rate
+    return {
+        "whole_ms": (source.t_last - source.t_first + 1) * 1e-3, "rate": polyline(times[:-1], rates),
+        "rate_top": f"{rates.max() * 1e-6:.3g} Mev/s" if len(rates) else "",
     }  # fmt: skip
 
 

@@ -1,0 +1,47 @@
+"""``amiwarp record``: what camera and encoder give, into a recording that survives whatever happens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from amiwarp.cli.console import report
+from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
+from amiwarp.cli.options import Common
+from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
+
+EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
+
+
+def run(
+    source: Annotated[str, typer.Argument(help="dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5).")],
+    *,
+    stream: SourceOptions,
+    camera: CameraOptions,
+    prism: NominalPrismOptions,
+    common: Common,
+) -> None:
+    """Record events with the prism's angles, until the source ends, --seconds are over, or Ctrl-C.
+
+    The file can be opened at any moment, also after a crash: NAME.part.h5 then, without at most its last second.
+    """
+    from amiwarp.io.live_writer import LiveWriter
+    from amiwarp.stream.session import Session
+
+    with stopped_by_interrupt() as stop, StatusLine(stop, stream.seconds) as line, stream.link() as link:
+        opened = stream.open(source)
+        check_angles(opened, link)
+        width, height = opened.size
+        writer = LiveWriter(
+            out, width=width, height=height, camera=camera.build(width, height) or opened.camera,
+            prism=prism.build(opened.prism), metadata={"recorded_from": opened.name},
+        )  # fmt: skip
+        with writer:
+            status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
+        line.end(opened)
+    data = {"file": str(out), **summary(status), "messages": list(line.messages)}
+    text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
+    report(common, data, [text, *([f"{status.late:,} events came late"] if status.late else [])])

@@ -1,0 +1,159 @@
+"""What ``record`` and ``live`` share: the source, the link, the status line, and how they end."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from amiwarp.link.link import Link
+    from amiwarp.stream.packets import Source
+    from amiwarp.stream.session import Status
+    from amiwarp.stream.sockets import PipeSink, SocketSink
+
+_SOURCE = "Source"
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """Where events and angles come from."""
+
+    port: Annotated[
+        str | None,
+        typer.Option(
+            help="Serial port of the prism's controller, its USB id VID:PID, or 'find'. Default: the source's own "
+            "encoder samples.",
+            rich_help_panel=_SOURCE,
+        ),
+    ] = None
+    counts_per_turn: Annotated[
+        int | None,
+        typer.Option(min=1, help="Of a controller that does not tell it (lines of text).", rich_help_panel=_SOURCE),
+    ] = None
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Replay a file as fast as it can be worked through.", rich_help_panel=_SOURCE)
+    ] = False
+    seconds: Annotated[
+        float | None, typer.Option(min=0.001, help="End after so long. Default: with the source, or by Ctrl-C.")
+    ] = None
+
+    def open(self, spec: str) -> Source:
+        from amiwarp.stream.sources import open_source
+
+        return open_source(spec, pace=None if self.fast else 1.0)
+
+    @contextlib.contextmanager
+    def link(self) -> Iterator[Link | None]:
+        """The controller, or None where no port was given."""
+        from amiwarp.link.link import Link
+
+        if self.port is None:
+            yield None
+            return
+        with Link(None if self.port == "find" else self.port, counts_per_turn=self.counts_per_turn) as link:
+            yield link
+
+
+@contextlib.contextmanager
+def stopped_by_interrupt() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets: once to finish what has come, twice to give up."""
+    stop = threading.Event()
+
+    def interrupted(number: int, frame: Any) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, interrupted) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class StatusLine:
+    """One line on stderr that follows a session, messages above it; without a terminal messages alone."""
+
+    def __init__(self, stop: threading.Event, seconds: float | None) -> None:
+        self._stop, self._seconds = stop, seconds
+        self._console = Console(stderr=True, highlight=False)
+        self._live = Live(console=self._console, refresh_per_second=5, transient=True)
+        self.messages: deque[str] = deque(maxlen=1000)
+        """The last ones said."""
+
+    def __enter__(self) -> StatusLine:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def say(self, message: str) -> None:
+        self.messages.append(message)
+        if self._console.is_terminal:
+            self._console.print(message, markup=False)
+        else:
+            print(message, file=sys.stderr, flush=True)
+
+    def update(self, status: Status) -> None:
+        if self._seconds is not None and status.seconds >= self._seconds:
+            self._stop.set()
+        if self._console.is_terminal:
+            self._live.update(Text(describe(status), no_wrap=True, overflow="ellipsis"))
+
+    def end(self, source: Source, served: SocketSink | PipeSink | None = None) -> None:
+        """Says what fell short on either side."""
+        problem = getattr(source, "problem", None)  # of a stream that broke off
+        if problem:
+            self.say(problem)
+        if served is not None and served.lost:
+            self.say(f"{served.lost:,} packets were not sent: who listens is too slow")
+
+
+def describe(s: Status) -> str:
+    """The line."""
+    parts = [f"{s.seconds:.1f} s", f"{s.events:,} events", f"{s.rate_mev_s:.2f} Mev/s"]
+    if s.done:
+        parts.append(f"latency {s.latency_ms[0]:.1f} ms (p99 {s.latency_ms[1]:.1f})")
+        parts.append(f"encoder covers {100.0 * s.covered:.1f} %")
+    if s.sharpness is not None:
+        parts.append(f"sharpness {s.sharpness:.2f}")
+    if s.coverage is not None:
+        parts.append(f"edges seen {100.0 * s.coverage:.1f} %")
+    if s.rpm is not None:
+        parts.append(f"{s.rpm:.0f} rpm")
+    if s.clock is not None:
+        parts.append(f"clocks ±{s.clock.offset_std_us:.0f} us")
+    parts += [f"{n:,} {what}" for n, what in ((s.dropped, "dropped"), (s.late, "late"), (s.waiting, "waiting")) if n]
+    return ", ".join(parts)
+
+
+def check_angles(source: Source, link: Link | None) -> None:
+    """Raises :class:`AmiwarpError` where nothing gives angles."""
+    if link is None and not source.has_encoder:
+        raise AmiwarpError(f"{source.name}: gives no encoder samples; give the controller's --port")
+
+
+def summary(s: Status) -> dict[str, Any]:
+    """For ``--json``."""
+    return {
+        "seconds": s.seconds, "events": s.events, "mev_per_s": s.events / max(s.seconds, 1e-9) / 1e6,
+        "compensated": s.done, "outside": s.outside, "extrapolated": s.guessed, "without_angle": s.unknown,
+        "dropped": s.dropped, "late": s.late,
+    }  # fmt: skip

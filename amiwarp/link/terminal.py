@@ -1,0 +1,118 @@
+"""An emulated controller behind a pseudo-terminal: a serial port to whoever opens it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from amiwarp.link.emulator import Controller
+
+STEP_S = 1e-3
+
+
+class PseudoTerminal:
+    """Runs a controller in real time until it is closed, in a thread of its own.
+
+    ``path``: a symbolic link to the port, kept while the cable is in and made anew with it, so that a lost port comes
+    back by the same name. ``now_us``: the world's time; default: since now. Raises :class:`AmiwarpError` where ``path``
+    is taken, or where the system has no pseudo-terminals.
+    """
+
+    def __init__(
+        self, controller: Controller, path: str | os.PathLike[str] | None = None,
+        *, now_us: Callable[[], int] | None = None,
+    ) -> None:  # fmt: skip
+        if not hasattr(os, "openpty"):
+            raise AmiwarpError("this system has no pseudo-terminals; the emulator needs Linux or macOS")
+        self._path = None if path is None else Path(path)
+        # a link that leads nowhere was left by one that was killed
+        if self._path is not None and self._path.exists():
+            raise AmiwarpError(f"{path}: is there already; give another path for the link, or remove it")
+        origin = time.monotonic_ns()
+        self._now_us = now_us or (lambda: (time.monotonic_ns() - origin) // 1000)
+        self._controller = controller
+        self._ended = threading.Event()
+        self._master: int | None = None
+        self._plug()
+        self._thread = threading.Thread(target=self._run, name="amiwarp-emulator", daemon=True)
+        self._thread.start()
+
+    @property
+    def name(self) -> str:
+        """To open it by: the link, or the port where there is none."""
+        return self._port if self._path is None else str(self._path)
+
+    def __enter__(self) -> PseudoTerminal:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends it; port and link are gone."""
+        self._ended.set()
+        self._thread.join()
+        self._unplug()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            data = b"" if self._master is None else self._read(self._master)
+            now = self._now_us()
+            self._controller.feed(data, now)
+            out = self._controller.advance(now)
+            if self._controller.plugged and self._master is None:
+                self._plug()
+            elif not self._controller.plugged and self._master is not None:
+                self._unplug()
+            # Nobody there, or too slow: bytes are lost, as on any line without flow control.
+            if out and self._master is not None and not self._alone(self._master):
+                with contextlib.suppress(OSError):
+                    os.write(self._master, out)
+
+    def _read(self, master: int) -> bytes:
+        """Bytes from the other end, waited for until the next step."""
+        if self._alone(master):
+            self._ended.wait(STEP_S)
+            return b""
+        if not select.select([master], [], [], STEP_S)[0]:
+            return b""
+        with contextlib.suppress(OSError):
+            return os.read(master, 4096)
+        return b""
+
+    def _alone(self, master: int) -> bool:
+        poll = select.poll()
+        poll.register(master, 0)
+        return any(event & select.POLLHUP for _, event in poll.poll(0))
+
+    def _plug(self) -> None:
+        import tty
+
+        self._master, port = os.openpty()
+        self._port = os.ttyname(port)
+        tty.setraw(port)
+        os.close(port)
+        os.set_blocking(self._master, False)
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+            self._path.symlink_to(self._port)
+
+    def _unplug(self) -> None:
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+        if self._master is not None:
+            os.close(self._master)
+            self._master = None

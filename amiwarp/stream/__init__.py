@@ -1,0 +1,1 @@
+"""Live streams of events: their packets, where they come from and where they go."""

@@ -1,0 +1,120 @@
+"""The camera's clock beside the controller's: from pulses that both saw or, without any, from when things arrived."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.link.clocks import FEWEST, Clock, from_pulses
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+PULSES = 100
+"""That are remembered, the last ones."""
+UNPAIRED = 16
+"""Pulses of either side that wait for their other."""
+ALIKE_US = 300.0
+"""Two distances between pulses are the same within this: a pulse's delay varies, and clocks drift by 1e-4 a second."""
+APART_US = 5_000_000
+"""The two reports of one pulse reach the host within this, and within half the time between two pulses [us]."""
+ARRIVALS = 2000
+"""Packets whose delays are remembered: the shortest tells how the camera's clock and the host's lie."""
+
+
+class CameraClock:
+    """Follows both clocks; :meth:`clock` takes the controller's times to the camera's."""
+
+    def __init__(self) -> None:
+        self._sync: deque[tuple[int, int]] = deque(maxlen=UNPAIRED)  # controller's time, host's
+        self._trigger: deque[tuple[int, int]] = deque(maxlen=UNPAIRED)  # camera's time, host's
+        self._pairs: deque[tuple[int, int]] = deque(maxlen=PULSES)
+        self._ahead: deque[int] = deque(maxlen=ARRIVALS)
+        self._found: Clock | None = None
+
+    @property
+    def pulses(self) -> int:
+        """Pulses that both clocks saw, of those remembered."""
+        return len(self._pairs)
+
+    def restart(self) -> None:
+        """The controller's clock began anew: what was known of it is void."""
+        self._sync.clear()
+        self._pairs.clear()
+        self._found = None
+
+    def sync(self, t_us: int, host_us: int) -> None:
+        """The controller sent a pulse at ``t_us`` of its clock; the host heard of it at ``host_us``."""
+        self._sync.append((t_us, host_us))
+        self._pair()
+
+    def triggers(self, t_us: ArrayLike, host_us: int) -> None:
+        """The camera saw pulses at ``t_us`` of its clock; the host heard of them at ``host_us``."""
+        for t in np.atleast_1d(np.asarray(t_us, np.int64)).tolist():
+            self._trigger.append((t, host_us))
+            self._pair()
+
+    def packet(self, t_last: int, host_us: int) -> None:
+        """The camera's events up to ``t_last`` arrived at ``host_us``."""
+        self._ahead.append(host_us - t_last)
+
+    def clock(self, host: Clock | None) -> Clock | None:
+        """The camera's clock beside the controller's, by pulses; without, by ``host``: the controller's beside it.
+
+        By the host it is off by the shortest way of the camera's packets, which nothing tells. None while unknown.
+        """
+        if self._found is not None or host is None or len(self._ahead) < FEWEST:
+            return self._found
+        ahead = np.array(self._ahead)
+        shortest = int(ahead.min())
+        spread = float(np.median(ahead) - shortest)
+        at = host.at_us + round(host.offset_us)
+        return replace(
+            host, at_us=at, offset_us=-host.offset_us - shortest, drift=-host.drift,
+            offset_std_us=math.hypot(host.offset_std_us, spread),
+        )  # fmt: skip
+
+    def _pair(self) -> None:
+        """Finds the one shift of the camera's clock under which pulses meet, and takes the pairs out."""
+        if not (self._sync and self._trigger):
+            return
+        t, s = (np.array(pulses, np.int64) for pulses in (self._trigger, self._sync))
+        expected = s[:, 0] if self._found is None else self._found(s[:, 0])
+        apart = t[:, None, 0] - expected[None, :]
+        if self._found is not None:
+            meet = np.abs(apart) <= ALIKE_US
+        else:
+            intervals = np.concatenate([np.diff(t[:, 0]), np.diff(s[:, 0]), [2 * APART_US]])
+            meet = _first_meeting(apart, t[:, None, 1] - s[None, :, 1], int(intervals.min()) // 2)
+        where = np.argwhere(meet)
+        if not len(where):
+            if self._found is not None and min(len(t), len(s)) == UNPAIRED:
+                self._found = None  # one of the clocks jumped
+                self._pairs.clear()
+            return
+        pairs = {int(j): int(i) for i, j in where}
+        self._pairs.extend((int(s[j, 0]), int(t[i, 0])) for j, i in sorted(pairs.items()))
+        last_t, last_s = max(pairs.values()), max(pairs)
+        self._trigger = deque(list(self._trigger)[last_t + 1 :], UNPAIRED)
+        self._sync = deque(list(self._sync)[last_s + 1 :], UNPAIRED)
+        if len(self._pairs) >= FEWEST:
+            own, other = np.array(self._pairs).T
+            self._found = from_pulses(own, other)
+
+
+def _first_meeting(apart: NDArray[np.int64], heard: NDArray[np.int64], reach: int) -> NDArray[np.bool_]:
+    """Which pairs share a shift, three or more; of several shifts that whose reports came closest to each other.
+
+    Pulses at even distances meet under many: two reports further apart than ``reach`` [us] are not of one pulse.
+    """
+    best, nearest = np.zeros(apart.shape, np.bool_), float(reach)
+    for i, j in np.argwhere(np.abs(heard) <= reach):
+        meet = np.abs(apart - apart[i, j]) <= ALIKE_US
+        away = float(np.median(np.abs(heard[meet])))
+        if meet.any(axis=0).sum() >= FEWEST and away < nearest:
+            best, nearest = meet, away
+    return best

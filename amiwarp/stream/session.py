@@ -1,0 +1,355 @@
+"""A live session: a source, the link to the prism and the compensator, and where it all goes."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
+from amiwarp.encoder import EncoderStream
+from amiwarp.iwe import CanvasShape
+from amiwarp.sharpness import Sharpness, SharpnessMeter
+from amiwarp.stream.clocking import CameraClock
+from amiwarp.stream.packets import NO_TIMES, Sorter
+from amiwarp.stream.queues import PacketQueue, Policy
+from amiwarp.stream.watch import PhaseWatch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib.result import Calibration
+    from amiwarp.events import Events
+    from amiwarp.io.live_writer import LiveWriter
+    from amiwarp.link.clocks import Clock
+    from amiwarp.link.link import Link, News
+    from amiwarp.stream.packets import Packet, Source
+    from amiwarp.stream.speed import SpeedKeeper
+
+QUEUE_EVENTS = 1 << 23
+"""Room between the source and the compensator: most of a second of the busiest sensor, 110 MB."""
+IMAGE_US = 33_333
+"""Window of the image whose sharpness is told [us]."""
+POLL_S = 0.001
+"""Longest wait for a packet, between two looks at the encoder."""
+MOST_HELD = 10_000
+"""Polls of the link that wait for the camera's clock to be known."""
+
+
+def monotonic_us() -> int:
+    """The host's clock [us]."""
+    return time.monotonic_ns() // 1000
+
+
+class Beside:
+    """Calls what is put, one after the other, in a thread of its own; while ``most`` wait, :meth:`put` does."""
+
+    def __init__(self, most: int = 256) -> None:
+        self._jobs: queue.Queue[Callable[[], object] | None] = queue.Queue(most)
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="amiwarp-beside", daemon=True)
+        self._thread.start()
+
+    def put(self, job: Callable[[], object]) -> None:
+        """Raises what a job before raised; after it none is called any more."""
+        if self._error is not None:
+            raise self._error
+        self._jobs.put(job)
+
+    def end(self) -> None:
+        """Waits until all were called."""
+        if self._thread.is_alive():
+            self._jobs.put(None)
+            self._thread.join()
+
+    def close(self) -> None:
+        """The same; raises as :meth:`put`."""
+        self.end()
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            if self._error is None:
+                try:
+                    job()
+                except BaseException as error:
+                    self._error = error
+
+
+@dataclass(slots=True)
+class Status:
+    """How a session goes; counts since its beginning, shares and rates since the status before."""
+
+    seconds: float = 0.0
+    events: int = 0
+    """Taken in."""
+    done: int = 0
+    """Compensated."""
+    outside: int = 0
+    guessed: int = 0
+    unknown: int = 0
+    dropped: int = 0
+    """By the queue, see :class:`Policy`."""
+    late: int = 0
+    """That came after later ones."""
+    waiting: int = 0
+    """For the encoder, or in the queue."""
+    rate_mev_s: float = 0.0
+    covered: float = 1.0
+    """Share whose angle the encoder gave."""
+    latency_ms: tuple[float, float] = (0.0, 0.0)
+    """From a packet's arrival to its coming out, median and 99th percentile."""
+    sharpness: float | None = None
+    """Of the last image, over :data:`IMAGE_US`."""
+    rpm: float | None = None
+    clock: Clock | None = None
+    """The camera's beside the controller's, where there is a link."""
+    coverage: float | None = None
+    """Share of the edges that the last window saw, where the speed is adaptive."""
+    phase_away: float | None = None
+    """What the watch found last, from the calibrated phase [rad]."""
+
+
+class Raw(Protocol):
+    """Takes events as they came, in order, and the encoder's samples on their clock; each in a thread of its own."""
+
+    def append(self, events: Events, /) -> None: ...
+
+    def append_encoder(
+        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: NDArray[np.int64], /
+    ) -> None: ...
+
+    def tick(self) -> None: ...
+
+
+class Session:
+    """Takes in what a source gives until it ends or is told to stop; compensates, writes and hands on all of it.
+
+    ``calibration``: None where nothing is to be compensated, as for a recording. ``link``: its samples are used in
+    place of the source's. ``out`` gets the compensated events and the encoder, ``sinks`` the compensated packets. All
+    are the caller's to open and to close.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        calibration: Calibration | None = None,
+        *,
+        link: Link | None = None,
+        raw: Sequence[Raw] = (),
+        out: LiveWriter | None = None,
+        sinks: tuple[Callable[[Compensated], None], ...] = (),
+        watch_s: float | None = None,
+        keeper: SpeedKeeper | None = None,
+        wait_us: int = 10_000,
+        policy: Policy = Policy.BLOCK,
+        queue_events: int = QUEUE_EVENTS,
+        device: Any = "cpu",
+        say: Callable[[str], None] = print,
+    ) -> None:
+        self.status = Status()
+        self._source, self._link, self._sinks, self._keeper, self._say = source, link, sinks, keeper, say
+        self._raw = [(taker, Beside()) for taker in raw]
+        self._out = None if out is None else (out, Beside())
+        self._queue = PacketQueue(queue_events, policy)
+        self._sorter, self._camera_clock = Sorter(), CameraClock()
+        # a source's own samples are on the events' clock already, as its file says; what was calibrated says it better
+        own = getattr(source, "clock_offset_us", 0.0) if link is None else 0.0
+        known = {} if calibration is None else calibration.parameters
+        self.encoder = EncoderStream(known.get("clock_offset", own) - own)
+        self._held: list[News] = []
+        self._compensator: Compensator | None = None
+        self._meter: SharpnessMeter | None = None
+        self._watch: PhaseWatch | None = None
+        if calibration is not None:
+            model = calibration.model
+            self._compensator = Compensator(model, self.encoder, wait_us=wait_us, device=device)
+            self._meter = SharpnessMeter(CanvasShape(*source.size), Sharpness.VARIANCE, smoothing=1.0, device=device)
+            if watch_s is not None:
+                self._watch = PhaseWatch(calibration, watch_s, say)
+        self._failed: BaseException | None = None
+        self._image_us: int | None = None
+        self._wants_image = True
+        self._wait_us = wait_us
+        self._latencies: list[int] = []
+        self._began_us = monotonic_us()
+        self._since = (self._began_us, 0, 0, 0)
+
+    def run(self, stop: threading.Event, on_status: Callable[[Status], None], *, every_s: float = 0.2) -> Status:
+        """Until the source has ended or ``stop`` is set, and then to the end of what had come by then.
+
+        Raises :class:`AmiwarpError` where source or a writer failed, after all that came before was worked through.
+        """
+        reader = threading.Thread(target=self._read, args=(stop,), name="amiwarp-source", daemon=True)
+        reader.start()
+        due = 0.0
+        try:
+            while not self._queue.ended:
+                self._step()
+                if self._seconds >= due:
+                    due = self._seconds + every_s
+                    self._report(on_status)
+            self._finish()
+        finally:
+            stop.set()
+            self._queue.close()
+            reader.join()
+            self._source.close()
+            for _, beside in self._takers:
+                beside.end()
+        self._report(on_status)
+        if self._failed is not None:
+            raise self._failed
+        return self.status
+
+    @property
+    def _takers(self) -> list[tuple[Raw | LiveWriter, Beside]]:
+        return [*self._raw, *([] if self._out is None else [self._out])]
+
+    @property
+    def _seconds(self) -> float:
+        return (monotonic_us() - self._began_us) * 1e-6
+
+    def _read(self, stop: threading.Event) -> None:
+        try:
+            for packet in self._source.packets():
+                self._queue.put(packet)
+                if stop.is_set():
+                    break
+        except BaseException as error:
+            self._failed = error
+        finally:
+            self._queue.close()
+
+    def _step(self) -> None:
+        self._follow()
+        packet = self._queue.get(POLL_S)
+        if packet is not None:
+            self._take_in(packet)
+        if self._compensator is not None:
+            self._give_out(self._compensator.take(monotonic_us()))
+
+    def _follow(self) -> None:
+        """What the controller sent: its clock to the camera's, its samples to the encoder."""
+        if self._link is None:
+            return
+        news = self._link.poll()
+        for message in news.messages:
+            self._say(message)
+        if news.restarted:
+            self._camera_clock.restart()
+            self.encoder.restart()
+            self._held.clear()
+        for _number, t_us, host_us in news.sync:
+            self._camera_clock.sync(t_us, host_us)
+        if len(news.t_us) or len(news.index_t_us):
+            self._held.append(news)
+        clock = self.status.clock = self._camera_clock.clock(self._link.clock())
+        if clock is None:
+            del self._held[:-MOST_HELD]
+            return
+        for held in self._held:
+            self._sample(clock(held.t_us), held.angle, clock(held.index_t_us))
+        self._held.clear()
+
+    def _sample(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
+        t, angle = self.encoder.append(t, angle)
+        for taker, beside in self._takers:
+            beside.put(partial(taker.append_encoder, t, angle, index_t))
+
+    def _take_in(self, packet: Packet) -> None:
+        if len(packet.events):
+            self._camera_clock.packet(int(packet.events.t[-1]), packet.arrived_us)
+        self._camera_clock.triggers(packet.triggers, packet.arrived_us)
+        if self._link is None and len(packet.encoder_t):
+            self._sample(packet.encoder_t, packet.encoder_angle, NO_TIMES)
+        self._pass_on(self._sorter.put(packet.events), packet.arrived_us)
+
+    def _pass_on(self, events: Events, arrived_us: int) -> None:
+        """Events in order, to where they go."""
+        if not len(events):
+            return
+        self.status.events += len(events)
+        for taker, beside in self._raw:
+            beside.put(partial(taker.append, events))
+        if self._watch is not None:
+            self._watch.put(events)
+        if self._compensator is not None:
+            self._compensator.put(events, arrived_us)
+
+    def _give_out(self, packets: list[Compensated]) -> None:
+        now, status = monotonic_us(), self.status
+        for packet in packets:
+            flags = packet.flags
+            status.done += len(flags)
+            if flags.any():
+                status.outside += int(np.count_nonzero(flags & OUTSIDE))
+                status.guessed += int(np.count_nonzero(flags & EXTRAPOLATED))
+                status.unknown += int(np.count_nonzero(flags & NO_ANGLE))
+            self._latencies.append(now - packet.put_us)
+            if self._out is not None:
+                inside, guessed = (flags & OUTSIDE) == 0, (flags & (EXTRAPOLATED | NO_ANGLE)) != 0
+                writer, beside = self._out
+                beside.put(partial(writer.append, packet.events, inside=inside, extrapolated=guessed))
+            for sink in self._sinks:
+                sink(packet)
+        if packets and self._keeper is not None:
+            self._keeper.put(packets, self.encoder)
+        if packets:
+            self._look(int(packets[-1].events.t[-1]))
+
+    def _look(self, t: int) -> None:
+        """Sharpness of the image of a window, once for each status."""
+        assert self._compensator is not None
+        assert self._meter is not None
+        if self._image_us is None:
+            self._compensator.image()  # begins the window
+            self._image_us = t
+        elif self._wants_image and t - self._image_us >= IMAGE_US:
+            self._meter.image.write(self._compensator.image()[None])
+            self.status.sharpness, self._image_us, self._wants_image = self._meter.measure(), t, False
+
+    def _report(self, on_status: Callable[[Status], None]) -> None:
+        now, status = monotonic_us(), self.status
+        status.seconds = self._seconds
+        then, events, done, unsure = self._since
+        sure = status.guessed + status.unknown
+        status.rate_mev_s = (status.events - events) / max(now - then, 1)
+        status.covered = 1.0 - (sure - unsure) / (status.done - done) if status.done > done else 1.0
+        self._since = (now, status.events, status.done, sure)
+        if self._latencies:
+            median, slow = np.percentile(self._latencies, [50, 99]) * 1e-3
+            status.latency_ms = float(median), float(slow)
+            self._latencies.clear()
+        status.dropped, status.late = self._queue.dropped, self._sorter.late
+        status.waiting = self._queue.held + (0 if self._compensator is None else self._compensator.waiting)
+        status.rpm = self.encoder.rpm
+        status.coverage = None if self._keeper is None else self._keeper.coverage
+        if self._watch is not None:
+            status.phase_away = self._watch.look(self.encoder)
+        for taker, beside in self._takers:
+            beside.put(taker.tick)
+        self._image_us, self._wants_image = None, True
+        on_status(status)
+
+    def _finish(self) -> None:
+        """All that is held anywhere."""
+        end = monotonic_us() + self._wait_us
+        while self._link is not None and monotonic_us() < end:  # samples that cover the last events
+            self._follow()
+            time.sleep(POLL_S)
+        self._pass_on(self._sorter.flush(), monotonic_us())
+        if self._compensator is not None:
+            self._give_out(self._compensator.flush())
+        for beside_it in (self._watch, self._keeper):
+            if beside_it is not None:
+                beside_it.close()
+        for _, beside in self._takers:
+            beside.close()

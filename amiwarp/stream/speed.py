@@ -1,0 +1,75 @@
+"""The prism's speed kept to what the stream needs: windows of compensated events in, commands to the motor out."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events
+from amiwarp.stream.adaptive import CoverageMeter, SpeedController, prism_path
+
+if TYPE_CHECKING:
+    from amiwarp.compensator import Compensated
+    from amiwarp.encoder import EncoderStream
+    from amiwarp.optics import Model
+
+WINDOW_US = 33_333
+
+
+class SpeedKeeper:
+    """Measures each window and asks for another speed where it should be; in a thread of its own waits for the answer.
+
+    ``set_speed``: takes rpm and ramp [rpm/s], as :meth:`Link.set_speed`. ``say`` gets what goes wrong there.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        controller: SpeedController,
+        set_speed: Callable[[float, float], None],
+        say: Callable[[str], None],
+    ) -> None:
+        self.controller = controller
+        self._model, self._set_speed, self._say = model, set_speed, say
+        self._meter = CoverageMeter(model.camera.width, model.camera.height)
+        self._packets: list[Events] = []
+        self._begins: int | None = None
+        self._asking: threading.Thread | None = None
+        self.coverage: float | None = None
+        """Share of the edges that the last window saw."""
+
+    def put(self, packets: list[Compensated], encoder: EncoderStream) -> None:
+        """Compensated packets, in order."""
+        for packet in packets:
+            self._packets.append(packet.events)
+        last = int(self._packets[-1].t[-1])
+        self._begins = int(self._packets[0].t[0]) if self._begins is None else self._begins
+        if last - self._begins < WINDOW_US:
+            return
+        self._window(Events.concatenate(self._packets), self._begins, last, encoder)
+        self._packets.clear()
+        self._begins = last
+
+    def _window(self, events: Events, start: int, end: int, encoder: EncoderStream) -> None:
+        first = encoder.first
+        if first is None or start < first:
+            return
+        path = prism_path(self._model, encoder.over(start, end), start, end)
+        self.coverage = self._meter(events, start, end, path).share
+        rpm = self.controller.update(end, self.coverage, len(events) / (end - start))
+        if rpm is not None and (self._asking is None or not self._asking.is_alive()):
+            self._asking = threading.Thread(target=self._ask, args=(rpm,), name="amiwarp-speed", daemon=True)
+            self._asking.start()
+
+    def _ask(self, rpm: float) -> None:
+        try:
+            self._set_speed(rpm, self.controller.ramp_rpm_s)
+        except AmiwarpError as error:
+            self._say(str(error))
+
+    def close(self) -> None:
+        """Waits for an answer that is due."""
+        if self._asking is not None:
+            self._asking.join()

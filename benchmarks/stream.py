@@ -1,0 +1,240 @@
+"""How fast streams are compensated, how late they come out, and whether memory stays flat for an hour.
+
+    python -m benchmarks.stream [--device cuda:0] [--picture FILE] [--only rate latency hour] [--out FILE.json]
+
+``rate``: packets of 10,000 events one after the other, an encoder of 1 kHz, an image each 33 ms of a stream at the rate
+that is asked for; on CUDA a hundred packets are put before some are taken. ``latency``: one packet each millisecond of
+real time, 10 million events a second, from put to taken, its encoder sample coming 0.2 ms after it. ``hour``: an hour
+of stream through a whole session, as fast as it goes. Places are compared with those of ``compensate_events`` in the
+same run. Exit status 1 where an aim is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.calib.result import Calibration
+from amiwarp.camera import Camera
+from amiwarp.compensate import compensate_events
+from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, Compensator
+from amiwarp.encoder import Encoder, EncoderStream
+from amiwarp.events import Events
+from amiwarp.machine import machine
+from amiwarp.optics import CircleModel, ExactModel, Model, Prism
+from amiwarp.simulate import simulate
+from amiwarp.stream.packets import Packet
+from amiwarp.stream.session import IMAGE_US, Session, Status, monotonic_us
+
+PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))
+MODELS: dict[str, Model] = {
+    "exact": ExactModel.from_prism(CAMERA, PRISM, 0.3), "circle": CircleModel.from_prism(CAMERA, PRISM, 0.3),
+}  # fmt: skip
+ASKED_MEV_S = {"cpu": 50.0, "cuda": 500.0}
+MOST_MS, LATENCY_MEV_S, MOST_ERROR_PX, MOST_GROWTH_MIB = 5.0, 10.0, 0.01, 16.0
+HOUR_S, HOUR_MEV_S = 3600.0, 0.5
+CHECKED = 50
+"""Packets whose places are compared, spread over the run."""
+
+
+def random_pool(n: int) -> Events:
+    """Events anywhere: the worst there can be for caches."""
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, CAMERA.width, n).astype(np.uint16), rng.integers(0, CAMERA.height, n).astype(np.uint16)
+    return Events(x, y, np.arange(n), rng.integers(0, 2, n).astype(np.uint8))
+
+
+def seen_pool(picture: str) -> Events:
+    """Those of a still picture, in the order a sensor gives them."""
+    recording = simulate(picture, CAMERA, PRISM, duration_s=0.25, motion=720.0)
+    return recording.events.slice(0, len(recording.events))
+
+
+def angles(t: np.ndarray) -> np.ndarray:
+    return t * (720.0 * 2.0 * math.pi / 60e6)
+
+
+class Stream:
+    """Packets of a pool's events, over and over, with new times at a rate; and samples of an encoder at 1 kHz."""
+
+    def __init__(self, pool: Events, mev_s: float) -> None:
+        self._parts = [pool[k : k + PACKET] for k in range(0, len(pool) - PACKET + 1, PACKET)]
+        self.span_us = PACKET / mev_s
+        self._within = np.floor(np.arange(PACKET) * (self.span_us / PACKET)).astype(np.int64)
+        self._sampled = 0
+
+    def packet(self, k: int) -> Events:
+        part = self._parts[k % len(self._parts)]
+        return Events(part.x, part.y, self._within + int(k * self.span_us), part.p)
+
+    def samples(self, until_us: int) -> tuple[np.ndarray, np.ndarray]:
+        """Those not given yet, up to the first after a time."""
+        t = np.arange(self._sampled, until_us + 1001, 1000, dtype=np.int64)
+        self._sampled += 1000 * len(t)
+        return t, angles(t)
+
+
+class Check:
+    """Keeps some of the packets that come out, to be compared when time no longer counts."""
+
+    def __init__(self, packets: int) -> None:
+        self._chosen = set(np.linspace(0, packets - 1, CHECKED).astype(int).tolist())
+        self._kept: list[tuple[Events, Events]] = []
+        self.count = 0
+
+    def __call__(self, given: Events, found: Events) -> None:
+        if self.count in self._chosen:
+            self._kept.append((given, Events(found.x.copy(), found.y.copy(), found.t, found.p)))
+        self.count += 1
+
+    def error_px(self, model: Model) -> float:
+        """Largest distance from the places of the same events in a recording; infinite where events differ."""
+        worst = 0.0
+        for given, found in self._kept:
+            if not (np.array_equal(given.t, found.t) and np.array_equal(given.p, found.p)):
+                return math.inf
+            t = np.arange(int(given.t[0]) // 1000 * 1000, int(given.t[-1]) + 2001, 1000, dtype=np.int64)
+            xy = compensate_events(given, model, Encoder(t, angles(t)))
+            worst = max(worst, float(np.nanmax(np.hypot(found.x - xy[:, 0], found.y - xy[:, 1]))))
+        return worst
+
+
+def rate(device: str, pool: Events, model: Model) -> dict[str, Any]:
+    kind = "cuda" if "cuda" in device else "cpu"
+    asked, packets, together = ASKED_MEV_S[kind], *((20_000, 100) if kind == "cuda" else (2000, 1))
+    compensator, encoder = None, EncoderStream()
+    for turn in range(2):  # the first warms up
+        stream, encoder, check, voted, imaged = Stream(pool, asked), EncoderStream(), Check(packets), 0.0, 0
+        compensator = Compensator(model, encoder, device=device)
+        ahead = [stream.packet(k) for k in range(packets if turn else 4 * together)]  # made by a sensor's driver
+        began = time.perf_counter()
+        for k in range(0, len(ahead), together):
+            some = ahead[k : k + together]
+            last = int(some[-1].t[-1])
+            encoder.append(*stream.samples(last))
+            for events in some:
+                compensator.put(events, 0)
+            for done in compensator.take(0):
+                check(ahead[check.count], done.events)
+            if last - imaged >= IMAGE_US:
+                voted, imaged = voted + float(compensator.image().sum(dtype=np.float64)), last
+        took = time.perf_counter() - began
+    voted += float(compensator.image().sum(dtype=np.float64))
+    mev_s, error = packets * PACKET / took / 1e6, check.error_px(model)
+    return {"mev_s": mev_s, "asked": asked, "packets": check.count, "error_px": error,
+            "voted": voted / (packets * PACKET),
+            "ok": check.count == packets and mev_s >= asked and error <= MOST_ERROR_PX}  # fmt: skip
+
+
+def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> dict[str, Any]:
+    stream, encoder, packets = Stream(pool, LATENCY_MEV_S), EncoderStream(), round(seconds * 1000)
+    compensator, check = Compensator(model, encoder, device=device), Check(packets)
+    ahead, guessed, late = [stream.packet(k) for k in range(packets)], 0, []
+    began, put, sampled = monotonic_us() + 10_000, 0, 0
+    while check.count < packets:
+        now = monotonic_us() - began
+        while put < packets and now >= (put + 1) * stream.span_us:  # when its last event has happened
+            compensator.put(ahead[put], round((put + 1) * stream.span_us))
+            put += 1
+        if now >= sampled * 1000 + 1200:
+            t = np.arange(sampled, (now - 200) // 1000 + 1) * 1000
+            encoder.append(t, angles(t))
+            sampled += len(t)
+        for done in compensator.take(now):
+            late.append(monotonic_us() - began - done.put_us)
+            guessed += int(np.count_nonzero(done.flags & (EXTRAPOLATED | NO_ANGLE)))
+            check(ahead[check.count], done.events)
+        time.sleep(0.0001)
+    median, p99 = np.percentile(late, [50, 99]) * 1e-3
+    error = check.error_px(model)
+    return {"mev_s": LATENCY_MEV_S, "ms_median": float(median), "ms_p99": float(p99), "asked_ms": MOST_MS,
+            "ms_slowest": max(late) * 1e-3, "guessed": guessed, "error_px": error,
+            "ok": p99 <= MOST_MS and error <= MOST_ERROR_PX}  # fmt: skip
+
+
+class Hour:
+    """A source: an hour of stream, its encoder's samples along with it."""
+
+    camera, prism, name, size, has_encoder = CAMERA, PRISM, "an hour", (CAMERA.width, CAMERA.height), True
+
+    def __init__(self, pool: Events) -> None:
+        self._stream = Stream(pool, HOUR_MEV_S)
+        self.count = round(HOUR_S * 1e6 / self._stream.span_us)
+
+    def packets(self) -> Iterator[Packet]:
+        none = np.zeros(0, np.int64)
+        for k in range(self.count):
+            events = self._stream.packet(k)
+            yield Packet(events, none, *self._stream.samples(int(events.t[-1])), monotonic_us())
+
+    def close(self) -> None:
+        pass
+
+
+def hour(device: str, pool: Events) -> dict[str, Any]:
+    source, sizes = Hour(pool), []
+    values = {"apex": PRISM.apex, "phase": 0.3}
+    known = Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 0.0, 0.0, (), 0, 0.0)
+
+    def note(status: Status) -> None:
+        with open("/proc/self/statm") as statm:
+            sizes.append((status.events, int(statm.read().split()[1]) * resource.getpagesize() / 2**20))
+
+    seen = 0
+
+    def count(packet: Any) -> None:
+        nonlocal seen
+        seen += len(packet.events)
+
+    status = Session(source, known, sinks=(count,), device=device).run(threading.Event(), note, every_s=0.5)
+    n = source.count * PACKET
+    early = [mib for events, mib in sizes if 0.05 * n < events < 0.15 * n]
+    growth = sizes[-1][1] - max(early)
+    return {"stream_s": HOUR_S, "events": status.done, "seconds": status.seconds,
+            "mev_s": status.done / status.seconds / 1e6, "mib": sizes[-1][1], "growth_mib": growth,
+            "guessed": status.guessed + status.unknown, "sharpness": status.sharpness,
+            "ok": status.done == n == seen and growth <= MOST_GROWTH_MIB and not status.unknown}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--picture", help="what the camera looks at; default: PyVista's map of the earth")
+    parser.add_argument("--only", nargs="+", default=["rate", "latency", "hour"])
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    if args.picture is None:
+        from pyvista.examples import mapfile
+
+        args.picture = mapfile
+    pools = {"edges of a picture": seen_pool(args.picture), "random pixels": random_pool(3_000_000)}
+    rows: list[dict[str, Any]] = []
+    for scene, pool in pools.items():
+        for name, model in MODELS.items():
+            for what, measure in (("rate", rate), ("latency", latency)):
+                if what in args.only:
+                    rows.append({"what": what, "scene": scene, "model": name, **measure(args.device, pool, model)})
+                    print(json.dumps(rows[-1]), flush=True)
+    if "hour" in args.only:
+        rows.append({"what": "hour", **hour(args.device, pools["edges of a picture"])})
+        print(json.dumps(rows[-1]), flush=True)
+    if args.out:
+        found = {"machine": machine(args.device), "device": args.device, "rows": rows}
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+    return int(not all(row["ok"] for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

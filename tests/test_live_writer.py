@@ -1,0 +1,348 @@
+"""Recordings that grow: whole at the end, and sound whatever ends them."""
+
+import itertools
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import hdf5plugin  # noqa: F401
+import numpy as np
+import pytest
+from io_samples import refusal
+
+from amiwarp.camera import Camera, RadialTangential
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events
+from amiwarp.io import RecordingWriter, open_recording
+from amiwarp.io.chunks import CHUNK
+from amiwarp.io.live_writer import WASTE, LiveWriter
+from amiwarp.optics import FlatSide, Prism
+
+SIZE = (320, 240)
+CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))
+PRISM = Prism(0.04, 1.5, FlatSide.CAMERA)
+
+
+def make(count: int, *, start: int = 5_000_000, seed: int = 0, mean_us: float = 3.0) -> Events:
+    rng = np.random.default_rng(seed)
+    t = start + np.cumsum(rng.poisson(mean_us, count))
+    x, y = (rng.integers(0, side, count) for side in SIZE)
+    return Events.from_arrays(x, y, t, rng.integers(0, 2, count))
+
+
+def cut(events: Events, least: int, most: int) -> list[Events]:
+    """In packets of random size."""
+    rng = np.random.default_rng(1)
+    edges = [0]
+    while edges[-1] < len(events):
+        edges.append(min(edges[-1] + int(rng.integers(least, most)), len(events)))
+    return [events[a:b] for a, b in itertools.pairwise(edges)]
+
+
+def live(path: Path, **options: object) -> LiveWriter:
+    return LiveWriter(path, width=SIZE[0], height=SIZE[1], **options)  # type: ignore[arg-type]
+
+
+def read(path: Path) -> Events:
+    return Events.concatenate(list(open_recording(path).events.blocks()))
+
+
+def assert_equal(got: Events, expected: Events) -> None:
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), strict=True)
+
+
+@pytest.mark.parametrize("flush_s", [0.0, 1e9])
+def test_everything_comes_back(tmp_path, flush_s):
+    events = make(2 * CHUNK + 12_345)
+    t, angle = np.arange(4_990_000, 7_000_000, 1000), np.linspace(-1.0, 700.0, 2010)
+    path = tmp_path / "a.h5"
+    with live(path, camera=CAMERA, prism=PRISM, metadata={"place": "roof"}, flush_s=flush_s) as writer:
+        for k, packet in enumerate(cut(events, 15_000, 40_000)):
+            writer.append(packet)
+            writer.append_encoder(t[100 * k : 100 * k + 100], angle[100 * k : 100 * k + 100], t[100 * k : 100 * k + 1])
+        writer.append_encoder(t[100 * k + 100 :], angle[100 * k + 100 :])
+        assert len(writer) == len(events)
+        assert not path.exists()
+    assert os.listdir(tmp_path) == ["a.h5"]
+    recording = open_recording(path)
+    assert_equal(read(path), events)
+    assert (recording.camera, recording.prism) == (CAMERA, PRISM)
+    assert recording.metadata == {"place": "roof", "format": "native"}
+    np.testing.assert_array_equal(recording.encoder.t, t)
+    np.testing.assert_array_equal(recording.encoder.angle, angle)
+    np.testing.assert_array_equal(recording.encoder.index_t, t[: 100 * k + 1 : 100])
+    with RecordingWriter(tmp_path / "b.h5", width=SIZE[0], height=SIZE[1]) as whole:
+        whole.append(events)
+    with h5py.File(path) as got, h5py.File(tmp_path / "b.h5") as expected:
+        for name in ("events/x", "events/t", "ms_to_idx", "t_offset"):
+            np.testing.assert_array_equal(got[name][()], expected[name][()], strict=True)
+            assert got[name].dtype == expected[name].dtype
+    wasted = os.path.getsize(path) - os.path.getsize(tmp_path / "b.h5")
+    assert wasted < (WASTE if flush_s == 0.0 else 500_000)
+
+
+def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
+    sensor = make(CHUNK + 99)
+    x = sensor.x.astype(np.float32) - 20.25
+    x[::1000] = np.nan
+    events = Events(x, sensor.y.astype(np.float32), sensor.t, sensor.p)
+    inside, extrapolated = x >= -0.5, sensor.p > 0
+    with live(tmp_path / "a.h5", compensated=True) as writer:
+        for start in range(0, len(events), 50_000):
+            which = slice(start, start + 50_000)
+            writer.append(events[which], inside=inside[which], extrapolated=extrapolated[which])
+        with pytest.raises(AmiwarpError, match=r"a\.h5: compensated events come with inside"):
+            writer.append(events)
+    source = open_recording(tmp_path / "a.h5").events
+    assert_equal(read(tmp_path / "a.h5"), events)
+    np.testing.assert_array_equal(source.inside(0, len(events)), inside)
+    np.testing.assert_array_equal(source.extrapolated(7, len(events)), extrapolated[7:])
+    with live(tmp_path / "b.h5") as writer, pytest.raises(AmiwarpError, match=r"b\.h5: events come with float32"):
+        writer.append(events)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_copy_at_any_moment_is_a_recording(tmp_path, seed):
+    """What is on the disk is what a crash would leave."""
+    rng = random.Random(seed)
+    events, given = make(CHUNK + 60_000, seed=seed), 0
+    with live(tmp_path / "a.h5", flush_s=0.0 if seed else 1e9) as writer:
+        for k, packet in enumerate(cut(events, 1, 30_000)):
+            writer.append(packet)
+            writer.append_encoder([4_000_000 + 1000 * k, 4_000_500 + 1000 * k], [k, k + 0.5])
+            given += len(packet)
+            if rng.random() < 0.2:
+                shutil.copy(writer.part, tmp_path / "copy.h5")
+                recording = open_recording(tmp_path / "copy.h5")
+                assert len(recording.events) == (given if seed else given - given % CHUNK)
+                assert_equal(recording.events.slice(0, given), events[: len(recording.events)])
+                if seed:
+                    assert recording.encoder.t[-1] == 4_000_500 + 1000 * k
+                    middle = int(events.t[given // 2])
+                    assert recording.events.find(middle) == np.searchsorted(events.t[:given], middle)
+                del recording
+                (tmp_path / "copy.h5").unlink()
+
+
+KILLED = """
+import sys, time
+import numpy as np
+from amiwarp.events import Events
+from amiwarp.io.live_writer import LiveWriter
+n, zeros = int(sys.argv[2]), np.zeros(int(sys.argv[2]), np.uint16)
+with LiveWriter(sys.argv[1], width=320, height=240, flush_s=0.05) as writer:
+    while True:
+        writer.append(Events(zeros, zeros, np.arange(len(writer), len(writer) + n), zeros.astype(np.uint8)))
+        writer.append_encoder(len(writer), len(writer) * 1e-3, [len(writer)])
+        print(time.monotonic_ns(), len(writer), flush=True)
+        time.sleep(0.0003)
+"""
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_killed_recording_lacks_its_last_moment(tmp_path, seed):
+    rng = random.Random(seed)
+    path = tmp_path / "a.h5"
+    with (
+        open(tmp_path / "log", "wb") as log,
+        subprocess.Popen([sys.executable, "-c", KILLED, path, str(10 ** (seed % 4 + 1))], stdout=log) as process,
+    ):
+        while not os.path.getsize(tmp_path / "log"):
+            assert process.poll() is None
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0.25, 0.5))
+        process.send_signal(signal.SIGKILL)
+    assert os.listdir(tmp_path).count("a.part.h5") == 1
+    lines = [tuple(map(int, line.split())) for line in (tmp_path / "log").read_text().splitlines()[:-1]]
+    recording = open_recording(tmp_path / "a.part.h5")
+    count = len(recording.events)
+    early = [number for at, number in lines if at < lines[-1][0] - 200_000_000]
+    assert count >= early[-1] > 0
+    np.testing.assert_array_equal(np.concatenate([block.t for block in recording.events.blocks()]), np.arange(count))
+    assert recording.encoder.t[-1] >= early[-1]
+    np.testing.assert_allclose(recording.encoder.angle, recording.encoder.t * 1e-3)
+    with pytest.raises(AmiwarpError, match=r"a\.part\.h5: is being written, or was left.*rename or delete"):  # noqa: SIM117
+        with live(path):
+            pass
+    assert not path.exists()
+
+
+FULL = """
+import resource, sys
+import numpy as np
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events
+from amiwarp.io.live_writer import LiveWriter
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+rng, n = np.random.default_rng(0), 10_000
+writer = LiveWriter(sys.argv[1], width=320, height=240, flush_s=float(sys.argv[3]))
+try:
+    with writer:
+        for k in range(1000):
+            t = 1000 * k + np.sort(rng.integers(0, 1000, n))
+            x, y = (rng.integers(0, 240, n).astype(np.uint16) for _ in range(2))
+            writer.append(Events(x, y, t, rng.integers(0, 2, n).astype(np.uint8)))
+            writer.append_encoder([1000 * k, 1000 * k + 500], [k, k + 0.5])
+except AmiwarpError as error:
+    print(len(writer), error)
+"""
+
+
+@pytest.mark.parametrize(("limit", "flush_s"), [(1000, 1.0), (4_500_000, 0.0), (7_000_000, 1e9), (9_000_000, 0.01)])
+def test_a_full_disk_keeps_all_that_came_before(tmp_path, limit, flush_s):
+    path = tmp_path / "a.h5"
+    arguments = [sys.executable, "-X", "dev", "-c", FULL, path, str(limit), str(flush_s)]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    count, _, said = done.stdout.partition(" ")
+    assert done.stderr == ""
+    if limit < 10_000:
+        assert said.strip() == f"{path}: cannot be begun: File too large; choose another place"
+        assert os.listdir(tmp_path) == []
+        return
+    assert said.strip() == (
+        f"{path}: File too large after {count} events; it holds these; make room, or write to another disk"
+    )
+    assert os.listdir(tmp_path) == ["a.h5"]
+    recording = open_recording(path)
+    assert len(read(path)) == len(recording.events) == int(count) > 0
+    assert 2 * (int(count) // 10_000) - len(recording.encoder.t) in (0, 2)
+    h5py.File(path).close()  # closed as it should be
+
+
+def test_an_empty_recording(tmp_path):
+    with live(tmp_path / "a.h5") as writer:
+        writer.tick()
+        writer.append(Events.empty())
+        shutil.copy(writer.part, tmp_path / "copy.h5")
+    for name in ("a.h5", "copy.h5"):
+        recording = open_recording(tmp_path / name)
+        assert (len(recording.events), recording.encoder, recording.events.size) == (0, None, SIZE)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_an_exception_keeps_what_was_appended(tmp_path, error):
+    events = make(1000)
+    with pytest.raises(error) as caught:  # noqa: PT012, SIM117
+        with live(tmp_path / "a.h5") as writer:
+            writer.append(events)
+            raise error
+    assert caught.value.__notes__ == [f"{tmp_path / 'a.h5'}: holds the 1000 events up to then"]
+    assert_equal(read(tmp_path / "a.h5"), events)
+    assert os.listdir(tmp_path) == ["a.h5"]
+
+
+def test_the_file_that_was_there_is_replaced_at_the_end(tmp_path):
+    path = tmp_path / "a.h5"
+    path.write_bytes(b"old")
+    with live(path) as writer:
+        writer.append(make(10))
+        writer.tick()
+        assert path.read_bytes() == b"old"
+    assert len(read(path)) == 10
+
+
+@pytest.mark.parametrize(
+    ("append", "message"),
+    [
+        (lambda w: w.append(make(5)[::-1]), "event 11 .* earlier"),
+        (lambda w: w.append(make(5, start=1000)), "event 10 .* earlier than the one before"),
+        (lambda w: w.append(Events.from_arrays([320], [0], [9_000_000], [0])), "event 10 .* outside the 320x240 frame"),
+        (lambda w: w.append(make(5), inside=np.ones(5)), "a sensor's with neither"),
+        (lambda w: w.append(make(1, start=2**61)), "timestamp is damaged"),
+        (lambda w: w.append_encoder([7, 6], [0.0, 0.0]), "encoder samples 7 .. 6 us do not follow"),
+        (lambda w: w.append_encoder([5, 6], [0.0, 0.0]), "encoder samples 5 .. 6 us do not follow 5 us"),
+        (lambda w: w.append_encoder([6], [np.nan]), "finite angles"),
+        (lambda w: w.append_encoder([6], [0.0, 1.0]), "one length"),
+    ],
+)
+def test_what_is_refused_does_not_end_the_recording(tmp_path, append, message):
+    with live(tmp_path / "a.h5") as writer:
+        writer.append(make(10))
+        writer.append_encoder([4, 5], [0.0, 0.1])
+        with pytest.raises(AmiwarpError, match=message) as caught:
+            append(writer)
+        assert "a.h5: " in str(caught.value)
+        writer.append(make(3, start=6_000_000))
+        writer.append_encoder([6], [0.2])
+    recording = open_recording(tmp_path / "a.h5")
+    assert len(recording.events) == 13
+    assert recording.encoder.t.tolist() == [4, 5, 6]
+
+
+def test_writer_refuses_its_path_and_options(tmp_path):
+    with pytest.raises(AmiwarpError, match="does not exist"), live(tmp_path / "no" / "a.h5"):
+        pass
+    with pytest.raises(AmiwarpError, match="give both one size"):
+        LiveWriter(tmp_path / "a.h5", width=10, height=10, camera=CAMERA)
+    with pytest.raises(AmiwarpError, match=r"a\.h5: making the file"), live(tmp_path / "a.h5", metadata={"n": "a\0b"}):
+        pass
+    with pytest.raises(AmiwarpError, match="outside the writer's with block"):
+        live(tmp_path / "a.h5").append(make(1))
+    assert os.listdir(tmp_path) == []
+    with live(tmp_path / "a.h5") as writer:
+        writer.append(make(1))
+    recording = open_recording(tmp_path / "a.h5")
+    with pytest.raises(AmiwarpError, match="is being read"), live(tmp_path / "a.h5"):
+        pass
+    assert len(recording.events) == 1
+
+
+@pytest.mark.parametrize("samples", [2, 20_000])
+def test_an_encoder_set_takes_the_place_of_samples(tmp_path, samples):
+    t = np.arange(samples) * 1000
+    encoder = Encoder(t, t * 1e-3, 12.5, t[1:2])
+    with live(tmp_path / "a.h5", flush_s=0.0) as writer:
+        writer.append_encoder(np.arange(9000), np.arange(9000.0), [17, 18])
+        writer.append(make(10))
+        writer.set_encoder(encoder)
+    got = open_recording(tmp_path / "a.h5").encoder
+    assert got.clock_offset_us == 12.5
+    for name in ("t", "angle", "index_t"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(encoder, name))
+
+
+def test_what_was_written_anew_is_left_out_of_the_finished_file(tmp_path):
+    events = make(200_000)
+    with live(tmp_path / "a.h5", camera=CAMERA, metadata={"place": "roof"}, flush_s=0.0) as writer:
+        writer.append_encoder([1, 2, 3], [0.0, 0.1, 0.2])
+        for packet in cut(events, 1000, 2000):
+            writer.append(packet)
+        grown = os.path.getsize(writer.part)
+    assert grown > 20_000_000 > 20 * os.path.getsize(tmp_path / "a.h5")
+    recording = open_recording(tmp_path / "a.h5")
+    assert recording.metadata == {"place": "roof", "format": "native"}
+    assert (recording.camera, recording.encoder.t.tolist()) == (CAMERA, [1, 2, 3])
+    assert_equal(read(tmp_path / "a.h5"), events)
+    assert os.listdir(tmp_path) == ["a.h5"]
+
+
+def test_a_damaged_part_is_refused_at_once(tmp_path):
+    with live(tmp_path / "a.h5", flush_s=0.0) as writer:
+        writer.append(make(3000))
+        writer.append_encoder([1, 2, 3], [0.0, 0.1, 0.2])
+        data = writer.part.read_bytes()
+    data = data[: len(data.rstrip(b"\0")) + 100]
+    rng, outcomes = random.Random(0), {"read": 0, "refused": 0}
+    for k in range(60):
+        mutant = bytearray(data)
+        if k % 3:
+            for _ in range(k % 3):
+                mutant[rng.randrange(48, 12_000)] ^= 1 << rng.randrange(8)
+        else:
+            del mutant[rng.randrange(len(mutant)) :]
+        path = tmp_path / f"{k}.h5"
+        path.write_bytes(mutant)
+        began = time.monotonic()
+        said = refusal(read, path)
+        assert said is None or str(path) in said
+        outcomes["read" if said is None else "refused"] += 1
+        assert time.monotonic() - began < 2.0
+    assert min(outcomes.values()) > 5

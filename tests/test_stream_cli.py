@@ -1,0 +1,237 @@
+"""``amiwarp live`` and ``record`` as commands: a whole rig, Ctrl-C and SIGKILL at any moment, a full disk, pipes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from amiwarp.calib.result import Calibration
+from amiwarp.camera import Camera
+from amiwarp.cli.app import app
+from amiwarp.compensate import compensate
+from amiwarp.encoder import Encoder
+from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.io import open_recording, save_recording
+from amiwarp.optics import Prism
+
+CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
+SCRIPT = (
+    "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); sys.argv[0] = 'amiwarp'; "
+    "from amiwarp.cli.app import main; print('up', file=sys.stderr, flush=True); main()"
+)
+"""A shell's job in the background ignores Ctrl-C, and so would its children."""
+SENT = 400_000
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of four seconds, one without encoder, and a calibration."""
+    path, rng = tmp_path_factory.mktemp("stream"), np.random.default_rng(0)
+    t = np.sort(rng.integers(0, 4_000_000, SENT))
+    x, y = rng.integers(0, 64, SENT), rng.integers(0, 48, SENT)
+    events = MemoryEvents(Events.from_arrays(x, y, t, rng.integers(0, 2, SENT)), 64, 48)
+    encoder = Encoder.constant_speed(720.0, -5000, 4_005_000)
+    save_recording(path / "recording.h5", Recording(events, CAMERA, encoder, PRISM))
+    save_recording(path / "still.h5", Recording(events, CAMERA))
+    values = {"apex": PRISM.apex, "phase": 0.4}
+    Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(path / "c.json")
+    return path
+
+
+def start(args: Sequence[str | Path], **given: object) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, *map(str, args)], env=environment, text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, **given,
+    )  # type: ignore[call-overload,no-any-return]  # fmt: skip
+
+
+def times(path: Path) -> np.ndarray:
+    events = open_recording(path).events
+    return events.slice(0, len(events)).t if len(events) else np.zeros(0, np.int64)
+
+
+def test_a_replayed_file_is_compensated_recorded_and_reported(folder: Path, tmp_path: Path) -> None:
+    args = ["live", folder / "recording.h5", "--fast", "--calibration", folder / "c.json", "--json", "--device", "cpu"]
+    done = CliRunner().invoke(
+        app, [*map(str, args), "--out", str(tmp_path / "o.h5"), "--record", str(tmp_path / "r.h5")]
+    )
+    assert done.exit_code == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["events"] == said["compensated"] == SENT
+    assert said["dropped"] == said["without_angle"] == said["late"] == 0
+    np.testing.assert_array_equal(times(tmp_path / "r.h5"), times(folder / "recording.h5"))
+    compensate(open_recording(tmp_path / "r.h5"), Calibration.load(folder / "c.json"), tmp_path / "offline.h5")
+    live, offline = (open_recording(tmp_path / name).events for name in ("o.h5", "offline.h5"))
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(live.slice(0, SENT), name), getattr(offline.slice(0, SENT), name))
+    assert {p.name for p in tmp_path.iterdir()} == {"o.h5", "r.h5", "offline.h5"}
+
+
+@pytest.mark.parametrize("after", [0.0, 0.3, 1.2, 2.2])
+def test_interrupted_recordings_are_whole_files(folder: Path, tmp_path: Path, after: float) -> None:
+    """Ctrl-C while it starts leaves nothing; later, all that had come."""
+    out = tmp_path / "r.h5"
+    with start(["record", folder / "recording.h5", out, "--json"]) as process:
+        try:
+            assert process.stderr is not None
+            assert process.stderr.readline() == "up\n"
+            time.sleep(after)
+            process.send_signal(signal.SIGINT)
+            said, error = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    if process.returncode == 130:
+        assert "interrupted" in error
+        assert list(tmp_path.iterdir()) == []
+        return
+    assert (process.returncode, error) == (0, "")
+    assert json.loads(said)["events"] == len(times(out))
+    assert {p.name for p in tmp_path.iterdir()} == {"r.h5"}
+    np.testing.assert_array_equal(times(out), times(folder / "recording.h5")[: len(times(out))])
+
+
+def test_a_killed_recording_holds_all_but_its_last_second(folder: Path, tmp_path: Path) -> None:
+    out, part = tmp_path / "r.h5", tmp_path / "r.part.h5"
+    with start(["record", folder / "recording.h5", out]) as process:
+        try:
+            until = time.monotonic() + 60.0
+            while not part.exists():
+                assert time.monotonic() < until
+                time.sleep(0.01)
+            began = time.monotonic()
+            time.sleep(2.5)
+            lasted = time.monotonic() - began
+        finally:
+            process.kill()
+            process.communicate()
+    assert not out.exists()
+    found, sent = times(part), times(folder / "recording.h5")
+    np.testing.assert_array_equal(found, sent[: len(found)])
+    assert found[-1] > (lasted - 1.2) * 1e6  # a fifth of a second to open the file
+    recording = open_recording(part)
+    assert recording.encoder is not None
+    assert recording.encoder.coverage[1] > found[-1] - 200_000
+
+
+def test_a_full_disk_ends_it_and_keeps_what_came(folder: Path, tmp_path: Path) -> None:
+    """The limit on a file's size stands for the disk's end."""
+    out, most = tmp_path / "r.h5", 4_600_000
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+
+    with start(["record", folder / "recording.h5", out, "--fast"], preexec_fn=limit) as process:
+        _, error = process.communicate(timeout=60)
+    assert process.returncode == 1
+    line = error.splitlines()[-1]
+    assert str(out) in line
+    assert "make room" in line
+    kept = times(out)
+    assert f"{len(kept)} events" in line
+    np.testing.assert_array_equal(kept, times(folder / "recording.h5")[: len(kept)])
+    assert {p.name for p in tmp_path.iterdir()} == {"r.h5"}
+
+
+def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
+    """The emulator with its camera, ``live`` at its port, what comes in handed on to a ``record``."""
+    rig = ["emulate", "--link", tmp_path / "prism", "--recording", folder / "recording.h5", "--counts-per-turn", 65536]
+    served, handed = f"unix:{tmp_path / 'camera'}", f"unix:{tmp_path / 'handed'}"
+    with start([*rig, "--camera", served]) as emulator:
+        try:
+            assert emulator.stdout is not None
+            assert emulator.stdout.readline().strip() == str(tmp_path / "prism")
+            args = ["live", served, "--port", tmp_path / "prism", "--calibration", folder / "c.json", "--device", "cpu"]
+            files = ["--out", tmp_path / "o.h5", "--record", tmp_path / "r.h5", "--raw-to", handed, "--wait-ms", 50]
+            with start([*args, *files, "--json"]) as live:
+                while not (tmp_path / "handed").exists():
+                    assert live.poll() is None, live.communicate()
+                    time.sleep(0.02)
+                with start(["record", handed, tmp_path / "h.h5", "--json"]) as record:
+                    said, error = live.communicate(timeout=60)
+                    recorded, other = record.communicate(timeout=60)
+            assert live.returncode == 0, error
+            assert record.returncode == 0, other
+            emulator.communicate(timeout=30)
+            assert emulator.returncode == 0
+        finally:
+            emulator.kill()
+    data = json.loads(said)
+    assert data["events"] == data["compensated"] == SENT
+    assert data["extrapolated"] < 0.1 * SENT
+    compensate(open_recording(tmp_path / "r.h5"), Calibration.load(folder / "c.json"), tmp_path / "offline.h5")
+    live_events, offline = (open_recording(tmp_path / name).events.slice(0, SENT) for name in ("o.h5", "offline.h5"))
+    np.testing.assert_array_equal(live_events.t, offline.t)
+    apart = np.hypot(live_events.x - offline.x, live_events.y - offline.y)
+    assert np.nanpercentile(apart, 90) <= 0.01
+    assert json.loads(recorded)["events"] > 0.8 * SENT  # it came a little late
+    assert not [p for p in tmp_path.iterdir() if p.name in ("prism", "camera", "handed")]
+
+
+def test_packets_go_through_pipes(folder: Path, tmp_path: Path) -> None:
+    """``live --raw-to -`` into ``record -``."""
+    args = ["live", folder / "recording.h5", "--fast", "--calibration", folder / "c.json", "--raw-to", "-"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    words = [sys.executable, "-c", "from amiwarp.cli.app import main; main()"]
+    with subprocess.Popen(
+        [*words, *map(str, args), "--device", "cpu"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as live:
+        out = subprocess.run(
+            [*words, "record", "-", str(tmp_path / "r.h5"), "--json"], env=environment, stdin=live.stdout,
+            capture_output=True, check=True,
+        )  # fmt: skip
+        assert live.stderr is not None
+        assert b"400,000 events" in live.stderr.read()
+    assert json.loads(out.stdout)["events"] == SENT
+    np.testing.assert_array_equal(times(tmp_path / "r.h5"), times(folder / "recording.h5"))
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["live", "still.h5", "--calibration", "c.json"], "still.h5: gives no encoder samples"),
+        (["record", "still.h5", "o.h5"], "give the controller's --port"),
+        (["live", "recording.h5", "--calibration", "c.json", "--adaptive"], "give the controller's --port"),
+        (["live", "nowhere.h5", "--calibration", "c.json"], "nowhere.h5"),
+        (["live", "tcp:127.0.0.1:1", "--calibration", "c.json"], "tcp:127.0.0.1:1"),
+        (["live", "recording.h5", "--calibration", "c.json", "--port", "/dev/no-such-port"], "/dev/no-such-port"),
+        (["record", "recording.h5", "nowhere/o.h5", "--fast"], "nowhere"),
+        (["record", "dv", "o.h5"], "amiwarp[dv]"),
+    ],
+    ids=lambda v: " ".join(v) if isinstance(v, list) else "",
+)
+def test_bad_input_is_one_line(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], says: str
+) -> None:
+    monkeypatch.chdir(folder)
+    before = set(folder.iterdir())
+    done = CliRunner().invoke(app, args)
+    assert done.exit_code == 1
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert set(folder.iterdir()) == before
+
+
+def test_another_camera_is_refused(folder: Path, tmp_path: Path) -> None:
+    values = {"apex": PRISM.apex, "phase": 0.4}
+    other = Calibration("exact", Camera.from_fov(32, 24, 1.0), PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+    other.save(tmp_path / "other.json")
+    done = CliRunner().invoke(
+        app, ["live", str(folder / "recording.h5"), "--calibration", str(tmp_path / "other.json")]
+    )
+    assert done.exit_code == 1
+    assert re.search(r"is 64x48, the calibration is for 32x24", done.stderr)

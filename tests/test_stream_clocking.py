@@ -1,0 +1,94 @@
+"""The camera's clock beside the controller's: pulses find each other, whichever are missing; else arrivals tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from amiwarp.link.clocks import from_round_trips
+from amiwarp.stream.clocking import CameraClock
+
+OFFSET, DRIFT = 1_700_000_000_000_000, 40e-6
+
+
+def camera_time(t: float) -> int:
+    return round(t + OFFSET + DRIFT * t)
+
+
+def follow(
+    times: np.ndarray,
+    *,
+    delay_us: int = 8000,
+    sync: set[int] | None = None,
+    seen: set[int] | None = None,
+    seed: int = 0,
+) -> CameraClock:
+    """Pulses at the controller's ``times``; the numbers that the serial line and the camera report; 2 us of jitter."""
+    rng, clock = np.random.default_rng(seed), CameraClock()
+    heard = [(t + 500, "sync", k) for k, t in enumerate(times) if sync is None or k in sync]
+    heard += [
+        (t + delay_us + rng.integers(0, 3000), "trigger", k) for k, t in enumerate(times) if seen is None or k in seen
+    ]
+    for host, kind, k in sorted(heard):
+        jitter = int(rng.integers(-2, 3))
+        if kind == "sync":
+            clock.sync(int(times[k]), int(host))
+        else:
+            clock.triggers([camera_time(times[k]) + jitter], int(host))
+    return clock
+
+
+@pytest.mark.parametrize("delay_us", [0, 8000, 40_000])
+def test_pulses_at_even_distances_meet_their_own(delay_us: int) -> None:
+    clock = follow(np.arange(60) * 100_000, delay_us=delay_us).clock(None)
+    assert clock is not None
+    late = 6_000_000
+    assert abs(int(clock(late)) - camera_time(late)) <= 4
+    assert clock.drift == pytest.approx(DRIFT, abs=4e-6)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pulses_that_one_side_missed_do_no_harm(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.arange(60) * 100_000
+    sync, seen = (set(np.flatnonzero(rng.uniform(size=60) > 0.3).tolist()) for _ in range(2))
+    clock = follow(times, sync=sync, seen=seen, seed=seed).clock(None)
+    assert clock is not None
+    assert abs(int(clock(6_000_000)) - camera_time(6_000_000)) <= 8
+
+
+def test_three_pulses_are_enough_and_two_are_not() -> None:
+    assert follow(np.arange(2) * 100_000).clock(None) is None
+    clock = follow(np.arange(3) * 100_000).clock(None)
+    assert clock is not None
+    assert abs(int(clock(300_000)) - camera_time(300_000)) <= 20
+
+
+def test_after_a_restart_of_the_controller_it_is_found_anew() -> None:
+    clock = follow(np.arange(10) * 100_000)
+    clock.restart()
+    assert clock.clock(None) is None
+    for k in range(5):
+        clock.sync(k * 100_000, 9_000_000 + k * 100_000)
+        clock.triggers([5_000_000 + k * 100_000], 9_004_000 + k * 100_000)
+    again = clock.clock(None)
+    assert again is not None
+    assert abs(int(again(400_000)) - 5_400_000) <= 3
+
+
+def test_without_pulses_arrivals_tell_within_what_they_say() -> None:
+    """The host's clock is 7 s ahead of the controller's; packets need 2 ms and up to 3 more."""
+    rng, clock = np.random.default_rng(0), CameraClock()
+    sent = np.arange(20) * 50_000 + 7_000_000
+    host = from_round_trips(sent, sent - 7_000_000 + 150, sent + 300)
+    for t in range(0, 1_000_000, 1000):
+        clock.packet(camera_time(t), t + 7_000_000 + 2000 + int(rng.integers(0, 3000)))
+    found = clock.clock(host)
+    assert found is not None
+    error = int(found(1_000_000)) - camera_time(1_000_000)
+    assert -2500 < error < 0  # by the shortest way of the packets, which nothing tells
+    assert found.offset_std_us > 1000
+
+
+def test_nothing_is_known_at_first() -> None:
+    assert CameraClock().clock(None) is None

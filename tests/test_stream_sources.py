@@ -1,0 +1,514 @@
+"""Sources of live events and sinks: files, sockets, pipes, and cameras by stand-ins for their libraries."""
+
+import itertools
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+from amiwarp.camera import Camera
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events
+from amiwarp.io import RecordingWriter
+from amiwarp.optics import Prism
+from amiwarp.stream import sockets, sources
+from amiwarp.stream.packets import (
+    HEADER,
+    Decoder,
+    End,
+    Hello,
+    Packet,
+    encode_compensated,
+    encode_encoder,
+    encode_end,
+    encode_events,
+    encode_hello,
+    encode_triggers,
+)
+from amiwarp.stream.sockets import PipeSink, SocketSink, open_sink
+from amiwarp.stream.sources import FileSource, StreamSource, open_source
+
+SIZE = (320, 240)
+CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5)
+HELLO = encode_hello(*SIZE, CAMERA, Prism(0.04))
+
+
+def make(count: int, *, start: int = 5_000_000, seed: int = 0, mean_us: float = 3.0) -> Events:
+    rng = np.random.default_rng(seed)
+    t = start + np.cumsum(rng.poisson(mean_us, count))
+    return Events.from_arrays(rng.integers(0, 320, count), rng.integers(0, 240, count), t, rng.integers(0, 2, count))
+
+
+def assert_equal(got: Events, expected: Events) -> None:
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), strict=True)
+
+
+def joined(packets: list[Packet]) -> Events:
+    return Events.concatenate([packet.events for packet in packets if len(packet.events)])
+
+
+def record(path: Path, events: Events, encoder: Encoder | None = None) -> Path:
+    with RecordingWriter(path, width=320, height=240, camera=CAMERA, prism=Prism(0.04), encoder=encoder) as writer:
+        writer.append(events)
+    return path
+
+
+class Host:
+    """A clock that only sleeping moves on."""
+
+    def __init__(self) -> None:
+        self.now = 70_000_000
+        self.slept: list[float] = []
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += round(seconds * 1e6)
+
+
+def test_a_file_is_replayed_at_its_pace(tmp_path):
+    gap = 130_000
+    events = Events.concatenate([make(3000), make(2000, start=5_009_000 + gap)])
+    host = Host()
+    path = record(tmp_path / "a.h5", events)
+    source = FileSource(path, pace=0.5, packet_us=2000, clock=lambda: host.now, sleep=host.sleep)
+    assert (source.size, source.camera, source.prism) == (SIZE, CAMERA, Prism(0.04))
+    assert (source.has_encoder, source.name) == (False, str(path))
+    got = []
+    for packet in source.packets():
+        got.append(packet)
+        if len(packet.events):
+            over = (int(packet.events.t[0]) - int(events.t[0])) // 2000 * 2000 + 2000
+            assert host.now == packet.arrived_us == 70_000_000 + 2 * over
+            assert np.ptp(packet.events.t) < 2000
+    assert_equal(joined(got), events)
+    assert max(host.slept) <= 0.05
+    assert sum(not len(packet.events) for packet in got) == 2 * gap // 50_000
+    source.close()
+
+
+def test_a_slow_reader_gets_all_and_is_told_when_it_came(tmp_path):
+    events, host = make(3000), Host()
+    source = FileSource(record(tmp_path / "a.h5", events), clock=lambda: host.now, sleep=host.sleep)
+    got = []
+    for packet in source.packets():
+        got.append(packet)
+        host.now += 5000  # takes five times as long as there is
+    assert host.slept == [0.001]
+    assert [packet.arrived_us for packet in got] == [70_001_000 + 1000 * k for k in range(len(got))]
+    assert_equal(joined(got), events)
+
+
+def test_encoder_samples_come_in_step_and_one_ahead(tmp_path):
+    t = np.arange(4_990_000, 5_050_000, 700)
+    encoder = Encoder(t + 300, np.linspace(0.0, 9.0, t.size), 300.25)
+    source = open_source(str(record(tmp_path / "a.h5", make(10_000), encoder)), pace=None, packet_us=1000)
+    assert source.has_encoder
+    got, seen = list(source.packets()), 0
+    for packet in got[:-1]:
+        end = int(packet.events.t[0] - got[0].events.t[0]) // 1000 * 1000 + 1000 + int(got[0].events.t[0])
+        seen += len(packet.encoder_t)
+        assert t[seen - 2] < end <= t[seen - 1]
+        assert packet.encoder_t.dtype == np.int64
+    assert not len(got[-1].events)
+    np.testing.assert_array_equal(np.concatenate([packet.encoder_t for packet in got]), t)
+    np.testing.assert_array_equal(np.concatenate([packet.encoder_angle for packet in got]), encoder.angle)
+
+
+def test_files_that_cannot_be_replayed(tmp_path):
+    moved = make(10)
+    moved = Events(moved.x.astype(np.float32), moved.y.astype(np.float32), moved.t, moved.p)
+    with pytest.raises(AmiwarpError, match=r"a\.h5: is compensated already"):
+        open_source(str(record(tmp_path / "a.h5", moved)))
+    path = str(record(tmp_path / "b.h5", make(10)))
+    for pace in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(AmiwarpError, match=r"pace = .*positive"):
+            open_source(path, pace=pace)
+    with pytest.raises(AmiwarpError, match="packet_us = 0"):
+        open_source(path, packet_us=0)
+    with pytest.raises(AmiwarpError, match="no such file"):
+        open_source(str(tmp_path / "c.h5"))
+
+
+def pipe(data: bytes) -> StreamSource:
+    """A source of all of a stream."""
+    reading, writing = os.pipe()
+    thread = threading.Thread(target=lambda: (os.write(writing, data), os.close(writing)))
+    thread.start()
+    try:
+        return StreamSource("the pipe", open(reading, "rb", buffering=0))
+    finally:
+        thread.join()
+
+
+def test_a_stream_brings_events_triggers_and_encoder():
+    events, edges, t, angle = make(3000), np.array([4, 5]), np.arange(7), np.arange(7.0)
+    parts = [HELLO, encode_events(events), encode_triggers(edges), encode_encoder(t, angle), HELLO, encode_end()]
+    source = pipe(b"".join(parts))
+    before = time.monotonic_ns() // 1000
+    first, second, third = source.packets()
+    assert (source.size, source.camera, source.prism) == (SIZE, CAMERA, Prism(0.04))
+    assert_equal(first.events, events)
+    np.testing.assert_array_equal(second.triggers, edges)
+    np.testing.assert_array_equal(third.encoder_t, t)
+    np.testing.assert_array_equal(third.encoder_angle, angle)
+    assert before <= first.arrived_us <= third.arrived_us
+    assert source.problem is None
+    source.close()
+
+
+@pytest.mark.parametrize(
+    ("tail", "problem"),
+    [
+        (b"", "ended without an end packet"),
+        (encode_events(make(9))[:-1], f"ended within the packet at byte {len(HELLO) + HEADER.size + 5 * 13}"),
+        (b"AM", f"ended within the packet at byte {len(HELLO) + HEADER.size + 5 * 13}"),
+    ],
+)
+def test_a_stream_that_breaks_off_is_used_up_to_there(tail, problem):
+    source = pipe(HELLO + encode_events(make(5)) + tail)
+    assert [len(packet.events) for packet in source.packets()] == [5]
+    assert source.problem == problem
+    source.close()
+
+
+@pytest.mark.parametrize(
+    ("tail", "message"),
+    [
+        (b"garbage, a good deal of it", f"packet at byte {len(HELLO) + HEADER.size + 5 * 13}: it begins with"),
+        (encode_compensated(Events.from_arrays([0.5], [0.5], [1], [1]), np.zeros(1, np.uint8)), "sends compensated"),
+        (encode_events(Events.from_arrays([320], [0], [1], [1])), "outside the 320x240 frame"),
+        (encode_encoder(np.arange(1), np.array([np.nan])), "not finite"),
+    ],
+)
+def test_a_wrong_stream_is_an_error_after_all_before_it(tail, message):
+    source, got = pipe(HELLO + encode_events(make(5)) + tail), []
+    with pytest.raises(AmiwarpError, match=f"the pipe: .*{message}"):  # noqa: PT012
+        for packet in source.packets():
+            got.append(len(packet.events))
+    assert got == [5]
+    source.close()
+
+
+def test_a_stream_begins_with_a_hello(monkeypatch):
+    for data, message in ((encode_end(), "begins without a hello"), (b"", "ended without"), (b"AMI", "ended within")):
+        with pytest.raises(AmiwarpError, match=f"the pipe: {message}"):
+            pipe(data)
+    monkeypatch.setattr(sources, "HELLO_S", 0.06)
+    ours, theirs = socket.socketpair()
+    with ours, theirs, pytest.raises(AmiwarpError, match="the silent: sent no hello"):
+        StreamSource("the silent", ours.makefile("rb", buffering=0))
+
+
+def test_standard_input_and_output(tmp_path):
+    events = make(700)
+    with open(tmp_path / "stream", "wb") as file, PipeSink(HELLO, file) as sink:
+        sink.send(encode_events(events))
+    script = (
+        "from amiwarp.stream.packets import encode_events, encode_hello\n"
+        "from amiwarp.stream.sockets import open_sink\n"
+        "from amiwarp.stream.sources import open_source\n"
+        "source = open_source('-')\n"
+        "with open_sink('-', encode_hello(*source.size, source.camera, source.prism)) as sink:\n"
+        "    for packet in source.packets():\n"
+        "        sink.send(encode_events(packet.events))\n"
+        "source.close()\n"
+    )
+    with open(tmp_path / "stream", "rb") as file:
+        done = subprocess.run([sys.executable, "-X", "dev", "-c", script], stdin=file, capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == ((tmp_path / "stream").read_bytes(), b"")
+
+
+def test_a_pipe_that_nobody_reads(tmp_path):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "wb", buffering=0) as file, pytest.raises(AmiwarpError, match="standard output: Broken pipe"):
+        PipeSink(HELLO, file)
+
+
+@pytest.fixture(params=["tcp", "tcp6", "unix"])
+def address(request, tmp_path):
+    return {"tcp": "tcp::0", "tcp6": "tcp:[::1]:0", "unix": f"unix:{tmp_path}/socket"}[request.param]
+
+
+def test_any_number_of_clients_get_hello_packets_and_end(address, tmp_path):
+    events = make(60_000)
+    with SocketSink(address, HELLO) as sink:
+        assert sink.address.startswith("tcp:127.0.0.1:" if address == "tcp::0" else address[: address.rfind(":") + 1])
+        sink.send(encode_events(events[:10]))  # nobody is there yet
+        early = [sockets.connect(sink.address) for _ in range(2)]
+        sink.tick()
+        assert sink.clients == 2
+        late = sockets.connect(sink.address)
+        sink.send(encode_events(events[10:20]))
+        parts = [StreamSource("it", one.makefile("rb", buffering=0)) for one in (*early, late)]
+        got: list[list[Packet]] = [[] for _ in parts]
+
+        def collect(source, into):
+            into += source.packets()
+
+        threads = [threading.Thread(target=collect, args=pair) for pair in zip(parts, got, strict=True)]
+        for thread in threads:
+            thread.start()
+        for start in range(20, len(events), 5000):
+            sink.send(encode_events(events[start : start + 5000]))
+    for thread in threads:
+        thread.join(10.0)
+    for source, packets, connection in zip(parts, got, (*early, late), strict=True):
+        assert_equal(joined(packets), events[10:])
+        assert (source.problem, source.size, sink.lost) == (None, SIZE, 0)
+        source.close()
+        connection.close()
+    assert not (tmp_path / "socket").exists()
+
+
+def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path):
+    with SocketSink(f"unix:{tmp_path}/s", HELLO, most_bytes=1 << 18) as sink:
+        slow, quick, gone = (sockets.connect(sink.address) for _ in range(3))
+        sink.tick()
+        gone.close()
+        decoder, seen = Decoder("quick"), []
+        quick.setblocking(False)
+        for k in range(300):
+            sink.send(encode_events(make(1000, start=10_000 * k)))
+            try:
+                while True:
+                    seen += decoder.feed(quick.recv(1 << 20))
+            except BlockingIOError:
+                pass
+        assert sink.clients == 2
+        lost = sink.lost
+        held = sink._clients[0].waiting_bytes
+        assert 0 < held <= (1 << 18) + 20_000
+        thread = threading.Thread(target=sink.close)
+        thread.start()
+        slow.settimeout(5.0)
+        data = b"".join(iter(lambda: slow.recv(1 << 20), b""))
+        quick.setblocking(True)
+        seen += decoder.feed(b"".join(iter(lambda: quick.recv(1 << 20), b"")))
+        thread.join()
+    slow.close()
+    quick.close()
+    assert [type(message) for message in seen] == [Hello, *[Events] * 300, End]
+    got = list(Decoder("slow").feed(data))
+    assert isinstance(got[0], Hello)
+    assert isinstance(got[-1], End)
+    starts = [int(message.t[0]) // 10_000 for message in got[1:-1]]
+    assert len(starts) == 300 - lost < 300
+    assert all(a < b for a, b in itertools.pairwise(starts))
+
+
+def test_a_source_may_listen_for_its_sender(tmp_path):
+    path, events = tmp_path / "s", make(100)
+
+    def send() -> None:
+        while not path.exists():
+            time.sleep(0.002)
+        with sockets.connect(f"unix:{path}") as connection:
+            connection.sendall(HELLO)
+            connection.sendall(encode_events(events) + encode_end())
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    source = open_source(f"unix-listen:{path}")
+    assert_equal(joined(list(source.packets())), events)
+    thread.join()
+    source.close()
+    assert not path.exists()
+
+
+def test_a_silent_sender_brings_empty_packets():
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        theirs.sendall(HELLO)
+        source = StreamSource("the silent", ours.makefile("rb", buffering=0))
+        began = time.monotonic()
+        packets = source.packets()
+        for _ in range(2):
+            assert not len(next(packets).events)
+        assert 0.1 <= time.monotonic() - began < 1.0
+        half = encode_events(make(10))
+        theirs.sendall(half[:50])
+        assert not len(next(packets).events)
+        theirs.sendall(half[50:])
+        assert next(len(packet.events) for packet in packets if len(packet.events)) == 10
+        source.close()
+
+
+def test_addresses_that_are_none(tmp_path):
+    for address in ("tcp:host", "tcp:host:99999", "tcp:", "unix:", "tcp:1:x"):
+        with pytest.raises(AmiwarpError, match=f"{address}: is no address; give tcp:HOST:PORT or unix:PATH"):
+            open_source(address)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        taken = f"tcp:127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(AmiwarpError, match=f"{taken}: cannot listen there: .*in use"):
+            SocketSink(taken, HELLO)
+    for address in (taken, f"unix:{tmp_path}/nobody"):
+        with pytest.raises(AmiwarpError, match=f"{address}: .*start its sender first"):
+            open_source(address)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(AmiwarpError, match="cannot listen there"):
+        open_sink(f"unix:{tmp_path}/file", HELLO)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_socket_left_behind_is_replaced_one_in_use_is_not(tmp_path):
+    address = f"unix:{tmp_path}/s"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(f"{tmp_path}/s")
+    with SocketSink(address, HELLO), pytest.raises(AmiwarpError, match="cannot listen there"):
+        SocketSink(address, HELLO)
+    assert not (tmp_path / "s").exists()
+
+
+class FakeDv:
+    """As much of dv-processing 2.0 as is used."""
+
+    def __init__(self, batches: list[object], triggers: list[list[tuple[int, str]]]) -> None:
+        self.batches, self.triggers, self.calls = list(batches), list(triggers), []
+        descriptor = SimpleNamespace(serialNumber="DX0")
+        module = ModuleType("dv_processing")
+        module.TriggerType = SimpleNamespace(EXTERNAL_SIGNAL_RISING_EDGE="rising")
+        module.io = SimpleNamespace(camera=SimpleNamespace(discover=lambda: [descriptor], open=self.open))
+        self.module = module
+
+    def open(self, serial: str) -> "FakeDv":
+        self.calls.append(serial)
+        return self
+
+    def getEventResolution(self):
+        return (320, 240)
+
+    def setTimeInterval(self, interval):
+        self.calls.append(interval.microseconds)
+
+    def setDetectorRisingEdges(self, on):
+        self.calls.append("rising")
+
+    def setDetectorRunning(self, on):
+        self.calls.append("running")
+
+    def isRunning(self):
+        return bool(self.batches)
+
+    def getNextEventBatch(self):
+        events = self.batches.pop(0) if self.batches else None
+        if isinstance(events, Exception):
+            raise events
+        if events is None:
+            return None
+        kind = np.dtype([("timestamp", "<i8"), ("x", "<i2"), ("y", "<i2"), ("polarity", "i1")], align=True)
+        rows = np.zeros(len(events), kind)
+        for name, column in zip(kind.names, (events.t, events.x, events.y, events.p), strict=True):
+            rows[name] = column
+        return SimpleNamespace(numpy=lambda: rows)
+
+    def getNextTriggerBatch(self):
+        edges = self.triggers.pop(0) if self.triggers else None
+        return edges and [SimpleNamespace(timestamp=t, type=kind) for t, kind in edges]
+
+
+def test_a_camera_by_dv_processing(monkeypatch):
+    events = make(2000)
+    fake = FakeDv([events[:900], None, events[900:]], [[(5, "rising"), (6, "falling")], [], [(9, "rising")]])
+    monkeypatch.setitem(sys.modules, "dv_processing", fake.module)
+    source = open_source("dv", packet_us=500)
+    assert (source.size, source.camera, source.prism, source.has_encoder) == (SIZE, None, None, False)
+    assert fake.calls == ["DX0", 500, "rising", "running"]
+    got = []
+    with pytest.raises(AmiwarpError, match="dv: the camera stopped"):  # noqa: PT012
+        for packet in source.packets():
+            got.append(packet)
+    assert_equal(joined(got), events)
+    assert np.concatenate([packet.triggers for packet in got]).tolist() == [5, 9]
+    source.close()
+
+
+def test_a_quiet_camera_brings_empty_packets_and_its_errors_are_one_line(monkeypatch):
+    fake = FakeDv([None] * 2000 + [RuntimeError("lost\nStacktrace:\n 0# 0x0")], [])
+    monkeypatch.setitem(sys.modules, "dv_processing", fake.module)
+    packets = open_source("dv:DX0").packets()
+    began = time.monotonic()
+    assert not len(next(packets).events)
+    assert 0.05 <= time.monotonic() - began < 1.0
+    del fake.batches[:-1]
+    with pytest.raises(AmiwarpError, match="dv:DX0: stopped: lost; check cable"):
+        list(packets)
+    with pytest.raises(AmiwarpError, match=r"dv:DX9: no such camera \(found: DX0\)"):
+        open_source("dv:DX9")
+
+
+def test_a_camera_without_its_library(monkeypatch):
+    for name, remedy in (("dv_processing", r"amiwarp\[dv\]"), ("metavision_core.event_io", "install OpenEB")):
+        monkeypatch.setitem(sys.modules, name, None)
+        spec = "dv" if name.startswith("dv") else "prophesee:0004"
+        with pytest.raises(AmiwarpError, match=f"^{spec}: needs {name.partition('.')[0]} .*{remedy}"):
+            open_source(spec)
+
+
+def test_a_camera_by_metavision(monkeypatch):
+    events, calls = make(2000), []
+    edges = np.array([(1, 70, 0), (0, 80, 0), (1, 90, 0)], [("p", "<i2"), ("t", "<i8"), ("id", "<i2")])
+
+    class Reader:
+        def __init__(self) -> None:
+            self.edges = edges
+
+        def get_ext_trigger_events(self):
+            return self.edges
+
+        def clear_ext_trigger_events(self):
+            self.edges = edges[:0]
+
+    class EventsIterator:
+        reader = Reader()
+
+        @classmethod
+        def from_device(cls, device, delta_t):
+            calls.append((device.path, delta_t))
+            return cls()
+
+        def get_size(self):
+            return 240, 320
+
+        def __iter__(self):
+            for part in (events[:700], events[:0], events[700:]):
+                rows = np.zeros(len(part), [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+                for name in rows.dtype.names:
+                    rows[name] = getattr(part, name)
+                yield rows
+
+    def initiate_device(path):
+        enable = SimpleNamespace(enable=calls.append)
+        return SimpleNamespace(path=path, get_i_trigger_in=lambda: enable) if path != "none" else None
+
+    modules = {
+        "metavision_core": {},
+        "metavision_core.event_io": {"EventsIterator": EventsIterator},
+        "metavision_core.event_io.raw_reader": {"initiate_device": initiate_device},
+        "metavision_hal": {"I_TriggerIn": SimpleNamespace(Channel=SimpleNamespace(MAIN="main"))},
+    }
+    for name, content in modules.items():
+        module = ModuleType(name)
+        module.__dict__.update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    source, got = open_source("prophesee:0004", packet_us=2000), []
+    assert (calls, source.size) == (["main", ("0004", 2000)], SIZE)
+    with pytest.raises(AmiwarpError, match="prophesee:0004: the camera stopped"):  # noqa: PT012
+        for packet in source.packets():
+            got.append(packet)
+    assert [len(packet.events) for packet in got] == [700, 0, 1300]
+    assert_equal(joined(got), events)
+    assert got[0].triggers.tolist() == [70, 90]
+    assert not len(got[1].triggers)
+    source.close()
+    with pytest.raises(AmiwarpError, match="prophesee:none: no such camera"):
+        open_source("prophesee:none")
