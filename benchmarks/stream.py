@@ -160,7 +160,7 @@ def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> d
     error = check.error_px(model)
     return {"mev_s": LATENCY_MEV_S, "ms_median": float(median), "ms_p99": float(p99), "asked_ms": MOST_MS,
             "ms_slowest": max(late) * 1e-3, "guessed": guessed, "error_px": error,
-            "ok": p99 <= MOST_MS and error <= MOST_ERROR_PX}  # fmt: skip
+            "ok": bool(p99 <= MOST_MS) and error <= MOST_ERROR_PX}  # fmt: skip
 
 
 class Hour:

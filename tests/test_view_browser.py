@@ -19,7 +19,7 @@ from test_serve import served, until
 
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.camera import Camera
-from amiwarp.events import Recording
+from amiwarp.events import MemoryEvents, Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.motion import PrismMotion
 from amiwarp.optics import Prism
@@ -131,8 +131,8 @@ def opened(context: Any, tabs: Tabs, recording: Recording, nothing_fails: None) 
     """Opens pages, and closes them."""
     pages: list[Any] = []
 
-    def open_page(of: Recording | None = None, calibration: Calibration | None = None) -> Any:
-        pages.append(tabs.open(context, lambda: Inspector(of or recording, calibration)))
+    def open_page(of: Recording | None = None, calibration: Calibration | None = None, **more: Any) -> Any:
+        pages.append(tabs.open(context, lambda: Inspector(of or recording, calibration, **more)))
         return pages[-1]
 
     yield open_page
@@ -657,3 +657,31 @@ def test_without_encoder_and_prism_the_speed_that_is_set_brings_the_angle(opened
     page.mouse.up()
     until(lambda: sharpness(page)[1] < 0.9 * best)
     page.locator("#curve-text").filter(has_text="best at").wait_for()
+
+
+def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, recording: Recording) -> None:
+    """It grows by 5 ms each time the page asks; stopped, the page works on what it has."""
+    events, asked = recording.events, [0]
+    width, height = events.size
+
+    def latest() -> Recording:
+        asked.append(asked[-1] + 1)
+        end = events.t_first + round(1.2e3 * TURN_MS) + 5000 * asked[-1]
+        return replace(recording, events=MemoryEvents(events.between(events.t_first, end), width, height))
+
+    page = opened(of=latest(), latest=latest)
+    assert page.locator("#do-play").inner_text().lower() == "stop"
+    shown, picture = field(page, "start_ms"), source(page, "image-before")
+    until(lambda: field(page, "start_ms") > shown + 8.0 and source(page, "image-before") != picture)
+    page.locator("#do-play").click()
+    page.locator("#do-play").filter(has_text=re.compile("follow", re.I)).wait_for()
+    page.wait_for_timeout(300)  # what was asked for has come
+    times = len(asked)
+    page.wait_for_timeout(700)
+    assert len(asked) == times
+    start, counts = field(page, "start_ms"), page.locator("#events").inner_text()
+    enter(page, "apex", APEX_DEG)
+    until(lambda: sharpness(page)[1] > 0)
+    assert (field(page, "start_ms"), page.locator("#events").inner_text()) == (start, counts)
+    page.locator("#do-play").click()
+    until(lambda: field(page, "start_ms") > start)

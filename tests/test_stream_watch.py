@@ -1,0 +1,197 @@
+"""Beside a stream: the watch over the phase, the keeper of the speed, the last seconds as a recording, handing on."""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amiwarp.calib.result import Calibration
+from amiwarp.camera import Camera
+from amiwarp.compensator import Compensator
+from amiwarp.encoder import EncoderStream
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, Recording
+from amiwarp.io import save_recording
+from amiwarp.optics import Prism
+from amiwarp.simulate import SensorModel, simulate
+from amiwarp.stream.adaptive import SpeedController
+from amiwarp.stream.forward import Forward
+from amiwarp.stream.packets import Angles, Decoder
+from amiwarp.stream.ring import SECONDS, Ring, followed
+from amiwarp.stream.sources import open_source
+from amiwarp.stream.speed import SpeedKeeper
+from amiwarp.stream.watch import PhaseWatch
+
+CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
+BIAS_DEG = 3.5
+"""By which the sharpest phase may differ from the true one."""
+
+
+@pytest.fixture(scope="module")
+def recording(texture: np.ndarray) -> Recording:
+    return simulate(texture, CAMERA, PRISM, duration_s=0.4, seed=1, sensor=SensorModel.ideal())
+
+
+def known(recording: Recording, away_deg: float) -> Calibration:
+    assert recording.truth is not None
+    values = {"apex": PRISM.apex, "phase": recording.truth.parameters["phase"] - math.radians(away_deg)}
+    return Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+
+
+def streamed(recording: Recording) -> EncoderStream:
+    stream = EncoderStream()
+    assert recording.encoder is not None
+    stream.append(recording.encoder.t, recording.encoder.angle)
+    return stream
+
+
+def looked(watch: PhaseWatch, encoder: EncoderStream, until_s: float = 60.0) -> float:
+    """What the watch finds, which it is asked again and again as by a session."""
+    end = time.monotonic() + until_s
+    while (found := watch.look(encoder)) is None:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    return math.degrees(found)
+
+
+def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
+    """Of 4 deg the second time: told; the first look is what it is compared with."""
+    said: list[str] = []
+    watch, encoder = PhaseWatch(known(recording, 1.0), 0.0, said.append), streamed(recording)
+    watch.put(recording.events.slice(0, len(recording.events)))
+    first = looked(watch, encoder)
+    assert first == pytest.approx(1.0, abs=BIAS_DEG)
+    watch.close()
+    assert said == []
+    slipped = EncoderStream()
+    assert recording.encoder is not None
+    slipped.append(recording.encoder.t, recording.encoder.angle - math.radians(4.0))
+    watch.result()
+    while abs(looked(watch, slipped) - first) < 1.0:
+        time.sleep(0.01)
+    assert looked(watch, slipped) - first == pytest.approx(4.0, abs=0.5)
+    assert len(said) == 1
+    assert re.search(r"moved by \+(3\.[5-9]|4\.[0-5]) deg", said[0])
+    watch.close()
+
+
+def test_a_watch_tells_a_phase_that_is_far_off(recording: Recording) -> None:
+    said: list[str] = []
+    watch = PhaseWatch(known(recording, 12.0), 0.0, said.append)
+    watch.put(recording.events.slice(0, len(recording.events)))
+    assert looked(watch, streamed(recording)) == pytest.approx(12.0, abs=BIAS_DEG)
+    assert "calibrate anew" in said[0]
+    watch.close()
+
+
+def test_a_watch_says_nothing_of_too_little(recording: Recording) -> None:
+    watch = PhaseWatch(known(recording, 0.0), 0.0, print)
+    assert not watch.begin(streamed(recording))
+    watch.put(recording.events.slice(0, 1000))
+    assert not watch.begin(streamed(recording))
+    assert not watch.begin(EncoderStream())
+    assert watch.look(streamed(recording)) is None
+
+
+def kept(recording: Recording, controller: SpeedController, fail: bool = False) -> tuple[list[float], list[str]]:
+    asked: list[float] = []
+    said: list[str] = []
+
+    def set_speed(rpm: float, ramp: float) -> None:
+        assert ramp == controller.ramp_rpm_s
+        if fail:
+            raise AmiwarpError("refused by the controller")
+        asked.append(rpm)
+
+    encoder, model = streamed(recording), known(recording, 0.0).model
+    compensator, keeper = Compensator(model, encoder), SpeedKeeper(model, controller, set_speed, said.append)
+    for events in recording.events.blocks(duration_us=2000):
+        compensator.put(events, 0)
+        keeper.put(compensator.take(0), encoder)
+        keeper.close()
+    assert keeper.coverage is not None
+    assert 0.0 <= keeper.coverage <= 1.0
+    return asked, said
+
+
+def test_a_keeper_asks_for_less_where_there_are_too_many_events(recording: Recording) -> None:
+    asked, said = kept(recording, SpeedController(720.0, most_mev_s=0.01))
+    assert len(asked) > 3
+    assert asked == sorted(asked, reverse=True)
+    assert 120.0 <= asked[-1] < 700.0
+    assert said == []
+
+
+def test_a_keeper_says_what_the_controller_refuses(recording: Recording) -> None:
+    asked, said = kept(recording, SpeedController(720.0, most_mev_s=0.01), fail=True)
+    assert asked == []
+    assert set(said) == {"refused by the controller"}
+
+
+def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:
+    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made"})()
+    ring = Ring(source)
+    assert ring.recording() is None
+    rng = np.random.default_rng(0)
+    for start in range(0, 10_000_000, 50_000):
+        t = np.sort(rng.integers(start, start + 50_000, 100))
+        ring.append(Events.from_arrays(rng.integers(0, 120, 100), rng.integers(0, 90, 100), t, np.zeros(100)))
+        samples = np.arange(start, start + 50_000, 1000)
+        ring.append_encoder(samples, samples * 7.5e-5)
+    found = ring.recording()
+    assert found is not None
+    assert found.encoder is not None
+    assert found.events.t_last - found.events.t_first == pytest.approx(SECONDS * 1e6, abs=100_000)
+    assert found.encoder.covers(found.events.t_first, found.events.t_last)
+    assert found.encoder.rpm == pytest.approx(7.5e-5 * 60e6 / math.tau)
+    assert (found.camera, found.prism) == (CAMERA, PRISM)
+
+
+def test_a_stream_is_followed_while_one_looks(recording: Recording, tmp_path: Path) -> None:
+    save_recording(tmp_path / "r.h5", replace(recording, truth=None))
+    said: list[str] = []
+    source = open_source(str(tmp_path / "r.h5"))
+    ring = Ring(source)
+    with followed(source, None, ring, said.append):
+        first = ring.recording()
+        assert first is not None
+        end = time.monotonic() + 20.0
+        while not said:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        last = ring.recording()
+    assert last is not None
+    assert last.events.t_last > first.events.t_last
+    assert "the stream has ended" in said[0]
+    assert not [t for t in threading.enumerate() if t.name == "amiwarp-follow"]
+
+
+def test_a_stream_without_a_turn_is_told(tmp_path: Path, recording: Recording) -> None:
+    assert recording.encoder is not None
+    still = replace(recording.encoder, angle=np.zeros(recording.encoder.t.size))
+    save_recording(tmp_path / "r.h5", replace(recording, encoder=still, truth=None))
+    source = open_source(str(tmp_path / "r.h5"), pace=None)
+    with pytest.raises(AmiwarpError, match="no whole turn"), followed(source, None, Ring(source), lambda _: None):
+        raise AssertionError("followed")
+
+
+def test_what_is_handed_on_is_what_came(recording: Recording) -> None:
+    sent: list[bytes] = []
+    sink = type("Sink", (), {"send": lambda self, data: sent.append(data), "tick": lambda self: sent.append(b"")})()
+    forward, events = Forward(sink), recording.events.slice(0, 500)
+    forward.append(events)
+    forward.append_encoder(np.array([1, 2]), np.array([0.5, 0.6]))
+    forward.tick()
+    assert sent.pop() == b""
+    first, second = [message for data in sent for message in Decoder("here").feed(data)]
+    assert isinstance(first, Events)
+    np.testing.assert_array_equal(first.t, events.t)
+    assert isinstance(second, Angles)
+    np.testing.assert_array_equal(second.angle, [0.5, 0.6])
