@@ -1,4 +1,4 @@
-"""Compensation of streams: packets of events and encoder samples in, compensated packets and a running image out."""
+"""Compensation of streams: packets of events and encoder samples in, compensated events and a running image out."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ VOTED = 1 << 15
 """Events that are voted into the image at a time."""
 SLICE = 4096
 """Blocks that are worth more threads than one."""
-PARALLEL = 1 << 17
-"""Events of a batch from which on its columns are copied by several threads."""
+PIECE = 1 << 16
+"""Events that a thread copies: of more, several threads do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compensated:
-    """A packet as it comes out: as many events as went in, in their order."""
+    """Events as they come out: a packet, or several that were ready together."""
 
     events: Events
-    """Places without the prism, float32 [px]; NaN where there is none."""
+    """Places without the prism, float32 [px], NaN where there is none; times and polarities as they were put."""
     flags: NDArray[np.uint8]
     """Shape ``(n,)``: sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED`, :data:`NO_ANGLE`."""
     put_us: int = 0
-    """When it was put, by the caller's clock [us]."""
+    """When the first of them was put, by the caller's clock [us]."""
 
 
 class Compensator:
@@ -85,8 +85,7 @@ class Compensator:
     def put(self, events: Events, now_us: int) -> None:
         """A packet that came at ``now_us``: uint16 pixels, sorted, not before the last one; kept, not copied.
 
-        One of more than ``batch`` events comes out in parts. Raises :class:`AmiwarpError` for other events; nothing was
-        put then.
+        Raises :class:`AmiwarpError` for other pixels or a packet that begins before the last; nothing was put then.
         """
         if events.x.dtype != np.uint16:
             raise AmiwarpError(
@@ -94,19 +93,26 @@ class Compensator:
             )
         if not len(events):
             return
-        if events.t[0] < self._t_last or bool((events.t[1:] < events.t[:-1]).any()):
-            raise AmiwarpError(f"a packet from {events.t[0]} us is unsorted or before {self._t_last} us; sort it first")
+        if events.t[0] < self._t_last:
+            raise AmiwarpError(f"a packet from {events.t[0]} us comes after one to {self._t_last} us; sort it first")
         self._t_last = int(events.t[-1])
         self.waiting += len(events)
         for start in range(0, len(events), self.batch):
             self._queue.append((events[start : start + self.batch], now_us))
 
     def take(self, now_us: int) -> list[Compensated]:
-        """Packets that are ready at ``now_us``, in the order they were put."""
+        """What is ready at ``now_us``, in the order it was put, packets that are ready together joined to a batch.
+
+        Raises :class:`AmiwarpError` for a packet that is not sorted; what was ready with it is lost.
+        """
         out: list[Compensated] = []
-        while packets := self._ready(now_us):
-            out += self._moved(packets)
-        return out
+        begun: _Begun | None = None
+        while packets := self._ready(now_us):  # a GPU works on one batch while the next is put together
+            following = self._begin(packets)
+            if begun is not None:
+                out.append(self._end(begun))
+            begun = following
+        return out if begun is None else [*out, self._end(begun)]
 
     def flush(self) -> list[Compensated]:
         """All that still waits, its angles guessed where they must be: at the end of a stream."""
@@ -131,23 +137,24 @@ class Compensator:
             self.waiting -= len(events)
         return packets
 
-    def _moved(self, packets: list[tuple[Events, int]]) -> list[Compensated]:
-        n, first, last = sum(len(events) for events, _ in packets), int(packets[0][0].t[0]), int(packets[-1][0].t[-1])
+    def _begin(self, packets: list[tuple[Events, int]]) -> _Begun:
+        parts = [events for events, _ in packets]
+        n, first, last = sum(map(len, parts)), int(parts[0].t[0]), int(parts[-1].t[-1])
         begins, ends = self.encoder.first, self.encoder.last
         if begins is None or ends is None:
             unknown = n
         else:
-            unknown = 0 if first >= begins else sum(int(np.searchsorted(e.t, begins)) for e, _ in packets)
+            unknown = 0 if first >= begins else sum(int(np.searchsorted(part.t, begins)) for part in parts)
         if unknown < n:
             self._cover(max(first, begins or first), last, ends or last)
-        x, y, t, flags = self._work.move([events for events, _ in packets], n, unknown)
-        flags[self.encoder.guessed(t)] |= EXTRAPOLATED
-        flags[:unknown] = OUTSIDE | NO_ANGLE
-        out, start = [], 0
-        for given, put_us in packets:
-            here = slice(start, start := start + len(given))
-            out.append(Compensated(Events(x[here], y[here], given.t, given.p), flags[here], put_us))
-        return out
+        return self._work.begin(parts, n, unknown, packets[0][1])
+
+    def _end(self, begun: _Begun) -> Compensated:
+        x, y, flags = self._work.end(begun)
+        if not self.encoder.knows(int(begun.t[0]), int(begun.t[-1])):
+            flags[self.encoder.guessed(begun.t)] |= EXTRAPOLATED
+        flags[: begun.unknown] = OUTSIDE | NO_ANGLE
+        return Compensated(Events(x, y, begun.t, begun.p), flags, begun.put_us)
 
     def _cover(self, first: int, last: int, ends: int) -> None:
         """Puts the encoder over a span of event times [us] on the device, where it is not there yet."""
@@ -156,6 +163,21 @@ class Compensator:
             self._work.set_encoder(self.encoder.over(first, until), first, until)
             # what was guessed for the end of it may be known the next time
             self._covered = (first, until) if until <= ends else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Begun:
+    """A batch that a device works on: from ``at`` to ``end`` of the buffers."""
+
+    at: int
+    end: int
+    t: NDArray[np.int64]
+    p: NDArray[np.uint8]
+    unknown: int
+    """Events at its beginning that have no angle."""
+    put_us: int
+    done: Any
+    """A ``wp.Event`` on CUDA."""
 
 
 class _Work:
@@ -217,11 +239,10 @@ class _Work:
         for command in self._recorded.values():
             command.set_param_at_index(3, p)
 
-    def move(self, parts: list[Events], n: int, unknown: int) -> tuple[NDArray[Any], ...]:
-        """Of all the parts x, y [px], t [us] (valid until the next call) and flags: outside the image or not.
+    def begin(self, parts: list[Events], n: int, unknown: int, put_us: int) -> _Begun:
+        """Sends a batch on its way; the first ``unknown`` get no place."""
+        import warp as wp
 
-        The first ``unknown`` get no place.
-        """
         padded = -(-n // self._block) * self._block
         if self._at + padded > self._room:
             self._vote()
@@ -229,16 +250,69 @@ class _Work:
         at, end, host = self._at, self._at + n, self._host
         self._at += padded
         self._wait_for_votes(at, self._at)
-        self._gather(parts, at, end)
+        t, p = self._gather(parts, n, at)
         if unknown < n:
             host["t"][end : self._at] = host["t"][end - 1]
             self._launch(at // self._block, padded // self._block, self._camera_of(at, end))
         self._nowhere(at, at + unknown)
         self._nowhere(end, self._at)
-        x, y, inside = self._fetch(at, end)
+        done = None
+        if self._device.is_cuda:
+            self._copy(self._ours, self._columns, ("out_x", "out_y", "inside"), at, end)
+            done = wp.record_event(wp.Event(self._device))
         if self._at - self._voted >= VOTED:
             self._vote()
-        return x, y, host["t"][at:end], inside ^ np.uint8(1)
+        return _Begun(at, end, t, p, unknown, put_us, done)
+
+    def end(self, begun: _Begun) -> list[NDArray[Any]]:
+        """Places x, y [px] and flags, outside the image or not."""
+        import warp as wp
+
+        if begun.done is not None:
+            wp.synchronize_event(begun.done)
+        n = begun.end - begun.at
+        out = [np.empty(n, dtype) for dtype in (np.float32, np.float32, np.uint8)]
+
+        def copy(span: tuple[int, int]) -> None:
+            here, there = slice(*span), slice(begun.at + span[0], begun.at + span[1])
+            out[0][here], out[1][here] = self._host["out_x"][there], self._host["out_y"][there]
+            np.bitwise_xor(self._host["inside"][there], np.uint8(1), out=out[2][here])
+
+        _each(copy, [(k, min(k + PIECE, n)) for k in range(0, n, PIECE)])
+        return out
+
+    def _gather(self, parts: list[Events], n: int, at: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Puts the parts together on the device; times and polarities of the whole. Raises where they are unsorted."""
+        host, several = self._host, len(parts) > 1
+        t, p = (np.empty(n, np.int64), np.empty(n, np.uint8)) if several else (parts[0].t, parts[0].p)
+
+        def copy(group: tuple[int, list[Events]]) -> bool:
+            first, some = group
+            here = slice(first, first + sum(map(len, some)))
+            there = slice(at + here.start, at + here.stop)
+            times = host["t"][there]
+            if len(some) == 1:
+                host["x"][there], host["y"][there], times[:] = some[0].x, some[0].y, some[0].t
+            else:
+                for name in ("x", "y", "t"):
+                    np.concatenate([getattr(part, name) for part in some], out=host[name][there])
+            if several:
+                t[here] = times
+                np.concatenate([part.p for part in some], out=p[here])
+            return bool((times[1:] < times[:-1]).any())
+
+        if any(_each(copy, _groups(parts) if n > PIECE else [(0, parts)])):
+            raise AmiwarpError(f"events of {parts[0].t[0]} to {parts[-1].t[-1]} us are not sorted; sort each packet")
+        if self._device.is_cuda:
+            self._copy(self._columns, self._ours, ("t", "x", "y"), at, at + n)
+        return t, p
+
+    def _copy(self, to: Any, source: Any, names: tuple[str, ...], at: int, end: int) -> None:
+        import warp as wp
+
+        for name in names:
+            columns = getattr(to, name), getattr(source, name)
+            wp.copy(*columns, dest_offset=at, src_offset=at, count=end - at)
 
     def _camera_of(self, at: int, end: int) -> Any:
         """The quick way of placing takes an event's pixel from the image's tables without a look: not for strays."""
@@ -273,29 +347,6 @@ class _Work:
             else:
                 getattr(self._columns, name)[start:stop].fill_(float("nan"))
 
-    def _gather(self, parts: list[Events], at: int, end: int) -> None:
-        import warp as wp
-
-        def column(name: str) -> None:
-            np.concatenate([getattr(part, name) for part in parts], out=self._host[name][at:end])
-
-        _each(column, ("t", "x", "y"), end - at)
-        if self._ours is not self._columns:
-            for name in ("t", "x", "y"):
-                to, source = getattr(self._columns, name), getattr(self._ours, name)
-                wp.copy(to, source, dest_offset=at, src_offset=at, count=end - at)
-
-    def _fetch(self, at: int, end: int) -> list[NDArray[Any]]:
-        import warp as wp
-
-        names = ("out_x", "out_y", "inside")
-        if self._ours is not self._columns:
-            for name in names:
-                to, source = getattr(self._ours, name), getattr(self._columns, name)
-                wp.copy(to, source, dest_offset=at, src_offset=at, count=end - at)
-            wp.synchronize_stream(self._device)
-        return _each(lambda name: self._host[name][at:end].copy(), names, end - at)
-
     def _vote(self) -> None:
         """What was not voted yet: on CPUs by a thread beside, one for all, so that votes come one after the other."""
         from amiwarp.kernels.launch import beside
@@ -321,8 +372,23 @@ class _Work:
         return self._votes.take()[0]
 
 
-def _each(job: Callable[[str], Any], names: tuple[str, ...], n: int) -> list[Any]:
-    """The job for each column, by several threads where there is enough to copy."""
+def _groups(parts: list[Events]) -> list[tuple[int, list[Events]]]:
+    """The parts in groups of about :data:`PIECE` events, each with the place of its first."""
+    groups: list[tuple[int, list[Events]]] = []
+    count = held = 0
+    for part in parts:
+        for start in range(0, len(part), PIECE):
+            piece = part if len(part) <= PIECE else part[start : start + PIECE]
+            if not groups or held + len(piece) > PIECE:
+                groups.append((count, []))
+                held = 0
+            groups[-1][1].append(piece)
+            held, count = held + len(piece), count + len(piece)
+    return groups
+
+
+def _each(job: Callable[[Any], Any], given: list[Any]) -> list[Any]:
+    """The job for each, by several threads where there are several."""
     from amiwarp.kernels.launch import pool
 
-    return list(pool().map(job, names)) if n >= PARALLEL else [job(name) for name in names]
+    return list(pool().map(job, given)) if len(given) > 1 else [job(each) for each in given]

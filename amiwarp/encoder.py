@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -238,6 +239,8 @@ class EncoderStream:
         Returns what was kept, with one that ends what came before where it began anew.
         """
         t, angles = as_times(t_us), np.asarray(angle, np.float64)
+        if not t.size and not angles.size:
+            return t, angles
         if t.shape != angles.shape or t.ndim != 1:
             raise AmiwarpError(f"encoder samples have shapes t {t.shape}, angle {angles.shape}; expected one length")
         if not np.isfinite(angles).all():
@@ -308,16 +311,25 @@ class EncoderStream:
             t, angle = np.append(t, end + 1), np.append(angle, self._guess(end + 1))
         return Encoder(t, angle, self.clock_offset_us)
 
+    def knows(self, t_first: int, t_last: int) -> bool:
+        """Whether no angle at the event times ``t_first`` .. ``t_last`` [us] is guessed."""
+        return len(self) >= 2 and not any(low < t_last and t_first < high for low, high in self._guesses())
+
+    def _guesses(self) -> Iterator[tuple[int, int]]:
+        """Spans of event times [us], ends not included, in which angles are guessed."""
+        yield -(2**62), math.ceil(int(self._t[0]) - self.clock_offset_us)
+        for begin, end in self._holes:
+            yield math.floor(begin - self.clock_offset_us), math.ceil(end - self.clock_offset_us)
+        yield math.floor(int(self._t[self._stop - 1]) - self.clock_offset_us), 2**62
+
     def guessed(self, t: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which event times, sorted, shape ``(n,)`` [us], lie in holes, before the first sample or after the last."""
         out = np.zeros(t.size, np.bool_)
         if len(self) < 2:
             return ~out
-        begins, ends = int(self._t[0]), int(self._t[self._stop - 1])
-        for low, high in ((-(2**62), begins), *self._holes, (ends, 2**62)):
-            low_t, high_t = low - self.clock_offset_us, high - self.clock_offset_us
-            if low_t < t[-1] and high_t > t[0]:
-                out[int(np.searchsorted(t, low_t, side="right")) : int(np.searchsorted(t, high_t))] = True
+        for low, high in self._guesses():
+            if low < t[-1] and t[0] < high:
+                out[int(np.searchsorted(t, low, side="right")) : int(np.searchsorted(t, high))] = True
         return out
 
 

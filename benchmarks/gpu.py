@@ -18,8 +18,8 @@ from pathlib import Path
 
 PICTURE = "china.jpg"
 TESTS = (
-    "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "simulate",
-    "translate", "benchmarks",
+    "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
+    "simulate", "translate", "benchmarks",
 )  # fmt: skip
 """Of what runs on a device, and needs neither the command line's packages nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
@@ -36,6 +36,7 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
         "tests": [*module, "pytest", "-q", "-k", " and not ".join(("(cuda or test_tiles)", *PLUGIN)), *tests],
         "speed": [*module, "benchmarks", *device, "--picture", picture, "--out", str(out / "speed_cuda.json")],
         "chart": [*module, "benchmarks.chart", picture, *device, "--out", str(out / "chart")],
+        "stream": [*module, "benchmarks.stream", *device, "--picture", picture, "--out", str(out / "stream_cuda.json")],
         "simulate": [*module, "benchmarks.simulate", *device, "--picture", picture],
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,

@@ -163,9 +163,11 @@ def test_a_stream_is_the_encoder_of_its_last_samples(sizes, origin, offset):
     asked = np.linspace(low, high, 50).astype(np.int64) if low < high else np.array([high])
     np.testing.assert_array_equal(stream.over(int(asked[0]), high).angle_at(asked), encoder.angle_at(asked))
     assert not stream.guessed(asked).any()
+    assert stream.knows(int(asked[0]), int(asked[-1]))
+    assert not stream.knows(int(asked[0]), high + 1)
     after = np.array([high + 1, high + 5000])
     assert stream.guessed(after).all()
-    expected = SPEED * (after + offset - origin)
+    expected = SPEED * ((after - origin) + offset)
     np.testing.assert_allclose(stream.over(high, high + 5000).angle_at(after), expected, rtol=0, atol=1e-6)
 
 
