@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -223,6 +224,23 @@ class Votes:
         blocks = count // int(BLOCK) if self.device.is_cpu else 0
         launch_slices(vote_point_blocks, blocks, inputs, self._cells, device=self.device, smallest=8192)
         self._exactly(vote_points, inputs, count - blocks * int(BLOCK), blocks * int(BLOCK))
+
+    def stretches(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
+        """For points of long-lived arrays, on a CPU: votes blocks of 64, from which on and how many, by one thread."""
+        import warp as wp
+
+        from amiwarp.kernels.votes import vote_point_blocks
+
+        vote_point_blocks.module.load(self.device, block_dim=1)
+        inputs = [x, y, layer, self._params, 0]
+        command = wp.launch(vote_point_blocks, 1, inputs, [self._cells[0]], device=self.device, record_cmd=True)
+
+        def vote(first: int, blocks: int) -> None:
+            command.set_dim(blocks)
+            command.set_param_at_index(len(inputs) - 1, first)
+            command.launch()
+
+        return vote
 
     def add_as_they_are(self, events: Events) -> None:
         """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""

@@ -254,6 +254,26 @@ def test_packets_that_are_ready_together_come_out_together(size: int, device: st
     np.testing.assert_array_equal(np.stack([out.events.x, out.events.y], axis=1), expected)
 
 
+def test_what_was_taken_stays_while_it_is_held(device: str) -> None:
+    """On a GPU memory is used again, of what nobody holds."""
+    events = random_events(1_500_000)
+    compensator = Compensator(MODEL, streamed(), batch=1 << 17, device=device)
+    held, sums, places = [], [], set()
+    for start in range(0, 1_500_000, 100_000):
+        compensator.put(events[start : start + 50_000], 0)
+        compensator.put(events[start + 50_000 : start + 100_000], 0)
+        (out,) = compensator.take(0)
+        places.add(out.events.x.ctypes.data)
+        if start % 300_000 == 0:
+            held.append(out)
+            sums.append([np.nansum(v, dtype=np.float64) for v in (out.events.x, out.events.y, out.events.t, out.flags)])
+        del out
+    assert device == "cpu" or len(places) < 10
+    for out, given in zip(held, sums, strict=True):
+        kept = [np.nansum(v, dtype=np.float64) for v in (out.events.x, out.events.y, out.events.t, out.flags)]
+        assert kept == given
+
+
 def test_what_is_put_stays_as_it_is() -> None:
     events = random_events(1000)
     kept = Events(*(getattr(events, name).copy() for name in ("x", "y", "t", "p")))

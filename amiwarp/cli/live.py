@@ -42,7 +42,7 @@ class AdaptiveOptions:
         bool,
         typer.Option(
             "--adaptive",
-            help="Set the prism's speed: fast where edges would be missed, slow where the camera moves.",
+            help="Set the prism's speed: as fast as the edges need, no faster.",
             rich_help_panel=_ADAPTIVE,
         ),
     ] = False

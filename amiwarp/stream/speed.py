@@ -37,6 +37,7 @@ class SpeedKeeper:
         self._packets: list[Events] = []
         self._begins: int | None = None
         self._asking: threading.Thread | None = None
+        self._asked = controller.rpm
         self.coverage: float | None = None
         """Share of the edges that the last window saw."""
 
@@ -58,8 +59,11 @@ class SpeedKeeper:
             return
         path = prism_path(self._model, encoder.over(start, end), start, end)
         self.coverage = self._meter(events, start, end, path).share
-        rpm = self.controller.update(end, self.coverage, len(events) / (end - start))
-        if rpm is not None and (self._asking is None or not self._asking.is_alive()):
+        self.controller.update(end, self.coverage, len(events) / (end - start))
+        rpm = self.controller.rpm
+        # what changed while the answer to the last command was waited for is asked for with the next window
+        if rpm != self._asked and (self._asking is None or not self._asking.is_alive()):
+            self._asked = rpm
             self._asking = threading.Thread(target=self._ask, args=(rpm,), name="amiwarp-speed", daemon=True)
             self._asking.start()
 

@@ -1,0 +1,348 @@
+"""Batches of a stream's events on their way through a device: put together, moved, fetched, voted."""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.iwe import CanvasShape, Votes
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    from amiwarp.encoder import Encoder
+    from amiwarp.events import Events
+    from amiwarp.optics import Model
+
+ROUNDS = 4
+"""Batches that the buffers hold: those before may still be voted."""
+VOTED = 1 << 16
+"""Events that are voted into the image at a time."""
+SLICE = 4096
+"""Blocks that are worth more threads than one."""
+PIECE, THREADS = 1 << 17, 4
+"""Events that a thread puts together: of more, several threads do."""
+DIRECT = 1 << 16
+"""Events from which on a GPU writes to where its results are handed out."""
+SPARE, UNUSED = 16, 3
+"""Arrays that are kept of a kind; references to one of them that nobody else holds: ours while we look."""
+
+
+OUT = ("out_x", "out_y", "inside")
+"""Columns of results."""
+Lent: TypeAlias = tuple[Any, NDArray[Any]]
+"""An array of Warp's and the part of it that is lent."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Begun:
+    """A batch that a device works on: from ``at`` to ``end`` of the buffers."""
+
+    at: int
+    end: int
+    t: NDArray[np.int64]
+    p: NDArray[np.uint8]
+    unknown: int
+    """Events at its beginning that have no angle."""
+    put_us: int
+    out: list[NDArray[Any]] | None
+    """Where a GPU writes places and whether they are inside; None: into the buffers."""
+    done: Any
+    """A ``wp.Event`` on CUDA."""
+
+
+class Batches:
+    """Buffers of a stream's compensation, allocated once, and what is done with them; for one thread."""
+
+    def __init__(self, model: Model, batch: int, device: Any) -> None:
+        """``batch``: most events of one."""
+        import warp as wp
+
+        from amiwarp.kernels import compensate as kernels
+        from amiwarp.kernels.structs import azimuths, camera_params, pinhole_params
+
+        self._device, self._at, self._voted = device, 0, 0
+        self._voting: deque[tuple[int, int, Future[None]]] = deque()
+        self._kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
+        self._kernel.module.load(device, **({"block_dim": 1} if device.is_cpu else {}))
+        self._block = int(kernels.BLOCK) if device.is_cpu else 1
+        self._room = ROUNDS * -(-batch // self._block) * self._block
+        self._size = model.camera.width, model.camera.height
+        self._camera = camera_params(model.camera, str(device))
+        self._pinhole = pinhole_params(model.camera) or self._camera
+        self._inputs = [model.params(str(device)), None, wp.vec2(*self._size), None, azimuths(str(device)), None]
+        dtypes = {"x": wp.uint16, "y": wp.uint16, "t": wp.int64, "out_x": float, "out_y": float, "inside": wp.uint8}
+        columns = kernels.Columns()
+        for name, dtype in dtypes.items():
+            setattr(columns, name, wp.zeros(self._room, dtype=dtype, device=device))
+        self._inputs[-1] = self._columns = columns
+        self._ours = columns if device.is_cpu else kernels.Columns()
+        if not device.is_cpu:
+            for name, dtype in dtypes.items():
+                setattr(self._ours, name, wp.zeros(self._room, dtype=dtype, device="cpu", pinned=True))
+        self._host = {name: getattr(self._ours, name).numpy() for name in dtypes}
+        self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
+        self._recorded: dict[int, Any] = {}
+        self._stretches: Callable[[int, int], None] | None = None
+        self._spare, self._gatherer = Spare(batch), Gatherer()
+        self._votes = Votes(CanvasShape(*self._size), device)
+
+    def set_encoder(self, encoder: Encoder, first: int, last: int) -> None:
+        """Puts its pieces over a span of event times [us] into one bucket, where a search finds them: they are few."""
+        import warp as wp
+
+        from amiwarp.kernels.encoder import EncoderParams
+        from amiwarp.kernels.structs import encoder_pieces
+
+        origin, *pieces = encoder_pieces(encoder, first, last)
+        n, p = len(pieces[0]), self._inputs[3]
+        if p is None or n > len(p.start):
+            p = self._inputs[3] = EncoderParams()
+            p.shift, p.first = 62, wp.zeros(2, dtype=int, device=self._device)
+            p.start, p.angle, p.slope = (
+                wp.zeros(max(2 * n, 64), dtype=dtype, device=self._device) for dtype in (wp.int64, wp.uint64, wp.uint64)
+            )
+        p.origin = origin
+        for to, values in zip(
+            (p.first, p.start, p.angle, p.slope), (np.array([0, n - 1], np.int32), *pieces), strict=True
+        ):
+            if self._device.is_cpu:
+                to.numpy()[: len(values)] = values
+            else:
+                wp.copy(to, wp.array(values, dtype=to.dtype, device="cpu", copy=False), count=len(values))
+        for command in self._recorded.values():
+            command.set_param_at_index(3, p)
+
+    def begin(self, parts: list[Events], n: int, unknown: int, put_us: int) -> Begun:
+        """Sends a batch on its way; the first ``unknown`` get no place."""
+        import warp as wp
+
+        padded = -(-n // self._block) * self._block
+        if self._at + padded > self._room:
+            self._vote()
+            self._at = self._voted = 0
+        at, end, host = self._at, self._at + n, self._host
+        self._at += padded
+        self._wait_for_votes(at, self._at)
+        direct = self._device.is_cuda and n > DIRECT
+        t, p, strays = self._gather(parts, n, at, self._spare(n, np.int64) if direct else None)
+        if unknown < n:
+            host["t"][end : self._at] = host["t"][end - 1]
+            camera = self._camera if strays else self._pinhole
+            self._launch(at // self._block, padded // self._block, camera)
+        self._nowhere(at, at + unknown)
+        self._nowhere(end, self._at)
+        out, done = None, None
+        if self._device.is_cuda:
+            out = self._send_back(at, end, direct)
+            done = wp.record_event(wp.Event(self._device))
+        if self._at - self._voted >= VOTED:
+            self._vote()
+        return Begun(at, end, t, p, unknown, put_us, out, done)
+
+    def end(self, begun: Begun) -> list[NDArray[Any]]:
+        """Places x, y [px] and flags, outside the image or not."""
+        import warp as wp
+
+        if begun.done is not None:
+            wp.synchronize_event(begun.done)
+        if begun.out is None:
+            x, y, inside = (self._host[name][begun.at : begun.end].copy() for name in OUT)
+        else:
+            x, y, inside = begun.out
+        return [x, y, np.bitwise_xor(inside, np.uint8(1), out=inside)]
+
+    def _send_back(self, at: int, end: int, direct: bool) -> list[NDArray[Any]] | None:
+        """Starts the results' way from a GPU, where there are many into arrays that are handed out."""
+        import warp as wp
+
+        if not direct:
+            self._copy(self._ours, self._columns, OUT, at, end)
+            return None
+        lent = [self._spare(end - at, dtype) for dtype in (np.float32, np.float32, np.uint8)]
+        for name, (array, _) in zip(OUT, lent, strict=True):
+            wp.copy(array, getattr(self._columns, name), src_offset=at, count=end - at)
+        return [view for _, view in lent]
+
+    def _gather(
+        self, parts: list[Events], n: int, at: int, lent: Lent | None
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8], bool]:
+        """Puts the parts together on the device: times, polarities and whether any event lies outside the sensor.
+
+        ``lent``: where to put the times, else beside the others. Raises :class:`AmiwarpError` where they are unsorted.
+        """
+        import warp as wp
+
+        several = len(parts) > 1
+        p = np.empty(n, np.uint8) if several else parts[0].p
+        t = self._host["t"][at : at + n] if lent is None else lent[1]
+        to = [self._host["x"][at : at + n], self._host["y"][at : at + n], t, p]
+        if several or n > PIECE:
+            unsorted, x, y = self._gatherer(parts, n, [_address(column) for column in to], with_p=several)
+        else:  # as quickly as that goes, for a single packet
+            to[0][:], to[1][:], to[2][:] = parts[0].x, parts[0].y, parts[0].t
+            unsorted, x, y = bool((t[1:] < t[:-1]).any()), to[0].max(), to[1].max()
+        if unsorted:
+            raise AmiwarpError(f"events of {parts[0].t[0]} to {parts[-1].t[-1]} us are not sorted; sort each packet")
+        if self._device.is_cuda:
+            self._copy(self._columns, self._ours, ("x", "y") if lent else ("x", "y", "t"), at, at + n)
+            if lent is not None:
+                wp.copy(self._columns.t, lent[0], dest_offset=at, count=n)
+        if lent is None:
+            t = t.copy() if several else parts[0].t
+        # the quick way of placing takes an event's pixel from the image's tables without a look: not for strays
+        return t, p, bool(x >= self._size[0] or y >= self._size[1])
+
+    def _copy(self, to: Any, source: Any, names: tuple[str, ...], at: int, end: int) -> None:
+        import warp as wp
+
+        for name in names:
+            columns = getattr(to, name), getattr(source, name)
+            wp.copy(*columns, dest_offset=at, src_offset=at, count=end - at)
+
+    def _launch(self, first: int, blocks: int, camera: Any) -> None:
+        import warp as wp
+
+        from amiwarp.kernels.launch import launch
+
+        inputs = [*self._inputs[:1], camera, *self._inputs[2:]]
+        if self._device.is_cpu and blocks >= SLICE:
+            launch(self._kernel, blocks, inputs, [], device=self._device, first=first, smallest=SLICE // 2)
+            return
+        command = self._recorded.get(id(camera))
+        if command is None:
+            # to launch again what was recorded takes a fraction of the time
+            command = wp.launch(self._kernel, 1, [*inputs, 0], device=self._device, record_cmd=True)
+            self._recorded[id(camera)] = command
+        command.set_dim(blocks)
+        command.set_param_at_index(len(inputs), first)
+        command.launch()
+
+    def _nowhere(self, start: int, stop: int) -> None:
+        if start >= stop:
+            return
+        for name in ("out_x", "out_y"):
+            if self._device.is_cpu:
+                self._host[name][start:stop] = np.nan
+            else:
+                getattr(self._columns, name)[start:stop].fill_(float("nan"))
+
+    def _vote(self) -> None:
+        """What was not voted yet: on CPUs by a thread beside, one for all, so that votes come one after the other."""
+        from amiwarp.kernels.launch import beside
+
+        start, stop = self._voted, self._at
+        if start == stop:
+            return
+        columns = (self._columns.out_x, self._columns.out_y, self._layer)
+        if self._device.is_cpu:
+            self._stretches = self._stretches or self._votes.stretches(*columns)
+            job = beside().submit(self._stretches, start // self._block, (stop - start) // self._block)
+            self._voting.append((start, stop, job))
+        else:
+            self._votes.add_points(*(column[start:stop] for column in columns))
+        self._voted = stop
+
+    def _wait_for_votes(self, start: int, stop: int) -> None:
+        """Until a stretch of the buffers is free again."""
+        while any(begin < stop and end > start for begin, end, _ in self._voting):
+            self._voting.popleft()[2].result()
+
+    def image(self) -> NDArray[np.float32]:
+        self._vote()
+        self._wait_for_votes(0, self._room)
+        return self._votes.take()[0]
+
+
+class Spare:
+    """Arrays to hand out that a GPU writes to at full speed; again when nobody holds them, for making one is slow."""
+
+    def __init__(self, size: int) -> None:
+        """``size`` of each."""
+        self._size = size
+        self._kept: dict[Any, list[Lent]] = {}
+
+    def __call__(self, n: int, dtype: Any) -> Lent:
+        """One of ``n`` values of any content."""
+        import warp as wp
+
+        kept = self._kept.setdefault(dtype, [])
+        for array, view in kept:
+            if sys.getrefcount(view) <= UNUSED:
+                return array, view[:n]
+        if len(kept) >= SPARE:
+            view = np.empty(n, dtype)
+            return wp.array(view, dtype=wp.dtype_from_numpy(dtype), device="cpu", copy=False), view
+        array = wp.empty(self._size, dtype=wp.dtype_from_numpy(dtype), device="cpu", pinned=True)
+        kept.append((array, array.numpy()))
+        return array, kept[-1][1][:n]
+
+
+class Gatherer:
+    """Puts packets together by several threads, see :mod:`amiwarp.kernels.gather`."""
+
+    def __init__(self) -> None:
+        from amiwarp.kernels import gather
+
+        self._kernel = gather.gather_parts
+        self._kernel.module.load("cpu", block_dim=1)
+        self._make(64)
+
+    def _make(self, rows: int) -> None:
+        import warp as wp
+
+        from amiwarp.kernels.gather import FOUND, ROW
+
+        table, found = (
+            wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
+            wp.zeros(rows * FOUND, dtype=int, device="cpu"),
+        )
+        self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
+        self._commands = [
+            wp.launch(self._kernel, 1, [table, found, 0], device="cpu", record_cmd=True) for _ in range(THREADS)
+        ]
+
+    def __call__(self, parts: list[Events], n: int, to: list[int], *, with_p: bool) -> tuple[bool, int, int]:
+        """Copies ``n`` events of the parts to where the addresses ``to`` say: of x, y, t and, if it is asked for, p.
+
+        Whether any part is unsorted, and the largest x and y.
+        """
+        from amiwarp.kernels.launch import pool
+
+        to_x, to_y, to_t, to_p = to
+        rows, held, place = [], [], 0
+        for part in parts:
+            columns = [np.ascontiguousarray(column) for column in (part.x, part.y, part.t, part.p)]
+            held.append(columns)
+            x, y, t, p = map(_address, columns)
+            for k in range(0, len(part), PIECE):
+                to_here = (to_x + 2 * place, to_y + 2 * place, to_t + 8 * place, to_p + place if with_p else 0)
+                count = min(PIECE, len(part) - k)
+                rows.append((x + 2 * k, y + 2 * k, t + 8 * k, p + k, *to_here, count, int(k > 0)))
+                place += count
+        if len(rows) > len(self._table):
+            self._make(2 * len(rows))
+        self._table[: len(rows)] = rows
+        threads = min(THREADS, len(rows), -(-n // PIECE))
+        edges = [len(rows) * k // threads for k in range(threads + 1)]
+
+        def run(k: int) -> None:
+            command = self._commands[k]
+            command.set_dim(edges[k + 1] - edges[k])
+            command.set_param_at_index(2, edges[k])
+            command.launch()
+
+        list(pool().map(run, range(threads))) if threads > 1 else run(0)
+        unsorted, x, y = self._found[: len(rows)].max(axis=0).tolist()
+        return bool(unsorted), x, y
+
+
+def _address(array: NDArray[Any]) -> int:
+    return int(array.__array_interface__["data"][0])

@@ -1,0 +1,407 @@
+"""The prism's speed set from the stream, beside fixed ones: edges seen against events; JSON and a chart.
+
+    python -m benchmarks.adaptive [--out FILE.json] [--figure FILE.png]
+
+A 320 × 240 camera (60°) behind a prism (apex 1.8°) looks at PyVista's map of the earth, stands still or turns, its gaze
+going round a circle. Each window of 33 ms is simulated at the speed that the last one led to, the motor lagging behind.
+What ``ok`` means and how edges are counted is in docs/adaptive.md. Exit status 1 where something is not ok.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from amiwarp.camera import Camera
+from amiwarp.compensate import compensate_events
+from amiwarp.demo import earth
+from amiwarp.encoder import Encoder
+from amiwarp.events import Events
+from amiwarp.figures import save
+from amiwarp.io.files import write_text
+from amiwarp.kernels import sight
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.structs import camera_params
+from amiwarp.machine import machine, versions
+from amiwarp.motion import CameraMotion, PrismMotion
+from amiwarp.optics import ExactModel, Prism
+from amiwarp.scenery import MapRing, place_scene, step_us
+from amiwarp.simulate import Scene, Simulation
+from amiwarp.stream.adaptive import CoverageMeter, SpeedController, prism_path
+
+CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
+PRISM, SMALL, PHASE = Prism(math.radians(1.8)), Prism(math.radians(0.9)), 1.0
+"""Orbits of 5.8 and 2.9 px."""
+WINDOW_US = 33_000
+FIXED, USUAL = (180.0, 360.0, 540.0, 720.0, 1440.0), 720.0
+MOTIONS = {"still": 0.0, "slow": 15.0, "fast": 120.0}
+"""The camera's rate [deg/s]."""
+CIRCLE_S = 1.0
+"""In which the gaze goes round."""
+SETTLED_S, ADAPTED_S = 0.2, 1.2
+"""When a circle of the gaze begins that is measured, at a fixed speed and adaptive [s]; whole circles lie between."""
+CHANGING = (("still", 2.0), ("slow", 1.0), ("fast", 2.0), ("still", 2.0))
+"""One motion after the other, and how long: whole circles, whose beginnings meet [s]."""
+MOST_RPM, START_RPM = 900.0, 540.0
+"""Of the controller: its limit, and where it starts, so as to have settled when it is measured."""
+BANDS: dict[str, dict[str, float]] = {"adaptive": {}, "adaptive, 99 %": {"low": 0.99, "high": 0.996}}
+"""Of the controller's coverage: its own, and one that is content with 99 %."""
+SPARE_S = 0.05
+"""Simulated past what is measured: windows do not end with it."""
+MOTOR_S = 0.1
+"""Time constant of the motor."""
+CONTRAST, NEAR, LEAST = 0.75, 1.0, 2
+"""An edge's change of log intensity within 3 × 3 pixels; distance [px] and number of events that show it."""
+MARGIN = 24
+"""Of the image, not judged: it is not in view all the window [px]."""
+TOLERANCE = 0.001
+"""Of the share, beside two standard errors."""
+
+
+@dataclass(eq=False)
+class Driven:
+    """A prism whose speed is told as it turns, for :class:`amiwarp.simulate.Simulation` in place of a PrismMotion."""
+
+    rpm: float
+    largest_rpm: float
+    phase: float = PHASE
+    tilt: tuple[float, float] = (0.0, 0.0)
+    rows: list[tuple[float, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.rows = [(-1.0, self.rpm), (0.0, self.rpm)]
+
+    @property
+    def largest_speed(self) -> float:
+        return self.largest_rpm * math.tau / 60.0
+
+    def drive(self, until_us: int, rpm: float) -> None:
+        """The motor is told ``rpm`` and has until then to follow."""
+        elapsed = until_us * 1e-6 - self.rows[-1][0]
+        self.rpm = rpm + (self.rpm - rpm) * math.exp(-elapsed / MOTOR_S)
+        self.rows.append((until_us * 1e-6, self.rpm))
+
+    def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        return PrismMotion(np.array(self.rows)).angle(t_us)
+
+
+class Edges:
+    """The scene's true edges, as the camera would see them without the prism at any time."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        placement = place_scene(simulation)
+        self._maps = MapRing(simulation, placement)
+        self._maps.cover(0, 0)
+        view = sight.View()
+        view.camera, view.maps = camera_params(CAMERA, "cpu"), self._maps.maps
+        view.width, view.height = placement.width, placement.height
+        self._view, self._to_texel = view, placement.to_texel()
+        self.orientation = simulation.camera_motion.orientation(simulation.duration_s)
+
+    def at(self, seconds: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of edge pixels: crests of the gradient with a change of CONTRAST or more."""
+        out = wp.empty(CAMERA.width * CAMERA.height, dtype=float, device="cpu")
+        matrix = self._to_texel @ self.orientation(np.array([seconds]))[0]
+        launch(sight.see_without_prism, len(out), [self._view, wp.mat33(*matrix.ravel().tolist())], [out], device="cpu")
+        log = out.numpy().reshape(CAMERA.height, CAMERA.width)
+        steep = ndimage.maximum_filter(log, 3) - ndimage.minimum_filter(log, 3) >= CONTRAST
+        steep[:MARGIN] = steep[-MARGIN:] = steep[:, :MARGIN] = steep[:, -MARGIN:] = False
+        gx, gy = (ndimage.gaussian_filter(log, 0.7, order=order) for order in ((0, 1), (1, 0)))
+        size = np.hypot(gx, gy)
+        rows, columns = np.nonzero(steep)
+        along = np.stack([gy[rows, columns], gx[rows, columns]]) / size[rows, columns]
+        ahead, behind = (
+            ndimage.map_coordinates(size, np.stack([rows, columns]) + s * along, order=1) for s in (1.0, -1.0)
+        )
+        crest = (size[rows, columns] >= ahead) & (size[rows, columns] > behind)
+        return rows[crest], columns[crest]
+
+    def seen(self, t_us: NDArray[np.int64], points: NDArray[np.float32], start_us: int, end_us: int) -> float:
+        """Share of the edges of a window's middle that have LEAST or more of its events within NEAR."""
+        middle = 0.5e-6 * (start_us + end_us)
+        grid = np.arange(start_us, end_us, 1000)
+        turned = self.orientation(np.array([middle]))[0].T @ self.orientation((grid + 500) * 1e-6)
+        c = CAMERA
+        pinhole = np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]])
+        moves = (pinhole @ turned @ np.linalg.inv(pinhole)).astype(np.float32)
+        places = []
+        for move, part in zip(moves, np.split(points, np.searchsorted(t_us, grid[1:])), strict=True):
+            x, y, z = move[:, :2] @ part.T + move[:, 2:]
+            column, row = np.rint(2.0 * x / z), np.rint(2.0 * y / z)
+            inside = (column >= 0) & (row >= 0) & (column < 2 * c.width) & (row < 2 * c.height)
+            places.append(row[inside].astype(np.int64) * (2 * c.width) + column[inside].astype(np.int64))
+        votes = np.bincount(np.concatenate(places), minlength=4 * c.width * c.height).reshape(2 * c.height, -1)
+        rows, columns = self.at(middle)
+        reach = range(-round(2 * NEAR), round(2 * NEAR) + 1)
+        disc = [(dy, dx) for dy in reach for dx in reach if math.hypot(dy, dx) <= 2 * NEAR]
+        return float(np.mean(sum(votes[2 * rows + dy, 2 * columns + dx] for dy, dx in disc) >= LEAST))
+
+
+def gaze(rates: ArrayLike, t: NDArray[np.float64]) -> CameraMotion:
+    """Round a circle that closes, at the rates [deg/s] that belong to the even times [s]."""
+    turn = math.tau * t / CIRCLE_S
+    radius = np.radians(np.broadcast_to(rates, t.shape)) * (CIRCLE_S / math.tau)
+    faced = Rotation.from_rotvec(np.column_stack([radius * np.sin(turn), radius * (1.0 - np.cos(turn)), 0.0 * t]))
+    step = float(t[1] - t[0])
+    ways = (faced[:-1].inv() * faced[1:]).as_rotvec() / step
+    return CameraMotion(np.column_stack([t[:-1] + 0.5 * step, ways]))
+
+
+@dataclass(frozen=True)
+class Window:
+    """What became of a window."""
+
+    t_s: float
+    """Its middle."""
+    end_s: float
+    seconds: float
+    rpm: float
+    events: int
+    share: float
+    coverage: float
+
+
+def run(
+    motion: CameraMotion, seconds: float, rpm: float, controller: SpeedController | None = None, prism: Prism = PRISM
+) -> Iterator[Window]:
+    """Windows of a run that starts at ``rpm``, or keeps it where there is no controller."""
+    largest = rpm if controller is None else max(rpm, controller.most_rpm)
+    driven = Driven(rpm, largest)
+    scene = Scene.from_picture(earth(), fov=math.radians(100.0))
+    made = Simulation(scene, CAMERA, prism, seconds, cast("PrismMotion", driven), motion)
+    edges, model, meter = Edges(made), ExactModel(CAMERA, prism, PHASE), CoverageMeter(CAMERA.width, CAMERA.height)
+    step = step_us(made)
+    length = WINDOW_US // step * step
+    start, told = 0, rpm
+    driven.drive(length, told)
+    for events, points in made.blocks(chunk_us=WINDOW_US):
+        end = start + length
+        if end > made.duration_us:
+            return
+        times = np.arange(start - 2000, end + 2001, 1000)
+        encoder = Encoder.from_angles(times, driven.angle(times))
+        xy = compensate_events(events, model, encoder)
+        moved = Events(xy[:, 0], xy[:, 1], events.t, events.p)
+        coverage = meter(moved, start, end, prism_path(model, encoder, start, end)).share
+        share = edges.seen(events.t, points, start, end)
+        yield Window(0.5e-6 * (start + end), end * 1e-6, length * 1e-6, driven.rpm, len(events), share, coverage)
+        if controller is not None:
+            told = controller.update(end, coverage, len(events) / length) or told
+        start = end
+        driven.drive(end + length, told)
+
+
+Row = dict[str, Any]
+
+
+def summary(name: str, windows: list[Window], start_s: float, end_s: float) -> Row:
+    """Events a second and shares of a run between two times; events of windows across these are shared out."""
+    chosen = [w for w in windows if start_s < w.t_s <= end_s]
+    share = np.array([w.share for w in chosen])
+    events = np.interp([start_s, end_s], [w.end_s for w in windows], np.cumsum([w.events for w in windows]))
+    return {
+        "name": name,
+        "rpm": float(np.mean([w.rpm for w in chosen])),
+        "mev_s": 1e-6 * float(np.diff(events)[0]) / (end_s - start_s),
+        "share": float(share.mean()),
+        "share_error": float(share.std(ddof=1) / math.sqrt(len(share))),
+        "share_p5": float(np.percentile(share, 5.0)),
+        "coverage": float(np.mean([w.coverage for w in chosen])),
+        "windows": len(share),
+    }
+
+
+def judge(row: Row, usual: Row) -> None:
+    """Sets ``ok``: fewer events than at the usual speed, with its share to within the error, or with 99 %."""
+    row["within"] = 2.0 * math.hypot(row["share_error"], usual["share_error"]) + TOLERANCE
+    row["fewer_events"] = 1.0 - row["mev_s"] / usual["mev_s"]
+    needed = usual["share"] - row["within"] if row["name"] == "adaptive" else 0.99
+    row["ok"] = row["share"] >= needed and row["fewer_events"] > 0.0
+
+
+def told(row: Row) -> None:
+    fewer = f"  {100 * row['fewer_events']:5.1f} % fewer  {'ok' if row['ok'] else 'NOT ok'}" if "ok" in row else ""
+    print(f"  {row['name']:15} {row['rpm']:5.0f} rpm  {row['mev_s']:6.3f} Mev/s  {100 * row['share']:7.3f} % "
+          f"± {100 * row['share_error']:.3f}, 5th {100 * row['share_p5']:7.3f} %{fewer}", flush=True)  # fmt: skip
+
+
+def one_motion(rate: float, prism: Prism, speeds: tuple[float, ...]) -> list[Row]:
+    """Fixed speeds, then the controller, over the same circle of the gaze."""
+    motion = gaze(rate, np.arange(0.0, ADAPTED_S + 2.0 * CIRCLE_S, 0.005))
+    rows = []
+    for rpm in speeds:
+        windows = list(run(motion, SETTLED_S + CIRCLE_S + SPARE_S, rpm, prism=prism))
+        rows.append(summary(f"{rpm:g} rpm", windows, SETTLED_S, SETTLED_S + CIRCLE_S))
+        told(rows[-1])
+    usual = rows[speeds.index(USUAL)]
+    for name, band in BANDS.items():
+        controller = SpeedController(START_RPM, most_rpm=MOST_RPM, **band)
+        windows = list(run(motion, ADAPTED_S + CIRCLE_S + SPARE_S, START_RPM, controller, prism))
+        rows.append(summary(name, windows, ADAPTED_S, ADAPTED_S + CIRCLE_S))
+        judge(rows[-1], usual)
+        told(rows[-1])
+    return rows
+
+
+def changing() -> tuple[list[Row], dict[str, Any]]:
+    """The camera's motion changes: whole runs, and their course."""
+    ends = np.cumsum([seconds for _, seconds in CHANGING])
+    t = np.arange(0.0, ends[-1] + 1.0, 0.005)
+    rates = np.array([MOTIONS[name] for name, _ in CHANGING])
+    motion = gaze(rates[np.minimum(np.searchsorted(ends, t, side="right"), len(rates) - 1)], t)
+    rows, course = [], {}
+    for name in (f"{USUAL:g} rpm", *BANDS):
+        controller = SpeedController(most_rpm=MOST_RPM, **BANDS[name]) if name in BANDS else None
+        windows = list(run(motion, float(ends[-1]) + SPARE_S, USUAL, controller))
+        rows.append(summary(name, windows, SETTLED_S, float(ends[-1])))
+        if controller is not None:
+            judge(rows[-1], rows[0])
+        told(rows[-1])
+        course[name] = {
+            "t_s": [round(w.t_s, 4) for w in windows],
+            "rpm": [round(w.rpm, 1) for w in windows],
+            "mev_s": [round(1e-6 * w.events / w.seconds, 4) for w in windows],
+            "share": [round(w.share, 5) for w in windows],
+        }
+    return rows, course
+
+
+def draw(path: Path, results: dict[str, Any]) -> None:
+    """Edges unseen against events, and speed and events of the changing scene over time."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.0, 5.6), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.15))
+    _against(figure.add_subplot(grid[:, 0]), results["motions"])
+    upper = figure.add_subplot(grid[0, 1])
+    _course(upper, results["course"], "rpm", "speed [turns/min]")
+    lower = figure.add_subplot(grid[1, 1], sharex=upper)
+    _course(lower, results["course"], "mev_s", "million events/s")
+    upper.set_title("the camera's motion changes", fontsize=11)
+    upper.tick_params(labelbottom=False)
+    upper.legend(loc="lower right", fontsize=9, framealpha=1.0)
+    lower.set_xlabel("time [s]")
+    save(figure, path)
+
+
+COLOURS = {"still": "#0072b2", "slow": "#009e73", "fast": "#d55e00"}
+COURSES = {f"{USUAL:g} rpm": ("#777777", "--"), "adaptive": ("#000000", "-"), "adaptive, 99 %": ("#cc79a7", "-")}
+ALL = 2e-5
+"""An unseen share that is drawn for none."""
+LABELS = {"still": (-26, 8), "slow": (5, -11), "fast": (10, -9)}
+"""Where the speeds stand beside their points [point]."""
+
+
+def _against(ax: Any, motions: dict[str, list[Row]]) -> None:
+    for motion, rows in motions.items():
+        fixed = [row for row in rows if row["name"] not in BANDS]
+        x = [row["mev_s"] for row in fixed]
+        y = [max(1.0 - row["share"], ALL) for row in fixed]
+        ax.plot(
+            x, y, "o-", color=COLOURS[motion], markersize=4, linewidth=1.3, label=f"{motion}, {MOTIONS[motion]:g}°/s"
+        )
+        for row, a, b in zip(fixed, x, y, strict=True):
+            ax.annotate(
+                f"{row['rpm']:g}", (a, b), LABELS[motion], textcoords="offset points", fontsize=8, color=COLOURS[motion]
+            )
+        for name, marker, size in (("adaptive", "*", 17), ("adaptive, 99 %", "D", 8)):
+            row = next(row for row in rows if row["name"] == name)
+            ax.plot(row["mev_s"], max(1.0 - row["share"], ALL), marker, color=COLOURS[motion], markersize=size,
+                    markeredgecolor="black", markeredgewidth=1.0)  # fmt: skip
+    for name, marker, size in (
+        ("fixed speeds [turns/min]", "o-", 4),
+        ("adaptive", "*", 14),
+        ("adaptive, 99 %", "D", 7),
+    ):
+        ax.plot(
+            [], [], marker, color="#999999", markersize=size, markeredgecolor="black" if size > 4 else None, label=name
+        )
+    ax.set_yscale("log")
+    ax.margins(x=0.09)
+    ax.set_ylim(0.1, ALL / 1.6)
+    ticks = {0.1: "90 %", 0.01: "99 %", 0.001: "99.9 %", 0.0001: "99.99 %", ALL: "all"}
+    ax.set_yticks(list(ticks), list(ticks.values()))
+    ax.minorticks_off()
+    ax.grid(True, color="#dddddd", linewidth=0.6)
+    ax.set(xlabel="million events/s", ylabel="edges seen per 33 ms window")
+    ax.set_title("edges seen against events", fontsize=11)
+    ax.legend(loc="lower right", fontsize=9, framealpha=1.0)
+
+
+def _course(ax: Any, course: dict[str, Any], what: str, label: str) -> None:
+    start, top = 0.0, 1.18 * max(max(run[what]) for run in course.values())
+    for motion, seconds in CHANGING:
+        ax.axvspan(start, start + seconds, color=COLOURS[motion], alpha=0.1, linewidth=0)
+        ax.text(start + seconds / 2, 0.97 * top, motion, color=COLOURS[motion], ha="center", va="top", fontsize=10)
+        start += seconds
+    for name, (colour, style) in COURSES.items():
+        ax.plot(course[name]["t_s"], course[name][what], style, color=colour, linewidth=1.6, label=name)
+    ax.set(xlim=(0.0, start), ylim=(0.0, top), ylabel=label)
+
+
+def measure_ms(events: int = 300_000, repeats: int = 50) -> float:
+    """Time for a window's coverage, median [ms]: points of a 640 × 480 image, each seen again and again."""
+    rng = np.random.default_rng(0)
+    meter, turned = CoverageMeter(640, 480), np.linspace(0.0, 2.5, 17)
+    path = 5.0 * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    places = rng.uniform(0.0, (640.0, 480.0), (20_000, 2))[rng.integers(0, 20_000, events)]
+    xy = (places + rng.normal(0.0, 0.3, places.shape)).astype(np.float32)
+    t, none = np.sort(rng.integers(0, WINDOW_US, events)), np.zeros(events, np.uint8)
+    x, y = (np.ascontiguousarray(column) for column in xy.T)
+    taken = []
+    for start in range(0, repeats * WINDOW_US, WINDOW_US):
+        window = Events(x, y, t + start, none)
+        began = time.perf_counter()
+        meter(window, start, start + WINDOW_US, path)
+        taken.append(1e3 * (time.perf_counter() - began))
+    return float(np.median(taken))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="where the figures go (JSON)")
+    parser.add_argument("--figure", type=Path, help="where the chart goes (PNG)")
+    parser.add_argument("--again", type=Path, metavar="FILE.json", help="only draw what an earlier run wrote")
+    args = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    if args.again:
+        draw(args.figure, json.loads(args.again.read_text()))
+        return 0
+    began = time.perf_counter()
+    results: dict[str, Any] = {"machine": machine("cpu"), "versions": versions(["warp-lang", "numpy", "scipy"])}
+    results |= {"window_ms": WINDOW_US / 1e3, "tolerance": TOLERANCE, "measure_ms": measure_ms(), "motions": {}}
+    for name, rate in MOTIONS.items():
+        print(f"{name}, {rate:g} deg/s", flush=True)
+        results["motions"][name] = one_motion(rate, PRISM, FIXED)
+    print("still, half the orbit", flush=True)
+    results["small_orbit"] = one_motion(0.0, SMALL, (360.0, 720.0))
+    print("changing", flush=True)
+    results["changing"], results["course"] = changing()
+    groups = (*results["motions"].values(), results["small_orbit"], results["changing"])
+    results["ok"] = all(row.get("ok", True) for rows in groups for row in rows)
+    print(f"{'ok' if results['ok'] else 'NOT ok'}, {time.perf_counter() - began:.0f} s; coverage of 300,000 events in "
+          f"{results['measure_ms']:.2f} ms", flush=True)  # fmt: skip
+    if args.out:
+        write_text(args.out, json.dumps(results, indent=1) + "\n")
+    if args.figure:
+        draw(args.figure, results)
+    return int(not results["ok"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
