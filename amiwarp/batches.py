@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.gatherer import PIECE, Gatherer, address
 from amiwarp.iwe import CanvasShape, Votes
 
 if TYPE_CHECKING:
@@ -27,8 +28,6 @@ VOTED = 1 << 16
 """Events that are voted into the image at a time."""
 SLICE = 4096
 """Blocks that are worth more threads than one."""
-PIECE, THREADS = 1 << 17, 4
-"""Events that a thread puts together: of more, several threads do."""
 DIRECT = 1 << 16
 """Events from which on a GPU writes to where its results are handed out."""
 SPARE, UNUSED = 16, 3
@@ -39,6 +38,22 @@ OUT = ("out_x", "out_y", "inside")
 """Columns of results."""
 Lent: TypeAlias = tuple[Any, NDArray[Any]]
 """An array of Warp's and the part of it that is lent."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Started:
+    """A batch that is put together at ``at`` to ``end`` of the buffers."""
+
+    parts: list[Events]
+    at: int
+    end: int
+    t: NDArray[np.int64]
+    p: NDArray[np.uint8]
+    put_us: int
+    lent: Lent | None
+    """Where its times are, if not in the buffers."""
+    found: Callable[[], tuple[bool, int, int]]
+    """Waits until it is together: whether any part is unsorted, and the largest x and y."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +83,8 @@ class Batches:
         from amiwarp.kernels import compensate as kernels
         from amiwarp.kernels.structs import azimuths, camera_params, pinhole_params
 
-        self._device, self._at, self._voted = device, 0, 0
+        self._device, self._at = device, 0
+        self._placed: list[tuple[int, int]] = []  # stretches that were not voted yet
         self._voting: deque[tuple[int, int, Future[None]]] = deque()
         self._kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
         self._kernel.module.load(device, **({"block_dim": 1} if device.is_cpu else {}))
@@ -90,9 +106,11 @@ class Batches:
         self._host = {name: getattr(self._ours, name).numpy() for name in dtypes}
         self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
         self._recorded: dict[int, Any] = {}
-        self._stretches: Callable[[int, int], None] | None = None
-        self._spare, self._gatherer = Spare(batch), Gatherer()
+        self._spare, self._gatherers = Spare(batch), [Gatherer(), Gatherer()]
         self._votes = Votes(CanvasShape(*self._size), device)
+        self._stretches = self._votes.stretches(columns.out_x, columns.out_y, self._layer)
+        if device.is_cuda and batch > DIRECT:
+            self._spare.fill()
 
     def set_encoder(self, encoder: Encoder, first: int, last: int) -> None:
         """Puts its pieces over a span of event times [us] into one bucket, where a search finds them: they are few."""
@@ -120,32 +138,59 @@ class Batches:
         for command in self._recorded.values():
             command.set_param_at_index(3, p)
 
-    def begin(self, parts: list[Events], n: int, unknown: int, put_us: int) -> Begun:
-        """Sends a batch on its way; the first ``unknown`` get no place."""
-        import warp as wp
-
+    def start(self, parts: list[Events], put_us: int) -> Started:
+        """Begins to put a batch together, by other threads where it is long."""
+        n, several = sum(map(len, parts)), len(parts) > 1
         padded = -(-n // self._block) * self._block
         if self._at + padded > self._room:
-            self._vote()
-            self._at = self._voted = 0
-        at, end, host = self._at, self._at + n, self._host
+            self._at = 0
+        at, end = self._at, self._at + n
         self._at += padded
+        self._vote(least=1 if any(begin < self._at and stop > at for begin, stop in self._placed) else VOTED)
         self._wait_for_votes(at, self._at)
-        direct = self._device.is_cuda and n > DIRECT
-        t, p, strays = self._gather(parts, n, at, self._spare(n, np.int64) if direct else None)
+        lent = self._spare(n, np.int64) if self._device.is_cuda and n > DIRECT else None
+        t = self._host["t"][at:end] if lent is None else lent[1]
+        p = np.empty(n, np.uint8) if several else parts[0].p
+        to = [self._host["x"][at:end], self._host["y"][at:end], t, p]
+        if several or n > PIECE:
+            self._gatherers.reverse()
+            addresses = [address(column) for column in to]
+            return Started(parts, at, end, t, p, put_us, lent, self._gatherers[0](parts, n, addresses, with_p=several))
+        # as quickly as that goes, for a single packet
+        to[0][:], to[1][:], to[2][:] = parts[0].x, parts[0].y, parts[0].t
+        found = bool((t[1:] < t[:-1]).any()), int(to[0].max()), int(to[1].max())
+        return Started(parts, at, end, t, p, put_us, lent, lambda: found)
+
+    def begin(self, started: Started, unknown: int) -> Begun:
+        """Sends a batch on its way; the first ``unknown`` get no place. Raises :class:`AmiwarpError` where unsorted."""
+        import warp as wp
+
+        s, (unsorted, x, y) = started, started.found()
+        at, end, n = s.at, s.end, s.end - s.at
+        if unsorted:
+            raise AmiwarpError(
+                f"events of {s.parts[0].t[0]} to {s.parts[-1].t[-1]} us are not sorted; sort each packet"
+            )
+        if self._device.is_cuda:
+            self._copy(self._columns, self._ours, ("x", "y") if s.lent else ("x", "y", "t"), at, end)
+            if s.lent is not None:
+                wp.copy(self._columns.t, s.lent[0], dest_offset=at, count=n)
+        padded = -(-n // self._block) * self._block
         if unknown < n:
-            host["t"][end : self._at] = host["t"][end - 1]
-            camera = self._camera if strays else self._pinhole
-            self._launch(at // self._block, padded // self._block, camera)
+            self._host["t"][end : at + padded] = s.t[-1]
+            # the quick way of placing takes an event's pixel from the image's tables without a look: not for strays
+            strays = x >= self._size[0] or y >= self._size[1]
+            self._launch(at // self._block, padded // self._block, self._camera if strays else self._pinhole)
         self._nowhere(at, at + unknown)
-        self._nowhere(end, self._at)
+        self._nowhere(end, at + padded)
+        self._placed.append((at, at + padded))
         out, done = None, None
         if self._device.is_cuda:
-            out = self._send_back(at, end, direct)
+            out = self._send_back(at, end, s.lent is not None)
             done = wp.record_event(wp.Event(self._device))
-        if self._at - self._voted >= VOTED:
-            self._vote()
-        return Begun(at, end, t, p, unknown, put_us, out, done)
+        self._vote(least=VOTED)
+        t = s.t if s.lent else s.t.copy() if len(s.parts) > 1 else s.parts[0].t
+        return Begun(at, end, t, s.p, unknown, s.put_us, out, done)
 
     def end(self, begun: Begun) -> list[NDArray[Any]]:
         """Places x, y [px] and flags, outside the image or not."""
@@ -170,35 +215,6 @@ class Batches:
         for name, (array, _) in zip(OUT, lent, strict=True):
             wp.copy(array, getattr(self._columns, name), src_offset=at, count=end - at)
         return [view for _, view in lent]
-
-    def _gather(
-        self, parts: list[Events], n: int, at: int, lent: Lent | None
-    ) -> tuple[NDArray[np.int64], NDArray[np.uint8], bool]:
-        """Puts the parts together on the device: times, polarities and whether any event lies outside the sensor.
-
-        ``lent``: where to put the times, else beside the others. Raises :class:`AmiwarpError` where they are unsorted.
-        """
-        import warp as wp
-
-        several = len(parts) > 1
-        p = np.empty(n, np.uint8) if several else parts[0].p
-        t = self._host["t"][at : at + n] if lent is None else lent[1]
-        to = [self._host["x"][at : at + n], self._host["y"][at : at + n], t, p]
-        if several or n > PIECE:
-            unsorted, x, y = self._gatherer(parts, n, [_address(column) for column in to], with_p=several)
-        else:  # as quickly as that goes, for a single packet
-            to[0][:], to[1][:], to[2][:] = parts[0].x, parts[0].y, parts[0].t
-            unsorted, x, y = bool((t[1:] < t[:-1]).any()), to[0].max(), to[1].max()
-        if unsorted:
-            raise AmiwarpError(f"events of {parts[0].t[0]} to {parts[-1].t[-1]} us are not sorted; sort each packet")
-        if self._device.is_cuda:
-            self._copy(self._columns, self._ours, ("x", "y") if lent else ("x", "y", "t"), at, at + n)
-            if lent is not None:
-                wp.copy(self._columns.t, lent[0], dest_offset=at, count=n)
-        if lent is None:
-            t = t.copy() if several else parts[0].t
-        # the quick way of placing takes an event's pixel from the image's tables without a look: not for strays
-        return t, p, bool(x >= self._size[0] or y >= self._size[1])
 
     def _copy(self, to: Any, source: Any, names: tuple[str, ...], at: int, end: int) -> None:
         import warp as wp
@@ -234,21 +250,20 @@ class Batches:
             else:
                 getattr(self._columns, name)[start:stop].fill_(float("nan"))
 
-    def _vote(self) -> None:
-        """What was not voted yet: on CPUs by a thread beside, one for all, so that votes come one after the other."""
+    def _vote(self, *, least: int) -> None:
+        """What was not voted yet, if it is so many events: on CPUs by a thread beside, one for all, so that votes come
+        one after the other."""
         from amiwarp.kernels.launch import beside
 
-        start, stop = self._voted, self._at
-        if start == stop:
+        if sum(stop - start for start, stop in self._placed) < least:
             return
-        columns = (self._columns.out_x, self._columns.out_y, self._layer)
-        if self._device.is_cpu:
-            self._stretches = self._stretches or self._votes.stretches(*columns)
-            job = beside().submit(self._stretches, start // self._block, (stop - start) // self._block)
-            self._voting.append((start, stop, job))
-        else:
-            self._votes.add_points(*(column[start:stop] for column in columns))
-        self._voted = stop
+        for start, stop in _joined(self._placed):
+            span = start // self._block, (stop - start) // self._block
+            if self._device.is_cpu:
+                self._voting.append((start, stop, beside().submit(self._stretches, *span)))
+            else:
+                self._stretches(*span)
+        self._placed.clear()
 
     def _wait_for_votes(self, start: int, stop: int) -> None:
         """Until a stretch of the buffers is free again."""
@@ -256,7 +271,7 @@ class Batches:
             self._voting.popleft()[2].result()
 
     def image(self) -> NDArray[np.float32]:
-        self._vote()
+        self._vote(least=1)
         self._wait_for_votes(0, self._room)
         return self._votes.take()[0]
 
@@ -267,13 +282,19 @@ class Spare:
     def __init__(self, size: int) -> None:
         """``size`` of each."""
         self._size = size
-        self._kept: dict[Any, list[Lent]] = {}
+        self._kept: dict[Any, list[Lent]] = {np.int64: [], np.float32: [], np.uint8: []}
+
+    def fill(self) -> None:
+        """Makes as many as there are batches under way."""
+        for dtype, each in ((np.int64, 1), (np.float32, 2), (np.uint8, 1)):
+            held = [self(1, dtype) for _ in range(each * ROUNDS)]
+            assert held  # so that they are different ones
 
     def __call__(self, n: int, dtype: Any) -> Lent:
         """One of ``n`` values of any content."""
         import warp as wp
 
-        kept = self._kept.setdefault(dtype, [])
+        kept = self._kept[dtype]
         for array, view in kept:
             if sys.getrefcount(view) <= UNUSED:
                 return array, view[:n]
@@ -285,64 +306,12 @@ class Spare:
         return array, kept[-1][1][:n]
 
 
-class Gatherer:
-    """Puts packets together by several threads, see :mod:`amiwarp.kernels.gather`."""
-
-    def __init__(self) -> None:
-        from amiwarp.kernels import gather
-
-        self._kernel = gather.gather_parts
-        self._kernel.module.load("cpu", block_dim=1)
-        self._make(64)
-
-    def _make(self, rows: int) -> None:
-        import warp as wp
-
-        from amiwarp.kernels.gather import FOUND, ROW
-
-        table, found = (
-            wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
-            wp.zeros(rows * FOUND, dtype=int, device="cpu"),
-        )
-        self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
-        self._commands = [
-            wp.launch(self._kernel, 1, [table, found, 0], device="cpu", record_cmd=True) for _ in range(THREADS)
-        ]
-
-    def __call__(self, parts: list[Events], n: int, to: list[int], *, with_p: bool) -> tuple[bool, int, int]:
-        """Copies ``n`` events of the parts to where the addresses ``to`` say: of x, y, t and, if it is asked for, p.
-
-        Whether any part is unsorted, and the largest x and y.
-        """
-        from amiwarp.kernels.launch import pool
-
-        to_x, to_y, to_t, to_p = to
-        rows, held, place = [], [], 0
-        for part in parts:
-            columns = [np.ascontiguousarray(column) for column in (part.x, part.y, part.t, part.p)]
-            held.append(columns)
-            x, y, t, p = map(_address, columns)
-            for k in range(0, len(part), PIECE):
-                to_here = (to_x + 2 * place, to_y + 2 * place, to_t + 8 * place, to_p + place if with_p else 0)
-                count = min(PIECE, len(part) - k)
-                rows.append((x + 2 * k, y + 2 * k, t + 8 * k, p + k, *to_here, count, int(k > 0)))
-                place += count
-        if len(rows) > len(self._table):
-            self._make(2 * len(rows))
-        self._table[: len(rows)] = rows
-        threads = min(THREADS, len(rows), -(-n // PIECE))
-        edges = [len(rows) * k // threads for k in range(threads + 1)]
-
-        def run(k: int) -> None:
-            command = self._commands[k]
-            command.set_dim(edges[k + 1] - edges[k])
-            command.set_param_at_index(2, edges[k])
-            command.launch()
-
-        list(pool().map(run, range(threads))) if threads > 1 else run(0)
-        unsorted, x, y = self._found[: len(rows)].max(axis=0).tolist()
-        return bool(unsorted), x, y
-
-
-def _address(array: NDArray[Any]) -> int:
-    return int(array.__array_interface__["data"][0])
+def _joined(stretches: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Those that follow one another as one."""
+    out: list[tuple[int, int]] = []
+    for start, stop in stretches:
+        if out and out[-1][1] == start:
+            out[-1] = (out[-1][0], stop)
+        else:
+            out.append((start, stop))
+    return out

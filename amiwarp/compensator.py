@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.batches import Batches, Begun
+from amiwarp.batches import Batches, Begun, Started
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
 
@@ -98,13 +98,19 @@ class Compensator:
         Raises :class:`AmiwarpError` for a packet that is not sorted; what was ready with it is lost.
         """
         out: list[Compensated] = []
+        started: Started | None = None
         begun: Begun | None = None
-        while packets := self._ready(now_us):  # a GPU works on one batch while the next is put together
-            following = self._begin(packets)
+        while (
+            True
+        ):  # while one batch is put together, a GPU works on that before it, and the one before that is fetched
+            packets = self._ready(now_us)
+            following = self._start(packets) if packets else None
+            moving = None if started is None else self._begin(started)
             if begun is not None:
                 out.append(self._end(begun))
-            begun = following
-        return out if begun is None else [*out, self._end(begun)]
+            started, begun = following, moving
+            if started is None and begun is None:
+                return out
 
     def flush(self) -> list[Compensated]:
         """All that still waits, its angles guessed where they must be: at the end of a stream."""
@@ -129,9 +135,12 @@ class Compensator:
             self.waiting -= len(events)
         return packets
 
-    def _begin(self, packets: list[tuple[Events, int]]) -> Begun:
-        parts = [events for events, _ in packets]
-        n, first, last = sum(map(len, parts)), int(parts[0].t[0]), int(parts[-1].t[-1])
+    def _start(self, packets: list[tuple[Events, int]]) -> Started:
+        return self._work.start([events for events, _ in packets], packets[0][1])
+
+    def _begin(self, started: Started) -> Begun:
+        parts, n = started.parts, started.end - started.at
+        first, last = int(parts[0].t[0]), int(parts[-1].t[-1])
         begins, ends = self.encoder.first, self.encoder.last
         if begins is None or ends is None:
             unknown = n
@@ -139,7 +148,7 @@ class Compensator:
             unknown = 0 if first >= begins else sum(int(np.searchsorted(part.t, begins)) for part in parts)
         if unknown < n:
             self._cover(max(first, begins or first), last, ends or last)
-        return self._work.begin(parts, n, unknown, packets[0][1])
+        return self._work.begin(started, unknown)
 
     def _end(self, begun: Begun) -> Compensated:
         x, y, flags = self._work.end(begun)

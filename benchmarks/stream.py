@@ -136,6 +136,8 @@ def rate(device: str, pool: Events, model: Model) -> dict[str, Any]:
             if last - imaged >= IMAGE_US:
                 voted, imaged = voted + float(compensator.image().sum(dtype=np.float64)), last
         took = time.perf_counter() - began
+        if not turn:
+            compensator.image()  # so that its kernels are there
     voted += float(compensator.image().sum(dtype=np.float64))
     mev_s, error = packets * PACKET / took / 1e6, check.error_px(model)
     return {"mev_s": mev_s, "asked": asked, "packets": check.count, "error_px": error,

@@ -80,6 +80,20 @@ def test_the_running_image_is_that_of_the_events_taken(device: str) -> None:
     assert compensator.image().sum() == 0.0
 
 
+@pytest.mark.parametrize("size", [700, 3000])
+def test_the_image_is_whole_however_many_batches_are_under_way(size: int, device: str) -> None:
+    """Many batches by one call: the buffers are gone round several times."""
+    events = random_events(100_000)
+    compensator = Compensator(MODEL, streamed(), batch=4096, device=device)
+    for start in range(0, 100_000, size):
+        compensator.put(events[start : start + size], 0)
+    found, _ = joined(compensator.take(0))
+    expected = compensate_events(events, MODEL, ENCODER, device=device)
+    np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
+    image = iwe(events, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, device=device)
+    assert np.abs(compensator.image() - np.squeeze(image)).max() < 0.5
+
+
 def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
     events, stream = random_events(3000, 0.03), EncoderStream()
     compensator = Compensator(MODEL, stream, wait_us=10_000, start_us=500_000)

@@ -36,7 +36,7 @@ ORDER = (
     ("pictures", "motion", "clouds"),
     ("io", "uploads", "link"),
     ("iwe", "peers"),
-    ("batches", "compensate", "compensator", "iwe_files", "sharpness", "metrics", "scenery", "tiles"),
+    ("gatherer", "batches", "compensate", "compensator", "iwe_files", "sharpness", "metrics", "scenery", "tiles"),
     ("pairs",),
     ("residuals",),
     ("brightness",),

@@ -1,0 +1,103 @@
+"""Packets of events put together to long columns, by threads of native code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from amiwarp.events import Events
+
+PIECE, THREADS = 1 << 18, 2
+"""Events that a thread puts together: of more, several do. Two fill the memory's way, more wait for each other."""
+WIDTHS = (2, 2, 8, 1)
+"""Bytes of x, y, t, p of an event."""
+
+
+class Gatherer:
+    """Puts packets together by several threads, see :mod:`amiwarp.kernels.gather`."""
+
+    def __init__(self) -> None:
+        from amiwarp.kernels import gather
+
+        self._kernel = gather.gather_parts
+        self._kernel.module.load("cpu", block_dim=1)
+        self._make(64)
+
+    def _make(self, rows: int) -> None:
+        import warp as wp
+
+        from amiwarp.kernels.gather import FOUND, ROW
+
+        table, found = (
+            wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
+            wp.zeros(rows * FOUND, dtype=int, device="cpu"),
+        )
+        self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
+        self._commands = [
+            wp.launch(self._kernel, 1, [table, found, 0], device="cpu", record_cmd=True) for _ in range(THREADS)
+        ]
+
+    def __call__(
+        self, parts: list[Events], n: int, to: list[int], *, with_p: bool
+    ) -> Callable[[], tuple[bool, int, int]]:
+        """Copies ``n`` events of the parts to where the addresses ``to`` say: of x, y, t and, if it is asked for, p.
+
+        What it returns waits for it, and tells whether any part is unsorted, and the largest x and y. Not before that
+        may this be called again.
+        """
+        from amiwarp.kernels.launch import pool
+
+        goes_on: Any = 0  # whether a row's first event follows the last of the row before in memory
+        if max(map(len, parts)) > PIECE:
+            parts, goes_on = _cut(parts)
+        columns = [[_plain(getattr(part, name)) for part in parts] for name in ("x", "y", "t", "p")]
+        counts = np.array([len(t) for t in columns[2]])
+        places = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        if len(parts) > len(self._table):
+            self._make(2 * len(parts))
+        table = self._table[: len(parts)]
+        for k, (column, start, width) in enumerate(zip(columns, to, WIDTHS, strict=True)):
+            table[:, k] = [address(values) for values in column]
+            table[:, 4 + k] = start + width * places if k < 3 or with_p else 0
+        table[:, 8], table[:, 9] = counts, goes_on
+        threads = min(THREADS, len(parts), -(-n // PIECE))
+        edges = [len(parts) * k // threads for k in range(threads + 1)]
+
+        def run(k: int) -> None:
+            command = self._commands[k]
+            command.set_dim(edges[k + 1] - edges[k])
+            command.set_param_at_index(2, edges[k])
+            command.launch()
+
+        jobs = [pool().submit(run, k) for k in range(threads)] if threads > 1 else []
+        if not jobs:
+            run(0)
+
+        def found() -> tuple[bool, int, int]:
+            for job in jobs:
+                job.result()
+            unsorted, most_x, most_y = self._found[: len(parts)].max(axis=0).tolist()
+            assert columns  # held until all was copied
+            return bool(unsorted), most_x, most_y
+
+        return found
+
+
+def _cut(parts: list[Events]) -> tuple[list[Events], list[int]]:
+    """Parts in pieces of :data:`PIECE` at most, and which of them go on where the one before ended."""
+    cut = [(part[k : k + PIECE], int(k > 0)) for part in parts for k in range(0, len(part), PIECE)]
+    return [piece for piece, _ in cut], [goes_on for _, goes_on in cut]
+
+
+def _plain(column: NDArray[Any]) -> NDArray[Any]:
+    """Without gaps."""
+    return column if column.strides[0] == column.itemsize else np.ascontiguousarray(column)
+
+
+def address(array: NDArray[Any]) -> int:
+    """Of its first value."""
+    return int(array.__array_interface__["data"][0])
