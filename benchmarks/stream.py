@@ -3,10 +3,10 @@
     python -m benchmarks.stream [--device cuda:0] [--picture FILE] [--only rate latency hour] [--out FILE.json]
 
 ``rate``: packets of 10,000 events one after the other, an encoder of 1 kHz, an image each 33 ms of a stream at the rate
-that is asked for; on CUDA 400 packets are put before some are taken. ``latency``: one packet each millisecond of
-real time, 10 million events a second, from put to taken, its encoder sample coming 0.2 ms after it. ``hour``: an hour
-of stream through a whole session, as fast as it goes. Places are compared with those of ``compensate_events`` in the
-same run. Exit status 1 where an aim is missed.
+that is asked for, the median of nine passes after a first; on CUDA 400 packets are put before some are taken.
+``latency``: one packet each millisecond of real time, 10 million events a second, from put to taken, its encoder
+sample coming 0.2 ms after it. ``hour``: an hour of stream through a whole session, as fast as it goes. Places are
+compared with those of ``compensate_events`` in the same run. Exit status 1 where an aim is missed.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ MODELS: dict[str, Model] = {
 ASKED_MEV_S = {"cpu": 50.0, "cuda": 500.0}
 MOST_MS, LATENCY_MEV_S, MOST_ERROR_PX, MOST_GROWTH_MIB = 5.0, 10.0, 0.01, 16.0
 HOUR_S, HOUR_MEV_S = 3600.0, 0.5
+REPEATS = 9
 CHECKED = 50
 """Packets whose places are compared, spread over the run."""
 
@@ -119,30 +120,39 @@ class Check:
 def rate(device: str, pool: Events, model: Model) -> dict[str, Any]:
     kind = "cuda" if "cuda" in device else "cpu"
     asked, packets, together = ASKED_MEV_S[kind], *((20_000, 400) if kind == "cuda" else (2000, 1))
-    compensator, encoder = None, EncoderStream()
-    for turn in range(2):  # the first warms up
-        stream, encoder, check, voted, imaged = Stream(pool, asked), EncoderStream(), Check(packets), 0.0, 0
-        compensator = Compensator(model, encoder, device=device)
-        ahead = [stream.packet(k) for k in range(packets if turn else 4 * together)]  # made by a sensor's driver
-        began = time.perf_counter()
-        for k in range(0, len(ahead), together):
-            some = ahead[k : k + together]
-            last = int(some[-1].t[-1])
-            encoder.append(*stream.samples(last))
-            for events in some:
-                compensator.put(events, 0)
-            for done in compensator.take(0):
-                check(ahead, done.events)
-            if last - imaged >= IMAGE_US:
-                voted, imaged = voted + float(compensator.image().sum(dtype=np.float64)), last
-        took = time.perf_counter() - began
-        if not turn:
-            compensator.image()  # so that its kernels are there
+    stream = Stream(pool, asked)
+    ahead = [stream.packet(k) for k in range(packets)]  # made by a sensor's driver
+    passes = [one_pass(device, pool, model, ahead, together, asked) for _ in range(REPEATS + 1)][1:]
+    mev_s = [found["mev_s"] for found in passes]
+    quartiles = np.percentile(mev_s, [25, 50, 75]).tolist()
+    error, voted = max(found["error_px"] for found in passes), passes[-1]["voted"]
+    whole = all(found["packets"] == packets for found in passes)
+    return {"mev_s": quartiles[1], "quartiles": [quartiles[0], quartiles[2]], "asked": asked, "packets": packets,
+            "error_px": error, "voted": voted,
+            "ok": whole and quartiles[1] >= asked and error <= MOST_ERROR_PX}  # fmt: skip
+
+
+def one_pass(
+    device: str, pool: Events, model: Model, ahead: list[Events], together: int, mev_s: float
+) -> dict[str, float]:
+    stream, encoder, check, voted, imaged = Stream(pool, mev_s), EncoderStream(), Check(len(ahead)), 0.0, 0
+    compensator = Compensator(model, encoder, device=device)
+    began = time.perf_counter()
+    for k in range(0, len(ahead), together):
+        some = ahead[k : k + together]
+        last = int(some[-1].t[-1])
+        encoder.append(*stream.samples(last))
+        for events in some:
+            compensator.put(events, 0)
+        for done in compensator.take(0):
+            check(ahead, done.events)
+        if last - imaged >= IMAGE_US:
+            voted, imaged = voted + float(compensator.image().sum(dtype=np.float64)), last
+    took = time.perf_counter() - began
     voted += float(compensator.image().sum(dtype=np.float64))
-    mev_s, error = packets * PACKET / took / 1e6, check.error_px(model)
-    return {"mev_s": mev_s, "asked": asked, "packets": check.count, "error_px": error,
-            "voted": voted / (packets * PACKET),
-            "ok": check.count == packets and mev_s >= asked and error <= MOST_ERROR_PX}  # fmt: skip
+    events = len(ahead) * PACKET
+    return {"mev_s": events / took / 1e6, "packets": check.count, "error_px": check.error_px(model),
+            "voted": voted / events}  # fmt: skip
 
 
 def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> dict[str, Any]:
