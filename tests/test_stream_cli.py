@@ -182,6 +182,21 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
     assert not [p for p in tmp_path.iterdir() if p.name in ("prism", "camera", "handed")]
 
 
+def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path) -> None:
+    """From rest; events at random are more than the limit allows, so that it is slowed down."""
+    from amiwarp.link.emulator import Controller, Motor, PseudoTerminal
+
+    motor = Motor()
+    with PseudoTerminal(Controller(motor), tmp_path / "prism") as port:
+        args = ["live", str(folder / "recording.h5"), "--port", port.name, "--calibration", str(folder / "c.json")]
+        options = ["--adaptive", "--most-mev-s", "0.05", "--seconds", "3", "--device", "cpu", "--json"]
+        done = CliRunner().invoke(app, [*args, *options])
+    assert done.exit_code == 0, done.stderr
+    assert 119.0 < motor.target_rpm(0) < 715.0
+    said = json.loads(done.stdout)
+    assert said["events"] == said["compensated"] > 100_000
+
+
 def test_packets_go_through_pipes(folder: Path, tmp_path: Path) -> None:
     """``live --raw-to -`` into ``record -``."""
     args = ["live", folder / "recording.h5", "--fast", "--calibration", folder / "c.json", "--raw-to", "-"]

@@ -63,6 +63,7 @@ class AdaptiveOptions:
         rpm = min(max(720.0, self.least_rpm), self.limit_rpm)
         most = float("inf") if self.most_mev_s is None else self.most_mev_s
         limits = SpeedController(rpm, least_rpm=self.least_rpm, most_rpm=self.limit_rpm, most_mev_s=most)
+        link.set_speed(rpm, limits.ramp_rpm_s)
         return SpeedKeeper(model, limits, link.set_speed, say)
 
 
