@@ -6,6 +6,7 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -30,8 +31,8 @@ SLICE = 4096
 """Blocks that are worth more threads than one."""
 DIRECT = 1 << 16
 """Events from which on a GPU writes to where its results are handed out."""
-SPARE, UNUSED = 16, 3
-"""Arrays that are kept of a kind; references to one of them that nobody else holds: ours while we look."""
+SPARE = 16
+"""Arrays that are kept of a kind."""
 
 
 OUT = ("out_x", "out_y", "inside")
@@ -49,7 +50,7 @@ class Started:
     end: int
     t: NDArray[np.int64]
     p: NDArray[np.uint8]
-    put_us: int
+    arrived_us: int
     lent: Lent | None
     """Where its times are, if not in the buffers."""
     found: Callable[[], tuple[bool, int, int]]
@@ -66,7 +67,7 @@ class Begun:
     p: NDArray[np.uint8]
     unknown: int
     """Events at its beginning that have no angle."""
-    put_us: int
+    arrived_us: int
     out: list[NDArray[Any]] | None
     """Where a GPU writes places and whether they are inside; None: into the buffers."""
     done: Any
@@ -138,7 +139,7 @@ class Batches:
         for command in self._recorded.values():
             command.set_param_at_index(3, p)
 
-    def start(self, parts: list[Events], put_us: int) -> Started:
+    def start(self, parts: list[Events], arrived_us: int) -> Started:
         """Begins to put a batch together, by other threads where it is long."""
         n, several = sum(map(len, parts)), len(parts) > 1
         padded = -(-n // self._block) * self._block
@@ -155,11 +156,13 @@ class Batches:
         if several or n > PIECE:
             self._gatherers.reverse()
             addresses = [address(column) for column in to]
-            return Started(parts, at, end, t, p, put_us, lent, self._gatherers[0](parts, n, addresses, with_p=several))
+            return Started(
+                parts, at, end, t, p, arrived_us, lent, self._gatherers[0](parts, n, addresses, with_p=several)
+            )
         # as quickly as that goes, for a single packet
         to[0][:], to[1][:], to[2][:] = parts[0].x, parts[0].y, parts[0].t
         found = bool((t[1:] < t[:-1]).any()), int(to[0].max()), int(to[1].max())
-        return Started(parts, at, end, t, p, put_us, lent, lambda: found)
+        return Started(parts, at, end, t, p, arrived_us, lent, lambda: found)
 
     def begin(self, started: Started, unknown: int) -> Begun:
         """Sends a batch on its way; the first ``unknown`` get no place. Raises :class:`AmiwarpError` where unsorted."""
@@ -177,7 +180,9 @@ class Batches:
                 wp.copy(self._columns.t, s.lent[0], dest_offset=at, count=n)
         padded = -(-n // self._block) * self._block
         if unknown < n:
-            self._host["t"][end : at + padded] = s.t[-1]
+            # what fills up the last block is placed too, so that it must have a place
+            for name, value in (("x", 0), ("y", 0), ("t", s.t[-1])):
+                self._host[name][end : at + padded] = value
             # the quick way of placing takes an event's pixel from the image's tables without a look: not for strays
             strays = x >= self._size[0] or y >= self._size[1]
             self._launch(at // self._block, padded // self._block, self._camera if strays else self._pinhole)
@@ -190,7 +195,7 @@ class Batches:
             done = wp.record_event(wp.Event(self._device))
         self._vote(least=VOTED)
         t = s.t if s.lent else s.t.copy() if len(s.parts) > 1 else s.parts[0].t
-        return Begun(at, end, t, s.p, unknown, s.put_us, out, done)
+        return Begun(at, end, t, s.p, unknown, s.arrived_us, out, done)
 
     def end(self, begun: Begun) -> list[NDArray[Any]]:
         """Places x, y [px] and flags, outside the image or not."""
@@ -296,7 +301,7 @@ class Spare:
 
         kept = self._kept[dtype]
         for array, view in kept:
-            if sys.getrefcount(view) <= UNUSED:
+            if sys.getrefcount(view) <= unused():
                 return array, view[:n]
         if len(kept) >= SPARE:
             view = np.empty(n, dtype)
@@ -304,6 +309,14 @@ class Spare:
         array = wp.empty(self._size, dtype=wp.dtype_from_numpy(dtype), device="cpu", pinned=True)
         kept.append((array, array.numpy()))
         return array, kept[-1][1][:n]
+
+
+@cache
+def unused() -> int:
+    """References to an array of such a list that nobody else holds, as Python counts them inside a loop over it."""
+    for _, view in [(None, np.empty(1))]:
+        count = sys.getrefcount(view)
+    return count
 
 
 def _joined(stretches: list[tuple[int, int]]) -> list[tuple[int, int]]:

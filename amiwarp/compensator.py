@@ -33,8 +33,8 @@ class Compensated:
     """Places without the prism, float32 [px], NaN where there is none; times and polarities as they were put."""
     flags: NDArray[np.uint8]
     """Shape ``(n,)``: sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED`, :data:`NO_ANGLE`."""
-    put_us: int = 0
-    """When the first of them was put, by the caller's clock [us]."""
+    arrived_us: int = 0
+    """When the first of them came, by the caller's clock [us]."""
 
 
 class Compensator:
@@ -65,15 +65,16 @@ class Compensator:
         self._device = wp.get_device(device)
         self.batch = batch or (1 << 16 if self._device.is_cpu else 1 << 20)
         self._work = Batches(model, self.batch, self._device)
-        self._queue: deque[tuple[Events, int]] = deque()
+        self._queue: deque[tuple[Events, int, int]] = deque()
         self.waiting = 0
         """Events put and not taken yet."""
         self._t_last = -(2**62)
         self._covered: tuple[int, int] | None = None
 
-    def put(self, events: Events, now_us: int) -> None:
-        """A packet that came at ``now_us``: uint16 pixels, sorted, not before the last one; kept, not copied.
+    def put(self, events: Events, now_us: int, *, arrived_us: int | None = None) -> None:
+        """A packet, now: uint16 pixels, sorted, not before the last one; kept, not copied. It waits from now on.
 
+        ``arrived_us``: when it came, if that was earlier, for :attr:`Compensated.arrived_us`.
         Raises :class:`AmiwarpError` for other pixels or a packet that begins before the last; nothing was put then.
         """
         if events.x.dtype != np.uint16:
@@ -87,10 +88,11 @@ class Compensator:
         self._t_last = int(events.t[-1])
         self.waiting += len(events)
         if len(events) <= self.batch:
-            self._queue.append((events, now_us))
+            self._queue.append((events, now_us, now_us if arrived_us is None else arrived_us))
             return
         for start in range(0, len(events), self.batch):
-            self._queue.append((events[start : start + self.batch], now_us))
+            part = events[start : start + self.batch]
+            self._queue.append((part, now_us, now_us if arrived_us is None else arrived_us))
 
     def take(self, now_us: int) -> list[Compensated]:
         """What is ready at ``now_us``, in the order it was put, packets that are ready together joined to a batch.
@@ -120,12 +122,12 @@ class Compensator:
         """Image of the events taken since the last call, shape (height, width)."""
         return self._work.image()
 
-    def _ready(self, now_us: int) -> list[tuple[Events, int]]:
-        packets: list[tuple[Events, int]] = []
+    def _ready(self, now_us: int) -> list[tuple[Events, int, int]]:
+        packets: list[tuple[Events, int, int]] = []
         count, last = 0, self.encoder.last
         patience = self.start_us if last is None else self.wait_us
         while self._queue:
-            events, put_us = self._queue[0]
+            events, put_us, _ = self._queue[0]
             covered = last is not None and events.t[-1] <= last
             overdue = now_us - put_us >= patience or self.waiting > self.most_waiting
             if count + len(events) > self.batch or not (covered or overdue):
@@ -135,8 +137,8 @@ class Compensator:
             self.waiting -= len(events)
         return packets
 
-    def _start(self, packets: list[tuple[Events, int]]) -> Started:
-        return self._work.start([events for events, _ in packets], packets[0][1])
+    def _start(self, packets: list[tuple[Events, int, int]]) -> Started:
+        return self._work.start([events for events, *_ in packets], packets[0][2])
 
     def _begin(self, started: Started) -> Begun:
         parts, n = started.parts, started.end - started.at
@@ -155,7 +157,7 @@ class Compensator:
         if not self.encoder.knows(int(begun.t[0]), int(begun.t[-1])):
             flags[self.encoder.guessed(begun.t)] |= EXTRAPOLATED
         flags[: begun.unknown] = OUTSIDE | NO_ANGLE
-        return Compensated(Events(x, y, begun.t, begun.p), flags, begun.put_us)
+        return Compensated(Events(x, y, begun.t, begun.p), flags, begun.arrived_us)
 
     def _cover(self, first: int, last: int, ends: int) -> None:
         """Puts the encoder over a span of event times [us] on the device, where it is not there yet."""

@@ -170,7 +170,7 @@ def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> d
             encoder.append(t, angles(t))
             sampled += len(t)
         for done in compensator.take(now):
-            late.append(monotonic_us() - began - done.put_us)
+            late.append(monotonic_us() - began - done.arrived_us)
             guessed += int(np.count_nonzero(done.flags & (EXTRAPOLATED | NO_ANGLE)))
             check(ahead, done.events)
         time.sleep(0.0001)

@@ -109,7 +109,7 @@ def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
     first = compensator.take(510_000)
     assert [len(p.events) for p in first] == [1000]  # not the late one
     assert (first[0].flags[-1] & EXTRAPOLATED) == EXTRAPOLATED
-    assert first[0].put_us == 500_000
+    assert first[0].arrived_us == 500_000
     assert compensator.waiting == 1000
     stream.append(ENCODER.t[known:], ENCODER.angle[known:])
     last = compensator.take(510_000)
@@ -230,6 +230,22 @@ def test_pixels_outside_the_sensor_are_placed_as_in_a_recording(device: str) -> 
     np.testing.assert_allclose(np.stack([found.x, found.y], axis=1), expected, atol=2e-3)
 
 
+def test_strays_leave_nothing_behind_for_events_that_come_after(device: str) -> None:
+    """A block's rest is placed too, with whatever pixels stand there."""
+    model = MODELS["ellipse"].from_prism(CAMERA, Prism(math.radians(2.0)), 0.4)
+    compensator = Compensator(model, streamed(), batch=64, device=device)
+    far = np.full(64, 65535, np.uint16)
+    events = random_events(400)
+    compensator.put(replace(events[:64], x=far, y=far), 0)
+    out = compensator.take(0)
+    for start in (64, 128, 192, 256, 257):
+        compensator.put(events[start : start + (64 if start < 256 else 1)], 0)
+        out += compensator.take(0)
+    found = joined(out[1:])[0]
+    expected = compensate_events(events[64:258], model, ENCODER, device=device)
+    np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
+
+
 def test_bad_packets_are_refused_and_nothing_is_put() -> None:
     events = random_events(100)
     compensator = Compensator(MODEL, streamed())
@@ -261,7 +277,7 @@ def test_packets_that_are_ready_together_come_out_together(size: int, device: st
     for start in range(0, 200_000, size):
         compensator.put(events[start : start + size], start)
     (out,) = compensator.take(0)
-    assert out.put_us == 0
+    assert out.arrived_us == 0
     np.testing.assert_array_equal(out.events.t, events.t)
     np.testing.assert_array_equal(out.events.p, events.p)
     expected = compensate_events(events, MODEL, ENCODER, device=device)

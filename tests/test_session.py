@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,14 @@ from amiwarp.compensator import OUTSIDE, Compensated
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, Recording
-from amiwarp.io import open_recording
+from amiwarp.io import open_recording, save_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics import ExactModel, Prism
+from amiwarp.stream.beside import Beside
 from amiwarp.stream.emulated import LEAD_US, EmulatedCamera
 from amiwarp.stream.packets import Packet, packet
 from amiwarp.stream.queues import Policy
-from amiwarp.stream.session import Beside, Session, Status
+from amiwarp.stream.session import Session, Status
 from amiwarp.stream.sources import open_source
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
@@ -246,6 +247,79 @@ def test_a_sink_that_fails_ends_the_session_and_says_so() -> None:
 
     with pytest.raises(AmiwarpError, match="no space left"):
         Session(Made(packets_of(points(20_000, 0.5))), KNOWN, sinks=(full,)).run(threading.Event(), lambda _: None)
+
+
+def test_a_taker_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> None:
+    """A disk that is full: the other file gets all that had come."""
+
+    class Full:
+        calls = 0
+
+        def append(self, events: Events) -> None:
+            self.calls += 1
+            if self.calls == 3:
+                raise AmiwarpError("no space left")
+
+        def append_encoder(self, *_: object) -> None: ...
+
+        def tick(self) -> None: ...
+
+    with LiveWriter(tmp_path / "raw.h5", width=64, height=48) as raw:
+        session = Session(Made(packets_of(points(20_000, 0.5))), KNOWN, raw=[Full(), raw])
+        with pytest.raises(AmiwarpError, match="no space left"):
+            session.run(threading.Event(), lambda _: None)
+    assert session.status.events == session.status.done == len(open_recording(tmp_path / "raw.h5").events) >= 1500
+
+
+def test_samples_that_wait_in_the_queue_are_waited_for() -> None:
+    """Each packet's come after it; a sink was slow for longer than one waits for the encoder."""
+    given = packets_of(points(100_000, 0.5))
+    apart = [packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)]
+    slow = iter([0.1])
+    out: list[Compensated] = []
+
+    def sink(done: Compensated) -> None:
+        time.sleep(next(slow, 0.0))
+        out.append(done)
+
+    status = Session(Made(apart), KNOWN, sinks=(sink,)).run(threading.Event(), lambda _: None)
+    assert status.done == 100_000
+    assert status.guessed < 2000
+
+
+def test_a_source_that_does_not_let_go_is_left_behind() -> None:
+    given, stop, free = packets_of(points(20_000, 0.5)), threading.Event(), threading.Event()
+
+    class Stuck(Made):
+        def packets(self) -> Iterator[Packet]:
+            yield from given
+            stop.set()
+            free.wait(30.0)
+
+    source, out = Stuck([]), []
+    status = Session(source, KNOWN, sinks=(out.append,)).run(stop, lambda _: None)
+    assert status.done == 20_000
+    assert not source.closed
+    free.set()
+
+
+@pytest.mark.parametrize("offset", [0.0, 700.0])
+def test_the_clock_offset_of_a_file_is_applied_once(tmp_path: Path, offset: float) -> None:
+    """By the calibration's value, live as offline, of the file and of what was recorded of it."""
+    recording = points(20_000, 0.5)
+    assert recording.encoder is not None
+    late = Encoder(recording.encoder.t + 700, recording.encoder.angle, offset)
+    save_recording(tmp_path / "file.h5", replace(recording, encoder=late))
+    known = replace(KNOWN, parameters={**KNOWN.parameters, "clock_offset": 700.0})
+    source = open_source(str(tmp_path / "file.h5"), pace=None)
+    out: list[Compensated] = []
+    with LiveWriter(tmp_path / "raw.h5", width=64, height=48, clock_offset_us=offset) as raw:
+        Session(source, known, raw=[raw], sinks=(out.append,)).run(threading.Event(), lambda _: None)
+    live = Events.concatenate([p.events for p in out])
+    for name in ("file.h5", "raw.h5"):
+        compensate(open_recording(tmp_path / name), known, tmp_path / "offline.h5")
+        offline = open_recording(tmp_path / "offline.h5").events.slice(0, 20_000)
+        assert np.nanmax(np.hypot(live.x - offline.x, live.y - offline.y)) < 1e-3
 
 
 def test_a_slow_sink_makes_a_queue_drop_and_not_grow() -> None:

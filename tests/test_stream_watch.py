@@ -68,12 +68,10 @@ def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
     watch.put(recording.events.slice(0, len(recording.events)))
     first = looked(watch, encoder)
     assert first == pytest.approx(1.0, abs=BIAS_DEG)
-    watch.close()
     assert said == []
     slipped = EncoderStream()
     assert recording.encoder is not None
     slipped.append(recording.encoder.t, recording.encoder.angle - math.radians(4.0))
-    watch.result()
     while abs(looked(watch, slipped) - first) < 1.0:
         time.sleep(0.01)
     assert looked(watch, slipped) - first == pytest.approx(4.0, abs=0.5)

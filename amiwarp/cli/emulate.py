@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import threading
 import time
@@ -13,6 +14,7 @@ import typer
 
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common
+from amiwarp.cli.streams import stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
@@ -21,8 +23,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"
 
-AFTER_S = 1.0
-"""The controller goes on for so long after the camera's last event: its samples cover that."""
+STEP_S, AFTER_S = 0.05, 1.0
+"""Between two looks at whether it is to end; and so long the controller goes on after the camera's last event."""
 
 
 def run(
@@ -77,11 +79,13 @@ def run(
     def now_us() -> int:
         return (time.monotonic_ns() - origin) // 1000
 
-    with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as held:
+        stop = threading.Event()
+        held.enter_context(stopped_by_interrupt(stop))
         terminal = held.enter_context(PseudoTerminal(controller, link, now_us=now_us))
         hint = f"amiwarp motor status --port {terminal.name}"
         data, lines = {"port": terminal.name, "try": hint}, [terminal.name, f"try: {hint}", "Ctrl-C ends it"]
-        ended = threading.Event()
+        served = None
         if played is not None and camera is not None and isinstance(rotor, Played):
             served = held.enter_context(EmulatedCamera(played[0], rotor, controller, camera, now_us))
             hint = f"amiwarp live {served.address} --port {terminal.name} --calibration CALIBRATION"
@@ -89,12 +93,13 @@ def run(
                 {**data, "camera": served.address, "try": hint},
                 [terminal.name, served.address, f"try: {hint}"],
             )
-            ended = served.done
         report(common, data, lines)
         sys.stdout.flush()
-        ended.wait(seconds)
-        if ended.is_set():
-            time.sleep(AFTER_S)
+        end = math.inf if seconds is None else time.monotonic() + seconds
+        while not stop.wait(STEP_S) and time.monotonic() < end:
+            if served is not None and served.done.is_set():
+                stop.wait(AFTER_S)
+                break
 
 
 def _recording(path: Path) -> tuple[Recording, Encoder]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +13,14 @@ import typer
 
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import Common
-from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
+from amiwarp.cli.streams import (
+    SourceOptions,
+    StatusLine,
+    check_angles,
+    clock_offset,
+    stopped_by_interrupt,
+    summary,
+)
 from amiwarp.errors import AmiwarpError
 from amiwarp.stream.queues import Policy
 
@@ -107,7 +115,7 @@ def run(
     device = choose_device(common.device)
     found = Calibration.load(calibration)
     with contextlib.ExitStack() as held:
-        stop = held.enter_context(stopped_by_interrupt())
+        stop = threading.Event()
         line = held.enter_context(StatusLine(stop, stream.seconds))
         link = held.enter_context(stream.link())
         opened = stream.open(source)
@@ -118,12 +126,17 @@ def run(
             raise AmiwarpError(f"{opened.name}: is {given}, the calibration is for {size[0]}x{size[1]}")
         raw: list[Raw] = []
         if record is not None:
-            raw.append(held.enter_context(_writer(record, opened, found, compensated=False)))
+            raw.append(
+                held.enter_context(
+                    _writer(record, opened, found, compensated=False, offset_us=clock_offset(opened, link))
+                )
+            )
         if raw_to is not None:
             raw.append(Forward(_sink(raw_to, found, held)))
         written = None if out is None else held.enter_context(_writer(out, opened, found, compensated=True))
         served = None if to is None else _sink(to, found, held)
         keeper = adaptive.build(found.model, link, line.say)
+        held.enter_context(stopped_by_interrupt(stop))
         session = Session(
             opened, found, link=link, raw=raw, out=written,
             sinks=() if served is None else (_sent(served),), watch_s=watch_s or None, keeper=keeper,
@@ -166,7 +179,7 @@ def _sent(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
     return lambda packet: sink.send(encode_compensated(packet.events, packet.flags))
 
 
-def _writer(path: Path, source: Source, found: Calibration, *, compensated: bool) -> LiveWriter:
+def _writer(path: Path, source: Source, found: Calibration, *, compensated: bool, offset_us: float = 0.0) -> LiveWriter:
     from amiwarp.io.live_writer import LiveWriter
 
     width, height = source.size
@@ -174,7 +187,7 @@ def _writer(path: Path, source: Source, found: Calibration, *, compensated: bool
     if compensated:
         metadata["compensated_with"] = found.model_name
     return LiveWriter(path, width=width, height=height, camera=found.camera, prism=source.prism or found.prism,
-                      metadata=metadata, compensated=compensated)  # fmt: skip
+                      metadata=metadata, compensated=compensated, clock_offset_us=offset_us)  # fmt: skip
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,14 @@ import typer
 from amiwarp.cli.console import report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
 from amiwarp.cli.options import Common
-from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
+from amiwarp.cli.streams import (
+    SourceOptions,
+    StatusLine,
+    check_angles,
+    clock_offset,
+    stopped_by_interrupt,
+    summary,
+)
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
@@ -31,15 +39,17 @@ def run(
     from amiwarp.io.live_writer import LiveWriter
     from amiwarp.stream.session import Session
 
-    with stopped_by_interrupt() as stop, StatusLine(stop, stream.seconds) as line, stream.link() as link:
+    stop = threading.Event()
+    with StatusLine(stop, stream.seconds) as line, stream.link() as link:
         opened = stream.open(source)
         check_angles(opened, link)
         width, height = opened.size
         writer = LiveWriter(
             out, width=width, height=height, camera=camera.build(width, height) or opened.camera,
             prism=prism.build(opened.prism), metadata={"recorded_from": opened.name},
+            clock_offset_us=clock_offset(opened, link),
         )  # fmt: skip
-        with writer:
+        with writer, stopped_by_interrupt(stop):
             status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
         line.end(opened)
     data = {"file": str(out), **summary(status), "messages": list(line.messages)}

@@ -68,9 +68,8 @@ class SourceOptions:
 
 
 @contextlib.contextmanager
-def stopped_by_interrupt() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets: once to finish what has come, twice to give up."""
-    stop = threading.Event()
+def stopped_by_interrupt(stop: threading.Event) -> Iterator[None]:
+    """Ctrl-C sets the event: once to finish what has come, twice to give up."""
 
     def interrupted(number: int, frame: Any) -> None:
         if stop.is_set():
@@ -79,7 +78,7 @@ def stopped_by_interrupt() -> Iterator[threading.Event]:
 
     before = {number: signal.signal(number, interrupted) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield stop
+        yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -148,6 +147,11 @@ def check_angles(source: Source, link: Link | None) -> None:
     """Raises :class:`AmiwarpError` where nothing gives angles."""
     if link is None and not source.has_encoder:
         raise AmiwarpError(f"{source.name}: gives no encoder samples; give the controller's --port")
+
+
+def clock_offset(source: Source, link: Link | None) -> float:
+    """Of the encoder that came along with a file: it is recorded with it, so that calibrations of either fit both."""
+    return 0.0 if link is not None else float(getattr(source, "clock_offset_us", 0.0))
 
 
 def summary(s: Status) -> dict[str, Any]:

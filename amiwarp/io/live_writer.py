@@ -74,14 +74,16 @@ class LiveWriter:
         prism: Prism | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
         compensated: bool = False,
+        clock_offset_us: float = 0.0,
         flush_s: float = 0.5,
     ) -> None:
+        """``clock_offset_us``: of the encoder that is written, see :class:`Encoder`; its samples are moved by it."""
         self.path = Path(path)
         check_frame(self.path, width, height, camera)
         self.part = self.path.with_name(f"{self.path.stem}.part.h5")
         self._size = (int(width), int(height))
         self._camera, self._prism, self._metadata = camera, prism, dict(metadata or {})
-        self._compensated, self._flush_s = compensated, flush_s
+        self._compensated, self._flush_s, self._clock_offset_us = compensated, flush_s, clock_offset_us
         self._file: Any = None
         self._columns: dict[str, Any] = {}
         self._small: dict[str, _Growing] = {}
@@ -142,7 +144,7 @@ class LiveWriter:
         for name, kind in small.items():
             dataset = file.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(SMALL_CHUNK,), dtype=kind)
             self._small[name] = _Growing(dataset)
-        file["encoder"].attrs["clock_offset_us"] = 0.0
+        file["encoder"].attrs["clock_offset_us"] = self._clock_offset_us
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -189,7 +191,8 @@ class LiveWriter:
         Raises :class:`AmiwarpError` for samples that are not later than those before, or not finite.
         """
         self._check_open("append_encoder")
-        t, angles = np.atleast_1d(as_times(t_us)), np.atleast_1d(np.asarray(angle, np.float64))
+        late = round(self._clock_offset_us)
+        t, angles = np.atleast_1d(as_times(t_us)) + late, np.atleast_1d(np.asarray(angle, np.float64))
         if t.shape != angles.shape or t.ndim != 1 or not np.isfinite(angles).all():
             shapes = f"t {t.shape}, angle {angles.shape}"
             raise AmiwarpError(f"{self.path}: encoder samples {shapes}; expected one length and finite angles")
@@ -202,7 +205,7 @@ class LiveWriter:
             self._small["encoder/angle"].add(angles)
             self._encoder_last = int(t[-1])
         if np.size(index_t_us):
-            self._small["encoder/index_t"].add(np.atleast_1d(as_times(index_t_us)))
+            self._small["encoder/index_t"].add(np.atleast_1d(as_times(index_t_us)) + late)
         self.tick()
 
     def set_encoder(self, encoder: Encoder) -> None:

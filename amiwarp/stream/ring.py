@@ -57,6 +57,9 @@ class Ring:
         if len(t_us):
             with self._lock:
                 self._samples.append((t_us, angle))
+                since = int(t_us[-1]) - round(2e6 * SECONDS)
+                while self._samples[0][0][-1] < since:
+                    self._samples.popleft()
 
     def tick(self) -> None:
         """Nothing waits here."""

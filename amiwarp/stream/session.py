@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import queue
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +16,7 @@ from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Co
 from amiwarp.encoder import EncoderStream
 from amiwarp.iwe import CanvasShape
 from amiwarp.sharpness import Sharpness, SharpnessMeter
+from amiwarp.stream.beside import QUEUE_EVENTS, Beside
 from amiwarp.stream.clocking import CameraClock
 from amiwarp.stream.packets import NO_TIMES, Sorter
 from amiwarp.stream.queues import PacketQueue, Policy
@@ -32,10 +33,10 @@ if TYPE_CHECKING:
     from amiwarp.stream.packets import Packet, Source
     from amiwarp.stream.speed import SpeedKeeper
 
-QUEUE_EVENTS = 1 << 23
-"""Room between the source and the compensator: most of a second of the busiest sensor, 110 MB."""
 IMAGE_US = 33_333
 """Window of the image whose sharpness is told [us]."""
+PATIENCE_S = 1.0
+"""A source that was told to stop gives up its thread within this."""
 POLL_S = 0.001
 """Longest wait for a packet, between two looks at the encoder."""
 MOST_HELD = 10_000
@@ -45,42 +46,6 @@ MOST_HELD = 10_000
 def monotonic_us() -> int:
     """The host's clock [us]."""
     return time.monotonic_ns() // 1000
-
-
-class Beside:
-    """Calls what is put, one after the other, in a thread of its own; while ``most`` wait, :meth:`put` does."""
-
-    def __init__(self, most: int = 256) -> None:
-        self._jobs: queue.Queue[Callable[[], object] | None] = queue.Queue(most)
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="amiwarp-beside", daemon=True)
-        self._thread.start()
-
-    def put(self, job: Callable[[], object]) -> None:
-        """Raises what a job before raised; after it none is called any more."""
-        if self._error is not None:
-            raise self._error
-        self._jobs.put(job)
-
-    def end(self) -> None:
-        """Waits until all were called."""
-        if self._thread.is_alive():
-            self._jobs.put(None)
-            self._thread.join()
-
-    def close(self) -> None:
-        """The same; raises as :meth:`put`."""
-        self.end()
-        if self._error is not None:
-            raise self._error
-
-    def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            if self._error is None:
-                try:
-                    job()
-                except BaseException as error:
-                    self._error = error
 
 
 @dataclass(slots=True)
@@ -155,9 +120,10 @@ class Session:
         say: Callable[[str], None] = print,
     ) -> None:
         self.status = Status()
-        self._source, self._link, self._sinks, self._keeper, self._say = source, link, sinks, keeper, say
-        self._raw = [(taker, Beside()) for taker in raw]
+        self._source, self._link, self._sinks, self._keeper, self._say = source, link, list(sinks), keeper, say
+        self._raw: list[tuple[Raw | LiveWriter, Beside]] = [(taker, Beside()) for taker in raw]
         self._out = None if out is None else (out, Beside())
+        self._stop = threading.Event()
         self._queue = PacketQueue(queue_events, policy)
         self._sorter, self._camera_clock = Sorter(), CameraClock()
         # a source's own samples are on the events' clock already, as its file says; what was calibrated says it better
@@ -188,20 +154,29 @@ class Session:
         Raises :class:`AmiwarpError` where source or a writer failed, after all that came before was worked through.
         """
         reader = threading.Thread(target=self._read, args=(stop,), name="amiwarp-source", daemon=True)
+        self._stop = stop
         reader.start()
-        due = 0.0
+        due, told = 0.0, math.inf
         try:
             while not self._queue.ended:
                 self._step()
                 if self._seconds >= due:
                     due = self._seconds + every_s
                     self._report(on_status)
+                if stop.is_set():
+                    told = min(told, self._seconds)
+                    if self._seconds - told > PATIENCE_S:  # the source does not let go of its thread
+                        self._queue.close()
             self._finish()
         finally:
             stop.set()
             self._queue.close()
-            reader.join()
-            self._source.close()
+            reader.join(PATIENCE_S)
+            if not reader.is_alive():
+                self._source.close()
+            for aside in (self._watch, self._keeper):
+                if aside is not None:
+                    aside.close()
             for _, beside in self._takers:
                 beside.end()
         self._report(on_status)
@@ -212,6 +187,22 @@ class Session:
     @property
     def _takers(self) -> list[tuple[Raw | LiveWriter, Beside]]:
         return [*self._raw, *([] if self._out is None else [self._out])]
+
+    def _hand(self, taker: tuple[Raw | LiveWriter, Beside], job: Callable[[], object], events: int = 0) -> None:
+        """To a taker; of one that failed no more is asked, the others get all that came until the session ends."""
+        try:
+            taker[1].put(job, events)
+        except Exception as error:
+            self._fail(error)
+            taker[1].end()
+            if taker is self._out:
+                self._out = None
+            else:
+                self._raw = [other for other in self._raw if other is not taker]
+
+    def _fail(self, error: Exception) -> None:
+        self._failed = self._failed or error
+        self._stop.set()
 
     @property
     def _seconds(self) -> float:
@@ -224,7 +215,7 @@ class Session:
                 if stop.is_set():
                     break
         except BaseException as error:
-            self._failed = error
+            self._failed = self._failed or error
         finally:
             self._queue.close()
 
@@ -261,8 +252,8 @@ class Session:
 
     def _sample(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
         t, angle = self.encoder.append(t, angle)
-        for taker, beside in self._takers:
-            beside.put(partial(taker.append_encoder, t, angle, index_t))
+        for taker in self._takers:
+            self._hand(taker, partial(taker[0].append_encoder, t, angle, index_t))
 
     def _take_in(self, packet: Packet) -> None:
         if len(packet.events):
@@ -277,12 +268,12 @@ class Session:
         if not len(events):
             return
         self.status.events += len(events)
-        for taker, beside in self._raw:
-            beside.put(partial(taker.append, events))
+        for taker in list(self._raw):
+            self._hand(taker, partial(taker[0].append, events), len(events))
         if self._watch is not None:
             self._watch.put(events)
         if self._compensator is not None:
-            self._compensator.put(events, arrived_us)
+            self._compensator.put(events, monotonic_us(), arrived_us=arrived_us)
 
     def _give_out(self, packets: list[Compensated]) -> None:
         now, status = monotonic_us(), self.status
@@ -293,13 +284,17 @@ class Session:
                 status.outside += int(np.count_nonzero(flags & OUTSIDE))
                 status.guessed += int(np.count_nonzero(flags & EXTRAPOLATED))
                 status.unknown += int(np.count_nonzero(flags & NO_ANGLE))
-            self._latencies.append(now - packet.put_us)
+            self._latencies.append(now - packet.arrived_us)
             if self._out is not None:
                 inside, guessed = (flags & OUTSIDE) == 0, (flags & (EXTRAPOLATED | NO_ANGLE)) != 0
-                writer, beside = self._out
-                beside.put(partial(writer.append, packet.events, inside=inside, extrapolated=guessed))
-            for sink in self._sinks:
-                sink(packet)
+                append = partial(self._out[0].append, packet.events, inside=inside, extrapolated=guessed)
+                self._hand(self._out, append, len(packet.events))
+            for sink in list(self._sinks):
+                try:
+                    sink(packet)
+                except Exception as error:
+                    self._fail(error)
+                    self._sinks.remove(sink)
         if packets and self._keeper is not None:
             self._keeper.put(packets, self.encoder)
         if packets:
@@ -334,8 +329,8 @@ class Session:
         status.coverage = None if self._keeper is None else self._keeper.coverage
         if self._watch is not None:
             status.phase_away = self._watch.look(self.encoder)
-        for taker, beside in self._takers:
-            beside.put(taker.tick)
+        for taker in self._takers:
+            self._hand(taker, taker[0].tick)
         self._image_us, self._wants_image = None, True
         on_status(status)
 
@@ -348,8 +343,8 @@ class Session:
         self._pass_on(self._sorter.flush(), monotonic_us())
         if self._compensator is not None:
             self._give_out(self._compensator.flush())
-        for beside_it in (self._watch, self._keeper):
-            if beside_it is not None:
-                beside_it.close()
         for _, beside in self._takers:
-            beside.close()
+            try:
+                beside.close()
+            except Exception as error:
+                self._fail(error)

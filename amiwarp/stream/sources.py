@@ -94,6 +94,8 @@ class FileSource:
         self.size, self.camera, self.prism = self._events.size, recording.camera, recording.prism
         self.has_encoder = encoder is not None
         self._encoder_t, self._encoder_angle = np.zeros(0, np.int64), np.zeros(0)
+        self.clock_offset_us = 0.0 if encoder is None else encoder.clock_offset_us
+        """By which the samples were moved to be on the events' clock."""
         if encoder is not None:
             # whole microseconds: at 3000 rpm half of one is less than 0.01 deg
             self._encoder_t, self._encoder_angle = encoder.t - round(encoder.clock_offset_us), encoder.angle

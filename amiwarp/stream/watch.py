@@ -48,7 +48,7 @@ class PhaseWatch:
     def __init__(self, calibration: Calibration, every_s: float, say: Callable[[str], None]) -> None:
         """``say`` gets a sentence where the phase has changed."""
         self._calibration, self._every_s, self._say = calibration, every_s, say
-        self._due = 0.0
+        self._due, self._closed = 0.0, False
         self._recent: deque[Events] = deque()
         self._held = 0
         self._thread: threading.Thread | None = None
@@ -91,7 +91,7 @@ class PhaseWatch:
     def begin(self, encoder: EncoderStream) -> bool:
         """Starts a look at the last turn, unless one is under way or there is too little; whether it did."""
         last = encoder.last
-        if self._thread is not None or last is None or not self._recent:
+        if self._closed or self._thread is not None or last is None or not self._recent:
             return False
         events = Events.concatenate(list(self._recent))
         events = events[: int(events.t.searchsorted(last, side="right"))]
@@ -118,7 +118,8 @@ class PhaseWatch:
         return found
 
     def close(self) -> None:
-        """Waits for a look that is under way."""
+        """Waits for a look that is under way; there is no other."""
+        self._closed = True
         if self._thread is not None:
             self._thread.join()
 
