@@ -37,6 +37,8 @@ KNOWN = Calibration(
     "exact", CAMERA, PRISM, {"apex": PRISM.apex, "phase": 0.4}, {}, (), "variance", 0.0, 0.0, (), 0, 0.0
 )
 COUNTS = 65536
+SPEED_PX_US = 720 / 60e6 * math.tau * math.radians(2.0) * 0.52 * CAMERA.fx
+"""By which the prism moves an event while its clock is wrong by a microsecond."""
 TURNING = pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
 
 
@@ -155,8 +157,11 @@ def test_a_fault_loses_nothing_and_is_told(tmp_path: Path, fault: str, said: str
     late = sent.t > 2_400_000 - 300_000
     early = sent.t < 1_400_000 - LEAD_US - 200_000
     assert np.count_nonzero(early) > 1000
+    # a busy machine hears of pulses too late to pair them; then the host ties the clocks, as well as the clock says
+    assert found.status.clock is not None
+    allowed = 0.05 + 4.0 * found.status.clock.offset_std_us * SPEED_PX_US
     for part in (early, late):
-        assert np.nanpercentile(away[part & ~found.guessed], 99) < 0.05
+        assert np.nanpercentile(away[part & ~found.guessed], 99) < allowed
         assert np.count_nonzero(found.guessed & part) < 0.2 * np.count_nonzero(part)
 
 

@@ -178,7 +178,10 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(live_events.t, offline.t)
     apart = np.hypot(live_events.x - offline.x, live_events.y - offline.y)
     assert np.nanpercentile(apart, 90) <= 0.01
-    assert json.loads(recorded)["events"] > 0.8 * SENT  # it came a little late
+    # it came a little late, a second or two on a busy machine, and got all from then on
+    kept = times(tmp_path / "h.h5")
+    assert json.loads(recorded)["events"] == len(kept) > 0.1 * SENT
+    np.testing.assert_array_equal(kept, times(folder / "recording.h5")[-len(kept) :])
     assert not [p for p in tmp_path.iterdir() if p.name in ("prism", "camera", "handed")]
 
 
