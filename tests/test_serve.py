@@ -20,7 +20,7 @@ from amiwarp.viewer.serve import Session, serve
 
 pytest.importorskip("trame_vuetify")
 TOKEN = "s3cret & more"
-WAIT_S = 10.0
+WAIT_S = 30.0
 
 
 @pytest.fixture(scope="module")

@@ -80,7 +80,7 @@ class Tabs:
         """A page that has come to rest."""
         self.make = make
         page = context.new_page()
-        page.set_default_timeout(10e3)
+        page.set_default_timeout(30e3)  # of machines that do other work, too
         page.on("console", self._console)
         page.on("pageerror", lambda error: self.failures.append(str(error)))
         page.goto(self.url)
@@ -310,7 +310,7 @@ def test_what_calibration_found_is_accepted_saved_and_opened_again(
     page.locator("#do-calibrate").click()
     page.locator(".side").get_by_text("calibrating, ").wait_for()
     assert page.locator(".side .v-progress-linear--active").is_visible()
-    page.locator("#found").wait_for(timeout=30e3)
+    page.locator("#found").wait_for()
     assert not page.locator(".side .v-progress-linear--active").is_visible()
     text = page.locator("#found").inner_text()
     apex, phase = map(float, re.findall(r"(?:apex|phase) (-?[\d.]+)°", text))

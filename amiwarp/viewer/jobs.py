@@ -21,6 +21,8 @@ FRAMES, FPS = 90, 25.0
 """Of a film."""
 LEAST_S, LIVE_S = 0.05, 0.25
 """Between the pictures of a recording that is played, and of a live stream."""
+PROGRESS_S = 0.1
+"""Between two words of a calibration's progress: a small recording has eighty in a second, a page draws all of them."""
 
 
 class Cancelled(Exception):
@@ -53,9 +55,15 @@ class Calibrating:
     async def _run(self) -> None:
         panel, inspector, loop = self._panel, self._panel.inspector, asyncio.get_running_loop()
 
+        told = -math.inf
+
         def tell(stage: str, done: int, budget: int) -> None:
+            nonlocal told
             if self._cancelled:
                 raise Cancelled
+            if (now := loop.time()) < told + PROGRESS_S:
+                return
+            told = now
             loop.call_soon_threadsafe(self._progress, stage, done / max(budget, 1))
 
         rpm = inspector.knobs.rpm
