@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
+from amiwarp.events import Events, check_sensor
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native import NativeEvents
@@ -79,10 +79,7 @@ class Mover:
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
         """The events moved (NaN: nowhere), and 1 for each that lies on a pixel of the image, shape ``(n,)``."""
-        if events.x.dtype != np.uint16:
-            raise AmiwarpError(
-                f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-            )
+        check_sensor(events)
         if not len(events):
             return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
         with self._alone:

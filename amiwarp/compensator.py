@@ -10,7 +10,7 @@ import numpy as np
 
 from amiwarp.batches import Batches, Begun, Started
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
+from amiwarp.events import Events, check_sensor
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -77,10 +77,7 @@ class Compensator:
         ``arrived_us``: when it came, if that was earlier, for :attr:`Compensated.arrived_us`.
         Raises :class:`AmiwarpError` for other pixels or a packet that begins before the last; nothing was put then.
         """
-        if events.x.dtype != np.uint16:
-            raise AmiwarpError(
-                f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-            )
+        check_sensor(events)
         if not len(events):
             return
         if events.t[0] < self._t_last:

@@ -109,6 +109,14 @@ def as_times(values: ArrayLike) -> NDArray[np.int64]:
     return np.asarray(np.rint(array) if array.dtype.kind == "f" else array, np.int64)
 
 
+def check_sensor(events: Events) -> None:
+    """Raises :class:`AmiwarpError` for events that are no sensor's (uint16): compensated ones."""
+    if events.x.dtype != np.uint16:
+        raise AmiwarpError(
+            f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
+        )
+
+
 def check_events(
     events: Events,
     width: int,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events import check_sensor
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -78,10 +79,7 @@ def upload_events(
     from amiwarp.kernels.structs import azimuths, encoder_params
     from amiwarp.kernels.votes import EventArrays, time_events, turn_events
 
-    if events.x.dtype != np.uint16:
-        raise AmiwarpError(
-            f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-        )
+    check_sensor(events)
     n, device = len(events), wp.get_device(device)
     padded = _padded(n, device)
 
