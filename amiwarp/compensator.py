@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 OUTSIDE, EXTRAPOLATED, NO_ANGLE = 1, 2, 4
 """Flags of an event: its place lies outside the image; no encoder sample came in time, so its angle goes on at constant
 speed; there is no angle at all, and so no place (NaN)."""
+MANY = 2
+"""Batches that a call gives at least before it leaves others to the next."""
 AHEAD_US = 100_000
 """Of encoder samples that are put on the device at once, where there are so many [us]."""
 
@@ -67,7 +69,9 @@ class Compensator:
         self._work = Batches(model, self.batch, self._device)
         self._queue: deque[tuple[Events, int, int]] = deque()
         self.waiting = 0
-        """Events put and not taken yet."""
+        """Events put that are not worked on yet."""
+        self._started: Started | None = None
+        self._begun: tuple[Begun, NDArray[np.bool_] | None] | None = None
         self._t_last = -(2**62)
         self._covered: tuple[int, int] | None = None
 
@@ -94,29 +98,33 @@ class Compensator:
     def take(self, now_us: int) -> list[Compensated]:
         """What is ready at ``now_us``, in the order it was put, packets that are ready together joined to a batch.
 
+        Of many batches a GPU may work on the last still: they come with the next call, or with :meth:`flush`.
         Raises :class:`AmiwarpError` for a packet that is not sorted; what was ready with it is lost.
         """
         out: list[Compensated] = []
-        started: Started | None = None
-        begun: Begun | None = None
-        while (
-            True
-        ):  # while one batch is put together, a GPU works on that before it, and the one before that is fetched
+        while True:
+            # while one batch is put together, a GPU works on that before it, and the one before that is fetched
             packets = self._ready(now_us)
-            following = self._start(packets) if packets else None
-            moving = None if started is None else self._begin(started)
+            if not packets and len(out) >= MANY and self._device.is_cuda:
+                return out
+            started, self._started = self._started, self._start(packets) if packets else None
+            begun, self._begun = self._begun, None
+            if started is not None:
+                self._begun = self._begin(started)
             if begun is not None:
-                out.append(self._end(begun))
-            started, begun = following, moving
-            if started is None and begun is None:
+                out.append(self._end(*begun))
+            if self._started is None and self._begun is None:
                 return out
 
     def flush(self) -> list[Compensated]:
         """All that still waits, its angles guessed where they must be: at the end of a stream."""
-        return self.take(2**62)
+        out = self.take(2**62)
+        while more := self.take(2**62):
+            out += more
+        return out
 
     def image(self) -> NDArray[np.float32]:
-        """Image of the events taken since the last call, shape (height, width)."""
+        """Image of the events worked on since the last call, shape (height, width)."""
         return self._work.image()
 
     def _ready(self, now_us: int) -> list[tuple[Events, int, int]]:
@@ -137,7 +145,8 @@ class Compensator:
     def _start(self, packets: list[tuple[Events, int, int]]) -> Started:
         return self._work.start([events for events, *_ in packets], packets[0][2])
 
-    def _begin(self, started: Started) -> Begun:
+    def _begin(self, started: Started) -> tuple[Begun, NDArray[np.bool_] | None]:
+        """With which of its events have a guessed angle, None for none: by the samples there are now."""
         parts, n = started.parts, started.end - started.at
         first, last = int(parts[0].t[0]), int(parts[-1].t[-1])
         begins, ends = self.encoder.first, self.encoder.last
@@ -147,12 +156,13 @@ class Compensator:
             unknown = 0 if first >= begins else sum(int(np.searchsorted(part.t, begins)) for part in parts)
         if unknown < n:
             self._cover(max(first, begins or first), last, ends or last)
-        return self._work.begin(started, unknown)
+        begun = self._work.begin(started, unknown)
+        return begun, None if self.encoder.knows(first, last) else self.encoder.guessed(begun.t)
 
-    def _end(self, begun: Begun) -> Compensated:
+    def _end(self, begun: Begun, guessed: NDArray[np.bool_] | None) -> Compensated:
         x, y, flags = self._work.end(begun)
-        if not self.encoder.knows(int(begun.t[0]), int(begun.t[-1])):
-            flags[self.encoder.guessed(begun.t)] |= EXTRAPOLATED
+        if guessed is not None:
+            flags[guessed] |= EXTRAPOLATED
         flags[: begun.unknown] = OUTSIDE | NO_ANGLE
         return Compensated(Events(x, y, begun.t, begun.p), flags, begun.arrived_us)
 

@@ -148,6 +148,8 @@ def one_pass(
             check(ahead, done.events)
         if last - imaged >= IMAGE_US:
             voted, imaged = voted + float(compensator.image().sum(dtype=np.float64)), last
+    for done in compensator.flush():
+        check(ahead, done.events)
     took = time.perf_counter() - began
     voted += float(compensator.image().sum(dtype=np.float64))
     events = len(ahead) * PACKET

@@ -87,7 +87,7 @@ def test_the_image_is_whole_however_many_batches_are_under_way(size: int, device
     compensator = Compensator(MODEL, streamed(), batch=4096, device=device)
     for start in range(0, 100_000, size):
         compensator.put(events[start : start + size], 0)
-    found, _ = joined(compensator.take(0))
+    found, _ = joined(compensator.take(0) + compensator.flush())
     expected = compensate_events(events, MODEL, ENCODER, device=device)
     np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
     image = iwe(events, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, device=device)

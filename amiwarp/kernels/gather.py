@@ -6,8 +6,8 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 ROW = 10
-"""Numbers of a part: addresses of its x, y, t, p, of where they go (p: 0 for nowhere), how many events, and 1 where the
-event before them in memory is the one before them in time."""
+"""Numbers of a part: where the addresses of its x, y, t, p stand, addresses where they go (p: 0 for nowhere), how many
+events, and 1 where the event before them in memory is the one before them in time."""
 FOUND = 3
 """What is found of a part: whether it is unsorted, and the largest x and y [px]."""
 
@@ -15,10 +15,10 @@ FOUND = 3
 @wp.func_native("""
     const uint64_t* row = (const uint64_t*)table.data + 10 * i;
     const int64_t n = (int64_t)row[8];
-    const uint16_t* __restrict__ x = (const uint16_t*)row[0];
-    const uint16_t* __restrict__ y = (const uint16_t*)row[1];
-    const int64_t* __restrict__ t = (const int64_t*)row[2];
-    const uint8_t* __restrict__ p = (const uint8_t*)row[3];
+    const uint16_t* __restrict__ x = *(const uint16_t**)row[0];
+    const uint16_t* __restrict__ y = *(const uint16_t**)row[1];
+    const int64_t* __restrict__ t = *(const int64_t**)row[2];
+    const uint8_t* __restrict__ p = *(const uint8_t**)row[3];
     uint16_t* __restrict__ to_x = (uint16_t*)row[4];
     uint16_t* __restrict__ to_y = (uint16_t*)row[5];
     int64_t* __restrict__ to_t = (int64_t*)row[6];

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 IMAGE_US = 33_333
 """Window of the image whose sharpness is told [us]."""
 PATIENCE_S = 1.0
-"""A source that was told to stop gives up its thread within this."""
+"""A source that was told to stop gives up its thread within this, and samples of the last events come."""
 POLL_S = 0.001
 """Longest wait for a packet, between two looks at the encoder."""
 MOST_HELD = 10_000
@@ -143,7 +143,7 @@ class Session:
         self._failed: BaseException | None = None
         self._image_us: int | None = None
         self._wants_image = True
-        self._wait_us = wait_us
+        self._last_us = -(2**62)
         self._latencies: list[int] = []
         self._began_us = monotonic_us()
         self._since = (self._began_us, 0, 0, 0)
@@ -221,9 +221,12 @@ class Session:
 
     def _step(self) -> None:
         self._follow()
-        packet = self._queue.get(POLL_S)
-        if packet is not None:
+        packet, events = self._queue.get(POLL_S), 0
+        most = 1 if self._compensator is None else self._compensator.batch
+        while packet is not None:  # what waits is compensated together, which is faster
             self._take_in(packet)
+            events += len(packet.events)
+            packet = self._queue.get(0.0) if events < most else None
         if self._compensator is not None:
             self._give_out(self._compensator.take(monotonic_us()))
 
@@ -268,6 +271,7 @@ class Session:
         if not len(events):
             return
         self.status.events += len(events)
+        self._last_us = int(events.t[-1])
         for taker in list(self._raw):
             self._hand(taker, partial(taker[0].append, events), len(events))
         if self._watch is not None:
@@ -336,11 +340,14 @@ class Session:
 
     def _finish(self) -> None:
         """All that is held anywhere."""
-        end = monotonic_us() + self._wait_us
-        while self._link is not None and monotonic_us() < end:  # samples that cover the last events
-            self._follow()
-            time.sleep(POLL_S)
         self._pass_on(self._sorter.flush(), monotonic_us())
+        end = monotonic_us() + 1e6 * PATIENCE_S
+        while self._link is not None and monotonic_us() < end:
+            self._follow()
+            last = self.encoder.last
+            if last is not None and last > self._last_us:  # samples cover the last events
+                break
+            time.sleep(POLL_S)
         if self._compensator is not None:
             self._give_out(self._compensator.flush())
         for _, beside in self._takers:
