@@ -57,6 +57,40 @@ def test_pulses_that_one_side_missed_do_no_harm(seed: int) -> None:
     assert abs(int(clock(6_000_000)) - camera_time(6_000_000)) <= 8
 
 
+@pytest.mark.parametrize(("syncs", "triggers"), [(4, 4), (4, 7), (7, 4), (5, 9)])
+def test_reports_that_all_come_at_once_do_not_meet_those_of_other_pulses(syncs: int, triggers: int) -> None:
+    """The host was busy as it began: what it heard first of either side came late, and it had not heard all."""
+    clock, times = CameraClock(), np.arange(40) * 50_000
+    heard = [(max(t, 450_000), "sync", t) for t in times[10 - syncs :]]
+    heard += [(max(t + 3000, 452_000), "trigger", t) for t in times[10 - triggers :]]
+    for host, kind, t in sorted(heard):
+        if kind == "sync":
+            clock.sync(int(t), int(host))
+        else:
+            clock.triggers([camera_time(t)], int(host))
+        known = clock.clock(None)
+        assert known is None or abs(int(known(2_000_000)) - camera_time(2_000_000)) < 100
+    assert clock.clock(None) is not None
+
+
+def test_triggers_that_come_at_once_beside_prompt_syncs_wait_for_others() -> None:
+    """As seen on a busy machine: five at once, the sync before the last 80 ms late."""
+    clock = CameraClock()
+    for k, late in enumerate((0, 6, 0, 82, 8)):
+        clock.sync(100_000 * k, 1000 * (100 * k + late))
+    for k in range(4):
+        clock.triggers([7_000_000 + 100_000 * k], 389_000 + 500 * k)
+    clock.triggers([7_400_000], 404_000)
+    assert clock.clock(None) is None
+    for k in (5, 6):
+        clock.sync(100_000 * k, 100_000 * k + 500)
+        clock.triggers([7_000_000 + 100_000 * k], 100_000 * k + 4000)
+    found = clock.clock(None)
+    assert found is not None
+    assert clock.pulses == 7
+    assert int(found(600_000)) == pytest.approx(7_600_000, abs=3)
+
+
 def test_three_pulses_are_enough_and_two_are_not() -> None:
     assert follow(np.arange(2) * 100_000).clock(None) is None
     clock = follow(np.arange(3) * 100_000).clock(None)

@@ -83,13 +83,10 @@ class CameraClock:
         if not (self._sync and self._trigger):
             return
         t, s = (np.array(pulses, np.int64) for pulses in (self._trigger, self._sync))
-        expected = s[:, 0] if self._found is None else self._found(s[:, 0])
-        apart = t[:, None, 0] - expected[None, :]
         if self._found is not None:
-            meet = np.abs(apart) <= ALIKE_US
+            meet = np.abs(t[:, None, 0] - self._found(s[:, 0])[None, :]) <= ALIKE_US
         else:
-            intervals = np.concatenate([np.diff(t[:, 0]), np.diff(s[:, 0]), [2 * APART_US]])
-            meet = _first_meeting(apart, t[:, None, 1] - s[None, :, 1], int(intervals.min()) // 2)
+            meet = _first_meeting(t, s)
         where = np.argwhere(meet)
         if not len(where):
             if self._found is not None and min(len(t), len(s)) == UNPAIRED:
@@ -106,15 +103,22 @@ class CameraClock:
             self._found = from_pulses(own, other)
 
 
-def _first_meeting(apart: NDArray[np.int64], heard: NDArray[np.int64], reach: int) -> NDArray[np.bool_]:
-    """Which pairs share a shift, three or more; of several shifts that whose reports came closest to each other.
+def _first_meeting(trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which pairs of pulses share the shift between their clocks, three or more; shape (triggers, syncs).
 
-    Pulses at even distances meet under many: two reports further apart than ``reach`` [us] are not of one pulse.
+    Pulses at even distances meet under many shifts: theirs is where they were heard of at the same time. Reports come
+    late, many at once where the host was busy, but never early: the promptest of either side tell, where three agree.
     """
-    best, nearest = np.zeros(apart.shape, np.bool_), float(reach)
-    for i, j in np.argwhere(np.abs(heard) <= reach):
+    apart = trigger[:, None, 0] - sync[None, :, 0]
+    intervals = np.concatenate([np.diff(trigger[:, 0]), np.diff(sync[:, 0]), [2 * APART_US]])
+    reach, best = int(intervals.min()) // 2, np.zeros(apart.shape, np.bool_)
+    delays = trigger[:, 1] - trigger[:, 0], sync[:, 1] - sync[:, 0]
+    if any(np.count_nonzero(some <= some.min() + reach) < FEWEST for some in delays):
+        return best
+    away = np.abs(apart - (delays[1].min() - delays[0].min()))
+    nearest = reach
+    for i, j in np.argwhere(away <= reach):
         meet = np.abs(apart - apart[i, j]) <= ALIKE_US
-        away = float(np.median(np.abs(heard[meet])))
-        if meet.any(axis=0).sum() >= FEWEST and away < nearest:
-            best, nearest = meet, away
+        if meet.any(axis=0).sum() >= FEWEST and away[i, j] <= nearest:
+            best, nearest = meet, int(away[i, j])
     return best
