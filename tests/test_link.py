@@ -370,7 +370,7 @@ def test_live_angles_and_clock(path: Path) -> None:
         true = live.controller.clock(clock.at_us - live.origin) - clock.at_us
         assert clock.offset_us == pytest.approx(true, abs=5 * clock.offset_std_us)
     assert not link.connected
-    assert not any(t.name.startswith("amiwarp-") for t in threading.enumerate())
+    assert [t.name for t in threading.enumerate() if t.name in ("amiwarp-link", "amiwarp-emulator")] == []
 
 
 def test_a_port_that_was_unplugged_comes_back(path: Path) -> None:
