@@ -21,7 +21,7 @@ from amiwarp.events import Events, Recording
 from amiwarp.io import save_recording
 from amiwarp.optics import Prism
 from amiwarp.simulate import SensorModel, simulate
-from amiwarp.stream.adaptive import SpeedController
+from amiwarp.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.stream.forward import Forward
 from amiwarp.stream.packets import Angles, Decoder
 from amiwarp.stream.ring import SECONDS, Ring, followed
@@ -98,7 +98,9 @@ def test_a_watch_says_nothing_of_too_little(recording: Recording) -> None:
     assert watch.look(streamed(recording)) is None
 
 
-def kept(recording: Recording, controller: SpeedController, fail: bool = False) -> tuple[list[float], list[str]]:
+def kept(recording: Recording, *, most_mev_s: float, fail: bool = False) -> tuple[list[float], list[str]]:
+    model = known(recording, 0.0).model
+    controller = SpeedController(prism_orbit(model), 720.0, most_mev_s=most_mev_s)
     asked: list[float] = []
     said: list[str] = []
 
@@ -108,7 +110,7 @@ def kept(recording: Recording, controller: SpeedController, fail: bool = False) 
             raise AmiwarpError("refused by the controller")
         asked.append(rpm)
 
-    encoder, model = streamed(recording), known(recording, 0.0).model
+    encoder = streamed(recording)
     compensator, keeper = Compensator(model, encoder), SpeedKeeper(model, controller, set_speed, said.append)
     for events in recording.events.blocks(duration_us=2000):
         compensator.put(events, 0)
@@ -120,7 +122,7 @@ def kept(recording: Recording, controller: SpeedController, fail: bool = False) 
 
 
 def test_a_keeper_asks_for_less_where_there_are_too_many_events(recording: Recording) -> None:
-    asked, said = kept(recording, SpeedController(720.0, most_mev_s=0.01))
+    asked, said = kept(recording, most_mev_s=0.01)
     assert len(asked) > 3
     assert asked == sorted(asked, reverse=True)
     assert 120.0 <= asked[-1] < 700.0
@@ -128,7 +130,7 @@ def test_a_keeper_asks_for_less_where_there_are_too_many_events(recording: Recor
 
 
 def test_a_keeper_says_what_the_controller_refuses(recording: Recording) -> None:
-    asked, said = kept(recording, SpeedController(720.0, most_mev_s=0.01), fail=True)
+    asked, said = kept(recording, most_mev_s=0.01, fail=True)
     assert asked == []
     assert set(said) == {"refused by the controller"}
 

@@ -61,7 +61,7 @@ class AdaptiveOptions:
     ] = None
 
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
-        from amiwarp.stream.adaptive import SpeedController
+        from amiwarp.stream.adaptive import SpeedController, prism_orbit
         from amiwarp.stream.speed import SpeedKeeper
 
         if not self.adaptive:
@@ -70,7 +70,8 @@ class AdaptiveOptions:
             raise AmiwarpError("--adaptive sets the motor's speed; give the controller's --port")
         rpm = min(max(720.0, self.least_rpm), self.limit_rpm)
         most = float("inf") if self.most_mev_s is None else self.most_mev_s
-        limits = SpeedController(rpm, least_rpm=self.least_rpm, most_rpm=self.limit_rpm, most_mev_s=most)
+        orbit = prism_orbit(model)
+        limits = SpeedController(orbit, rpm, least_rpm=self.least_rpm, most_rpm=self.limit_rpm, most_mev_s=most)
         link.set_speed(rpm, limits.ramp_rpm_s)
         return SpeedKeeper(model, limits, link.set_speed, say)
 

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 DIRECTIONS = 18
 """Bins of edge directions over half a turn."""
+_BINS = (np.arange(DIRECTIONS) + 0.5) * (math.pi / DIRECTIONS)
+NORMALS = np.stack([np.cos(_BINS), np.sin(_BINS)])
+"""Of edges in the bins' middles, shape (2, DIRECTIONS)."""
 SWING = 0.25
 """An edge moved across itself by s is seen with probability 1 - exp(-s / SWING), as found in simulations [px]."""
 TOLD = 1.0
@@ -44,15 +47,16 @@ TEXTURE_S = 0.5
 """Memory of which edge directions the scene has [s]."""
 ANGLES = 17
 """Places of the prism's path over a window."""
-MEMORY_S, RISING_S = 0.25, 0.1
-"""Of coverage and rate in the controller: windows see now these directions, now those. Shorter while the speed rises,
-or what was unseen before would make it overshoot [s]."""
-GAIN = 0.15
-"""Relative change of the speed a second, for each factor e by which the unseen share is too large or too small."""
-FASTEST_FALL, FASTEST_RISE, SLOWEST = 0.4, 1.0, 0.05
-"""Relative changes a second."""
-LIMITED_S = 1.5
-"""In which the event rate comes nearer to its limit by a factor e."""
+PHASES, ORBIT = 8, 1024
+"""Of the prism at which a window to come may begin, and places of its orbit."""
+SPEEDS = 32
+"""Between the limits, for which coverage is foretold."""
+MEMORY_S = 0.25
+"""Of what is foretold and of the rate, in the controller: windows see now these directions, now those [s]."""
+FOLLOW_S, LIMITED_S = 0.2, 1.5
+"""In which the speed comes nearer by a factor e to that which is enough, and to where the event rate has its limit."""
+THERE = 0.01
+"""Relative distance from the speed that is enough at which it has been reached."""
 NEAR_LIMIT, BELOW_LIMIT = 0.9, 0.8
 """Shares of the largest event rate: down to the first falls a speed that was too much, under the second it may rise."""
 
@@ -62,90 +66,35 @@ def prism_path(model: Model, encoder: Encoder, start_us: int, end_us: int) -> ND
 
     Raises :class:`AmiwarpError` where the encoder does not cover it, or the middle has no ray.
     """
-    middle = np.array([[0.5 * (model.camera.width - 1), 0.5 * (model.camera.height - 1)]])
     times = np.rint(np.linspace(start_us, end_us, ANGLES)).astype(np.int64)
-    path = model.deflect_points(np.repeat(middle, ANGLES, axis=0), encoder.angle_at(times))
+    return _middle(model, np.asarray(encoder.angle_at(times), np.float64))
+
+
+def prism_orbit(model: Model) -> NDArray[np.float64]:
+    """Where the prism puts the image's middle at even angles of a turn, shape (n, 2) [px].
+
+    Raises :class:`AmiwarpError` where it has no ray.
+    """
+    return _middle(model, np.linspace(0.0, math.tau, ORBIT, endpoint=False))
+
+
+def _middle(model: Model, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    middle = np.array([[0.5 * (model.camera.width - 1), 0.5 * (model.camera.height - 1)]])
+    path = model.deflect_points(np.repeat(middle, len(angles), axis=0), angles)
     if not np.isfinite(path).all():
         raise AmiwarpError("the image's middle has no ray through the prism at some angle; check the model")
     return np.asarray(path, np.float64)
 
 
-@dataclass(slots=True, eq=False)
-class SpeedController:
-    """A speed from coverage and event rate. Raises :class:`AmiwarpError` for limits that leave no speed or no band.
+def _drifted(drift: NDArray[np.float64], turn: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+    """Where a drift that changes evenly takes the image over a window, shape (ANGLES, 2) [px]."""
+    along = np.linspace(0.0, 1.0, ANGLES)[:, None]
+    return np.asarray(seconds * (along * drift + 0.5 * (along * along - along) * turn))
 
-    With coverage under :attr:`low` the speed rises, above :attr:`high` it falls, in either case until what is unseen
-    is half-way between by ratio; otherwise it stays.
-    """
 
-    rpm: float = 720.0
-    """The speed now: to start with, then what was last asked for [turns/min]."""
-    least_rpm: float = 120.0
-    most_rpm: float = 1440.0
-    ramp_rpm_s: float = 600.0
-    """What the motor follows [turns/min/s]."""
-    most_mev_s: float = math.inf
-    """What sensor, cable and computer carry [million events/s]; comes before coverage."""
-    low: float = 0.999
-    high: float = 0.9998
-    """The band of coverage in which the speed stays as it is."""
-    _t_us: int | None = field(default=None, init=False)
-    _coverage: float = field(default=0.0, init=False)
-    _rate: float = field(default=0.0, init=False)
-    _way: int = field(default=0, init=False)
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.least_rpm <= self.rpm <= self.most_rpm < math.inf:
-            given = f"{self.rpm:g} rpm to start with is not in {self.least_rpm:g} .. {self.most_rpm:g} rpm"
-            raise AmiwarpError(f"adaptive speed: {given}; give limits above 0 around it")
-        if not 0.0 < self.low < self.high < 1.0:
-            raise AmiwarpError(f"adaptive speed: coverage from {self.low:g} to {self.high:g}; give 0 < low < high < 1")
-        for name in ("ramp_rpm_s", "most_mev_s"):
-            if not getattr(self, name) > 0.0:
-                raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give more than 0")
-
-    def update(self, t_us: int, coverage: float, rate_mev_s: float) -> float | None:
-        """The speed to ask for after a window that ended at ``t_us`` [turns/min]; None: leave it as it is.
-
-        ``coverage``: :attr:`Coverage.share`; ``rate_mev_s``: million events a second. Raises :class:`AmiwarpError`
-        where time does not advance, or for what is no share or no rate.
-        """
-        if not (0.0 <= coverage <= 1.0 and 0.0 <= rate_mev_s < math.inf):
-            raise AmiwarpError(f"adaptive speed: coverage {coverage:g} at {rate_mev_s:g} Mev/s; give 0 .. 1 and a rate")
-        if self._t_us is None:
-            self._t_us, self._coverage, self._rate = t_us, coverage, rate_mev_s
-            return None
-        if t_us <= self._t_us:
-            raise AmiwarpError(f"adaptive speed: window at {t_us} us after that at {self._t_us} us; give them in order")
-        seconds = (t_us - self._t_us) * 1e-6
-        new = 1.0 - math.exp(-seconds / (RISING_S if self._way > 0 else MEMORY_S))
-        self._t_us = t_us
-        self._coverage += new * (coverage - self._coverage)
-        self._rate += new * (rate_mev_s - self._rate)
-        self._way = self._next_way()
-        if not self._way:
-            return None
-        change = GAIN * math.log(max(1.0 - self._coverage, 1e-6) / (1.0 - self._aim))
-        allowed = math.log(NEAR_LIMIT / max(self._rate / self.most_mev_s, 1e-9)) / LIMITED_S
-        change = min(change, allowed)
-        change = max(change, SLOWEST) if self._way > 0 else min(change, -SLOWEST)
-        change = min(max(change, -FASTEST_FALL), FASTEST_RISE)
-        largest = self.ramp_rpm_s * seconds
-        step = min(max(self.rpm * math.expm1(change * seconds), -largest), largest)
-        before, self.rpm = self.rpm, min(max(self.rpm + step, self.least_rpm), self.most_rpm)
-        return self.rpm if self.rpm != before else None
-
-    @property
-    def _aim(self) -> float:
-        return 1.0 - math.sqrt((1.0 - self.low) * (1.0 - self.high))
-
-    def _next_way(self) -> int:
-        """1 to rise, -1 to fall, 0 to stay: what has begun goes on until it is enough."""
-        rate, aim = self._rate / self.most_mev_s, self._aim
-        if rate > (NEAR_LIMIT if self._way < 0 else 1.0) or self._coverage > (aim if self._way < 0 else self.high):
-            return -1
-        wanted = self._coverage < (aim if self._way > 0 else self.low)
-        return int(wanted and rate < (NEAR_LIMIT if self._way > 0 else BELOW_LIMIT))
+def _seen(swing: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of edges with a swing [px] that are seen."""
+    return np.asarray(-np.expm1(-swing / SWING))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,10 +105,118 @@ class Coverage:
     """Of the scene's edges that are seen, by their directions and what moved them, 0 .. 1."""
     drift: NDArray[np.float64]
     """The image's velocity by the camera's motion alone, shape (2,) [px/s]; 0 where none is clear."""
+    turn: NDArray[np.float64]
+    """By how much the drift changes over the window, shape (2,) [px/s]; 0 where that is not known."""
     swing: NDArray[np.float64]
     """How far edges were moved across themselves, by the direction of their normal, shape (n,) [px]."""
     texture: NDArray[np.float64]
     """Share of the edges in each direction over the last while, shape (n,), sum 1; even where there are none."""
+
+    def foretold(self, rpm: NDArray[np.float64], orbit: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+        """Share that such a window would see at other speeds, in the worst of the prism's phases, shape (n,).
+
+        ``rpm``: shape (n,); ``orbit``: see :func:`prism_orbit`; ``seconds``: the window's length.
+        """
+        along = np.linspace(0.0, 1.0, ANGLES)
+        turns = (seconds / 60.0) * rpm[:, None, None] * along + np.arange(PHASES)[:, None] / PHASES
+        way = orbit[np.rint(turns * len(orbit)).astype(np.int64) % len(orbit)] + _drifted(
+            self.drift, self.turn, seconds
+        )
+        return np.asarray((_seen(np.ptp(way @ NORMALS, axis=2)) @ self.texture).min(axis=1))
+
+
+@dataclass(slots=True, eq=False)
+class SpeedController:
+    """A speed from coverage and event rate. Raises :class:`AmiwarpError` for limits that leave no speed or no band.
+
+    What a window would see at the worst of the prism's phases is foretold for all speeds. Where that is under
+    :attr:`low` or above :attr:`high` for the speed now, it goes to the lowest one for which what is unseen is half-way
+    between by ratio, or to the best there is.
+    """
+
+    orbit: NDArray[np.float64]
+    """See :func:`prism_orbit`."""
+    rpm: float = 720.0
+    """The speed now: to start with, then what was last asked for [turns/min]."""
+    least_rpm: float = 120.0
+    most_rpm: float = 1440.0
+    ramp_rpm_s: float = 600.0
+    """What the motor follows [turns/min/s]."""
+    most_mev_s: float = math.inf
+    """What sensor, cable and computer carry [million events/s]; comes before coverage."""
+    low: float = 0.9988
+    high: float = 0.9996
+    """The band of coverage in which the speed stays as it is."""
+    _t_us: int | None = field(default=None, init=False)
+    _unseen: NDArray[np.float64] = field(init=False)
+    _rate: float = field(default=0.0, init=False)
+    _moving: bool = field(default=False, init=False)
+    _limited: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.least_rpm <= self.rpm <= self.most_rpm < math.inf:
+            given = f"{self.rpm:g} rpm to start with is not in {self.least_rpm:g} .. {self.most_rpm:g} rpm"
+            raise AmiwarpError(f"adaptive speed: {given}; give limits above 0 around it")
+        if not 0.0 < self.low < self.high < 1.0:
+            raise AmiwarpError(f"adaptive speed: coverage from {self.low:g} to {self.high:g}; give 0 < low < high < 1")
+        for name in ("ramp_rpm_s", "most_mev_s"):
+            if not getattr(self, name) > 0.0:
+                raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give more than 0")
+        self._unseen = np.zeros(SPEEDS)
+
+    def update(self, start_us: int, end_us: int, coverage: Coverage, rate_mev_s: float) -> float | None:
+        """The speed to ask for after a window [us] [turns/min]; None: leave it as it is.
+
+        ``rate_mev_s``: million events a second. Raises :class:`AmiwarpError` where windows are not in order, or for
+        what is no rate.
+        """
+        if not 0.0 <= rate_mev_s < math.inf:
+            raise AmiwarpError(f"adaptive speed: {rate_mev_s:g} Mev/s; give a rate")
+        first = self._t_us is None
+        if not start_us < end_us or (self._t_us is not None and start_us < self._t_us):
+            given = f"window {start_us} .. {end_us} us after one that ended at {self._t_us} us"
+            raise AmiwarpError(f"adaptive speed: {given}; give windows one after the other")
+        seconds = (end_us - (start_us if self._t_us is None else self._t_us)) * 1e-6
+        self._t_us = end_us
+        new = 1.0 if first else 1.0 - math.exp(-seconds / MEMORY_S)
+        unseen = 1.0 - coverage.foretold(self._speeds, self.orbit, (end_us - start_us) * 1e-6)
+        self._unseen += new * (unseen - self._unseen)
+        self._rate += new * (rate_mev_s - self._rate)
+        return None if first else self._step(seconds)
+
+    @property
+    def _speeds(self) -> NDArray[np.float64]:
+        return np.geomspace(self.least_rpm, self.most_rpm, SPEEDS)
+
+    def _step(self, seconds: float) -> float | None:
+        """Towards where it should be."""
+        rate, within = self._rate / self.most_mev_s, FOLLOW_S
+        self._limited = rate > (NEAR_LIMIT if self._limited else 1.0)
+        now = float(np.interp(math.log(self.rpm), np.log(self._speeds), self._unseen))
+        self._moving = self._moving or not 1.0 - self.high <= now <= 1.0 - self.low
+        enough = self._enough() if self._moving else self.rpm
+        if self._limited:
+            enough, within = min(enough, self.rpm * NEAR_LIMIT / rate), LIMITED_S
+        elif enough > self.rpm and rate > BELOW_LIMIT:
+            enough = self.rpm
+        if abs(enough / self.rpm - 1.0) < THERE:
+            self._moving = False
+            return None
+        largest = self.ramp_rpm_s * seconds
+        step = min(max((enough - self.rpm) * -math.expm1(-seconds / within), -largest), largest)
+        before, self.rpm = self.rpm, min(max(self.rpm + step, self.least_rpm), self.most_rpm)
+        return self.rpm if self.rpm != before else None
+
+    def _enough(self) -> float:
+        """The lowest speed with what may be unseen, between those looked at; the best where there is none."""
+        aim = math.sqrt((1.0 - self.low) * (1.0 - self.high))
+        good = np.flatnonzero(self._unseen <= aim)
+        k = int(good[0]) if len(good) else int(self._unseen.argmin())
+        if k == 0 or not len(good):
+            return float(self._speeds[k])
+        above, below = np.log(np.maximum(self._unseen[k - 1 : k + 1], 1e-12))
+        part = (above - math.log(aim)) / (above - below)
+        return float(self._speeds[k - 1] * (self._speeds[k] / self._speeds[k - 1]) ** part)
 
 
 class CoverageMeter:
@@ -167,10 +224,8 @@ class CoverageMeter:
 
     def __init__(self, width: int, height: int) -> None:
         self._corner = np.array([(width - SIDE) // 2, (height - SIDE) // 2], np.float32)
-        angle = (np.arange(DIRECTIONS) + 0.5) * (math.pi / DIRECTIONS)
-        self._normals = np.stack([np.cos(angle), np.sin(angle)])
         self._texture = np.full(DIRECTIONS, np.nan)
-        self._end_us = -(1 << 62)
+        self._end_us, self._last = -(1 << 62), np.zeros(2)
         self._before: tuple[float, NDArray[np.complex64]] | None = None
         along = np.exp(-2.0 * (math.pi * np.fft.fftfreq(SIDE)) ** 2).astype(np.float32)
         self._smooth = along[:, None] * along[None, : SIDE // 2 + 1]
@@ -184,18 +239,17 @@ class CoverageMeter:
         if not self._end_us <= start_us < end_us:
             given = f"window {start_us} .. {end_us} us after one that ended at {self._end_us} us"
             raise AmiwarpError(f"coverage: {given}; give windows one after the other")
-        self._end_us = end_us
-        seconds = (end_us - start_us) * 1e-6
-        drift = self._drift(events, end_us)
-        way = path + np.linspace(0.0, seconds, len(path))[:, None] * drift
-        across = way @ self._normals
+        seconds, follows = (end_us - start_us) * 1e-6, start_us - self._end_us < SLICE_US
+        before, drift = self._last, self._drift(events, end_us)
+        turn = drift - before if follows and before.any() and drift.any() else np.zeros(2)
+        self._end_us, self._last = end_us, drift
+        across = (path + _drifted(drift, turn, seconds)) @ NORMALS
         swing = np.ptp(across, axis=0)
         self._learn(events, (start_us + end_us) // 2, drift, seconds, across)
         known = np.isfinite(self._texture)
         weight = np.where(known, self._texture, self._texture[known].mean() if known.any() else 1.0)
         weight = weight / weight.sum() if weight.sum() > 0.0 else np.full(DIRECTIONS, 1.0 / DIRECTIONS)
-        share = max(0.0, 1.0 - float(weight @ np.exp(-swing / SWING)))
-        return Coverage(share, drift, swing, weight)
+        return Coverage(float(_seen(swing) @ weight), drift, turn, swing, weight)
 
     def _drift(self, events: Events, end_us: int) -> NDArray[np.float64]:
         """Velocity of the image without the prism [px/s]: the shift of this window's end from the last window's."""

@@ -58,8 +58,9 @@ class SpeedKeeper:
         if first is None or start < first:
             return
         path = prism_path(self._model, encoder.over(start, end), start, end)
-        self.coverage = self._meter(events, start, end, path).share
-        self.controller.update(end, self.coverage, len(events) / (end - start))
+        coverage = self._meter(events, start, end, path)
+        self.coverage = coverage.share
+        self.controller.update(start, end, coverage, len(events) / (end - start))
         rpm = self.controller.rpm
         # what changed while the answer to the last command was waited for is asked for with the next window
         if rpm != self._asked and (self._asking is None or not self._asking.is_alive()):
