@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.gatherer import PIECE, Gatherer, address
 from amiwarp.iwe import CanvasShape, Votes
+from amiwarp.placing import Placing
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -81,34 +82,28 @@ class Batches:
         """``batch``: most events of one."""
         import warp as wp
 
-        from amiwarp.kernels import compensate as kernels
-        from amiwarp.kernels.structs import azimuths, camera_params, pinhole_params
+        from amiwarp.kernels.compensate import Columns
 
         self._device, self._at = device, 0
+        self._encoder: Any = None
         self._placed: list[tuple[int, int]] = []  # stretches that were not voted yet
         self._voting: deque[tuple[int, int, Future[None]]] = deque()
-        self._kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
-        self._kernel.module.load(device, **({"block_dim": 1} if device.is_cpu else {}))
-        self._block = int(kernels.BLOCK) if device.is_cpu else 1
-        self._room = ROUNDS * -(-batch // self._block) * self._block
-        self._size = model.camera.width, model.camera.height
-        self._camera = camera_params(model.camera, str(device))
-        self._pinhole = pinhole_params(model.camera) or self._camera
-        self._inputs = [model.params(str(device)), None, wp.vec2(*self._size), None, azimuths(str(device)), None]
+        self._placing = Placing(model, device)
+        self._block = self._placing.block
+        self._room = ROUNDS * self._placing.padded(batch)
         dtypes = {"x": wp.uint16, "y": wp.uint16, "t": wp.int64, "out_x": float, "out_y": float, "inside": wp.uint8}
-        columns = kernels.Columns()
+        columns = self._columns = Columns()
         for name, dtype in dtypes.items():
             setattr(columns, name, wp.zeros(self._room, dtype=dtype, device=device))
-        self._inputs[-1] = self._columns = columns
-        self._ours = columns if device.is_cpu else kernels.Columns()
+        self._ours = columns if device.is_cpu else Columns()
         if not device.is_cpu:
             for name, dtype in dtypes.items():
                 setattr(self._ours, name, wp.zeros(self._room, dtype=dtype, device="cpu", pinned=True))
         self._host = {name: getattr(self._ours, name).numpy() for name in dtypes}
         self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
-        self._recorded: dict[int, Any] = {}
+        self._recorded: dict[bool, Any] = {}
         self._spare, self._gatherers = Spare(batch), [Gatherer(), Gatherer()]
-        self._votes = Votes(CanvasShape(*self._size), device)
+        self._votes = Votes(CanvasShape(*self._placing.size), device)
         self._stretches = self._votes.stretches(columns.out_x, columns.out_y, self._layer)
         if device.is_cuda and batch > DIRECT:
             self._spare.fill()
@@ -121,9 +116,9 @@ class Batches:
         from amiwarp.kernels.structs import encoder_pieces
 
         origin, *pieces = encoder_pieces(encoder, first, last)
-        n, p = len(pieces[0]), self._inputs[3]
+        n, p = len(pieces[0]), self._encoder
         if p is None or n > len(p.start):
-            p = self._inputs[3] = EncoderParams()
+            p = self._encoder = EncoderParams()
             p.shift, p.first = 62, wp.zeros(2, dtype=int, device=self._device)
             p.start, p.angle, p.slope = (
                 wp.zeros(max(2 * n, 64), dtype=dtype, device=self._device) for dtype in (wp.int64, wp.uint64, wp.uint64)
@@ -142,7 +137,7 @@ class Batches:
     def start(self, parts: list[Events], arrived_us: int) -> Started:
         """Begins to put a batch together, by other threads where it is long."""
         n, several = sum(map(len, parts)), len(parts) > 1
-        padded = -(-n // self._block) * self._block
+        padded = self._placing.padded(n)
         if self._at + padded > self._room:
             self._at = 0
         at, end = self._at, self._at + n
@@ -178,14 +173,12 @@ class Batches:
             self._copy(self._columns, self._ours, ("x", "y") if s.lent else ("x", "y", "t"), at, end)
             if s.lent is not None:
                 wp.copy(self._columns.t, s.lent[0], dest_offset=at, count=n)
-        padded = -(-n // self._block) * self._block
+        padded = self._placing.padded(n)
         if unknown < n:
             # what fills up the last block is placed too, so that it must have a place
             for name, value in (("x", 0), ("y", 0), ("t", s.t[-1])):
                 self._host[name][end : at + padded] = value
-            # the quick way of placing takes an event's pixel from the image's tables without a look: not for strays
-            strays = x >= self._size[0] or y >= self._size[1]
-            self._launch(at // self._block, padded // self._block, self._camera if strays else self._pinhole)
+            self._launch(at // self._block, padded // self._block, self._placing.strays(x, y))
         self._nowhere(at, at + unknown)
         self._nowhere(end, at + padded)
         self._placed.append((at, at + padded))
@@ -228,20 +221,20 @@ class Batches:
             columns = getattr(to, name), getattr(source, name)
             wp.copy(*columns, dest_offset=at, src_offset=at, count=end - at)
 
-    def _launch(self, first: int, blocks: int, camera: Any) -> None:
+    def _launch(self, first: int, blocks: int, strays: bool) -> None:
         import warp as wp
 
         from amiwarp.kernels.launch import launch
 
-        inputs = [*self._inputs[:1], camera, *self._inputs[2:]]
+        kernel, inputs = self._placing.kernel, self._placing.inputs(self._encoder, self._columns, strays=strays)
         if self._device.is_cpu and blocks >= SLICE:
-            launch(self._kernel, blocks, inputs, [], device=self._device, first=first, smallest=SLICE // 2)
+            launch(kernel, blocks, inputs, [], device=self._device, first=first, smallest=SLICE // 2)
             return
-        command = self._recorded.get(id(camera))
+        command = self._recorded.get(strays)
         if command is None:
             # to launch again what was recorded takes a fraction of the time
-            command = wp.launch(self._kernel, 1, [*inputs, 0], device=self._device, record_cmd=True)
-            self._recorded[id(camera)] = command
+            command = wp.launch(kernel, 1, [*inputs, 0], device=self._device, record_cmd=True)
+            self._recorded[strays] = command
         command.set_dim(blocks)
         command.set_param_at_index(len(inputs), first)
         command.launch()

@@ -18,6 +18,7 @@ from amiwarp.events import Events, check_sensor
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native import NativeEvents
+from amiwarp.placing import Placing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,21 +62,13 @@ class Mover:
     def __init__(self, model: Model, encoder: Encoder, t_first: int, t_last: int, device: Any) -> None:
         import warp as wp
 
-        from amiwarp.kernels import compensate as kernels
-        from amiwarp.kernels.structs import azimuths, camera_params, encoder_params, pinhole_params
+        from amiwarp.kernels.structs import encoder_params
 
         self._device = wp.get_device(device)
-        self._size = (model.camera.width, model.camera.height)
-        name = str(self._device)
-        self._camera = camera_params(model.camera, name)
-        self._pinhole = pinhole_params(model.camera) or self._camera
-        self._model, self._encoder = model.params(name), encoder_params(encoder, t_first, t_last, name)
-        self._azimuths = azimuths(name)
-        self._kernel = kernels.compensate_blocks if self._device.is_cpu else kernels.compensate_events
+        self._placing = Placing(model, self._device)
+        self._encoder = encoder_params(encoder, t_first, t_last, str(self._device))
         # Warp's CUDA side keeps its books for one thread at a time
         self._alone = contextlib.nullcontext() if self._device.is_cpu else threading.Lock()
-        # once, before threads would each try
-        self._kernel.module.load(self._device, **({"block_dim": 1} if self._device.is_cpu else {}))
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
         """The events moved (NaN: nowhere), and 1 for each that lies on a pixel of the image, shape ``(n,)``."""
@@ -89,24 +82,22 @@ class Mover:
     def _move(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
         import warp as wp
 
-        from amiwarp.kernels.compensate import BLOCK, Columns
+        from amiwarp.kernels.compensate import Columns
         from amiwarp.kernels.launch import launch
 
-        n, block = len(events), int(BLOCK) if self._device.is_cpu else 1
-        padded = -(-n // block) * block
-        width, height = self._size
-        # The quick way of placing takes the event's pixel from the image's tables without a look.
-        camera = self._pinhole if events.x.max() < width and events.y.max() < height else self._camera
+        placing, n = self._placing, len(events)
+        padded = placing.padded(n)
         c = Columns()
         c.x, c.y = (_on(self._device, values, wp.uint16, padded) for values in (events.x, events.y))
         c.t = _on(self._device, events.t, wp.int64, padded)
         c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=self._device) for _ in range(2))
         c.inside = wp.empty(padded, dtype=wp.uint8, device=self._device)
-        inputs = [self._model, camera, wp.vec2(width, height), self._encoder, self._azimuths, c]
+        inputs = placing.inputs(self._encoder, c, strays=placing.strays(events.x.max(), events.y.max()))
+        blocks = padded // placing.block
         if all_cores:
-            launch(self._kernel, padded // block, inputs, [], device=self._device, smallest=512)
+            launch(placing.kernel, blocks, inputs, [], device=self._device, smallest=512)
         else:
-            wp.launch(self._kernel, dim=padded // block, inputs=[*inputs, 0], device=self._device)
+            wp.launch(placing.kernel, dim=blocks, inputs=[*inputs, 0], device=self._device)
         return [values.numpy()[:n] for values in (c.out_x, c.out_y, c.inside)]
 
 
@@ -164,7 +155,7 @@ def compensate(
     """
     began = time.perf_counter()
     width, height = recording.events.size
-    check_size(calibration, recording)
+    check_size(calibration, recording.events.size, recording.name)
     n = len(recording.events)
     encoder = recording.encoder
     if n:
@@ -207,11 +198,10 @@ def _read_and_move(read: Callable[[], Events], mover: Mover) -> tuple[Events, ND
     return mover(read())
 
 
-def check_size(calibration: Calibration, recording: Recording) -> None:
-    """Raises :class:`AmiwarpError` where a calibration belongs to a camera of another size."""
-    size = (calibration.camera.width, calibration.camera.height)
-    if size != recording.events.size:
-        width, height = recording.events.size
+def check_size(calibration: Calibration, size: tuple[int, int], name: str) -> None:
+    """Raises :class:`AmiwarpError` where a calibration belongs to a camera of another size than ``name``'s."""
+    width, height = calibration.camera.width, calibration.camera.height
+    if size != (width, height):
         raise AmiwarpError(
-            f"{recording.name}: is {width}x{height}, the calibration is for {size[0]}x{size[1]}; calibrate this camera"
+            f"{name}: is {size[0]}x{size[1]}, the calibration is for {width}x{height}; calibrate this camera"
         )

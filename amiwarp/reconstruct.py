@@ -135,7 +135,7 @@ class Reconstruction:
             raise AmiwarpError(f"{recording.name}: has no events to make a picture of")
         first, last = recording.events.t_first, recording.events.t_last
         if calibration is not None:
-            check_size(calibration, recording)
+            check_size(calibration, recording.events.size, recording.name)
             model, encoder = calibration.model, calibration.encoder_for(recording.encoder, first, last)
         encoder = encoder or recording.encoder
         if model is None or encoder is None:

@@ -31,11 +31,12 @@ from amiwarp.compensate import compensate_events
 from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, Compensator
 from amiwarp.encoder import Encoder, EncoderStream
 from amiwarp.events import Events
+from amiwarp.link.clocks import monotonic_us
 from amiwarp.machine import machine
 from amiwarp.optics import CircleModel, ExactModel, Model, Prism
 from amiwarp.simulate import simulate
 from amiwarp.stream.packets import Packet
-from amiwarp.stream.session import IMAGE_US, Session, Status, monotonic_us
+from amiwarp.stream.session import IMAGE_US, Session, Status
 
 PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))
 MODELS: dict[str, Model] = {

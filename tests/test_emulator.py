@@ -14,7 +14,7 @@ import pytest
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.link.clocks import WRAP
-from amiwarp.link.emulator import MOST_RPM, Controller, Fault, Motor, Played, PseudoTerminal
+from amiwarp.link.emulator import MOST_RPM, Controller, Fault
 from amiwarp.link.protocol import (
     Answer,
     Decoder,
@@ -30,6 +30,8 @@ from amiwarp.link.protocol import (
     Sync,
     encode,
 )
+from amiwarp.link.rotors import Motor, Played
+from amiwarp.link.terminal import PseudoTerminal
 
 S = 1_000_000
 

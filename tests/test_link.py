@@ -17,12 +17,14 @@ from typer.testing import CliRunner
 from amiwarp.cli import motor as command
 from amiwarp.errors import AmiwarpError
 from amiwarp.link import following
-from amiwarp.link.clocks import WRAP
-from amiwarp.link.emulator import LASTING, Controller, Fault, Motor, PseudoTerminal
+from amiwarp.link.clocks import WRAP, monotonic_us
+from amiwarp.link.emulator import LASTING, Controller, Fault
 from amiwarp.link.following import Follower, News
 from amiwarp.link.link import Link
 from amiwarp.link.port import open_port, usb_id
 from amiwarp.link.protocol import Decoder, Index, Message, Ping, Samples, Status, encode
+from amiwarp.link.rotors import Motor
+from amiwarp.link.terminal import PseudoTerminal
 
 S = 1_000_000
 RPM = 720.0
@@ -340,10 +342,10 @@ class Live:
     """An emulator in real time whose world's clock is the host's, less its start."""
 
     def __init__(self, path: Path, *faults: str, rpm: float = RPM, drift_ppm: float = 0.0) -> None:
-        self.origin = time.monotonic_ns() // 1000
+        self.origin = monotonic_us()
         self.motor = Motor(rpm)
         self.controller = Controller(self.motor, faults=[Fault.parse(f) for f in faults], drift_ppm=drift_ppm)
-        self.terminal = PseudoTerminal(self.controller, path, now_us=lambda: time.monotonic_ns() // 1000 - self.origin)
+        self.terminal = PseudoTerminal(self.controller, path, now_us=lambda: monotonic_us() - self.origin)
 
     def __enter__(self) -> "Live":
         return self

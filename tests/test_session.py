@@ -67,8 +67,10 @@ class Ran:
 
 def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran:
     """The recording played by an emulated rig through a session, which writes both files."""
-    from amiwarp.link.emulator import Controller, Fault, Played, PseudoTerminal
+    from amiwarp.link.emulator import Controller, Fault
     from amiwarp.link.link import Link
+    from amiwarp.link.rotors import Played
+    from amiwarp.link.terminal import PseudoTerminal
 
     assert recording.encoder is not None
     rotor = Played(recording.encoder)

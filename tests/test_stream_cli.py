@@ -187,7 +187,9 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
 
 def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path) -> None:
     """From rest; events at random are more than the limit allows, so that it is slowed down."""
-    from amiwarp.link.emulator import Controller, Motor, PseudoTerminal
+    from amiwarp.link.emulator import Controller
+    from amiwarp.link.rotors import Motor
+    from amiwarp.link.terminal import PseudoTerminal
 
     motor = Motor()
     with PseudoTerminal(Controller(motor), tmp_path / "prism") as port:

@@ -58,7 +58,9 @@ def run(
     common: Common,
 ) -> None:
     """Be a controller with motor, encoder and index, for trying out without one, and with what goes wrong on demand."""
-    from amiwarp.link.emulator import Controller, Fault, Motor, Played, PseudoTerminal
+    from amiwarp.link.emulator import Controller, Fault
+    from amiwarp.link.rotors import Motor, Played
+    from amiwarp.link.terminal import PseudoTerminal
     from amiwarp.stream.emulated import EmulatedCamera
 
     if (recording is None) != (camera is None):

@@ -17,7 +17,6 @@ from amiwarp.cli.streams import (
     SourceOptions,
     StatusLine,
     check_angles,
-    clock_offset,
     stopped_by_interrupt,
     summary,
 )
@@ -110,6 +109,8 @@ def run(
     Every event comes out once, in order, marked where it left the image or its angle had to be extrapolated.
     """
     from amiwarp.calib import Calibration
+    from amiwarp.compensate import check_size
+    from amiwarp.stream.clocking import clock_offset
     from amiwarp.stream.forward import Forward
     from amiwarp.stream.session import Session
 
@@ -121,10 +122,7 @@ def run(
         link = held.enter_context(stream.link())
         opened = stream.open(source)
         check_angles(opened, link)
-        size = (found.camera.width, found.camera.height)
-        if opened.size != size:
-            given = "{}x{}".format(*opened.size)
-            raise AmiwarpError(f"{opened.name}: is {given}, the calibration is for {size[0]}x{size[1]}")
+        check_size(found, opened.size, opened.name)
         raw: list[Raw] = []
         if record is not None:
             raw.append(

@@ -15,7 +15,6 @@ from amiwarp.cli.streams import (
     SourceOptions,
     StatusLine,
     check_angles,
-    clock_offset,
     stopped_by_interrupt,
     summary,
 )
@@ -37,6 +36,7 @@ def run(
     The file can be opened at any moment, also after a crash: NAME.part.h5 then, without at most its last second.
     """
     from amiwarp.io.live_writer import LiveWriter
+    from amiwarp.stream.clocking import clock_offset
     from amiwarp.stream.session import Session
 
     stop = threading.Event()

@@ -149,11 +149,6 @@ def check_angles(source: Source, link: Link | None) -> None:
         raise AmiwarpError(f"{source.name}: gives no encoder samples; give the controller's --port")
 
 
-def clock_offset(source: Source, link: Link | None) -> float:
-    """Of the encoder that came along with a file: it is recorded with it, so that calibrations of either fit both."""
-    return 0.0 if link is not None else float(getattr(source, "clock_offset_us", 0.0))
-
-
 def summary(s: Status) -> dict[str, Any]:
     """For ``--json``."""
     return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,11 @@ OUTLIER = 4.0
 """Robust standard deviations beyond which a pair is left out: a pulse that was taken for another."""
 QUICK = 2.0
 """Round trips up to so many times the shortest tell the offset; in the longer ones something waited."""
+
+
+def monotonic_us() -> int:
+    """The host's clock [us]."""
+    return time.monotonic_ns() // 1000
 
 
 class Unwrapped:

@@ -32,13 +32,10 @@ from amiwarp.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.link.rotors import Motor, Played, Rotor
-from amiwarp.link.terminal import PseudoTerminal
+from amiwarp.link.rotors import Played, Rotor
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
-
-__all__ = ["Controller", "Fault", "Motor", "Played", "PseudoTerminal", "Rotor"]
 
 LASTING = {
     "garbage": 0.5, "truncate": 0.5, "crc": 0.5, "drop": 0.5, "missed-index": 0.5, "stall": 2.0, "reverse": 1.0,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.link.following import Follower, News
+from amiwarp.link.clocks import monotonic_us
+from amiwarp.link.following import Follower
 from amiwarp.link.port import open_port, usb_id
 from amiwarp.link.protocol import REFUSALS, Message, Ping, SetCounts, SetSpeed, Stop, encode
 
@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from amiwarp.link.clocks import Clock
+    from amiwarp.link.following import News
     from amiwarp.link.protocol import Status
-
-__all__ = ["Link", "News"]
 
 RETRY_S = 0.2
 """Between attempts to open a port that is gone."""
@@ -27,10 +26,6 @@ ANSWER_S = 1.0
 """Longest wait for the answer to a command."""
 QUICK, QUICK_US, PING_US = 10, 50_000, 1_000_000
 """The first pings come quickly, the others once a second."""
-
-
-def _monotonic_us() -> int:
-    return time.monotonic_ns() // 1000
 
 
 class Link:
@@ -42,7 +37,7 @@ class Link:
     """
 
     def __init__(
-        self, port: str | None = None, *, counts_per_turn: int | None = None, host_us: Callable[[], int] = _monotonic_us
+        self, port: str | None = None, *, counts_per_turn: int | None = None, host_us: Callable[[], int] = monotonic_us
     ) -> None:
         if counts_per_turn is not None and counts_per_turn < 1:
             raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; give 1 or more")

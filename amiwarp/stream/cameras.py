@@ -16,6 +16,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
+from amiwarp.link.clocks import monotonic_us
 from amiwarp.stream.packets import Packet, packet
 
 if TYPE_CHECKING:
@@ -86,12 +87,12 @@ class DvSource(_CameraSource):
                 running = self._camera.isRunning()
                 store, triggers = self._camera.getNextEventBatch(), self._triggers()
             if store is not None or triggers.size:
-                yield packet(time.monotonic_ns() // 1000, _dv_events(store), triggers)
+                yield packet(monotonic_us(), _dv_events(store), triggers)
                 given = time.monotonic()
             elif not running:
                 raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
             elif time.monotonic() - given >= IDLE_S:
-                yield packet(time.monotonic_ns() // 1000)
+                yield packet(monotonic_us())
                 given = time.monotonic()
             else:
                 time.sleep(POLL_S)
@@ -150,7 +151,7 @@ class PropheseeSource(_CameraSource):
                 triggers = self._triggers()
             if events is None:
                 raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
-            now = time.monotonic_ns() // 1000
+            now = monotonic_us()
             yield packet(now, _events(events["x"], events["y"], events["t"], events["p"]), triggers)
 
     def close(self) -> None:

@@ -14,6 +14,9 @@ from amiwarp.link.clocks import FEWEST, Clock, from_pulses
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from amiwarp.link.link import Link
+    from amiwarp.stream.packets import Source
+
 PULSES = 100
 """That are remembered, the last ones."""
 UNPAIRED = 16
@@ -24,6 +27,11 @@ APART_US = 5_000_000
 """The two reports of one pulse reach the host within this, and within half the time between two pulses [us]."""
 ARRIVALS = 2000
 """Packets whose delays are remembered: the shortest tells how the camera's clock and the host's lie."""
+
+
+def clock_offset(source: Source, link: Link | None) -> float:
+    """Of the encoder that came along with a file [us]: what is recorded has it too, so that calibrations fit both."""
+    return 0.0 if link is not None else float(getattr(source, "clock_offset_us", 0.0))
 
 
 class CameraClock:

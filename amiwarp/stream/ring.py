@@ -49,8 +49,6 @@ class Ring:
             since = int(events.t[-1]) - round(SECONDS * 1e6)
             while self._count > MOST_EVENTS or self._events[0].t[-1] < since:
                 self._count -= len(self._events.popleft())
-            while len(self._samples) > 1 and self._samples[1][0][0] < self._events[0].t[0]:
-                self._samples.popleft()
 
     def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
         """Samples in order, on the events' clock; index pulses are in the angles."""

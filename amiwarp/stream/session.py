@@ -15,9 +15,10 @@ import numpy as np
 from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.encoder import EncoderStream
 from amiwarp.iwe import CanvasShape
+from amiwarp.link.clocks import monotonic_us
 from amiwarp.sharpness import Sharpness, SharpnessMeter
 from amiwarp.stream.beside import QUEUE_EVENTS, Beside
-from amiwarp.stream.clocking import CameraClock
+from amiwarp.stream.clocking import CameraClock, clock_offset
 from amiwarp.stream.packets import NO_TIMES, Sorter
 from amiwarp.stream.queues import PacketQueue, Policy
 from amiwarp.stream.watch import PhaseWatch
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from amiwarp.events import Events
     from amiwarp.io.live_writer import LiveWriter
     from amiwarp.link.clocks import Clock
-    from amiwarp.link.link import Link, News
+    from amiwarp.link.following import News
+    from amiwarp.link.link import Link
     from amiwarp.stream.packets import Packet, Source
     from amiwarp.stream.speed import SpeedKeeper
 
@@ -41,11 +43,6 @@ POLL_S = 0.001
 """Longest wait for a packet, between two looks at the encoder."""
 MOST_HELD = 10_000
 """Polls of the link that wait for the camera's clock to be known."""
-
-
-def monotonic_us() -> int:
-    """The host's clock [us]."""
-    return time.monotonic_ns() // 1000
 
 
 @dataclass(slots=True)
@@ -127,7 +124,7 @@ class Session:
         self._queue = PacketQueue(queue_events, policy)
         self._sorter, self._camera_clock = Sorter(), CameraClock()
         # a source's own samples are on the events' clock already, as its file says; what was calibrated says it better
-        own = getattr(source, "clock_offset_us", 0.0) if link is None else 0.0
+        own = clock_offset(source, link)
         known = {} if calibration is None else calibration.parameters
         self.encoder = EncoderStream(known.get("clock_offset", own) - own)
         self._held: list[News] = []
@@ -318,11 +315,11 @@ class Session:
     def _report(self, on_status: Callable[[Status], None]) -> None:
         now, status = monotonic_us(), self.status
         status.seconds = self._seconds
-        then, events, done, unsure = self._since
-        sure = status.guessed + status.unknown
+        then, events, done, unsure_then = self._since
+        unsure = status.guessed + status.unknown
         status.rate_mev_s = (status.events - events) / max(now - then, 1)
-        status.covered = 1.0 - (sure - unsure) / (status.done - done) if status.done > done else 1.0
-        self._since = (now, status.events, status.done, sure)
+        status.covered = 1.0 - (unsure - unsure_then) / (status.done - done) if status.done > done else 1.0
+        self._since = (now, status.events, status.done, unsure)
         if self._latencies:
             median, slow = np.percentile(self._latencies, [50, 99]) * 1e-3
             status.latency_ms = float(median), float(slow)

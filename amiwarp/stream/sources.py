@@ -14,6 +14,7 @@ from amiwarp.compensator import Compensated
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
 from amiwarp.io import open_recording
+from amiwarp.link.clocks import monotonic_us
 from amiwarp.stream.packets import (
     Angles,
     Decoder,
@@ -79,7 +80,7 @@ class FileSource:
         *,
         pace: float | None = 1.0,
         packet_us: int = 1000,
-        clock: Callable[[], int] = lambda: time.monotonic_ns() // 1000,
+        clock: Callable[[], int] = monotonic_us,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         if pace is not None and not 0.0 < pace < float("inf"):
@@ -163,7 +164,7 @@ class StreamSource:
                 yield self._packet(message)
                 given = time.monotonic()
             elif time.monotonic() - given >= IDLE_S:
-                yield packet(time.monotonic_ns() // 1000)
+                yield packet(monotonic_us())
                 given = time.monotonic()
 
     def close(self) -> None:
@@ -201,7 +202,7 @@ class StreamSource:
         self._ended, self.problem = True, problem
 
     def _packet(self, message: Events | Compensated | Triggers | Angles) -> Packet:
-        now = time.monotonic_ns() // 1000
+        now = monotonic_us()
         if isinstance(message, Triggers):
             return packet(now, triggers=message.t)
         if isinstance(message, Angles):
