@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,6 +28,42 @@ _PICTURE = "Picture"
 LEAST_PX, MOST_PX = 100, 8000
 
 
+@dataclass(frozen=True)
+class PictureOptions:
+    """Of a picture that is written in place of a page."""
+
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Write a picture of both clouds (.png) and end.", rich_help_panel=_PICTURE)
+    ] = None
+    view: Annotated[View, typer.Option(help="Where the camera stands.", rich_help_panel=_PICTURE)] = View.FREE
+    colour: Annotated[Colour, typer.Option(help="What colours tell.", rich_help_panel=_PICTURE)] = Colour.POLARITY
+    axis: Annotated[
+        Axis | None, typer.Option(help="Third axis. Default: the angle, where there is one.", rich_help_panel=_PICTURE)
+    ] = None
+    dark: Annotated[bool, typer.Option("--dark", help="On a dark ground.", rich_help_panel=_PICTURE)] = False
+    overlaid: Annotated[bool, typer.Option("--overlaid", help="Both in one frame.", rich_help_panel=_PICTURE)] = False
+    size: Annotated[str, typer.Option(help="Of the picture (px).", rich_help_panel=_PICTURE)] = "1400x620"
+
+    def write(self, first: Inspector, path: Path) -> dict[str, Any]:
+        """What is drawn, for ``--json``. Raises :class:`AmiwarpError` for a format or a size that cannot be."""
+        from amiwarp.viewer.app import save_screenshot
+
+        if path.suffix.lower() != ".png":
+            raise AmiwarpError(f"{path}: pictures are written as .png")
+        third = self.axis or (Axis.ANGLE if first.has_encoder or first.knobs.rpm else Axis.TIME)
+        width, height = parse_size(self.size)
+        if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
+            raise AmiwarpError(f"--size {self.size!r}: pictures have {LEAST_PX} to {MOST_PX} pixels a side")
+        look = Look(self.colour, third, dark=self.dark, overlaid=self.overlaid)
+        save_screenshot(first, path, view=self.view, look=look, size=(width, height))
+        shown = first.show()
+        return {
+            "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
+            "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
+            "notes": list(first.notes),
+        }  # fmt: skip
+
+
 def run(
     recording: Annotated[
         Path,
@@ -43,10 +79,6 @@ def run(
     web: Annotated[bool, typer.Option("--web", help="Serve the page and print its address; open no window.")] = False,
     host: Annotated[str, typer.Option(help="Interface to serve on; the address carries a secret token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve on; 0: a free one.")] = 0,
-    screenshot: Annotated[
-        Path | None, typer.Option(help="Write a picture of both clouds (.png) and end.", rich_help_panel=_PICTURE)
-    ] = None,
-    view: Annotated[View, typer.Option(help="Where the camera stands.", rich_help_panel=_PICTURE)] = View.FREE,
     window: Annotated[
         str | None,
         typer.Option(help="Only these seconds of the recording. Default: one turn in its middle.", metavar="START:END"),
@@ -54,19 +86,13 @@ def run(
     model: Annotated[
         str | None, typer.Option(help="circle, exact, radial or ellipse. Default: as calibrated, or exact.")
     ] = None,
-    colour: Annotated[Colour, typer.Option(help="What colours tell.", rich_help_panel=_PICTURE)] = Colour.POLARITY,
-    axis: Annotated[
-        Axis | None, typer.Option(help="Third axis. Default: the angle, where there is one.", rich_help_panel=_PICTURE)
-    ] = None,
-    dark: Annotated[bool, typer.Option("--dark", help="On a dark ground.", rich_help_panel=_PICTURE)] = False,
-    overlaid: Annotated[bool, typer.Option("--overlaid", help="Both in one frame.", rich_help_panel=_PICTURE)] = False,
-    size: Annotated[str, typer.Option(help="Of the picture [px].", rich_help_panel=_PICTURE)] = "1400x620",
+    picture: PictureOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
     """Look at events in x, y and prism angle, as recorded and compensated, and turn the prism's knobs."""
-    from amiwarp.viewer.app import has_display, open_window, save_screenshot, serve_panel
+    from amiwarp.viewer.app import has_display, open_window, serve_panel
     from amiwarp.viewer.scene import check_display
 
     device = choose_device(common.device)
@@ -79,21 +105,8 @@ def run(
             return inspector(recording, calibration, window, model, camera, prism, device, latest)
 
         first = make()  # what is wrong is said here, not in the page
-        if screenshot is not None:
-            if screenshot.suffix.lower() != ".png":
-                raise AmiwarpError(f"{screenshot}: pictures are written as .png")
-            third = axis or (Axis.ANGLE if first.has_encoder or first.knobs.rpm else Axis.TIME)
-            width, height = parse_size(size)
-            if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
-                raise AmiwarpError(f"--size {size!r}: pictures have {LEAST_PX} to {MOST_PX} pixels a side")
-            look = Look(colour, third, dark=dark, overlaid=overlaid)
-            save_screenshot(first, screenshot, view=view, look=look, size=(width, height))
-            shown = first.show()
-            data: dict[str, Any] = {
-                "file": str(screenshot), "events": shown.span.count, "drawn": len(shown.events),
-                "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
-                "notes": list(first.notes), "device": device,
-            }  # fmt: skip
+        if picture.screenshot is not None:
+            data = {**picture.write(first, picture.screenshot), "device": device}
             report(common, data, _lines(data))
             return
         served = [first]
