@@ -3,7 +3,6 @@
 import asyncio
 import gc
 import os
-import shutil
 import threading
 import time
 import weakref
@@ -21,20 +20,6 @@ from amiwarp.viewer.serve import Session, serve
 pytest.importorskip("trame_vuetify")
 TOKEN = "s3cret & more"
 WAIT_S = 30.0
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A headless Chromium; its tests are skipped, visibly, where there is none."""
-    sync_api = pytest.importorskip("playwright.sync_api")
-    chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium on PATH")
-    arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=arguments)
-        yield started
-        started.close()
 
 
 @contextmanager

@@ -5,7 +5,6 @@ import io
 import itertools
 import math
 import re
-import shutil
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -52,17 +51,9 @@ def recording(texture: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="module")
-def context() -> Iterator[Any]:
-    """Windows of a headless Chromium; the tests are skipped, visibly, where there is none."""
-    sync_api = pytest.importorskip("playwright.sync_api")
-    chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium on PATH")
-    arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=arguments)
-        yield started.new_context(viewport=SIZE)
-        started.close()
+def context(browser: Any) -> Any:
+    """Windows of it."""
+    return browser.new_context(viewport=SIZE)
 
 
 class Tabs:
