@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,7 @@ OUTSIDE, EXTRAPOLATED, NO_ANGLE = 1, 2, 4
 """Flags of an event: its place lies outside the image; no encoder sample came in time, so its angle goes on at constant
 speed; there is no angle at all, and so no place (NaN)."""
 MANY = 2
-"""Batches that a call gives at least before it leaves others to the next."""
+"""Batches that a call gives at least before it leaves those that a GPU works on to the next."""
 AHEAD_US = 100_000
 """Of encoder samples that are put on the device at once, where there are so many [us]."""
 
@@ -67,6 +68,7 @@ class Compensator:
         self._device = wp.get_device(device)
         self.batch = batch or (1 << 16 if self._device.is_cpu else 1 << 20)
         self._work = Batches(model, self.batch, self._device)
+        self._many = MANY if self._device.is_cuda else math.inf
         self._queue: deque[tuple[Events, int, int]] = deque()
         self.waiting = 0
         """Events put that are not worked on yet."""
@@ -105,7 +107,7 @@ class Compensator:
         while True:
             # while one batch is put together, a GPU works on that before it, and the one before that is fetched
             packets = self._ready(now_us)
-            if not packets and len(out) >= MANY and self._device.is_cuda:
+            if not packets and len(out) >= self._many:
                 return out
             started, self._started = self._started, self._start(packets) if packets else None
             begun, self._begun = self._begun, None

@@ -94,6 +94,38 @@ def test_the_image_is_whole_however_many_batches_are_under_way(size: int, device
     assert np.abs(compensator.image() - np.squeeze(image)).max() < 0.5
 
 
+def test_batches_under_way_come_with_the_next_call(device: str) -> None:
+    """Marked by the samples there were when they were begun; each event once, in order."""
+    events, stream = random_events(60_000), EncoderStream()
+    compensator = Compensator(MODEL, stream, wait_us=0, batch=1024, device=device)
+    compensator._many = 2  # as on CUDA
+    out, known = [], ENCODER.t <= 90_000
+    for start in range(0, 60_000, 6000):
+        part = events[start : start + 6000]
+        if start == 6000:
+            stream.append(ENCODER.t[known], ENCODER.angle[known])
+        if start == 54_000:  # samples come while some are under way
+            compensator.put(part, 0)
+            out += compensator.take(10**9)
+            stream.append(ENCODER.t[~known], ENCODER.angle[~known])
+            continue
+        for k in range(0, 6000, 500):
+            compensator.put(part[k : k + 500], 0)
+        out += compensator.take(10**9 if start == 0 else 0)
+        assert compensator.waiting == 0
+    assert sum(len(packet.flags) for packet in out) < 60_000
+    found, flags = joined(out + compensator.flush())
+    np.testing.assert_array_equal(found.t, events.t)
+    np.testing.assert_array_equal(found.p, events.p)
+    expected = compensate_events(events, MODEL, ENCODER, device=device)
+    sure = flags & (NO_ANGLE | EXTRAPOLATED) == 0
+    np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1)[sure], expected[sure])
+    last = sure[found.t > 91_000]
+    assert not last[0]  # begun before its samples came
+    assert last[-1]  # put together then, and begun after
+    assert sure[(found.t > events.t[6000]) & (found.t < 90_000)].all()
+
+
 def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
     events, stream = random_events(3000, 0.03), EncoderStream()
     compensator = Compensator(MODEL, stream, wait_us=10_000, start_us=500_000)
