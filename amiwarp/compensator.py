@@ -88,20 +88,20 @@ class Compensator:
             return
         if events.t[0] < self._t_last:
             raise AmiwarpError(f"a packet from {events.t[0]} us comes after one to {self._t_last} us; sort it first")
+        if (events.t[self.batch :: self.batch] < events.t[self.batch - 1 : -1 : self.batch]).any():
+            raise AmiwarpError(f"events of {events.t[0]} to {events.t[-1]} us are not sorted; sort each packet")
         self._t_last = int(events.t[-1])
         self.waiting += len(events)
-        if len(events) <= self.batch:
-            self._queue.append((events, now_us, now_us if arrived_us is None else arrived_us))
-            return
+        arrived = now_us if arrived_us is None else arrived_us
         for start in range(0, len(events), self.batch):
-            part = events[start : start + self.batch]
-            self._queue.append((part, now_us, now_us if arrived_us is None else arrived_us))
+            self._queue.append((events[start : start + self.batch], now_us, arrived))
 
     def take(self, now_us: int) -> list[Compensated]:
         """What is ready at ``now_us``, in the order it was put, packets that are ready together joined to a batch.
 
         Of many batches a GPU may work on the last still: they come with the next call, or with :meth:`flush`.
-        Raises :class:`AmiwarpError` for a packet that is not sorted; what was ready with it is lost.
+        Raises :class:`AmiwarpError` for a packet that is not sorted; what was ready with it, and what was under way, is
+        lost.
         """
         out: list[Compensated] = []
         while True:
@@ -120,7 +120,7 @@ class Compensator:
 
     def flush(self) -> list[Compensated]:
         """All that still waits, its angles guessed where they must be: at the end of a stream."""
-        out = self.take(2**62)
+        out: list[Compensated] = []
         while more := self.take(2**62):
             out += more
         return out

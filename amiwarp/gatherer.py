@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from ctypes import c_uint64
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from amiwarp.events import Events
+from amiwarp.events import Events
 
 PIECE, THREADS = 1 << 18, 2
 """Events that a thread puts together: of more, several do. Two fill the memory's way, more wait for each other."""
@@ -85,11 +84,11 @@ class Gatherer:
         if not jobs:
             run(0)
 
-        def found() -> tuple[bool, int, int]:
+        def found(_held: object = columns) -> tuple[bool, int, int]:
+            """The columns are held until all was copied: of the arrays only the addresses are with the threads."""
             for job in jobs:
                 job.result()
             unsorted, most_x, most_y = self._found[: len(parts)].max(axis=0).tolist()
-            assert columns  # held until all was copied
             return bool(unsorted), most_x, most_y
 
         return found
@@ -97,7 +96,8 @@ class Gatherer:
 
 def _cut(parts: list[Events]) -> tuple[list[Events], list[int]]:
     """Parts in pieces of :data:`PIECE` at most, and which of them go on where the one before ended."""
-    cut = [(part[k : k + PIECE], int(k > 0)) for part in parts for k in range(0, len(part), PIECE)]
+    whole = [Events(*(_plain(column) for column in (part.x, part.y, part.t, part.p))) for part in parts]
+    cut = [(part[k : k + PIECE], int(k > 0)) for part in whole for k in range(0, len(part), PIECE)]
     return [piece for piece, _ in cut], [goes_on for _, goes_on in cut]
 
 

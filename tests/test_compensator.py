@@ -52,7 +52,7 @@ def test_a_stream_comes_out_as_its_recording_does(name: str, distorted: bool, de
         compensator.put(events[start : start + n], 0)
         out += compensator.take(0)
         start += n
-    found, flags = joined(out)
+    found, flags = joined(out + compensator.flush())
     expected = compensate_events(events, model, encoder, device=device)
     np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
     np.testing.assert_array_equal(found.t, events.t)
@@ -92,6 +92,26 @@ def test_the_image_is_whole_however_many_batches_are_under_way(size: int, device
     np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
     image = iwe(events, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, device=device)
     assert np.abs(compensator.image() - np.squeeze(image)).max() < 0.5
+
+
+def test_columns_with_gaps_are_sorted_too(device: str) -> None:
+    """Long packets whose columns are views of records."""
+    n = 600_000
+    records = np.zeros(n, [("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("p", "u1")])
+    records["t"] = np.arange(n) // 6
+    compensator = Compensator(MODEL, streamed(), batch=1 << 20, device=device)
+    compensator.put(Events(*(records[name] for name in "xytp")), 0)
+    found, _ = joined(compensator.take(0))
+    np.testing.assert_array_equal(found.t, records["t"])
+
+
+def test_a_packet_that_steps_back_between_two_batches_is_refused() -> None:
+    events = random_events(8000)
+    back = Events(events.x, events.y, np.concatenate([events.t[4000:], events.t[:4000]]), events.p)
+    compensator = Compensator(MODEL, streamed(), batch=4000)
+    with pytest.raises(AmiwarpError, match="not sorted"):
+        compensator.put(back, 0)
+    assert compensator.waiting == 0
 
 
 def test_batches_under_way_come_with_the_next_call(device: str) -> None:

@@ -7,14 +7,16 @@ import re
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from amiwarp.calib.result import Calibration
 from amiwarp.camera import Camera
-from amiwarp.compensator import Compensator
+from amiwarp.compensator import Compensated, Compensator
 from amiwarp.encoder import EncoderStream
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, Recording
@@ -26,7 +28,7 @@ from amiwarp.stream.forward import Forward
 from amiwarp.stream.packets import Angles, Decoder
 from amiwarp.stream.ring import SECONDS, Ring, followed
 from amiwarp.stream.sources import open_source
-from amiwarp.stream.speed import SpeedKeeper
+from amiwarp.stream.speed import WINDOW_US, SpeedKeeper
 from amiwarp.stream.watch import PhaseWatch
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
@@ -133,6 +135,47 @@ def test_a_keeper_says_what_the_controller_refuses(recording: Recording) -> None
     asked, said = kept(recording, most_mev_s=0.01, fail=True)
     assert asked == []
     assert set(said) == {"refused by the controller"}
+
+
+@pytest.mark.parametrize("packet_us", [2000, 50_000, 400_000])
+def test_a_keeper_measures_windows_of_one_length(
+    recording: Recording, packet_us: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However much comes at once; of a backlog the last windows."""
+    model, encoder, windows = known(recording, 0.0).model, streamed(recording), []
+    controller = SpeedController(prism_orbit(model), 720.0)
+    update = SpeedController.update
+
+    def noted(self: SpeedController, start_us: int, end_us: int, *more: Any) -> float | None:
+        windows.append((start_us, end_us))
+        return update(self, start_us, end_us, *more)
+
+    monkeypatch.setattr(SpeedController, "update", noted)
+    compensator = Compensator(model, encoder)
+    keeper = SpeedKeeper(model, controller, lambda rpm, ramp: None, pytest.fail)
+    for events in recording.events.blocks(duration_us=packet_us):
+        compensator.put(events, 0)
+        keeper.put(compensator.take(0), encoder)
+    keeper.close()
+    assert {end - start for start, end in windows} == {WINDOW_US}
+    assert all(start == end for (_, end), (start, _) in pairwise(windows[-10:]))
+    assert recording.events.t_last - windows[-1][1] < WINDOW_US + packet_us
+    assert len(windows) >= min(10, recording.events.t_last // WINDOW_US - 2)
+
+
+def test_a_keeper_passes_over_what_the_samples_do_not_cover(recording: Recording) -> None:
+    """The first two are six times as far apart as the others: before them angles are known for a usual distance."""
+    model, encoder = known(recording, 0.0).model, EncoderStream()
+    t = np.concatenate([[0], np.arange(6000, 200_000, 1000)])
+    encoder.append(t, t * 7.5e-5)
+    keeper = SpeedKeeper(model, SpeedController(prism_orbit(model)), lambda rpm, ramp: None, pytest.fail)
+    x = np.full(1000, 10.0, np.float32)
+    early = Events(x, x, np.linspace(-5000, 30_000, 1000).astype(np.int64), np.ones(1000, np.uint8))
+    late = Events(x, x, np.linspace(30_000, 150_000, 1000).astype(np.int64), np.ones(1000, np.uint8))
+    keeper.put([Compensated(early, np.zeros(1000, np.uint8))], encoder)
+    assert keeper.coverage is None
+    keeper.put([Compensated(late, np.zeros(1000, np.uint8))], encoder)
+    assert keeper.coverage is not None
 
 
 def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:

@@ -148,6 +148,7 @@ class SpeedController:
     high: float = 0.9996
     """The band of coverage in which the speed stays as it is."""
     _t_us: int | None = field(default=None, init=False)
+    _speeds: NDArray[np.float64] = field(init=False)
     _unseen: NDArray[np.float64] = field(init=False)
     _rate: float = field(default=0.0, init=False)
     _moving: bool = field(default=False, init=False)
@@ -162,7 +163,7 @@ class SpeedController:
         for name in ("ramp_rpm_s", "most_mev_s"):
             if not getattr(self, name) > 0.0:
                 raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give more than 0")
-        self._unseen = np.zeros(SPEEDS)
+        self._unseen, self._speeds = np.zeros(SPEEDS), np.geomspace(self.least_rpm, self.most_rpm, SPEEDS)
 
     def update(self, start_us: int, end_us: int, coverage: Coverage, rate_mev_s: float) -> float | None:
         """The speed to ask for after a window [us] [turns/min]; None: leave it as it is.
@@ -185,14 +186,15 @@ class SpeedController:
         return None if first else self._step(seconds)
 
     @property
-    def _speeds(self) -> NDArray[np.float64]:
-        return np.geomspace(self.least_rpm, self.most_rpm, SPEEDS)
+    def _logs(self) -> NDArray[np.float64]:
+        """Of what is unseen, which between two speeds goes evenly by ratio."""
+        return np.asarray(np.log(np.maximum(self._unseen, 1e-12)))
 
     def _step(self, seconds: float) -> float | None:
         """Towards where it should be."""
         rate, within = self._rate / self.most_mev_s, FOLLOW_S
         self._limited = rate > (NEAR_LIMIT if self._limited else 1.0)
-        now = float(np.interp(math.log(self.rpm), np.log(self._speeds), self._unseen))
+        now = math.exp(np.interp(math.log(self.rpm), np.log(self._speeds), self._logs))
         self._moving = self._moving or not 1.0 - self.high <= now <= 1.0 - self.low
         enough = self._enough() if self._moving else self.rpm
         if self._limited:
@@ -209,13 +211,13 @@ class SpeedController:
 
     def _enough(self) -> float:
         """The lowest speed with what may be unseen, between those looked at; the best where there is none."""
-        aim = math.sqrt((1.0 - self.low) * (1.0 - self.high))
-        good = np.flatnonzero(self._unseen <= aim)
-        k = int(good[0]) if len(good) else int(self._unseen.argmin())
+        aim = 0.5 * math.log((1.0 - self.low) * (1.0 - self.high))
+        good = np.flatnonzero(self._logs <= aim)
+        k = int(good[0]) if len(good) else int(self._logs.argmin())
         if k == 0 or not len(good):
             return float(self._speeds[k])
-        above, below = np.log(np.maximum(self._unseen[k - 1 : k + 1], 1e-12))
-        part = (above - math.log(aim)) / (above - below)
+        above, below = self._logs[k - 1 : k + 1]
+        part = (above - aim) / (above - below)
         return float(self._speeds[k - 1] * (self._speeds[k] / self._speeds[k - 1]) ** part)
 
 
@@ -225,7 +227,8 @@ class CoverageMeter:
     def __init__(self, width: int, height: int) -> None:
         self._corner = np.array([(width - SIDE) // 2, (height - SIDE) // 2], np.float32)
         self._texture = np.full(DIRECTIONS, np.nan)
-        self._end_us, self._last = -(1 << 62), np.zeros(2)
+        self._end_us = -(1 << 62)
+        self._last: NDArray[np.float64] | None = None
         self._before: tuple[float, NDArray[np.complex64]] | None = None
         along = np.exp(-2.0 * (math.pi * np.fft.fftfreq(SIDE)) ** 2).astype(np.float32)
         self._smooth = along[:, None] * along[None, : SIDE // 2 + 1]
@@ -240,9 +243,10 @@ class CoverageMeter:
             given = f"window {start_us} .. {end_us} us after one that ended at {self._end_us} us"
             raise AmiwarpError(f"coverage: {given}; give windows one after the other")
         seconds, follows = (end_us - start_us) * 1e-6, start_us - self._end_us < SLICE_US
-        before, drift = self._last, self._drift(events, end_us)
-        turn = drift - before if follows and before.any() and drift.any() else np.zeros(2)
-        self._end_us, self._last = end_us, drift
+        before, found = self._last, self._drift(events, end_us)
+        turn = found - before if follows and before is not None and found is not None else np.zeros(2)
+        drift = np.zeros(2) if found is None else found
+        self._end_us, self._last = end_us, found
         across = (path + _drifted(drift, turn, seconds)) @ NORMALS
         swing = np.ptp(across, axis=0)
         self._learn(events, (start_us + end_us) // 2, drift, seconds, across)
@@ -251,8 +255,11 @@ class CoverageMeter:
         weight = weight / weight.sum() if weight.sum() > 0.0 else np.full(DIRECTIONS, 1.0 / DIRECTIONS)
         return Coverage(float(_seen(swing) @ weight), drift, turn, swing, weight)
 
-    def _drift(self, events: Events, end_us: int) -> NDArray[np.float64]:
-        """Velocity of the image without the prism [px/s]: the shift of this window's end from the last window's."""
+    def _drift(self, events: Events, end_us: int) -> NDArray[np.float64] | None:
+        """Velocity of the image without the prism [px/s]: the shift of this window's end from the last window's.
+
+        None where none is clear.
+        """
         from scipy import fft
 
         first = int(np.searchsorted(events.t, end_us - SLICE_US))
@@ -262,13 +269,13 @@ class CoverageMeter:
         middle = end_us - 0.5 * SLICE_US
         before, self._before = self._before, (middle, spectrum)
         if before is None or middle - before[0] > LONGEST_US:
-            return np.zeros(2)
+            return None
         cross = spectrum * np.conj(before[1])
         cross *= self._smooth / np.sqrt(np.abs(cross) + 1e-6)
         likeness = fft.irfft2(cross, (SIDE, SIDE))
         row, column = divmod(int(likeness.argmax()), SIDE)
         if likeness[row, column] < CLEAR * likeness.std():
-            return np.zeros(2)
+            return None
         shift = [
             _signed(column + _summit(likeness[row, (column + np.arange(-1, 2)) % SIDE])),
             _signed(row + _summit(likeness[(row + np.arange(-1, 2)) % SIDE, column])),

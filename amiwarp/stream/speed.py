@@ -6,6 +6,8 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
 from amiwarp.stream.adaptive import CoverageMeter, SpeedController, prism_path
@@ -15,7 +17,8 @@ if TYPE_CHECKING:
     from amiwarp.encoder import EncoderStream
     from amiwarp.optics import Model
 
-WINDOW_US = 33_333
+WINDOW_US, MOST_WINDOWS = 33_333, 10
+"""Length of a window [us], and how many are measured of what comes at once: the last ones, the others are long past."""
 
 
 class SpeedKeeper:
@@ -43,21 +46,29 @@ class SpeedKeeper:
 
     def put(self, packets: list[Compensated], encoder: EncoderStream) -> None:
         """Compensated packets, in order."""
-        for packet in packets:
-            self._packets.append(packet.events)
+        self._packets += [packet.events for packet in packets]
         last = int(self._packets[-1].t[-1])
         self._begins = int(self._packets[0].t[0]) if self._begins is None else self._begins
-        if last - self._begins < WINDOW_US:
+        windows = (last - self._begins) // WINDOW_US
+        if windows < 1:
             return
-        self._window(Events.concatenate(self._packets), self._begins, last, encoder)
-        self._packets.clear()
-        self._begins = last
+        events = Events.concatenate(self._packets)
+        self._begins += WINDOW_US * max(0, windows - MOST_WINDOWS)
+        while last - self._begins >= WINDOW_US:
+            end = self._begins + WINDOW_US
+            first, after = np.searchsorted(events.t, [self._begins, end])
+            self._window(events[first:after], self._begins, end, encoder)
+            events, self._begins = events[after:], end
+        self._packets = [events]
 
     def _window(self, events: Events, start: int, end: int, encoder: EncoderStream) -> None:
         first = encoder.first
         if first is None or start < first:
             return
-        path = prism_path(self._model, encoder.over(start, end), start, end)
+        samples = encoder.over(start, end)
+        if not samples.covers(start, end):  # the first samples lie further apart than is usual
+            return
+        path = prism_path(self._model, samples, start, end)
         coverage = self._meter(events, start, end, path)
         self.coverage = coverage.share
         self.controller.update(start, end, coverage, len(events) / (end - start))
