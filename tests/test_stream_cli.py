@@ -30,9 +30,10 @@ from amiwarp.optics import Prism
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 SCRIPT = (
     "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); sys.argv[0] = 'amiwarp'; "
-    "from amiwarp.cli.app import main; print('up', file=sys.stderr, flush=True); main()"
+    "from amiwarp.cli import app; run = app.app; "
+    "app.app = lambda **given: (print('up', file=sys.stderr, flush=True), run(**given)); app.main()"
 )
-"""A shell's job in the background ignores Ctrl-C, and so would its children."""
+"""A shell's job in the background ignores Ctrl-C, and so would its children. Says when the command line is at work."""
 SENT = 400_000
 
 
