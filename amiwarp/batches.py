@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from amiwarp.encoder import Encoder
     from amiwarp.events import Events
+    from amiwarp.kernels.launch import Recorded
     from amiwarp.optics import Model
 
 ROUNDS = 4
@@ -101,7 +102,7 @@ class Batches:
                 setattr(self._ours, name, wp.zeros(self._room, dtype=dtype, device="cpu", pinned=True))
         self._host = {name: getattr(self._ours, name).numpy() for name in dtypes}
         self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
-        self._recorded: dict[bool, Any] = {}
+        self._recorded: dict[bool, Recorded] = {}
         self._spare, self._gatherers = Spare(batch), [Gatherer(), Gatherer()]
         self._votes = Votes(CanvasShape(*self._placing.size), device)
         self._stretches = self._votes.stretches(columns.out_x, columns.out_y, self._layer)
@@ -132,7 +133,7 @@ class Batches:
             else:
                 wp.copy(to, wp.array(values, dtype=to.dtype, device="cpu", copy=False), count=len(values))
         for command in self._recorded.values():
-            command.set_param_at_index(3, p)
+            command.set(3, p)
 
     def start(self, parts: list[Events], arrived_us: int) -> Started:
         """Begins to put a batch together, by other threads where it is long."""
@@ -222,9 +223,7 @@ class Batches:
             wp.copy(*columns, dest_offset=at, src_offset=at, count=end - at)
 
     def _launch(self, first: int, blocks: int, strays: bool) -> None:
-        import warp as wp
-
-        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.launch import Recorded, launch
 
         kernel, inputs = self._placing.kernel, self._placing.inputs(self._encoder, self._columns, strays=strays)
         if self._device.is_cpu and blocks >= SLICE:
@@ -232,12 +231,8 @@ class Batches:
             return
         command = self._recorded.get(strays)
         if command is None:
-            # to launch again what was recorded takes a fraction of the time
-            command = wp.launch(kernel, 1, [*inputs, 0], device=self._device, record_cmd=True)
-            self._recorded[strays] = command
-        command.set_dim(blocks)
-        command.set_param_at_index(len(inputs), first)
-        command.launch()
+            command = self._recorded[strays] = Recorded(kernel, inputs, [], device=self._device)
+        command(first, blocks)
 
     def _nowhere(self, start: int, stop: int) -> None:
         if start >= stop:

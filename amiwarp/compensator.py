@@ -156,8 +156,8 @@ class Compensator:
             unknown = n
         else:
             unknown = 0 if first >= begins else sum(int(np.searchsorted(part.t, begins)) for part in parts)
-        if unknown < n:
-            self._cover(max(first, begins or first), last, ends or last)
+            if unknown < n:
+                self._cover(max(first, begins), last, ends)
         begun = self._work.begin(started, unknown)
         return begun, None if self.encoder.knows(first, last) else self.encoder.guessed(begun.t)
 

@@ -24,28 +24,23 @@ class Gatherer:
     """Puts packets together by several threads, see :mod:`amiwarp.kernels.gather`."""
 
     def __init__(self) -> None:
-        from amiwarp.kernels import gather
-
         probe = np.zeros(1)
         if c_uint64.from_address(id(probe) + HEAD).value != address(probe):
             raise RuntimeError(f"NumPy {np.__version__} keeps its arrays' addresses elsewhere; use NumPy 2")
-        self._kernel = gather.gather_parts
-        self._kernel.module.load("cpu", block_dim=1)
         self._make(64)
 
     def _make(self, rows: int) -> None:
         import warp as wp
 
-        from amiwarp.kernels.gather import FOUND, ROW
+        from amiwarp.kernels.gather import FOUND, ROW, gather_parts
+        from amiwarp.kernels.launch import Recorded
 
         table, found = (
             wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
             wp.zeros(rows * FOUND, dtype=int, device="cpu"),
         )
         self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
-        self._commands = [
-            wp.launch(self._kernel, 1, [table, found, 0], device="cpu", record_cmd=True) for _ in range(THREADS)
-        ]
+        self._commands = [Recorded(gather_parts, [table, found], [], device="cpu") for _ in range(THREADS)]
 
     def __call__(
         self, parts: list[Events], n: int, to: list[int], *, with_p: bool
@@ -75,10 +70,7 @@ class Gatherer:
         edges = [len(parts) * k // threads for k in range(threads + 1)]
 
         def run(k: int) -> None:
-            command = self._commands[k]
-            command.set_dim(edges[k + 1] - edges[k])
-            command.set_param_at_index(2, edges[k])
-            command.launch()
+            self._commands[k](edges[k], edges[k + 1] - edges[k])
 
         jobs = [pool().submit(run, k) for k in range(threads)] if threads > 1 else []
         if not jobs:

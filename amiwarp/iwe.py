@@ -226,25 +226,12 @@ class Votes:
         self._exactly(vote_points, inputs, count - blocks * int(BLOCK), blocks * int(BLOCK))
 
     def stretches(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
-        """For points of long-lived arrays: votes some from one on, on a CPU in blocks of 64 and by one thread.
-
-        To launch again what was recorded takes a tenth of the time.
-        """
-        import warp as wp
-
+        """For points of long-lived arrays: votes some from one on, on a CPU in blocks of 64 and by one thread."""
+        from amiwarp.kernels.launch import Recorded
         from amiwarp.kernels.votes import vote_point_blocks, vote_points
 
         kernel = vote_point_blocks if self.device.is_cpu else vote_points
-        kernel.module.load(self.device, **({"block_dim": 1} if self.device.is_cpu else {}))
-        inputs = [x, y, layer, self._params, 0]
-        command = wp.launch(kernel, 1, inputs, [self._cells[0]], device=self.device, record_cmd=True)
-
-        def vote(first: int, count: int) -> None:
-            command.set_dim(count)
-            command.set_param_at_index(len(inputs) - 1, first)
-            command.launch()
-
-        return vote
+        return Recorded(kernel, [x, y, layer, self._params], [self._cells[0]], device=self.device)
 
     def add_as_they_are(self, events: Events) -> None:
         """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""

@@ -58,6 +58,7 @@ def run(
     common: Common,
 ) -> None:
     """Be a controller with motor, encoder and index, for trying out without one, and with what goes wrong on demand."""
+    from amiwarp.link.clocks import monotonic_us
     from amiwarp.link.emulator import Controller, Fault
     from amiwarp.link.rotors import Motor, Played
     from amiwarp.link.terminal import PseudoTerminal
@@ -76,10 +77,10 @@ def run(
         faults=[Fault.parse(text) for text in fault or ()],
         seed=common.seed,
     )
-    origin = time.monotonic_ns()
+    origin = monotonic_us()
 
     def now_us() -> int:
-        return (time.monotonic_ns() - origin) // 1000
+        return monotonic_us() - origin
 
     with contextlib.ExitStack() as held:
         stop = threading.Event()

@@ -13,13 +13,7 @@ import typer
 
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import Common
-from amiwarp.cli.streams import (
-    SourceOptions,
-    StatusLine,
-    check_angles,
-    stopped_by_interrupt,
-    summary,
-)
+from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
 from amiwarp.errors import AmiwarpError
 from amiwarp.stream.queues import Policy
 

@@ -11,13 +11,7 @@ import typer
 from amiwarp.cli.console import report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
 from amiwarp.cli.options import Common
-from amiwarp.cli.streams import (
-    SourceOptions,
-    StatusLine,
-    check_angles,
-    stopped_by_interrupt,
-    summary,
-)
+from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 

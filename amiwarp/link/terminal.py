@@ -6,11 +6,11 @@ import contextlib
 import os
 import select
 import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.link.clocks import monotonic_us
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,8 +39,8 @@ class PseudoTerminal:
         # a link that leads nowhere was left by one that was killed
         if self._path is not None and self._path.exists():
             raise AmiwarpError(f"{path}: is there already; give another path for the link, or remove it")
-        origin = time.monotonic_ns()
-        self._now_us = now_us or (lambda: (time.monotonic_ns() - origin) // 1000)
+        origin = monotonic_us()
+        self._now_us = now_us or (lambda: monotonic_us() - origin)
         self._controller = controller
         self._ended = threading.Event()
         self._master: int | None = None

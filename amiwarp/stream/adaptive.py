@@ -185,18 +185,14 @@ class SpeedController:
         self._rate += new * (rate_mev_s - self._rate)
         return None if first else self._step(seconds)
 
-    @property
-    def _logs(self) -> NDArray[np.float64]:
-        """Of what is unseen, which between two speeds goes evenly by ratio."""
-        return np.asarray(np.log(np.maximum(self._unseen, 1e-12)))
-
     def _step(self, seconds: float) -> float | None:
         """Towards where it should be."""
         rate, within = self._rate / self.most_mev_s, FOLLOW_S
         self._limited = rate > (NEAR_LIMIT if self._limited else 1.0)
-        now = math.exp(np.interp(math.log(self.rpm), np.log(self._speeds), self._logs))
+        logs = np.log(np.maximum(self._unseen, 1e-12))  # between two speeds it goes evenly by ratio
+        now = math.exp(np.interp(math.log(self.rpm), np.log(self._speeds), logs))
         self._moving = self._moving or not 1.0 - self.high <= now <= 1.0 - self.low
-        enough = self._enough() if self._moving else self.rpm
+        enough = self._enough(logs) if self._moving else self.rpm
         if self._limited:
             enough, within = min(enough, self.rpm * NEAR_LIMIT / rate), LIMITED_S
         elif enough > self.rpm and rate > BELOW_LIMIT:
@@ -209,14 +205,14 @@ class SpeedController:
         before, self.rpm = self.rpm, min(max(self.rpm + step, self.least_rpm), self.most_rpm)
         return self.rpm if self.rpm != before else None
 
-    def _enough(self) -> float:
+    def _enough(self, logs: NDArray[np.float64]) -> float:
         """The lowest speed with what may be unseen, between those looked at; the best where there is none."""
         aim = 0.5 * math.log((1.0 - self.low) * (1.0 - self.high))
-        good = np.flatnonzero(self._logs <= aim)
-        k = int(good[0]) if len(good) else int(self._logs.argmin())
+        good = np.flatnonzero(logs <= aim)
+        k = int(good[0]) if len(good) else int(logs.argmin())
         if k == 0 or not len(good):
             return float(self._speeds[k])
-        above, below = self._logs[k - 1 : k + 1]
+        above, below = logs[k - 1 : k + 1]
         part = (above - aim) / (above - below)
         return float(self._speeds[k - 1] * (self._speeds[k] / self._speeds[k - 1]) ** part)
 

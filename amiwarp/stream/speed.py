@@ -62,11 +62,10 @@ class SpeedKeeper:
         self._packets = [events]
 
     def _window(self, events: Events, start: int, end: int, encoder: EncoderStream) -> None:
-        first = encoder.first
-        if first is None or start < first:
+        if encoder.first is None:
             return
         samples = encoder.over(start, end)
-        if not samples.covers(start, end):  # the first samples lie further apart than is usual
+        if not samples.covers(start, end):  # before the first samples
             return
         path = prism_path(self._model, samples, start, end)
         coverage = self._meter(events, start, end, path)
