@@ -137,7 +137,7 @@ class Batches:
 
     def start(self, parts: list[Events], arrived_us: int) -> Started:
         """Begins to put a batch together, by other threads where it is long."""
-        n, several = sum(map(len, parts)), len(parts) > 1
+        n, several = sum(part.t.size for part in parts), len(parts) > 1
         padded = self._placing.padded(n)
         if self._at + padded > self._room:
             self._at = 0
@@ -147,7 +147,7 @@ class Batches:
         self._wait_for_votes(at, self._at)
         lent = self._spare(n, np.int64) if self._device.is_cuda and n > DIRECT else None
         t = self._host["t"][at:end] if lent is None else lent[1]
-        p = np.empty(n, np.uint8) if several else parts[0].p
+        p = parts[0].p if not several else np.empty(n, np.uint8) if lent is None else self._spare(n, np.uint8)[1]
         to = [self._host["x"][at:end], self._host["y"][at:end], t, p]
         if several or n > PIECE:
             self._gatherers.reverse()
@@ -278,9 +278,9 @@ class Spare:
         self._kept: dict[Any, list[Lent]] = {np.int64: [], np.float32: [], np.uint8: []}
 
     def fill(self) -> None:
-        """Makes as many as there are batches under way."""
-        for dtype, each in ((np.int64, 1), (np.float32, 2), (np.uint8, 1)):
-            held = [self(1, dtype) for _ in range(each * ROUNDS)]
+        """Makes as many as there are batches under way, and as many with who took them: each takes a millisecond."""
+        for dtype, each in ((np.int64, 1), (np.float32, 2), (np.uint8, 2)):
+            held = [self(1, dtype) for _ in range(2 * each * ROUNDS)]
             assert held  # so that they are different ones
 
     def __call__(self, n: int, dtype: Any) -> Lent:

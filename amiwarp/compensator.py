@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -26,6 +26,8 @@ MANY = 2
 """Batches that a call gives at least before it leaves those that a GPU works on to the next."""
 AHEAD_US = 100_000
 """Of encoder samples that are put on the device at once, where there are so many [us]."""
+Waiting: TypeAlias = tuple[Events, int, int, int]
+"""A packet, its last time, when it was put, and when it had come [us]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +71,7 @@ class Compensator:
         self.batch = batch or (1 << 16 if self._device.is_cpu else 1 << 20)
         self._work = Batches(model, self.batch, self._device)
         self._many = MANY if self._device.is_cuda else math.inf
-        self._queue: deque[tuple[Events, int, int]] = deque()
+        self._queue: deque[Waiting] = deque()
         self.waiting = 0
         """Events put that are not worked on yet."""
         self._started: Started | None = None
@@ -84,17 +86,20 @@ class Compensator:
         Raises :class:`AmiwarpError` for other pixels or a packet that begins before the last; nothing was put then.
         """
         check_sensor(events)
-        if not len(events):
+        t = events.t
+        if not t.size:
             return
-        if events.t[0] < self._t_last:
-            raise AmiwarpError(f"a packet from {events.t[0]} us comes after one to {self._t_last} us; sort it first")
-        if (events.t[self.batch :: self.batch] < events.t[self.batch - 1 : -1 : self.batch]).any():
-            raise AmiwarpError(f"events of {events.t[0]} to {events.t[-1]} us are not sorted; sort each packet")
-        self._t_last = int(events.t[-1])
-        self.waiting += len(events)
+        if t.item(0) < self._t_last:
+            raise AmiwarpError(f"a packet from {t[0]} us comes after one to {self._t_last} us; sort it first")
+        parts = [events]
+        if t.size > self.batch:
+            if (t[self.batch :: self.batch] < t[self.batch - 1 : -1 : self.batch]).any():
+                raise AmiwarpError(f"events of {t[0]} to {t[-1]} us are not sorted; sort each packet")
+            parts = [events[start : start + self.batch] for start in range(0, t.size, self.batch)]
+        self._t_last = t.item(-1)
+        self.waiting += t.size
         arrived = now_us if arrived_us is None else arrived_us
-        for start in range(0, len(events), self.batch):
-            self._queue.append((events[start : start + self.batch], now_us, arrived))
+        self._queue.extend((part, part.t.item(-1), now_us, arrived) for part in parts)
 
     def take(self, now_us: int) -> list[Compensated]:
         """What is ready at ``now_us``, in the order it was put, packets that are ready together joined to a batch.
@@ -129,23 +134,22 @@ class Compensator:
         """Image of the events worked on since the last call, shape (height, width)."""
         return self._work.image()
 
-    def _ready(self, now_us: int) -> list[tuple[Events, int, int]]:
-        packets: list[tuple[Events, int, int]] = []
-        count, last = 0, self.encoder.last
-        patience = self.start_us if last is None else self.wait_us
+    def _ready(self, now_us: int) -> list[Waiting]:
+        packets: list[Waiting] = []
+        count, covered = 0, self.encoder.last
+        patience = self.start_us if covered is None else self.wait_us
         while self._queue:
-            events, put_us, _ = self._queue[0]
-            covered = last is not None and events.t[-1] <= last
-            overdue = now_us - put_us >= patience or self.waiting > self.most_waiting
-            if count + len(events) > self.batch or not (covered or overdue):
+            events, last, put_us, _ = self._queue[0]
+            n, overdue = events.t.size, now_us - put_us >= patience or self.waiting > self.most_waiting
+            if count + n > self.batch or not (overdue or (covered is not None and last <= covered)):
                 break
             packets.append(self._queue.popleft())
-            count += len(events)
-            self.waiting -= len(events)
+            count += n
+            self.waiting -= n
         return packets
 
-    def _start(self, packets: list[tuple[Events, int, int]]) -> Started:
-        return self._work.start([events for events, *_ in packets], packets[0][2])
+    def _start(self, packets: list[Waiting]) -> Started:
+        return self._work.start([events for events, *_ in packets], packets[0][3])
 
     def _begin(self, started: Started) -> tuple[Begun, NDArray[np.bool_] | None]:
         """With which of its events have a guessed angle, None for none: by the samples there are now."""

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 DEFAULT_BLOCK = 1 << 20
 """Events per block where nothing else is asked for."""
 
+SENSOR = np.dtype(np.uint16)
+"""Type of a sensor's pixels."""
+
 MetadataValue: TypeAlias = str | int | float | bool
 
 
@@ -111,7 +114,7 @@ def as_times(values: ArrayLike) -> NDArray[np.int64]:
 
 def check_sensor(events: Events) -> None:
     """Raises :class:`AmiwarpError` for events that are no sensor's (uint16): compensated ones."""
-    if events.x.dtype != np.uint16:
+    if events.x.dtype != SENSOR:
         raise AmiwarpError(
             f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
         )

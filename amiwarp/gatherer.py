@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from amiwarp.events import Events
 
-PIECE, THREADS = 1 << 18, 2
-"""Events that a thread puts together: of more, several do. Two fill the memory's way, more wait for each other."""
+PIECE, THREADS, OURS = 1 << 17, 2, 8
+"""Of more events than that, an eighth of the packets is put together by the caller and the rest by two threads beside:
+while it copies, they get Python's lock and begin. Otherwise they would wait until the caller waits for them."""
 WIDTHS = (2, 2, 8, 1)
 """Bytes of x, y, t, p of an event."""
 HEAD = object.__basicsize__
@@ -40,7 +41,7 @@ class Gatherer:
             wp.zeros(rows * FOUND, dtype=int, device="cpu"),
         )
         self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
-        self._commands = [Recorded(gather_parts, [table, found], [], device="cpu") for _ in range(THREADS)]
+        self._commands = [Recorded(gather_parts, [table, found], [], device="cpu") for _ in range(1 + THREADS)]
 
     def __call__(
         self, parts: list[Events], n: int, to: list[int], *, with_p: bool
@@ -53,10 +54,11 @@ class Gatherer:
         from amiwarp.kernels.launch import pool
 
         goes_on: Any = 0  # whether a row's first event follows the last of the row before in memory
-        if max(map(len, parts)) > PIECE:
+        counts = np.array([part.t.size for part in parts])
+        if counts.max() > PIECE:
             parts, goes_on = _cut(parts)
-        columns = [[_plain(getattr(part, name)) for part in parts] for name in ("x", "y", "t", "p")]
-        counts = np.array([len(t) for t in columns[2]])
+            counts = np.array([part.t.size for part in parts])
+        columns = [_plain([getattr(part, name) for part in parts]) for name in ("x", "y", "t", "p")]
         places = np.concatenate([[0], np.cumsum(counts)[:-1]])
         if len(parts) > len(self._table):
             self._make(2 * len(parts))
@@ -66,15 +68,15 @@ class Gatherer:
             table[:, 4 + k] = start + width * places if k < 3 or with_p else 0
         table[:, :4] += np.uint64(HEAD)
         table[:, 8], table[:, 9] = counts, goes_on
-        threads = min(THREADS, len(parts), -(-n // PIECE))
-        edges = [len(parts) * k // threads for k in range(threads + 1)]
+        threads = THREADS if n > PIECE else 0
+        ours = len(parts) // OURS if threads else len(parts)
+        edges = [0, *(ours + (len(parts) - ours) * k // max(threads, 1) for k in range(threads + 1))]
 
         def run(k: int) -> None:
             self._commands[k](edges[k], edges[k + 1] - edges[k])
 
-        jobs = [pool().submit(run, k) for k in range(threads)] if threads > 1 else []
-        if not jobs:
-            run(0)
+        jobs = [pool().submit(run, k) for k in range(1, threads + 1)]
+        run(0)
 
         def found(_held: object = columns) -> tuple[bool, int, int]:
             """The columns are held until all was copied: of the arrays only the addresses are with the threads."""
@@ -88,14 +90,14 @@ class Gatherer:
 
 def _cut(parts: list[Events]) -> tuple[list[Events], list[int]]:
     """Parts in pieces of :data:`PIECE` at most, and which of them go on where the one before ended."""
-    whole = [Events(*(_plain(column) for column in (part.x, part.y, part.t, part.p))) for part in parts]
+    whole = [Events(*_plain([part.x, part.y, part.t, part.p])) for part in parts]
     cut = [(part[k : k + PIECE], int(k > 0)) for part in whole for k in range(0, len(part), PIECE)]
     return [piece for piece, _ in cut], [goes_on for _, goes_on in cut]
 
 
-def _plain(column: NDArray[Any]) -> NDArray[Any]:
+def _plain(columns: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """Without gaps."""
-    return column if column.strides[0] == column.itemsize else np.ascontiguousarray(column)
+    return [column if column.flags.c_contiguous else np.ascontiguousarray(column) for column in columns]
 
 
 def address(array: NDArray[Any]) -> int:

@@ -19,6 +19,7 @@ import resource
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -96,16 +97,17 @@ class Check:
     """Keeps some of the packets that come out, to be compared when time no longer counts."""
 
     def __init__(self, packets: int) -> None:
-        self._chosen = set(np.linspace(0, packets - 1, CHECKED).astype(int).tolist())
+        self._chosen = deque(np.unique(np.linspace(0, packets - 1, CHECKED).astype(int)).tolist())
         self._kept: list[tuple[Events, Events]] = []
         self.count = 0
 
     def __call__(self, ahead: list[Events], found: Events) -> None:
         """What came out next, of one packet or several, of those that went in."""
-        for start in range(0, len(found), PACKET):
-            if self.count in self._chosen:
-                self._kept.append((ahead[self.count], copied(found[start : start + PACKET])))
-            self.count += 1
+        first, self.count = self.count, self.count + len(found) // PACKET
+        while self._chosen and self._chosen[0] < self.count:
+            k = self._chosen.popleft()
+            start = (k - first) * PACKET
+            self._kept.append((ahead[k], copied(found[start : start + PACKET])))
 
     def error_px(self, model: Model) -> float:
         """Largest distance from the places of the same events in a recording; infinite where events differ."""

@@ -341,6 +341,11 @@ def test_what_was_taken_stays_while_it_is_held(device: str) -> None:
     events = random_events(1_500_000)
     compensator = Compensator(MODEL, streamed(), batch=1 << 17, device=device)
     held, sums, places = [], [], set()
+
+    def summed(out: Compensated) -> list[float]:
+        e = out.events
+        return [float(np.nansum(values, dtype=np.float64)) for values in (e.x, e.y, e.t, e.p, out.flags)]
+
     for start in range(0, 1_500_000, 100_000):
         compensator.put(events[start : start + 50_000], 0)
         compensator.put(events[start + 50_000 : start + 100_000], 0)
@@ -348,12 +353,11 @@ def test_what_was_taken_stays_while_it_is_held(device: str) -> None:
         places.add(out.events.x.ctypes.data)
         if start % 300_000 == 0:
             held.append(out)
-            sums.append([np.nansum(v, dtype=np.float64) for v in (out.events.x, out.events.y, out.events.t, out.flags)])
+            sums.append(summed(out))
         del out
     assert device == "cpu" or len(places) < 10
     for out, given in zip(held, sums, strict=True):
-        kept = [np.nansum(v, dtype=np.float64) for v in (out.events.x, out.events.y, out.events.t, out.flags)]
-        assert kept == given
+        assert summed(out) == given
 
 
 def test_what_is_put_stays_as_it_is() -> None:
