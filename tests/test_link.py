@@ -186,6 +186,18 @@ def test_a_wrap_of_the_counts_is_no_restart() -> None:
     np.testing.assert_allclose(np.diff(news.angle), math.tau / 1000 * np.diff(news.t_us) / 1000, atol=1e-9)
 
 
+def test_each_index_pulse_is_told_once_however_often_one_asks() -> None:
+    line, news = Line(counts_per_turn=4096), []
+    for _ in range(600):
+        news += line.run(0.005)
+    t, angle, pulses = (np.concatenate([getattr(n, name) for n in news]) for name in ("t_us", "angle", "index_t_us"))
+    assert len(pulses) == pytest.approx(36, abs=1)
+    assert t[0] <= pulses[0]
+    assert (np.diff(pulses) > 80_000).all()
+    at = np.interp(pulses, t, angle) / math.tau
+    np.testing.assert_allclose(at, np.round(at), atol=1e-3)
+
+
 def test_samples_wait_for_the_index_two_turns_at_most() -> None:
     line = Line("missed-index@0+1")
     news = line.run(0.15)

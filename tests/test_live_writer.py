@@ -89,6 +89,15 @@ def test_everything_comes_back(tmp_path, flush_s):
     assert wasted < (WASTE if flush_s == 0.0 else 500_000)
 
 
+def test_index_pulses_may_come_before_the_samples_about_them(tmp_path):
+    with live(tmp_path / "a.h5") as writer:
+        writer.append(make(1000))
+        writer.append_encoder([], [], [4_000_000])
+        writer.append_encoder([5_000_000, 5_001_000], [0.0, 0.1], [4_999_000, 5_000_500, 5_001_500])
+        writer.append_encoder([5_002_000, 5_003_000], [0.2, 0.3], [5_003_500])
+    np.testing.assert_array_equal(open_recording(tmp_path / "a.h5").encoder.index_t, [5_000_500, 5_001_500])
+
+
 def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
     sensor = make(CHUNK + 99)
     x = sensor.x.astype(np.float32) - 20.25

@@ -167,6 +167,31 @@ def test_a_fault_loses_nothing_and_is_told(tmp_path: Path, fault: str, said: str
         assert np.count_nonzero(found.guessed & part) < 0.2 * np.count_nonzero(part)
 
 
+@TURNING
+def test_an_emulated_camera_loses_nothing_where_its_client_is_slow(tmp_path: Path) -> None:
+    from amiwarp.link.emulator import Controller
+    from amiwarp.link.rotors import Played
+
+    recording, began = points(3_000_000, 0.3), time.monotonic_ns()
+    assert recording.encoder is not None
+    rotor = Played(recording.encoder)
+    controller = Controller(rotor, counts_per_turn=COUNTS)
+
+    def now_us() -> int:
+        return (time.monotonic_ns() - began) // 1000
+
+    with EmulatedCamera(recording, rotor, controller, f"unix:{tmp_path / 'camera'}", now_us) as camera:
+        source, got = open_source(camera.address), []
+        for k, given in enumerate(source.packets()):
+            got.append(given.events)
+            if k == 1:
+                time.sleep(2.0)
+        source.close()
+        assert camera.done.wait(10.0)
+    np.testing.assert_array_equal(Events.concatenate(got).t, recording.events.slice(0, 3_000_000).t)
+    assert camera.late_us > 500_000
+
+
 class Made:
     """A source of given packets."""
 

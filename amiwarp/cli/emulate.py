@@ -25,6 +25,8 @@ EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplu
 
 STEP_S, AFTER_S = 0.05, 1.0
 """Between two looks at whether it is to end; and so long the controller goes on after the camera's last event."""
+LATE_US = 100_000
+"""From which on it is told that events were late."""
 
 
 def run(
@@ -103,6 +105,9 @@ def run(
             if served is not None and served.done.is_set():
                 stop.wait(AFTER_S)
                 break
+        if served is not None and served.late_us > LATE_US:
+            late = f"events were sent up to {served.late_us * 1e-6:.1f} s late, none lost"
+            print(f"{late}: this machine, or who listens, is slower than the recording", file=sys.stderr)
 
 
 def _recording(path: Path) -> tuple[Recording, Encoder]:

@@ -96,7 +96,8 @@ class LiveWriter:
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
-        self._encoder_last: int | None = None
+        self._encoder_span: tuple[int, int] | None = None  # first and last sample
+        self._pulses = np.zeros(0, np.int64)  # later than the last sample
         self._encoder: Encoder | None = None
 
     def __len__(self) -> int:
@@ -188,7 +189,8 @@ class LiveWriter:
     def append_encoder(self, t_us: ArrayLike, angle: ArrayLike, index_t_us: ArrayLike = ()) -> None:
         """Add encoder samples on the events' clock [us], angles unwrapped [rad], and times of index pulses [us].
 
-        Raises :class:`AmiwarpError` for samples that are not later than those before, or not finite.
+        Pulses before the first sample are left out. Raises :class:`AmiwarpError` for samples that are not later than
+        those before, or not finite.
         """
         self._check_open("append_encoder")
         late = round(self._clock_offset_us)
@@ -197,15 +199,18 @@ class LiveWriter:
             shapes = f"t {t.shape}, angle {angles.shape}"
             raise AmiwarpError(f"{self.path}: encoder samples {shapes}; expected one length and finite angles")
         if t.size:
-            later = t[0] if self._encoder_last is None else self._encoder_last + 1
-            if t[0] < later or (t[1:] <= t[:-1]).any():
-                raise AmiwarpError(f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {later - 1} us")
+            first, last = self._encoder_span or (int(t[0]), int(t[0]) - 1)
+            if t[0] <= last or (t[1:] <= t[:-1]).any():
+                raise AmiwarpError(f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {last} us")
             self._reserve(2 * t.nbytes)
             self._small["encoder/t"].add(t)
             self._small["encoder/angle"].add(angles)
-            self._encoder_last = int(t[-1])
-        if np.size(index_t_us):
-            self._small["encoder/index_t"].add(np.atleast_1d(as_times(index_t_us)) + late)
+            self._encoder_span = first, int(t[-1])
+        if self._encoder_span is not None:
+            first, last = self._encoder_span
+            pulses = np.append(self._pulses, as_times(index_t_us) + late)
+            self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
+            self._pulses = pulses[pulses > last]
         self.tick()
 
     def set_encoder(self, encoder: Encoder) -> None:

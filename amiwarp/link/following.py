@@ -49,7 +49,7 @@ class News:
     angle: NDArray[np.float64]
     """Unwrapped prism angle [rad] at them, whole turns at the index once it was seen, shape ``(n,)``."""
     index_t_us: NDArray[np.int64]
-    """Times of the index pulses among them [us]."""
+    """Times of the index pulses among them, or between those before and these [us]."""
     sync: tuple[tuple[int, int, int], ...]
     """Sync pulses: number, controller's time, host's time when it was told [us]."""
     restarted: bool
@@ -71,8 +71,7 @@ class _Part:
     def news(self) -> News:
         t = np.array([t for t, _ in self.samples], np.int64)
         angle = np.array([a for _, a in self.samples], np.float64)
-        index = np.array([i for i in self.index if self.samples and i >= self.samples[0][0]], np.int64)
-        return News(t, angle, index, tuple(self.sync), self.restarted, tuple(self.messages))
+        return News(t, angle, np.array(self.index, np.int64), tuple(self.sync), self.restarted, tuple(self.messages))
 
 
 class Follower:
@@ -333,7 +332,9 @@ class Follower:
         part.samples.append((t, angle))
         self._kept += 1
         if self._kept > MOST:
-            self._parts[0].samples.popleft()
+            gone, _ = self._parts[0].samples.popleft()
+            while (pulses := self._parts[0].index) and pulses[0] <= gone:
+                pulses.popleft()
             self._kept, self._dropped = self._kept - 1, self._dropped + 1
             if not self._parts[0].samples:
                 self._join()

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from amiwarp.link.emulator import Controller
     from amiwarp.link.rotors import Played
 
-STEP_S = 2e-3
+STEP_US, LATE_STEP_S = 2000, 2e-4
+"""Events that are sent together, by their time; and how often one looks again whether who is behind has room."""
 LEAD_US = 1_000_000
 """From the first client to the first event: time for pulses that tie the clocks."""
 NEVER = 1 << 60
@@ -28,7 +29,8 @@ NEVER = 1 << 60
 class EmulatedCamera:
     """Serves a recording's events at their own pace, and triggers at the controller's sync pulses.
 
-    It begins, and ``rotor`` with it, when the first client has come. ``now_us``: the world's time, the controller's.
+    It begins, and ``rotor`` with it, when the first client has come. Where reading, sending or a client is slower than
+    the recording was, events are sent late, and none is lost. ``now_us``: the world's time, the controller's.
     Raises :class:`AmiwarpError` for a recording without encoder or events, or an address that is taken.
     """
 
@@ -42,7 +44,9 @@ class EmulatedCamera:
         self._origin = round(int(encoder.t[0]) - encoder.clock_offset_us)
         """On the events' clock when the rotor begins."""
         rotor.begin(NEVER)
-        self._start: int | None = None
+        self._start, self._told = NEVER, -1
+        self.late_us = 0
+        """By how much events were sent late at most."""
         self._sink = SocketSink(address, encode_hello(*events.size, recording.camera, recording.prism))
         self.address = self._sink.address
         self._ended = threading.Event()
@@ -64,35 +68,35 @@ class EmulatedCamera:
         self._ended.set()
         self._thread.join()
 
-    @property
-    def lost(self) -> int:
-        """Packets that were not sent because a client was too slow."""
-        return self._sink.lost
-
     def _run(self) -> None:
-        sent, told = self._origin, -1
         with self._sink:
-            while not self._ended.wait(STEP_S):
+            while not self._sink.clients:
+                if self._ended.wait(STEP_US * 1e-6):
+                    return
                 self._sink.tick()
-                if self._start is None:
-                    if not self._sink.clients:
-                        continue
-                    self._start = self._now_us() + LEAD_US
-                    self._rotor.begin(self._start)
-                    sent = self._events.t_first
-                now = self._time(self._now_us())
-                pulses = [(n, self._time(world)) for n, world in list(self._controller.pulses) if n > told]
-                if pulses:
-                    told = pulses[-1][0]
-                    self._sink.send(encode_triggers(np.array([t for _, t in pulses], np.int64)))
-                if now > sent:
-                    self._sink.send(encode_events(self._events.between(sent, now)))
-                    sent = now
-                if sent > self._events.t_last:
-                    break
+            self._start = self._now_us() + LEAD_US
+            self._rotor.begin(self._start)
+            for block in self._events.blocks(duration_us=STEP_US):
+                while (early := int(block.t[-1]) - self._time(self._now_us())) >= 0 or self._sink.waiting:
+                    if self._pause(min(early, STEP_US) * 1e-6 if early > 0 else LATE_STEP_S):
+                        return
+                self.late_us = max(self.late_us, -early)
+                self._sink.send(encode_events(block))
+            while self._sink.waiting:
+                if self._pause(LATE_STEP_S):
+                    return
         self.done.set()
+
+    def _pause(self, seconds: float) -> bool:
+        """Waits, then sends what pulses there were and what waits; whether it is to end."""
+        if self._ended.wait(seconds):
+            return True
+        pulses = [(n, self._time(world)) for n, world in list(self._controller.pulses) if n > self._told]
+        if pulses:
+            self._told = pulses[-1][0]
+        self._sink.send(encode_triggers(np.array([t for _, t in pulses], np.int64)))
+        return False
 
     def _time(self, world_us: int) -> int:
         """On the camera's clock."""
-        assert self._start is not None
         return world_us - self._start + self._origin

@@ -163,6 +163,11 @@ class SocketSink:
         """Number of those who are connected."""
         return len(self._clients)
 
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the client for whom most do."""
+        return max((client.waiting_bytes for client in self._clients), default=0)
+
     def send(self, data: bytes) -> None:
         """Hands whole packets, as ``encode_...`` makes them, to all clients."""
         self._accept()
