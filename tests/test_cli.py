@@ -443,6 +443,19 @@ def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
     assert left_behind(place) == set()
 
 
+def test_interrupt_while_the_command_is_loaded_is_one_line() -> None:
+    script = (
+        "import sys, types; from amiwarp.__main__ import main\n"
+        "def find(name, path, target=None):\n"
+        "    if name == 'typer': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, types.SimpleNamespace(find_spec=find)); main()"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, text=True, capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "amiwarp: interrupted; nothing was left half-written\n"
+
+
 def test_interrupt_inside_a_finaliser_is_not_lost(place: Path) -> None:
     """Python drops an exception there; the command must end all the same."""
     script = f"""

@@ -11,6 +11,8 @@ import typer
 from typer.core import TyperGroup
 
 from amiwarp.cli import (
+    INTERRUPTED,
+    STOPPED,
     calibrate,
     chart,
     compensate,
@@ -31,8 +33,7 @@ from amiwarp.cli import (
 from amiwarp.cli.options import command
 from amiwarp.errors import AmiwarpError
 
-BAD_INPUT, USAGE, INTERRUPTED = 1, 2, 130
-STOPPED = "interrupted; nothing was left half-written"
+BAD_INPUT, USAGE = 1, 2
 
 _UsageError: Any = typer.BadParameter.__base__
 """Typer carries its own copy of click since 0.2x, and used the real one before: this is either's."""
