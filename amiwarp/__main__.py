@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-
-from amiwarp.cli import INTERRUPTED, STOPPED
+from amiwarp.cli import INTERRUPTED, STOPPED, fail
 
 
 def main() -> None:
-    """The command line, which takes a moment to load: it may be interrupted then, too."""
+    """Load the command line, which takes a moment, and run it; ends the process."""
     try:
         from amiwarp.cli import app
-    except KeyboardInterrupt:
-        print(f"amiwarp: {STOPPED}", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    app.main()
+
+        app.main()
+    except KeyboardInterrupt:  # while it is loaded, before a command began, or after it ended
+        fail(INTERRUPTED, STOPPED)
 
 
 if __name__ == "__main__":

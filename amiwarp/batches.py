@@ -145,9 +145,11 @@ class Batches:
         self._at += padded
         self._vote(least=1 if any(begin < self._at and stop > at for begin, stop in self._placed) else VOTED)
         self._wait_for_votes(at, self._at)
-        lent = self._spare(n, np.int64) if self._device.is_cuda and n > DIRECT else None
+        direct, p = self._device.is_cuda and n > DIRECT, parts[0].p
+        lent = self._spare(n, np.int64) if direct else None
         t = self._host["t"][at:end] if lent is None else lent[1]
-        p = parts[0].p if not several else np.empty(n, np.uint8) if lent is None else self._spare(n, np.uint8)[1]
+        if several:
+            p = self._spare(n, np.uint8)[1] if direct else np.empty(n, np.uint8)
         to = [self._host["x"][at:end], self._host["y"][at:end], t, p]
         if several or n > PIECE:
             self._gatherers.reverse()

@@ -96,7 +96,7 @@ class Engine:
 
     def prepare(self) -> None:
         """Read the first pictures and load the kernels, which else happens in the first span."""
-        kernels.run_pixels.module.load(self._device, block_dim=1 if self._device.is_cpu else None)
+        launching.load(kernels.run_pixels, self._device)
         self._maps.cover(0, self._chunk_steps * self._step)
 
     def run(self) -> Iterator[DeviceBlock]:

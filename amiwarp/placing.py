@@ -16,6 +16,7 @@ class Placing:
         import warp as wp
 
         from amiwarp.kernels import compensate as kernels
+        from amiwarp.kernels.launch import load
         from amiwarp.kernels.structs import azimuths, camera_params, pinhole_params
 
         name = str(device)
@@ -26,7 +27,7 @@ class Placing:
         self._camera = camera_params(model.camera, name)
         self._pinhole = pinhole_params(model.camera) or self._camera
         self._model, self._limits, self._azimuths = model.params(name), wp.vec2(*self.size), azimuths(name)
-        self.kernel.module.load(device, **({"block_dim": 1} if device.is_cpu else {}))
+        load(self.kernel, device)
 
     def padded(self, n: int) -> int:
         """Events that a column for ``n`` has room for."""

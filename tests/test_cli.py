@@ -420,7 +420,7 @@ def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
         "simulate": ["simulate", "long.h5", "--picture", "photo.jpg", "--duration", "60"],
         "calibrate": ["calibrate", "recording.h5", "long.json", "--global-evaluations", "1000000"],
     }[command]
-    script = f"{INTERRUPTIBLE}; sys.argv[0] = 'amiwarp'; from amiwarp.cli.app import main"
+    script = f"{INTERRUPTIBLE}; sys.argv[0] = 'amiwarp'; from amiwarp.__main__ import main"
     script += "; print('up', flush=True); main()"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     process = subprocess.Popen(
@@ -462,7 +462,7 @@ def test_interrupt_inside_a_finaliser_is_not_lost(place: Path) -> None:
 {INTERRUPTIBLE}
 import time
 import amiwarp.io
-from amiwarp.cli import app
+from amiwarp.__main__ import main
 
 class Dropping:
     def __del__(self):
@@ -476,7 +476,7 @@ def slow(*args, **extra):
     time.sleep(30)
 
 amiwarp.io.open_recording = slow
-app.main()
+main()
 """
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     done = subprocess.run(

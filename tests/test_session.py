@@ -7,7 +7,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.live_writer import LiveWriter
+from amiwarp.link.clocks import monotonic_us
 from amiwarp.optics import ExactModel, Prism
 from amiwarp.stream.beside import Beside
 from amiwarp.stream.emulated import LEAD_US, EmulatedCamera
@@ -65,6 +66,12 @@ class Ran:
     messages: list[str]
 
 
+def world() -> Callable[[], int]:
+    """A clock that begins now [us]."""
+    origin = monotonic_us()
+    return lambda: monotonic_us() - origin
+
+
 def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran:
     """The recording played by an emulated rig through a session, which writes both files."""
     from amiwarp.link.emulator import Controller, Fault
@@ -78,10 +85,7 @@ def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran
         rotor, counts_per_turn=COUNTS, drift_ppm=80.0, clock_start=2**32 - 2_000_000,
         faults=[Fault.parse(fault) for fault in faults],
     )  # fmt: skip
-    origin, messages = time.monotonic_ns(), []
-
-    def now_us() -> int:
-        return (time.monotonic_ns() - origin) // 1000
+    now_us, messages = world(), []
 
     with (
         PseudoTerminal(controller, folder / "prism", now_us=now_us) as port,
@@ -172,13 +176,10 @@ def test_an_emulated_camera_loses_nothing_where_its_client_is_slow(tmp_path: Pat
     from amiwarp.link.emulator import Controller
     from amiwarp.link.rotors import Played
 
-    recording, began = points(3_000_000, 0.3), time.monotonic_ns()
+    recording, now_us = points(3_000_000, 0.3), world()
     assert recording.encoder is not None
     rotor = Played(recording.encoder)
     controller = Controller(rotor, counts_per_turn=COUNTS)
-
-    def now_us() -> int:
-        return (time.monotonic_ns() - began) // 1000
 
     with EmulatedCamera(recording, rotor, controller, f"unix:{tmp_path / 'camera'}", now_us) as camera:
         source, got = open_source(camera.address), []

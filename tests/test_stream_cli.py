@@ -30,8 +30,8 @@ from amiwarp.optics import Prism
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 SCRIPT = (
     "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); sys.argv[0] = 'amiwarp'; "
-    "from amiwarp.cli import app; run = app.app; "
-    "app.app = lambda **given: (print('up', file=sys.stderr, flush=True), run(**given)); app.main()"
+    "from amiwarp.__main__ import main; from amiwarp.cli import app; run = app.app; "
+    "app.app = lambda **given: (print('up', file=sys.stderr, flush=True), run(**given)); main()"
 )
 """A shell's job in the background ignores Ctrl-C, and so would its children. Says when the command line is at work."""
 SENT = 400_000
@@ -207,7 +207,7 @@ def test_packets_go_through_pipes(folder: Path, tmp_path: Path) -> None:
     """``live --raw-to -`` into ``record -``."""
     args = ["live", folder / "recording.h5", "--fast", "--calibration", folder / "c.json", "--raw-to", "-"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    words = [sys.executable, "-c", "from amiwarp.cli.app import main; main()"]
+    words = [sys.executable, "-c", "from amiwarp.__main__ import main; main()"]
     with subprocess.Popen(
         [*words, *map(str, args), "--device", "cpu"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as live:

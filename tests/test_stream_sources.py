@@ -18,6 +18,7 @@ from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
 from amiwarp.io import RecordingWriter
+from amiwarp.link.clocks import monotonic_us
 from amiwarp.optics import Prism
 from amiwarp.stream import sockets, sources
 from amiwarp.stream.packets import (
@@ -153,7 +154,7 @@ def test_a_stream_brings_events_triggers_and_encoder():
     events, edges, t, angle = make(3000), np.array([4, 5]), np.arange(7), np.arange(7.0)
     parts = [HELLO, encode_events(events), encode_triggers(edges), encode_encoder(t, angle), HELLO, encode_end()]
     source = pipe(b"".join(parts))
-    before = time.monotonic_ns() // 1000
+    before = monotonic_us()
     first, second, third = source.packets()
     assert (source.size, source.camera, source.prism) == (SIZE, CAMERA, Prism(0.04))
     assert_equal(first.events, events)

@@ -20,6 +20,7 @@ from amiwarp.cli import (
     demo,
     design,
     emulate,
+    fail,
     info,
     live,
     motor,
@@ -48,19 +49,14 @@ class _Group(TyperGroup):
             code = super().main(*args, **extra)
         except _UsageError as error:
             path = error.ctx.command_path if error.ctx else "amiwarp"
-            _fail(USAGE, f"{error.format_message().rstrip('.')}; see {path} --help")
+            fail(USAGE, f"{error.format_message().rstrip('.')}; see {path} --help")
         except (AmiwarpError, OSError) as error:
-            _fail(BAD_INPUT, str(error))
+            fail(BAD_INPUT, str(error))
         except (KeyboardInterrupt, typer.Abort):
             code = INTERRUPTED
         if code == INTERRUPTED:
-            _fail(INTERRUPTED, STOPPED)
+            fail(INTERRUPTED, STOPPED)
         sys.exit(code if isinstance(code, int) else 0)
-
-
-def _fail(code: int, message: str) -> None:
-    print(f"amiwarp: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(code)
 
 
 app = typer.Typer(
@@ -95,10 +91,7 @@ for module in (
 def main() -> None:
     """Run the command line; ends the process."""
     sys.unraisablehook = _interrupt_again
-    try:
-        app(prog_name="amiwarp")
-    except KeyboardInterrupt:  # before a command began, or after it ended
-        _fail(INTERRUPTED, STOPPED)
+    app(prog_name="amiwarp")
 
 
 def _interrupt_again(dropped: Any) -> None:

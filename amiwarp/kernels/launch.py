@@ -25,6 +25,11 @@ def beside() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-beside")
 
 
+def load(kernel: Any, device: Any) -> None:
+    """Compiles and loads a kernel as it is launched here: once, before threads would each try."""
+    kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+
+
 def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:
     """At most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``, none much below ``smallest``."""
     parts = max(1, min(parts, n // smallest))
@@ -53,7 +58,7 @@ def launch(
         wp.launch(kernel, dim=n, inputs=[*inputs, first], outputs=list(outputs), device=device)
         return
     ranges = slices(n, cpu_threads(), smallest)
-    kernel.module.load(device, block_dim=1)  # once, before the threads would each try
+    load(kernel, device)
 
     def run(span: tuple[int, int]) -> None:
         inputs_ = [*inputs, first + span[0]]
@@ -81,7 +86,7 @@ def launch_slices(
         return
     ranges = slices(n, len(outputs), smallest) if device.is_cpu else [(0, n)]
     if device.is_cpu:
-        kernel.module.load(device, block_dim=1)
+        load(kernel, device)
 
     def run(job: tuple[tuple[int, int], Any]) -> None:
         (start, stop), out = job
@@ -97,7 +102,7 @@ class Recorded:
     def __init__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
         """Arrays among the inputs and outputs are used each time. Nothing is launched yet."""
         device = wp.get_device(device)
-        kernel.module.load(device, **({"block_dim": 1} if device.is_cpu else {}))
+        load(kernel, device)
         self._start = len(inputs)
         self._command = wp.launch(kernel, 1, [*inputs, 0], list(outputs), device=device, record_cmd=True)
 
