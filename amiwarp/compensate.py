@@ -146,12 +146,14 @@ def compensate(
     device: Any = "cpu",
     progress: Progress | None = None,
     on_block: Callable[[Events], None] | None = None,
+    overwrite: bool = False,
 ) -> CompensationSummary:
     """Writes the compensated recording: sub-pixel float32 coordinates; time, polarity and order kept.
 
     In blocks, in constant memory. Events that leave the image are kept and marked (``events/inside``). ``on_block``
     sees each compensated block. Raises :class:`AmiwarpError` for a camera of another size, an encoder that does not
-    cover the events, or an output that cannot be written; nothing is left behind then.
+    cover the events, or an output that cannot be written, is the recording, or exists (unless ``overwrite``); nothing
+    is left behind then.
     """
     began = time.perf_counter()
     width, height = recording.events.size
@@ -175,7 +177,7 @@ def compensate(
 
     with RecordingWriter(
         out_path, width=width, height=height, camera=recording.camera or calibration.camera, prism=recording.prism,
-        encoder=encoder, truth_parameters=truth, metadata=metadata,
+        encoder=encoder, truth_parameters=truth, metadata=metadata, overwrite=overwrite,
     ) as writer:  # fmt: skip
         if encoder is not None and n:
             first, last = recording.events.t_first, recording.events.t_last

@@ -19,7 +19,7 @@ from amiwarp.camera import Camera
 from amiwarp.compensate import compensate, compensate_events
 from amiwarp.figures import Reconstructed, draw_demo
 from amiwarp.io import open_recording
-from amiwarp.io.files import make_folder
+from amiwarp.io.output import check_output, make_folder
 from amiwarp.motion import PrismMotion
 from amiwarp.optics import Prism
 from amiwarp.pairs import Sensor
@@ -92,6 +92,8 @@ def run_demo(demo: Demo, progress: Progress | None = None) -> Outcome:
     """Runs the whole main job into the folder ``demo.out``. Raises :class:`AmiwarpError` for an unusable file."""
     tell = progress or (lambda what, share: None)
     files = _files(demo.out)
+    for path in files.values():
+        check_output(path)
     began = time.perf_counter()
     made = simulation(demo)
     made.write(files["recording"], progress=lambda share: tell("simulating", share))

@@ -14,7 +14,7 @@ from amiwarp import clouds
 from amiwarp.calib.calibrate import thin
 from amiwarp.calib.parameters import size_name
 from amiwarp.calib.result import cost_surface
-from amiwarp.io.files import write_text
+from amiwarp.io.output import write_text
 from amiwarp.iwe import iwe
 from amiwarp.iwe_files import PERCENTILE, save_png
 from amiwarp.picture_files import Tone, limits, tones
@@ -312,13 +312,13 @@ def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = Non
     return figure
 
 
-def save(figure: Any, path: Path) -> None:
+def save(figure: Any, path: Path, *, overwrite: bool = False) -> None:
     """Writes a figure as a PNG of 256 colours, which is a third of the size and looks the same; whole or not at all."""
     from PIL import Image
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
-    save_png(path, indexed(np.asarray(Image.open(buffer).convert("RGB"))))
+    save_png(path, indexed(np.asarray(Image.open(buffer).convert("RGB"))), overwrite=overwrite)
 
 
 def save_svg(figure: Any, path: Path) -> None:

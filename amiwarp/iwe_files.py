@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import itertools
 import os
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import part_path
+from amiwarp.io.output import NewFile, check_output
 from amiwarp.iwe import PIECE, CanvasShape, Votes
 
 if TYPE_CHECKING:
@@ -65,17 +64,18 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(shown, 0.0, 1.0) * 255.0), np.uint8)
 
 
-def save_png(path: Path, picture: Any) -> None:
-    """Writes an 8-bit picture, an array or Pillow's, beside first and then by renaming."""
+def save_png(path: Path, picture: Any, *, overwrite: bool = False) -> None:
+    """Write an 8-bit picture, an array or Pillow's, whole or not at all."""
+    with NewFile(path, overwrite=overwrite) as new:
+        encode_png(new.part, picture)
+
+
+def encode_png(path: Path, picture: Any) -> None:
+    """Write an 8-bit picture, an array or Pillow's, to an unfinished file."""
     from PIL import Image
 
-    part = part_path(path)
-    try:
-        image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
-        image.save(part, format="PNG", optimize=True)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
+    image.save(path, format="PNG", optimize=True)
 
 
 class IweFiles:
@@ -88,7 +88,6 @@ class IweFiles:
         for path in paths:
             if path.suffix.lower() not in (".png", ".npy"):
                 raise AmiwarpError(f"{path}: images of events are written as .png or .npy")
-            part_path(path)  # raises where there is no folder
         self.written: list[Path] = []
         self._layers = layers
         width, height = source.size
@@ -101,7 +100,8 @@ class IweFiles:
             raise AmiwarpError(f"{self._count} windows are more than {MOST_WINDOWS}; give a longer --iwe-window-ms")
         self._at = 0
         self._paths = paths
-        self._parts: list[tuple[Path, Path]] = []
+        self._check_outputs()
+        self._new: list[NewFile] = []
         self._stacks: dict[Path, Any] = {}
 
     def __enter__(self) -> IweFiles:
@@ -115,9 +115,8 @@ class IweFiles:
                 self._finish()
         finally:
             self._stacks.clear()
-            for part, _ in self._parts:
-                with contextlib.suppress(OSError):
-                    part.unlink(missing_ok=True)
+            for new in self._new:
+                new.discard()
 
     def add(self, events: Events) -> None:
         """Votes compensated events, which follow in time on those before."""
@@ -146,12 +145,12 @@ class IweFiles:
             if path.suffix.lower() == ".npy":
                 self._stack(path, image.shape)[self._at] = image
             else:
-                save_png(self._part(self._numbered(path)), to_picture(image, self._layers))
+                encode_png(self._begin(self._numbered(path, self._at)), to_picture(image, self._layers))
         self._at += 1
 
     def _stack(self, path: Path, shape: tuple[int, ...]) -> Any:
         if path not in self._stacks:
-            part = self._part(path)
+            part = self._begin(path)
             full = (self._count, *shape)
             flat = np.lib.format.open_memmap(
                 part, mode="w+", dtype=np.float32, shape=shape if self._window_us is None else full
@@ -159,13 +158,22 @@ class IweFiles:
             self._stacks[path] = flat.reshape(full)
         return self._stacks[path]
 
-    def _numbered(self, path: Path) -> Path:
-        return path if self._window_us is None else path.with_name(f"{path.stem}_{self._at:05d}{path.suffix}")
+    def _numbered(self, path: Path, at: int) -> Path:
+        return path if self._window_us is None else path.with_name(f"{path.stem}_{at:05d}{path.suffix}")
 
-    def _part(self, path: Path) -> Path:
-        part = part_path(path)
-        self._parts.append((part, path))
-        return part
+    def _check_outputs(self) -> None:
+        """Raise AmiwarpError before the work if an image cannot be written at its end."""
+        for path in self._paths:
+            count = self._count if path.suffix.lower() == ".png" else 1
+            check_output(self._numbered(path, 0) if count > 1 else path)
+            there = set(os.listdir(path.parent)) if count > 1 else set()
+            for name in (self._numbered(path, at) for at in range(count)):
+                if name.name in there:
+                    check_output(name)
+
+    def _begin(self, path: Path) -> Path:
+        self._new.append(NewFile(path))
+        return self._new[-1].part
 
     def _finish(self) -> None:
         while self._at < self._count:
@@ -173,9 +181,9 @@ class IweFiles:
         for stack in self._stacks.values():
             stack.flush()
         self._stacks.clear()
-        for part, path in self._parts:
-            os.replace(part, path)
-            self.written.append(path)
+        for new in self._new:
+            new.commit()
+            self.written.append(new.path)
 
 
 __all__ = ["IweFiles", "Layers", "save_png", "to_picture", "tone"]

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import enum
-import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import part_path
+from amiwarp.io.output import NewFile, check_output
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,20 +64,7 @@ def check_path(path: Path, endings: tuple[str, ...] = (*STILLS, VIDEO)) -> None:
     """Raises :class:`AmiwarpError` for another ending, or where there is no folder."""
     if path.suffix.lower() not in endings:
         raise AmiwarpError(f"{path}: ends in {path.suffix or 'nothing'}; expected one of {', '.join(endings)}")
-    part_path(path)
-
-
-@contextmanager
-def written(path: Path) -> Iterator[Path]:
-    """A file beside to write to, that takes the place of ``path`` at the end, or is gone after an error."""
-    part = part_path(path)
-    try:
-        yield part
-        os.replace(part, path)
-    except OSError as error:
-        raise AmiwarpError(f"{path}: cannot be written: {error.strerror or error}; choose another place") from error
-    finally:
-        part.unlink(missing_ok=True)
+    check_output(path)
 
 
 def save_picture(
@@ -91,7 +76,7 @@ def save_picture(
         raise AmiwarpError(f"{path}: {bits} bits; expected 8 or 16")
     ending = path.suffix.lower()
     if ending == ".npy":
-        with written(path) as part, open(part, "wb") as file:
+        with NewFile(path) as new, open(new.part, "wb") as file:
             np.save(file, (contrast * picture.log).astype(np.float32))
         return
     save_grey(tones(picture, tone, contrast=contrast), path, bits=bits if ending == ".png" else 16)
@@ -108,8 +93,8 @@ def save_grey(value: NDArray[np.float32], path: Path, *, bits: int) -> None:
 
     kind = np.uint8 if bits == 8 else np.uint16
     image = Image.fromarray(np.rint(value * np.iinfo(kind).max).astype(kind))
-    with written(path) as part:
-        image.save(part, format="PNG" if path.suffix.lower() == ".png" else "TIFF")
+    with NewFile(path) as new:
+        image.save(new.part, format="PNG" if path.suffix.lower() == ".png" else "TIFF")
 
 
 def save_video(
@@ -139,7 +124,7 @@ def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) ->
 
     check_path(path, (VIDEO, ".gif"))
     count, kind = 0, path.suffix.lower().removeprefix(".")
-    with written(path) as part, av.open(str(part), "w", format=kind) as container:
+    with NewFile(path) as new, av.open(str(new.part), "w", format=kind) as container:
         stream: Any = None
         for value in map(even, frames):
             if stream is None:

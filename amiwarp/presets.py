@@ -14,7 +14,7 @@ from amiwarp.calib import Settings
 from amiwarp.calib.parameters import size_name
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import write_text
+from amiwarp.io.output import write_text
 from amiwarp.optics import MODELS
 
 if TYPE_CHECKING:

@@ -214,7 +214,7 @@ class Simulation:
             "simulation",
         )
 
-    def write(self, path: str | Path, *, progress: Progress | None = None) -> None:
+    def write(self, path: str | Path, *, progress: Progress | None = None, overwrite: bool = False) -> None:
         """The whole recording to a file, in constant memory."""
         from amiwarp.io import RecordingWriter
 
@@ -227,6 +227,7 @@ class Simulation:
             encoder=self.encoder(),
             truth_parameters=self.truth_parameters(),
             metadata=self.metadata(),
+            overwrite=overwrite,
         ) as writer:
             for events, points in self.blocks(progress=progress):
                 writer.append(events, truth_points=points)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import register_reader
 from amiwarp.motion import EncoderModel, PrismMotion
 from amiwarp.pictures import linear_luminance, read_picture, srgb_to_linear
 from amiwarp.simulate import Progress, Scene, SensorModel, Simulation
@@ -27,10 +28,13 @@ if TYPE_CHECKING:
 DEFAULT_FOV = math.radians(60.0)
 """Horizontal field of view of the camera where none is given [rad]."""
 
+TIMES = "times.csv"
+"""Of a folder of pictures: columns file, t_us."""
+
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class PictureFolder:
     """Picture files with times."""
 
@@ -55,7 +59,7 @@ class PictureFolder:
             yield t, light
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class PictureStack:
     """An array of pictures, shape (n, height, width) or (n, height, width, 3), sRGB-encoded: 0 .. 1 or uint8."""
 
@@ -89,7 +93,7 @@ class PictureStack:
             )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class VideoFile:
     """A video that PyAV decodes, a frame at a time; frames stamped no later than the one before are left out."""
 
@@ -140,12 +144,16 @@ def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
     if not path.exists():
         raise AmiwarpError(f"{path} does not exist; give a video, a folder of pictures or an .npy stack")
     if path.is_dir():
-        return _open_folder(path, fps)
-    return _open_stack(path, fps) if path.suffix == ".npy" else _open_video(path, fps)
+        folder = _open_folder(path, fps)
+        register_reader(folder, path / TIMES, *folder.files)
+        return folder
+    opened = _open_stack(path, fps) if path.suffix == ".npy" else _open_video(path, fps)
+    register_reader(opened, path)
+    return opened
 
 
 def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
-    table = folder / "times.csv"
+    table = folder / TIMES
     if table.is_file() and fps is None:
         files, times = _read_times(table)
     else:

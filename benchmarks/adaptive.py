@@ -297,7 +297,7 @@ def draw(path: Path, results: dict[str, Any]) -> None:
     upper.tick_params(labelbottom=False)
     upper.legend(loc="lower right", fontsize=9, framealpha=1.0)
     lower.set_xlabel("time [s]")
-    save(figure, path)
+    save(figure, path, overwrite=True)
 
 
 COLOURS = {"still": "#0072b2", "slow": "#009e73", "fast": "#d55e00", "very fast": "#cc79a7"}

@@ -16,6 +16,7 @@ import warp as wp
 from amiwarp.chart import Charts, make, simulated
 from amiwarp.chart.rows import beaten_by, fronts
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.output import own_folder
 
 
 def main() -> int:
@@ -46,7 +47,8 @@ def main() -> int:
 
 def _redrawn(data: Path, out: Path) -> Charts:
     out.mkdir(parents=True, exist_ok=True)
-    return Charts.load(data).draw(out)
+    with own_folder(out):
+        return Charts.load(data).draw(out)
 
 
 def _measured(args: argparse.Namespace) -> Charts:
@@ -61,7 +63,9 @@ def _measured(args: argparse.Namespace) -> Charts:
 
     tell("simulating", 0.0)
     recording = simulated(args.picture, seed=args.seed, device=args.device, quick=args.quick)
-    charts = make(recording, args.out, device=args.device, seed=args.seed, quick=args.quick, progress=tell)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with own_folder(args.out):
+        charts = make(recording, args.out, device=args.device, seed=args.seed, quick=args.quick, progress=tell)
     tell("done", 1.0)
     return charts
 

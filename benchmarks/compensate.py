@@ -189,7 +189,7 @@ def stages_alone(recording: Any, mover: Mover, folder: Path) -> dict[str, float]
     moved, inside = mover(held[0])
 
     def write() -> None:
-        with RecordingWriter(folder / "alone.h5", width=WIDTH, height=HEIGHT) as writer:
+        with RecordingWriter(folder / "alone.h5", width=WIDTH, height=HEIGHT, overwrite=True) as writer:
             pieces = (partial(moved_again, moved, inside, k) for k in range(len(reads)))
             writer.fill(pieces, t_first=int(moved.t[0]), done=lambda _events, _inside: None)
 

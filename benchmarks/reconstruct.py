@@ -246,7 +246,7 @@ def grid(shown: dict[str, dict[str, NDArray[np.float32]]], path: Path) -> None:
         axes[k][0].set_ylabel(name, fontsize=8)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.08)
-    save_png(path, Image.open(buffer).convert("L"))
+    save_png(path, Image.open(buffer).convert("L"), overwrite=True)
 
 
 def real(folder: Path, device: str) -> dict[str, dict[str, NDArray[np.float32]]]:

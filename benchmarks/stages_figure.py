@@ -76,7 +76,7 @@ def main() -> None:
     right.legend(frameon=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
-    save_png(args.out, Image.open(buffer).convert("RGB"))
+    save_png(args.out, Image.open(buffer).convert("RGB"), overwrite=True)
 
 
 if __name__ == "__main__":

@@ -202,8 +202,8 @@ def test_files_and_memory_give_the_same(
         ("plain", open_recording(tmp_path / "plain.h5")),
     ):
         blocks: list[Events] = []
-        summary = compensate(source, calibration, tmp_path / "out.h5", device=device, on_block=blocks.append)
-        moved = open_recording(tmp_path / "out.h5").events.slice(0, len(many))
+        summary = compensate(source, calibration, tmp_path / f"{name}-out.h5", device=device, on_block=blocks.append)
+        moved = open_recording(tmp_path / f"{name}-out.h5").events.slice(0, len(many))
         assert summary.events == len(many) > 2 * CHUNK, name
         for events in (moved, Events.concatenate(blocks)):
             np.testing.assert_array_equal(np.stack([events.x, events.y], axis=1), expected, name)

@@ -209,7 +209,7 @@ def test_failure_keeps_the_file_that_was_there(tmp_path):
     path = write(tmp_path / "a.h5", make(10))
     before = path.read_bytes()
     with pytest.raises(KeyboardInterrupt):  # noqa: PT012, SIM117
-        with RecordingWriter(path, width=SIZE[0], height=SIZE[1]) as writer:
+        with RecordingWriter(path, width=SIZE[0], height=SIZE[1], overwrite=True) as writer:
             writer.append(make(99))
             raise KeyboardInterrupt
     assert path.read_bytes() == before
@@ -240,9 +240,9 @@ def test_writer_refuses_its_path(tmp_path):
     (tmp_path / "link.h5").symlink_to(path)
     for target in (path, tmp_path / "link.h5"):
         with pytest.raises(AmiwarpError, match="write to another file"):
-            save_recording(target, recording)
-        with pytest.raises(AmiwarpError, match="is being read"):
-            write(target, make(10))
+            save_recording(target, recording, overwrite=True)
+        with pytest.raises(AmiwarpError, match="is read in this run"):
+            write(target, make(10), overwrite=True)
     with pytest.raises(AmiwarpError, match="is a folder"):
         write(tmp_path, make(10))
     with pytest.raises(AmiwarpError, match="does not exist"):
@@ -250,7 +250,9 @@ def test_writer_refuses_its_path(tmp_path):
     with pytest.raises(AmiwarpError, match="outside the writer's with block"):
         RecordingWriter(tmp_path / "b.h5", width=1, height=1).append(make(1))
     del recording
-    write(path, make(20))
+    with pytest.raises(AmiwarpError, match=r"a\.h5: exists; .*overwrite=True"):
+        write(path, make(20))
+    write(path, make(20), overwrite=True)
     assert len(open_recording(path).events) == 20
 
 

@@ -326,8 +326,8 @@ def test_convert_refuses(tmp_path):
     (tmp_path / "link").symlink_to(path)
     before = path.read_bytes()
     for target in (path, tmp_path / "link"):
-        with pytest.raises(AmiwarpError, match="is the input"):
-            convert(path, target)
+        with pytest.raises(AmiwarpError, match="is read in this run"):
+            convert(path, target, overwrite=True)
     with pytest.raises(AmiwarpError, match="give both one size"):
         convert(path, tmp_path / "out.h5", camera=Camera(10, 10, 5.0, 5.0, 4.5, 4.5))
     assert path.read_bytes() == before

@@ -251,7 +251,9 @@ def test_an_exception_keeps_what_was_appended(tmp_path, error):
 def test_the_file_that_was_there_is_replaced_at_the_end(tmp_path):
     path = tmp_path / "a.h5"
     path.write_bytes(b"old")
-    with live(path) as writer:
+    with pytest.raises(AmiwarpError, match=r"a\.h5: exists"), live(path):
+        pass
+    with live(path, overwrite=True) as writer:
         writer.append(make(10))
         writer.tick()
         assert path.read_bytes() == b"old"
@@ -299,7 +301,7 @@ def test_writer_refuses_its_path_and_options(tmp_path):
     with live(tmp_path / "a.h5") as writer:
         writer.append(make(1))
     recording = open_recording(tmp_path / "a.h5")
-    with pytest.raises(AmiwarpError, match="is being read"), live(tmp_path / "a.h5"):
+    with pytest.raises(AmiwarpError, match="is read in this run"), live(tmp_path / "a.h5", overwrite=True):
         pass
     assert len(recording.events) == 1
 

@@ -17,6 +17,7 @@ from amiwarp.calib.parameters import MOTION, UNITS, build_model, turning_of
 from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.output import write_text
 from amiwarp.optics import MODELS, FlatSide, Prism
 from amiwarp.turning import Turning
 
@@ -245,16 +246,9 @@ class Calibration:
             out["degrees"] = math.degrees(value)
         return out
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the JSON file, beside first and then by renaming."""
-        path = Path(path)
-        beside = path.with_name(path.name + ".part")
-        try:
-            beside.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
-            os.replace(beside, path)
-        except OSError as error:
-            beside.unlink(missing_ok=True)
-            raise AmiwarpError(f"{path}: cannot be written: {error.strerror}; choose another place") from error
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the JSON file. Raises :class:`AmiwarpError` if it exists (unless ``overwrite``) or cannot be made."""
+        write_text(Path(path), json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", overwrite=overwrite)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:

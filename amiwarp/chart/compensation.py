@@ -268,7 +268,7 @@ def _file_rows(
         return sample.error(raw_places(events[:: sample.step]), Vote.BILINEAR)
 
     def run(calibration: Calibration) -> Path:
-        compensate(source, calibration, place / "out.h5", device=device)
+        compensate(source, calibration, place / "out.h5", device=device, overwrite=True)
         return place / "out.h5"
 
     with tempfile.TemporaryDirectory(dir=folder, prefix=".chart-") as name:

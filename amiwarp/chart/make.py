@@ -17,7 +17,7 @@ from amiwarp.chart.drawing import draw
 from amiwarp.chart.rows import Progress, Row, beaten_by, fastest_within, fronts, most_accurate_within
 from amiwarp.chart.truth import Known
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import make_folder, write_text
+from amiwarp.io.output import check_output, make_folder, write_text
 from amiwarp.machine import machine, versions
 from amiwarp.presets import Preset
 from amiwarp.uploads import TURNS
@@ -72,7 +72,7 @@ class Charts:
         events = self.about["recording"]["events"] / 1e6
         title = f"{chart.capitalize()} on {self.about['machine']}: {events:.1f} M events"
         draw(out / chart, rows, title, _share_note(rows) if chart == "compensation" else _guess_note(rows))
-        return {chart: out / f"{chart}.png", f"{chart} (SVG)": out / f"{chart}.svg"}
+        return _drawn(chart, out)
 
     def answer(
         self, folder: Path, *, budget_px: float | None = None, budget_ms: float | None = None
@@ -139,10 +139,13 @@ def make(
     """Measures a recording with truth and writes both charts and their data into the folder ``out``.
 
     ``quick``: a few settings, once each. Raises :class:`AmiwarpError` for a recording without truth, a folder that
-    cannot be made, and an image that is wrong.
+    cannot be made or holds these files, and an image that is wrong.
     """
     known = Known.of(recording)
     make_folder(out)
+    files = {"data": out / "chart.json", "table": out / "chart.csv"}
+    for path in (*files.values(), *(path for chart in REPEATS for path in _drawn(chart, out).values())):
+        check_output(path)
     tell = progress or (lambda what, share: None)
     repeats = dict.fromkeys(REPEATS, 1) if quick else REPEATS
     compensated, notes = compensation.rows(
@@ -152,12 +155,15 @@ def make(
         known, device, repeats=repeats["calibration"], quick=quick, seed=seed, tell=_part(tell, 0.3, 0.97)
     )
     tell("drawing", 0.97)
-    files = {"data": out / "chart.json", "table": out / "chart.csv"}
     done = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), _about(known, device))
     # the figures last: they need packages that a machine with a GPU may lack
     write_text(files["data"], json.dumps({**done.about, **_data(done)}, indent=1, allow_nan=False) + "\n")
     write_text(files["table"], _csv([*compensated, *calibrated]))
     return done.draw(out)
+
+
+def _drawn(chart: str, out: Path) -> dict[str, Path]:
+    return {chart: out / f"{chart}.png", f"{chart} (SVG)": out / f"{chart}.svg"}
 
 
 def _part(tell: Progress, start: float, end: float) -> Progress:

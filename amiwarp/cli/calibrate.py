@@ -12,7 +12,7 @@ import typer
 
 from amiwarp.cli.console import Advance, choose_device, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, number, span
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.sharpness import Sharpness
 
@@ -185,7 +185,9 @@ def _named(text: str) -> tuple[str, str, str]:
 def run(
     recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
     out: Annotated[
-        Path | None, typer.Argument(help="Calibration to write; default: NAME.calibration.json beside the recording.")
+        Path | None,
+        typer.Argument(help="Calibration to write; default: NAME.calibration.json beside the recording."),
+        OUTPUT,
     ] = None,
     *,
     method: Annotated[
@@ -198,7 +200,7 @@ def run(
         Path | None, typer.Option(help="Settings that 'amiwarp chart' chose; options given beside it win.")
     ] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Draw the cost surface, and the events' image before and after (.png).")
+        Path | None, typer.Option(help="Draw the cost surface, and the events' image before and after (.png)."), OUTPUT
     ] = None,
     window: Annotated[
         str | None, typer.Option(help="Only these seconds of the recording.", metavar="START:END")
@@ -213,6 +215,7 @@ def run(
     from amiwarp.calib import Settings, calibrate
     from amiwarp.calib.paper import calibrate_as_paper
     from amiwarp.io import open_recording
+    from amiwarp.io.output import check_output
     from amiwarp.presets import Preset
 
     device = choose_device(common.device)
@@ -221,7 +224,9 @@ def run(
     opened = complete(open_recording(recording), camera, prism)
     opened = cut(opened, window) if window else opened
     out = out or recording.with_name(f"{recording.stem}.calibration.json")
-    check_outputs(out, figure)
+    check_output(out)
+    if figure is not None and figure.suffix.lower() != ".png":
+        raise AmiwarpError(f"{figure}: figures are written as .png")
     with progress("calibrating") as advance:
         if method is Method.PAPER:
             check_paper(search, parameters, preset)
@@ -243,17 +248,6 @@ def check_paper(search: SearchOptions, parameters: ParameterOptions, preset: Pat
     """The paper's method has no settings but where it starts."""
     if search != SearchOptions() or preset is not None or replace(parameters, start=None) != ParameterOptions():
         raise AmiwarpError("--method paper takes no settings of the search but --start phase=…; leave the others out")
-
-
-def check_outputs(out: Path, figure: Path | None) -> None:
-    """Raises :class:`AmiwarpError` now, not after the search, where the files could not be written."""
-    from amiwarp.io.files import part_path
-
-    part_path(out)
-    if figure is not None:
-        part_path(figure)
-        if figure.suffix.lower() != ".png":
-            raise AmiwarpError(f"{figure}: figures are written as .png")
 
 
 def cut(recording: Recording, window: str) -> Recording:

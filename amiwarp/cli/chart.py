@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import choose_device, progress, report, table
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
@@ -23,7 +23,9 @@ def run(
         Path | None, typer.Argument(help="Recording with truth. Default: simulated, 10 million events.")
     ] = None,
     *,
-    out: Annotated[Path, typer.Option(help="Folder for charts, tables and presets.")] = Path("amiwarp-chart"),
+    out: Annotated[Path, typer.Option(help="Folder for charts, tables and presets."), OUTPUT_FOLDER] = Path(
+        "amiwarp-chart"
+    ),
     picture: Annotated[Path | None, typer.Option(help="Picture to simulate from. Default: a map of the earth.")] = None,
     budget_px: Annotated[
         float | None, typer.Option(min=0.0, help="Answer with the fastest settings within this error (px).")
@@ -46,6 +48,12 @@ def run(
     device = choose_device(common.device)
     from amiwarp.chart import make, simulated
     from amiwarp.io import open_recording
+    from amiwarp.io.output import check_output
+
+    if budget_px is not None or budget_ms is not None:
+        for kind in ("calibration", "compensation"):
+            if out.is_dir():
+                check_output(out / f"preset_{kind}.json")
 
     with progress("starting") as advance:
         if recording is not None:

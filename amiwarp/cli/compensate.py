@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import choose_device, progress, report
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.iwe_files import IweFiles, Layers
 
@@ -32,6 +32,7 @@ class IweOptions:
             metavar="<path>",
             rich_help_panel=_IWE,
         ),
+        OUTPUT,
     ] = None
     iwe_window_ms: Annotated[
         float | None,
@@ -56,7 +57,7 @@ class IweOptions:
 
 def run(
     recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
-    out: Annotated[Path, typer.Argument(help="Compensated recording to write (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Compensated recording to write (.h5)."), OUTPUT],
     *,
     calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
     preset: Annotated[

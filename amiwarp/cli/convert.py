@@ -12,7 +12,7 @@ import typer
 
 from amiwarp.cli.console import progress, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class EncoderOptions:
 
 def run(
     source: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
-    out: Annotated[Path, typer.Argument(help="Native recording to write (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Native recording to write (.h5)."), OUTPUT],
     encoder: EncoderOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,

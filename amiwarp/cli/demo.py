@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -10,16 +11,19 @@ from typing import Annotated, Any
 import typer
 
 from amiwarp.cli.console import choose_device, progress, report, table
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT_FOLDER, Common
 
 EXAMPLE = "amiwarp demo --out amiwarp-demo"
+
+OWN_FOLDER = Path("amiwarp-demo")
+"""What an earlier demo left in this folder is replaced."""
 
 
 def run(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for recording, calibration, picture and figure.")] = Path(
-        "amiwarp-demo"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Folder for recording, calibration, picture and figure."), OUTPUT_FOLDER
+    ] = OWN_FOLDER,
     picture: Annotated[Path | None, typer.Option(help="Your own picture. Default: a map of the earth.")] = None,
     size: Annotated[str, typer.Option(help="Pixels of the camera.", metavar="WIDTHxHEIGHT")] = "640x480",
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.5,
@@ -31,10 +35,12 @@ def run(
     with progress("starting") as advance:
         from amiwarp.cli.rig import parse_size
         from amiwarp.demo import Demo, run_demo
+        from amiwarp.io.output import own_folder
 
         width, height = parse_size(size)
         demo = Demo(out, picture, width, height, duration, common.seed, device)
-        outcome = run_demo(demo, lambda what, share: advance(share, what))
+        with own_folder(out) if out == OWN_FOLDER else contextlib.nullcontext():
+            outcome = run_demo(demo, lambda what, share: advance(share, what))
     data = asdict(outcome) | {"seconds": time.perf_counter() - began, "device": device}
     report(common, data, lines(data))
 

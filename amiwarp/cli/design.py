@@ -14,7 +14,7 @@ import typer
 
 from amiwarp.cli.console import choose_device, plain, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, numbers
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
 from amiwarp.optics import FlatSide, Prism
 
@@ -104,7 +104,9 @@ class FaultOptions:
 
 def run(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for the chart and the tables.")] = Path("amiwarp-design"),
+    out: Annotated[Path, typer.Option(help="Folder for the chart and the tables."), OUTPUT_FOLDER] = Path(
+        "amiwarp-design"
+    ),
     size: Annotated[
         str | None,
         typer.Option(help="Pixels of the camera. Default: 640x480, or as --camera says.", metavar="WIDTHxHEIGHT",
@@ -129,9 +131,13 @@ def run(
     from amiwarp.demo import earth
     from amiwarp.design import design
     from amiwarp.design.drawing import draw
-    from amiwarp.io.files import make_folder, write_text
+    from amiwarp.io.output import check_output, make_folder, write_text
     from amiwarp.simulate import Scene, SensorModel
 
+    make_folder(out)
+    files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
+    for path in files.values():
+        check_output(Path(path))
     sensor = SensorModel(contrast_on=faults.contrast, contrast_off=faults.contrast)
     scene = Scene.from_picture(picture or earth())
     with progress("starting") as advance:
@@ -139,8 +145,6 @@ def run(
             seen, scene, glass, apexes=grid.apexes, rpms=grid.rpms, timing=faults.timing(), limits=limits.build(),
             sensor=sensor, seed=common.seed, device=device, progress=lambda what, share: advance(share, what),
         )  # fmt: skip
-    make_folder(out)
-    files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
     data = summary(made)
     write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
     write_text(Path(files["csv"]), _csv(data["choices"]))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import choose_device, report
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
 from amiwarp.errors import AmiwarpError
 from amiwarp.stream.queues import Policy
@@ -73,8 +73,8 @@ def run(
     source: Annotated[str, typer.Argument(help="dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")],
     *,
     calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
-    out: Annotated[Path | None, typer.Option(help="Compensated recording to write (.h5).")] = None,
-    record: Annotated[Path | None, typer.Option(help="Recording of what comes in to write (.h5).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Compensated recording to write (.h5)."), OUTPUT] = None,
+    record: Annotated[Path | None, typer.Option(help="Recording of what comes in to write (.h5)."), OUTPUT] = None,
     to: Annotated[
         str | None,
         typer.Option(

@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
+
+from amiwarp.io import output
+
+OUTPUT = "output"
+"""Marks, in ``Annotated``, an option that names a file to write; every other path is read."""
+OUTPUT_FOLDER = "output folder"
+"""Marks an option that names a folder to write to; the command checks its files."""
+
+_FORCE = Annotated[
+    bool,
+    typer.Option("--force", help="Replace outputs that exist; never a file that is read.", rich_help_panel="Common"),
+]
 
 
 @dataclass(frozen=True)
@@ -42,17 +55,34 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
             groups[parameter.name] = (kind, [f.name for f in fields(kind)])
         else:
             spread.append(parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY))
+    marks = {p.name: getattr(p.annotation, "__metadata__", ()) for p in spread}
+    writes = any(OUTPUT in mark or OUTPUT_FOLDER in mark for mark in marks.values())
+    if writes:
+        spread.append(inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_FORCE))
 
     @functools.wraps(function)
     def run(**values: Any) -> None:
+        force = writes and values.pop("force")
+        paths = list(_paths(values))
+        inputs = [path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER} & set(marks[name])]
+        outputs = [path for name, path in paths if OUTPUT in marks[name]]
         for key, (kind, names) in groups.items():
             values[key] = kind(**{n: values.pop(n) for n in names})
-        function(**values)
+        with output.run(inputs, outputs, overwrite=force):
+            function(**values)
 
     del run.__wrapped__  # else the signature would be looked up there
     run.__signature__ = inspect.Signature(spread)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in spread}
     app.command(name, epilog=f"[bold]Example:[/bold] {example}", help=inspect.getdoc(function))(run)
+
+
+def _paths(values: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
+    """Give each path among the options with the option's name."""
+    for name, value in values.items():
+        for one in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(one, Path):
+                yield name, one
 
 
 def _parameters(group: type) -> list[inspect.Parameter]:

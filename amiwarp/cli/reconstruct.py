@@ -12,7 +12,7 @@ import typer
 
 from amiwarp.cli.console import Advance, choose_device, progress, report
 from amiwarp.cli.inputs import numbers
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.picture_files import CONTRAST, VIDEO, Tone, check_path, save_mask, save_picture, save_video
 from amiwarp.reconstruct import Fill
@@ -91,12 +91,13 @@ class PictureOptions:
         typer.Option(
             help="Also write where events determine the picture (.png).", metavar="<path>", rich_help_panel=_PICTURE
         ),
+        OUTPUT,
     ] = None
 
 
 def run(
     recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
-    out: Annotated[Path, typer.Argument(help="To write: .png, .tif (16 bit), .npy (log intensity) or .mp4.")],
+    out: Annotated[Path, typer.Argument(help="To write: .png, .tif (16 bit), .npy (log intensity) or .mp4."), OUTPUT],
     *,
     calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
     window: WindowOptions,

@@ -10,7 +10,7 @@ import typer
 
 from amiwarp.cli.console import report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
@@ -18,7 +18,7 @@ EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
 def run(
     source: Annotated[str, typer.Argument(help="dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")],
-    out: Annotated[Path, typer.Argument(help="Recording to write (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     stream: SourceOptions,
     camera: CameraOptions,

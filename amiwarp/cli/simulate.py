@@ -12,7 +12,7 @@ import typer
 
 from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.inputs import numbers
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class SceneOptions:
 
 
 def run(
-    out: Annotated[Path, typer.Argument(help="Recording to write (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     picture: Annotated[Path, typer.Option(help="Any picture: JPEG, PNG, TIFF ...")],
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import choose_device, progress, report, table
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.cores import cpu_threads
 
@@ -30,7 +30,9 @@ SEEDS, QUICK_SEEDS, QUICK_MINUTES = 20, 1, 9.0
 
 def run(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for cells, figures and tables.")] = Path("amiwarp-atlas"),
+    out: Annotated[Path, typer.Option(help="Folder for cells, figures and tables."), OUTPUT_FOLDER] = Path(
+        "amiwarp-atlas"
+    ),
     quick: Annotated[
         bool, typer.Option("--quick", help="Three values of each axis, three methods, one seed: within ten minutes.")
     ] = False,
@@ -62,12 +64,13 @@ def run(
     stopped goes on with the same command, and a rerun does only what is missing.
     """
     device = choose_device(common.device)
-    from amiwarp.io.files import make_folder
+    from amiwarp.io.output import make_folder, own_folder
     from amiwarp.stability import aggregate, draw, identity, load
 
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
     make_folder(cells_in)
+    earlier = any(cells_in.iterdir())  # then the atlas in this folder is an earlier one of these cells
     began = time.perf_counter()
     new = left = 0
     if redraw:
@@ -79,7 +82,7 @@ def run(
         left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
     took = time.perf_counter() - began
     atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
-    with progress("drawing"):
+    with progress("drawing"), own_folder(out) if earlier else contextlib.nullcontext():
         files = atlas.write(out) | draw(atlas, out)
     speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
     data = {"aims": atlas.aims.to_json(), "files": {name: str(path) for name, path in files.items()}, **speed}

@@ -9,7 +9,7 @@ import typer
 
 from amiwarp.camera import Camera
 from amiwarp.cli.console import choose_device
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
 from amiwarp.cli.simulate import write
 
@@ -18,7 +18,7 @@ EXAMPLE = "amiwarp translate video.mp4 recording.h5 --apex-deg 1 --rpm 720"
 
 def run(
     source: Annotated[Path, typer.Argument(help="Video, folder of pictures (times.csv: file, t_us) or .npy stack.")],
-    out: Annotated[Path, typer.Argument(help="Recording to write (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     fps: Annotated[
         float | None, typer.Option(help="Pictures per second, where the source does not tell or tells wrong.")

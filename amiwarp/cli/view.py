@@ -13,7 +13,7 @@ import typer
 
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import parse_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.scene import Axis, Colour, Look, View
@@ -33,7 +33,9 @@ class PictureOptions:
     """Of a picture that is written in place of a page."""
 
     screenshot: Annotated[
-        Path | None, typer.Option(help="Write a picture of both clouds (.png) and end.", rich_help_panel=_PICTURE)
+        Path | None,
+        typer.Option(help="Write a picture of both clouds (.png) and end.", rich_help_panel=_PICTURE),
+        OUTPUT,
     ] = None
     view: Annotated[View, typer.Option(help="Where the camera stands.", rich_help_panel=_PICTURE)] = View.FREE
     colour: Annotated[Colour, typer.Option(help="What colours tell.", rich_help_panel=_PICTURE)] = Colour.POLARITY

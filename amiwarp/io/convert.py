@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
-from amiwarp.errors import AmiwarpError
 from amiwarp.events import EventSource
-from amiwarp.io.files import same_file
 from amiwarp.io.formats import open_recording
 from amiwarp.io.native_writer import Progress, RecordingWriter, copy_events
 
@@ -56,14 +53,14 @@ def convert(
     camera: Camera | None = None,
     prism: Prism | None = None,
     progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> Summary:
     """Convert a recording to the native format in constant memory; what is given replaces what the file holds.
 
     Where the file does not tell the sensor's size, the camera's is taken. Raises :class:`AmiwarpError` for what cannot
-    be read or written, and for an output that is the input; nothing is left behind then.
+    be read or written, for an output that is the input, and for one that exists unless ``overwrite``; nothing is left
+    behind then.
     """
-    if same_file(Path(source_path), Path(out_path)):
-        raise AmiwarpError(f"{out_path}: is the input; write to another file")
     recording = open_recording(source_path)
     source = recording.events
     encoder = encoder or recording.encoder
@@ -81,6 +78,7 @@ def convert(
         encoder=encoder,
         truth_parameters=None if recording.truth is None else recording.truth.parameters,
         metadata={"source_name": recording.name, "source_format": recording.metadata["format"], **metadata},
+        overwrite=overwrite,
     ) as writer:
         copy_events(recording, writer, progress)
     return _summary(source, (width, height), encoder, dict(getattr(source, "repairs", {})))

@@ -1,37 +1,44 @@
-"""What all readers and writers share: errors with a place, no file half written, none overwritten while it is read."""
+"""What all readers share: errors with a place, and which files are inputs that no writer may touch."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Protocol
 
 from amiwarp.errors import AmiwarpError
 
-
-class HasPath(Protocol):
-    """A source that reads from a file."""
-
-    path: Path
+_sources: weakref.WeakKeyDictionary[object, tuple[Path, ...]] = weakref.WeakKeyDictionary()
+_noted: set[Path] | None = None
 
 
-_being_read: weakref.WeakSet[HasPath] = weakref.WeakSet()
+def register_reader(source: object, *paths: Path) -> None:
+    """Remember that ``source`` reads from ``paths`` for as long as it lives."""
+    _sources[source] = paths
 
 
-def register_reader(source: HasPath) -> None:
-    """Remember that ``source`` reads from its ``path`` for as long as it lives."""
-    _being_read.add(source)
+def note_input(path: Path) -> None:
+    """Remember a file that is read at once as an input of the command that runs, if one does."""
+    if _noted is not None:
+        _noted.add(path.absolute())
 
 
-def refuse_overwriting(path: Path) -> None:
-    """Raise :class:`AmiwarpError` where ``path`` is a file that a living source reads."""
-    for source in list(_being_read):
-        if same_file(source.path, path):
-            raise AmiwarpError(f"{path}: is being read; write to another file")
+@contextlib.contextmanager
+def inputs_noted(paths: Iterable[Path]) -> Iterator[None]:
+    """Count ``paths``, and all that :func:`note_input` names within the block, as inputs."""
+    global _noted
+    before, _noted = _noted, {path.absolute() for path in paths}
+    try:
+        yield
+    finally:
+        _noted = before
+
+
+def inputs_in_use() -> tuple[Path, ...]:
+    """Return the files that open sources read, and those that the running command has read."""
+    return (*(path for paths in list(_sources.values()) for path in paths), *(_noted or ()))
 
 
 def same_file(first: Path, second: Path) -> bool:
@@ -39,33 +46,6 @@ def same_file(first: Path, second: Path) -> bool:
     with contextlib.suppress(OSError):
         return os.path.samefile(first, second)
     return False
-
-
-def part_path(path: Path) -> Path:
-    """A name beside ``path`` to write to before ``os.replace``; :class:`AmiwarpError` without a folder to write in."""
-    if path.is_dir():
-        raise AmiwarpError(f"{path}: is a folder; give the name of a file")
-    if not path.parent.is_dir():
-        raise AmiwarpError(f"{path}: its folder {path.parent} does not exist; make it first")
-    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
-
-
-def make_folder(path: Path) -> None:
-    """Makes a folder and those above it; :class:`AmiwarpError` where it cannot be."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise AmiwarpError(f"{path}: cannot be made a folder: {error.strerror}; choose another --out") from error
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file beside first and then by renaming."""
-    part = part_path(path)
-    try:
-        part.write_text(text)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

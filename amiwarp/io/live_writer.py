@@ -26,7 +26,7 @@ from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MetadataValue, as_times, check_events
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
-from amiwarp.io.files import errors_name, part_path, refuse_overwriting
+from amiwarp.io.files import errors_name
 from amiwarp.io.native import open_native
 from amiwarp.io.native_writer import (
     Columns,
@@ -37,6 +37,7 @@ from amiwarp.io.native_writer import (
     save_recording,
     write_header,
 )
+from amiwarp.io.output import check_output, put_in_place
 
 if TYPE_CHECKING:
     from amiwarp.optics import Prism
@@ -60,8 +61,8 @@ class LiveWriter:
     So it does at any end: after an exception what was appended is kept as well, and when the disk is full; the error
     tells how much. ``compensated`` recordings hold float32 coordinates and flags. Every ``flush_s`` [s] all is in the
     file, if :meth:`append` or :meth:`tick` is called as often. For one thread.
-    Raises :class:`AmiwarpError` for a path that cannot be written or a part left over from before, and for events that
-    are unsorted or out of the frame; the recording can go on after these.
+    Raises :class:`AmiwarpError` for a path that cannot be written or exists (unless ``overwrite``), a part left over
+    from before, and for events that are unsorted or out of the frame; the recording can go on after these.
     """
 
     def __init__(
@@ -76,11 +77,12 @@ class LiveWriter:
         compensated: bool = False,
         clock_offset_us: float = 0.0,
         flush_s: float = 0.5,
+        overwrite: bool = False,
     ) -> None:
         """``clock_offset_us``: of the encoder that is written, see :class:`Encoder`; its samples are moved by it."""
-        self.path = Path(path)
+        self.path, self._overwrite = Path(path), overwrite
         check_frame(self.path, width, height, camera)
-        self.part = self.path.with_name(f"{self.path.stem}.part.h5")
+        self.part = self.path.resolve().with_name(f"{self.path.stem}.part.h5")
         self._size = (int(width), int(height))
         self._camera, self._prism, self._metadata = camera, prism, dict(metadata or {})
         self._compensated, self._flush_s, self._clock_offset_us = compensated, flush_s, clock_offset_us
@@ -106,8 +108,7 @@ class LiveWriter:
     def __enter__(self) -> LiveWriter:
         import h5py
 
-        refuse_overwriting(self.path)
-        part_path(self.path)  # raises without a folder to write in
+        check_output(self.path, overwrite=self._overwrite)
         try:
             with open(self.part, "xb") as file:
                 _allocate(file.fileno(), 0, self._to_finish())
@@ -294,10 +295,11 @@ class LiveWriter:
                 file.truncate(int.from_bytes(file.read(8), "little"))
             if tidy and os.path.getsize(self.part) > 2 * stored + WASTE:
                 with contextlib.suppress(AmiwarpError):  # of a full disk: the part will do
-                    save_recording(self.path, dataclasses.replace(open_native(self.part), metadata=self._metadata))
+                    tidied = dataclasses.replace(open_native(self.part), metadata=self._metadata)
+                    save_recording(self.path, tidied, overwrite=self._overwrite)
                     self.part.unlink()
                     return
-            os.replace(self.part, self.path)
+            put_in_place(self.part, self.path, overwrite=self._overwrite)
 
     def _replace_encoder(self, encoder: Encoder) -> None:
         self._reserve(2 * (encoder.t.nbytes + encoder.angle.nbytes))

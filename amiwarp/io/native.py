@@ -51,7 +51,7 @@ class NativeEvents:
         self._ms_to_idx = _dataset(file, "ms_to_idx", "iu") if "ms_to_idx" in file and not unfinished else None
         self._size = self._find_size()
         self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
-        register_reader(self)
+        register_reader(self, self.path)
 
     def _find_size(self) -> tuple[int, int]:
         attributes = self._file.attrs

@@ -19,7 +19,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MetadataValue, Recording, check_events
 from amiwarp.io.attributes import camera_attributes, prism_attributes
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
-from amiwarp.io.files import errors_name, part_path, refuse_overwriting, same_file
+from amiwarp.io.files import errors_name
+from amiwarp.io.output import NewFile
 
 if TYPE_CHECKING:
     from amiwarp.optics import Prism
@@ -43,8 +44,8 @@ MAX_MS = 100_000_000
 class RecordingWriter:
     """Streams a recording into a file that appears, whole, when the ``with`` block ends without an exception.
 
-    Raises :class:`AmiwarpError` for a path that cannot be written or is being read, and for events that are unsorted or
-    out of the frame; then nothing is left behind.
+    Raises :class:`AmiwarpError` for a path that cannot be written, is being read, or exists (unless ``overwrite``), and
+    for events that are unsorted or out of the frame; then nothing is left behind.
     """
 
     def __init__(
@@ -58,8 +59,9 @@ class RecordingWriter:
         encoder: Encoder | None = None,
         truth_parameters: Mapping[str, float] | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
+        overwrite: bool = False,
     ) -> None:
-        self.path = Path(path)
+        self.path, self._overwrite = Path(path), overwrite
         check_frame(self.path, width, height, camera)
         self._size = (int(width), int(height))
         self._camera, self._prism, self._encoder = camera, prism, encoder
@@ -67,7 +69,7 @@ class RecordingWriter:
         self._metadata = dict(metadata or {})
         self._file: Any = None
         self._datasets: dict[str, Any] = {}
-        self._part = self.path
+        self._new: NewFile | None = None
         self._pending: list[Columns] = []
         self._pending_count = 0
         self._written = 0
@@ -84,12 +86,11 @@ class RecordingWriter:
     def __enter__(self) -> RecordingWriter:
         import h5py
 
-        refuse_overwriting(self.path)
-        self._part = part_path(self.path)
+        self._new = NewFile(self.path, overwrite=self._overwrite)
         try:
             with errors_name(self.path, lambda: "making the file"):
                 # Since HDF5 1.10 the file's structure carries checksums: damage is noticed, not followed.
-                self._file = h5py.File(self._part, "x", libver=("v110", "v110"))
+                self._file = h5py.File(self._new.part, "x", libver=("v110", "v110"))
                 self._write_header()
         except BaseException:
             self._discard()
@@ -99,14 +100,14 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
+        if kind is not None or self._new is None:
             self._discard()
             return
         try:
             with errors_name(self.path, lambda: f"finishing after {len(self)} events"):
                 self._finish()
                 self._file.close()
-                os.replace(self._part, self.path)
+                self._new.commit()
         except BaseException:
             self._discard()
             raise
@@ -272,8 +273,8 @@ class RecordingWriter:
             # A full disk makes closing fail as well; the file goes either way.
             with contextlib.suppress(Exception):
                 self._file.close()
-        with contextlib.suppress(OSError):
-            self._part.unlink()
+        if self._new is not None:
+            self._new.discard()
 
 
 def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
@@ -350,12 +351,9 @@ def write_header(
         group.attrs[name] = item
 
 
-def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
+def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwrite: bool = False) -> None:
     """Write a recording, block by block, with all it holds. Raises :class:`AmiwarpError` as the writer does."""
     source = recording.events
-    origin = getattr(source, "path", None)
-    if origin is not None and same_file(Path(origin), Path(path)):
-        raise AmiwarpError(f"{path}: is the file the recording is read from; write to another file")
     width, height = source.size
     with RecordingWriter(
         path,
@@ -366,6 +364,7 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
         encoder=recording.encoder,
         truth_parameters=None if recording.truth is None else recording.truth.parameters,
         metadata=recording.metadata,
+        overwrite=overwrite,
     ) as writer:
         copy_events(recording, writer)
 

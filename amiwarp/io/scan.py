@@ -85,7 +85,7 @@ class FileEvents:
                 self._kept = self._kept if self._tally.count <= KEEP else None
         self._judge()
         self._size = size or smallest_sensor(self._tally.x_max, self._tally.y_max)
-        register_reader(self)
+        register_reader(self, self.path)
 
     def _judge(self) -> None:
         tally = self._tally

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from amiwarp.camera import Camera, RadialTangential
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
-from amiwarp.io.files import errors_name
+from amiwarp.io.files import errors_name, note_input
 from amiwarp.io.scan import FileEvents, Packet
 
 READ_BYTES = 1 << 22
@@ -40,6 +40,7 @@ def open_text(path: Path) -> Recording:
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
     """The camera of a ``calib.txt``. Raises :class:`AmiwarpError` where it does not hold nine finite numbers."""
+    note_input(path)
     with errors_name(path, lambda: "reading the calibration"):
         with path.open("rb") as file:
             words = file.read(10_000).decode("utf-8").split()

@@ -22,7 +22,7 @@ from amiwarp.calib.parameters import build_model, size_name
 from amiwarp.calib.rungs import Places
 from amiwarp.calib.search import AUTO, STAGES
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import write_text
+from amiwarp.io.output import write_text
 from amiwarp.machine import machine
 from amiwarp.metrics import model_error
 from amiwarp.optics import ExactModel, predicted_error
@@ -231,4 +231,4 @@ class Store:
         """All that is known of a cell."""
         data = {"condition": asdict(known.cell.condition), "seed": known.cell.seed, "events": known.events,
                 "results": {name: r.to_json() for name, r in sorted(known.results.items())}}  # fmt: skip
-        write_text(self.folder / f"{known.cell.name}.json", json.dumps(data, indent=1) + "\n")
+        write_text(self.folder / f"{known.cell.name}.json", json.dumps(data, indent=1) + "\n", overwrite=True)

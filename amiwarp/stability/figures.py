@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import re
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp.figures import save
-from amiwarp.io.files import part_path
+from amiwarp.io.output import NewFile
 from amiwarp.stability.cells import LIMIT_PX, Outcome
 from amiwarp.stability.conditions import Axis
 from amiwarp.stability.report import DEFAULT, PAPER, Atlas, Spot, title_of, words_of
@@ -55,12 +54,8 @@ def _save_pdf(figures: Sequence[Any], path: Path) -> None:
     with PdfPages(buffer, metadata={"CreationDate": None}) as pages:
         for figure in figures:
             pages.savefig(figure)
-    part = part_path(path)
-    try:
-        part.write_bytes(buffer.getvalue())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with NewFile(path) as new:
+        new.part.write_bytes(buffer.getvalue())
 
 
 def _figure(width: float, height: float) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import write_text
+from amiwarp.io.output import write_text
 from amiwarp.stability.cells import Cell, Method, Outcome, Result, Store, Stored, identity
 from amiwarp.stability.conditions import Axis, Condition, sensible
 

@@ -107,9 +107,9 @@ def save_screenshot(
     inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
 ) -> None:
     """Writes both clouds as PNG; ``size``: of the picture [px]."""
-    from amiwarp.io.files import part_path
+    from amiwarp.io.output import check_output
 
-    part_path(path)
+    check_output(path)
     look = look or Look()
     scene = Scene(size)
     scene.show(inspector.show(), look)

@@ -1,0 +1,412 @@
+"""What no command may do: write over a file that it reads, under any name, or over anything else unasked."""
+
+import json
+import math
+import os
+import shutil
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+from amiwarp.calib import Calibration
+from amiwarp.camera import Camera
+from amiwarp.cli.app import app
+from amiwarp.encoder import Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.io import RecordingWriter, convert, open_recording, output, save_recording
+from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
+from amiwarp.optics import Prism
+
+SIZE = (64, 48)
+CAMERA = Camera.from_fov(*SIZE, math.radians(40.0))
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(app, [str(arg) for arg in args])
+
+
+def events(count: int = 2000) -> Events:
+    rng = np.random.default_rng(5)
+    t = np.sort(rng.integers(0, 200_000, count))
+    return Events.from_arrays(rng.integers(0, SIZE[0], count), rng.integers(0, SIZE[1], count), t, np.arange(count) % 2)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One file of each kind that a command reads."""
+    folder = tmp_path_factory.mktemp("inputs")
+    recording = Recording(
+        MemoryEvents(events(), *SIZE), CAMERA, Encoder.constant_speed(720.0, -1000, 201_000), Prism(math.radians(2.0))
+    )
+    save_recording(folder / "a.h5", recording)
+    with open_recording(folder / "a.h5").events.path.open("rb") as file:
+        assert file.read(4) == b"\x89HDF"
+    values = {"apex": math.radians(2.0), "index": 1.5168, "phase": 0.0, "tilt_x": 0.0, "tilt_y": 0.0}
+    Calibration("exact", CAMERA, Prism(math.radians(2.0)), values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(
+        folder / "cal.json"
+    )
+    camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    (folder / "cam.json").write_text(json.dumps(camera))
+    (folder / "enc.csv").write_text("t_us,angle_deg\n-1000,0\n100000,436.3\n201000,872.6\n")
+    Image.fromarray(np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1))).save(folder / "pic.png")
+    pictures = folder / "pictures"
+    pictures.mkdir()
+    for k in range(3):
+        shutil.copy(folder / "pic.png", pictures / f"{k}.png")
+    np.save(folder / "v.npy", np.zeros((4, 48, 64), np.float32))
+    text = folder / "text"
+    text.mkdir()
+    (text / "events.txt").write_text("".join(f"{k * 1e-4:.6f} {k % 64} {k % 48} {k % 2}\n" for k in range(100)))
+    (text / "calib.txt").write_text("50 50 32 24 0 0 0 0 0\n")
+    return folder
+
+
+@pytest.fixture
+def place(inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the inputs to work in."""
+    shutil.copytree(inputs, tmp_path / "w")
+    monkeypatch.chdir(tmp_path / "w")
+    return tmp_path / "w"
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file() and not f.is_symlink()}
+
+
+OVER_INPUTS = (
+    ("calibrate a.h5 {}", "a.h5"),
+    ("calibrate a.h5 out.json --figure {}", "a.h5"),
+    ("calibrate a.h5 out.json --preset cal.json --figure {}", "cal.json"),
+    ("calibrate a.h5 {} --camera cam.json", "cam.json"),
+    ("compensate a.h5 {} --calibration cal.json", "a.h5"),
+    ("compensate a.h5 {} --calibration cal.json", "cal.json"),
+    ("compensate a.h5 out.h5 --calibration cal.json --iwe {}", "cal.json"),
+    ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
+    ("reconstruct a.h5 out.png --calibration cal.json --mask {}", "cal.json"),
+    ("simulate {} --picture pic.png --duration 0.01", "pic.png"),
+    ("simulate {} --picture pic.png --camera cam.json --duration 0.01", "cam.json"),
+    ("translate v.npy {} --fps 100", "v.npy"),
+    ("translate pictures {} --fps 100", "pictures/0.png"),
+    ("translate pictures {} --fps 100 --camera cam.json", "cam.json"),
+    ("convert a.h5 {}", "a.h5"),
+    ("convert a.h5 {} --encoder enc.csv", "enc.csv"),
+    ("convert a.h5 {} --camera cam.json", "cam.json"),
+    ("convert text/events.txt {}", "text/calib.txt"),
+    ("record a.h5 {} --fast", "a.h5"),
+    ("live a.h5 --fast --calibration cal.json --out {}", "cal.json"),
+    ("live a.h5 --fast --calibration cal.json --out {}", "a.h5"),
+    ("live a.h5 --fast --calibration cal.json --record {}", "a.h5"),
+    ("view a.h5 --screenshot {}", "a.h5"),
+    ("view a.h5 --calibration cal.json --screenshot {}", "cal.json"),
+)
+
+
+def same_name(path: Path) -> Path:
+    return path
+
+
+def symlink(path: Path) -> Path:
+    link = path.with_name(f"symlink{path.suffix}")
+    link.symlink_to(path.name)
+    return link
+
+
+def hard_link(path: Path) -> Path:
+    link = path.with_name(f"hardlink{path.suffix}")
+    link.hardlink_to(path)
+    return link
+
+
+def roundabout(path: Path) -> Path:
+    return path.parent / ".." / path.parent.name / path.name
+
+
+@pytest.mark.parametrize("name", [same_name, symlink, hard_link, roundabout])
+@pytest.mark.parametrize(("line", "read"), OVER_INPUTS, ids=lambda value: str(value))
+def test_no_command_writes_over_what_it_reads(place: Path, line: str, read: str, name: Callable[[Path], Path]) -> None:
+    """Whatever name the file is given, and though everything may be replaced."""
+    target = name(place / read)
+    before = snapshot(place)
+    for more in ((), ("--force",)):
+        result = run(*line.format(target).split(), *more)
+        assert result.exit_code == 1, result.output
+        expected = "is read in this run" if more else "is read in this run|exists|written as|expected one of"
+        assert any(word in result.stderr for word in expected.split("|")), result.stderr
+        assert result.stderr.count("\n") == 1
+        assert snapshot(place) == before
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "calibrate a.h5 {}.json",
+        "calibrate a.h5 new.json --figure {}.png",
+        "compensate a.h5 {}.h5 --calibration cal.json",
+        "compensate a.h5 new.h5 --calibration cal.json --iwe {}.png",
+        "compensate a.h5 new.h5 --calibration cal.json --iwe {}.npy",
+        "reconstruct a.h5 {}.png --calibration cal.json",
+        "reconstruct a.h5 new.png --calibration cal.json --mask {}.png",
+        "simulate {}.h5 --picture pic.png --duration 0.01",
+        "translate v.npy {}.h5 --fps 100",
+        "convert a.h5 {}.h5",
+        "record a.h5 {}.h5 --fast",
+        "live a.h5 --fast --calibration cal.json --out {}.h5",
+        "live a.h5 --fast --calibration cal.json --record {}.h5",
+        "view a.h5 --screenshot {}.png",
+    ],
+)
+def test_what_exists_is_replaced_by_force_alone(place: Path, line: str) -> None:
+    words = line.format("there").split()
+    there = next(Path(word) for word in words if word.startswith("there"))
+    there.write_bytes(b"mine")
+    before = snapshot(place)
+    result = run(*words)
+    assert (result.exit_code, result.stdout) == (1, ""), result.output
+    assert f"{there}: exists; give another name, or --force" in result.stderr
+    assert snapshot(place) == before
+    if words[0] in ("convert", "compensate", "simulate", "record", "live"):
+        assert run(*words, "--force").exit_code == 0
+        assert there.read_bytes() != b"mine"
+
+
+def test_default_output_of_calibrate_is_refused_before_the_search(place: Path) -> None:
+    (place / "a.calibration.json").write_text("mine")
+    result = run("calibrate", "a.h5")
+    assert (result.exit_code, "a.calibration.json: exists" in result.stderr) == (1, True)
+
+
+def test_windows_of_events_that_exist_are_refused_before_the_work(place: Path) -> None:
+    (place / "w_00001.png").write_bytes(b"mine")
+    before = snapshot(place)
+    line = "compensate a.h5 out.h5 --calibration cal.json --iwe w.png --iwe-window-ms 50"
+    result = run(*line.split())
+    assert (result.exit_code, "w_00001.png: exists" in result.stderr) == (1, True), result.stderr
+    assert snapshot(place) == before
+    assert run(*line.split(), "--force").exit_code == 0
+    assert (place / "w_00001.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize("command", ["design --size 64x48 --apex-deg 1 --rpm 720", "chart a.h5 --quick"])
+def test_folders_keep_what_they_hold(place: Path, command: str) -> None:
+    file = place / ("design.csv" if "design" in command else "chart.csv")
+    file.write_bytes(b"mine")
+    result = run(*command.split(), "--out", ".")
+    assert result.exit_code == 1, result.output
+    assert file.read_bytes() == b"mine"
+
+
+def test_demo_replaces_its_own_folder_alone(place: Path) -> None:
+    (place / "mine").mkdir()
+    (place / "mine" / "recording.h5").write_bytes(b"mine")
+    result = run("demo", "--out", "mine", "--size", "64x48", "--duration", "0.1", "--picture", "pic.png")
+    assert (result.exit_code, "recording.h5: exists" in result.stderr) == (1, True), result.stderr
+    assert (place / "mine" / "recording.h5").read_bytes() == b"mine"
+    with own_folder(place / "mine"):
+        write_text(place / "mine" / "recording.h5", "new")
+    assert (place / "mine" / "recording.h5").read_text() == "new"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "live a.h5 --fast --calibration cal.json --out x.h5 --record x.h5",
+        "live a.h5 --fast --calibration cal.json --out x.h5 --record ./y/../x.h5",
+        "compensate a.h5 x.png --calibration cal.json --iwe x.png",
+        "calibrate a.h5 x.png --figure x.png",
+    ],
+)
+def test_one_name_for_two_outputs_is_refused(place: Path, line: str) -> None:
+    (place / "y").mkdir()
+    before = snapshot(place)
+    for more in ((), ("--force",)):
+        result = run(*line.split(), *more)
+        assert (result.exit_code, "is given for two outputs" in result.stderr) == (1, True), result.output
+        assert snapshot(place) == before
+
+
+def special(kind: str, path: Path) -> Path:
+    if kind == "FIFO":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(path.name)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        return Path("/dev/null")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["FIFO", "socket", "folder", "device"])
+@pytest.mark.parametrize("line", ["convert a.h5 {}", "calibrate a.h5 {}", "record a.h5 {} --fast",
+                                  "compensate a.h5 x.h5 --calibration cal.json --iwe {}"])  # fmt: skip
+def test_outputs_that_are_no_files_are_refused(place: Path, kind: str, line: str) -> None:
+    path = special(kind, place / "thing.png")
+    mode = stat.S_IFMT(os.stat(path).st_mode)
+    for more in ((), ("--force",)):
+        result = run(*line.format(path).split(), *more)
+        assert (result.exit_code, f"is a {kind}; give the name of a file" in result.stderr) == (1, True), result.output
+    assert stat.S_IFMT(os.stat(path).st_mode) == mode
+
+
+@pytest.mark.parametrize("exists", [True, False])
+@pytest.mark.parametrize("writer", ["convert", "record"])
+def test_a_symbolic_link_is_followed(place: Path, exists: bool, writer: str) -> None:
+    (place / "real").mkdir()
+    real, link = place / "real" / "out.h5", place / "out.h5"
+    link.symlink_to(real)
+    if exists:
+        real.write_bytes(b"mine")
+        assert run(writer, "a.h5", link, *(["--fast"] if writer == "record" else [])).exit_code == 1
+        assert real.read_bytes() == b"mine"
+    result = run(writer, "a.h5", link, "--force", *(["--fast"] if writer == "record" else []))
+    assert result.exit_code == 0, result.output
+    assert link.is_symlink()
+    assert [f.name for f in real.parent.iterdir()] == ["out.h5"]
+    assert len(open_recording(real).events) == 2000
+
+
+def test_a_loop_of_links_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(AmiwarpError, match="cannot be written"):
+        check_output(tmp_path / "a")
+
+
+def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    new = NewFile(path)
+    new.part.write_text("ours")
+    path.write_text("theirs")
+    with pytest.raises(AmiwarpError, match="exists"), new:
+        pass
+    assert path.read_text() == "theirs"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_a_file_that_appears_in_the_last_moment_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the last look and the rename: the rename itself replaces nothing."""
+    path = tmp_path / "a.txt"
+    seen = output.check_output
+
+    def late(target: Path, **options: Any) -> Path:
+        found = seen(target, **options)
+        path.write_text("theirs")
+        return found
+
+    new = NewFile(path)
+    new.part.write_text("ours")
+    monkeypatch.setattr(output, "check_output", late)
+    with pytest.raises(AmiwarpError, match="another program"), new:
+        pass
+    assert path.read_text() == "theirs"
+
+
+def test_disks_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def link(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "link", link)
+    write_text(tmp_path / "a.txt", "new")
+    assert {f.name: f.read_text() for f in tmp_path.iterdir()} == {"a.txt": "new"}
+
+
+def test_a_replaced_file_keeps_who_may_read_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    path.chmod(0o640)
+    write_text(path, "new", overwrite=True)
+    assert (path.read_text(), stat.S_IMODE(path.stat().st_mode)) == ("new", 0o640)
+
+
+@pytest.fixture
+def dead_pid() -> int:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path, dead_pid: int) -> None:
+    keep = {f".a.h5.{HOST}-{os.getppid()}-00c0ffee.part", f".a.h5.elsewhere-{dead_pid}-00c0ffee.part",
+            ".part", "a.part", ".a.h5.part", f".a.h5.{HOST}-{dead_pid}-nothex00.part"}  # fmt: skip
+    for name in (*keep, f".a.h5.{HOST}-{dead_pid}-00c0ffee.part"):
+        (tmp_path / name).write_bytes(b"")
+    remove_abandoned.cache_clear()
+    write_text(tmp_path / "new.txt", "")
+    assert set(os.listdir(tmp_path)) == keep | {"new.txt"}
+
+
+def test_sigkill_leaves_nothing_after_the_next_run(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys; from pathlib import Path; from amiwarp.io.output import NewFile\n"
+        "new = NewFile(Path(sys.argv[1])); new.part.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", script, tmp_path / "a.txt"], env=environment(), check=False)
+    assert done.returncode == -9
+    (left,) = os.listdir(tmp_path)
+    assert left.endswith(".part")
+    remove_abandoned.cache_clear()
+    write_text(tmp_path / "a.txt", "whole")
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+
+
+def test_api_calls_guard_what_they_read(place: Path) -> None:
+    recording = open_recording("a.h5")
+    before = snapshot(place)
+    calibration = Calibration.load("cal.json")
+    from amiwarp.compensate import compensate
+
+    for write in (
+        lambda: compensate(recording, calibration, "a.h5", overwrite=True),
+        lambda: save_recording("a.h5", recording, overwrite=True),
+        lambda: convert("a.h5", "a.h5", overwrite=True),
+        lambda: calibration.save("a.h5", overwrite=True),
+    ):
+        with pytest.raises(AmiwarpError, match="is read in this run"):
+            write()
+    for write in (
+        lambda: compensate(recording, calibration, "cal.json"),
+        lambda: convert("a.h5", "cal.json"),
+        lambda: calibration.save("cal.json"),
+    ):
+        with pytest.raises(AmiwarpError, match=r"cal\.json: exists"):
+            write()
+    assert snapshot(place) == before
+    calibration.save("cal.json", overwrite=True)
+    assert snapshot(place) == before
+
+
+def writers(path: Path) -> Iterator[Any]:
+    yield RecordingWriter(path, width=SIZE[0], height=SIZE[1])
+    yield LiveWriter(path, width=SIZE[0], height=SIZE[1])
+
+
+def test_a_recording_that_appears_while_one_is_written_is_kept(tmp_path: Path) -> None:
+    def write(writer: Any) -> None:
+        with writer:
+            writer.append(events())
+            (tmp_path / "a.h5").write_bytes(b"theirs")
+
+    for k, writer in enumerate(writers(tmp_path / "a.h5")):
+        with pytest.raises(AmiwarpError, match=r"a\.h5: exists"):
+            write(writer)
+        assert (tmp_path / "a.h5").read_bytes() == b"theirs"
+        (tmp_path / "a.h5").unlink()
+        # what was recorded live is not lost either
+        assert os.listdir(tmp_path) == ([] if k == 0 else ["a.part.h5"])
+    assert len(open_recording(tmp_path / "a.part.h5").events) == 2000
