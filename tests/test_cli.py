@@ -139,6 +139,7 @@ def test_examples_of_the_help_run(place: Path, texture: np.ndarray) -> None:
         assert words[:2] == ["amiwarp", name]
         ok(*words[1:])
     assert left_behind(place) == {"compensated.h5", "iwe.png", "calibration.png"}
+    (place / "recording.h5").unlink()
     ok(*shlex.split(simulate.EXAMPLE)[1:], "--size", "64x48", "--duration", "0.05")
     _own_recording(place)
     ok(*shlex.split(convert.EXAMPLE.replace("events.raw", "events.npz").replace("recording.h5", "mine.h5"))[1:])
@@ -181,7 +182,7 @@ def test_seed_decides_the_recording(place: Path) -> None:
         return open_recording(name).events.slice(0, 10_000_000).t.tobytes()
 
     assert simulated("a.h5", "1") == simulated("b.h5", "1")
-    assert simulated("c.h5", "2") != simulated("a.h5", "1")
+    assert simulated("c.h5", "2") != simulated("d.h5", "1")
 
 
 def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
@@ -272,7 +273,7 @@ def test_iwe_whole(place: Path, layers: str, shape: tuple[int, ...]) -> None:
 def test_iwe_by_windows_adds_up_to_the_whole(place: Path) -> None:
     common = ("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe")
     ok(*common, "whole.npy")
-    data = ok(*common, "parts.npy", "--iwe", "parts.png", "--iwe-window-ms", "30")
+    data = ok(*common, "parts.npy", "--iwe", "parts.png", "--iwe-window-ms", "30", "--force")
     whole, parts = np.load("whole.npy"), np.load("parts.npy")
     assert parts.shape == (7, 120, 160)
     assert np.abs(parts.sum(axis=0) - whole).max() <= 1e-3 * whole.max()
@@ -414,8 +415,12 @@ INTERRUPTIBLE = "import signal, sys; signal.signal(signal.SIGINT, signal.default
 """A shell's job in the background ignores Ctrl-C, and so would its children."""
 
 
-@pytest.mark.parametrize("command", ["simulate", "calibrate"])
-def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [("simulate", signal.SIGINT), ("simulate", signal.SIGTERM), ("simulate", signal.SIGHUP),
+     ("calibrate", signal.SIGINT), ("calibrate", signal.SIGTERM)],
+)  # fmt: skip
+def test_interrupt_leaves_nothing(place: Path, command: str, number: signal.Signals) -> None:
     args = {
         "simulate": ["simulate", "long.h5", "--picture", "photo.jpg", "--duration", "60"],
         "calibrate": ["calibrate", "recording.h5", "long.json", "--global-evaluations", "1000000"],
@@ -434,8 +439,8 @@ def test_interrupt_leaves_nothing(place: Path, command: str) -> None:
             if command == "simulate":
                 wait_until(lambda: any(file.name.endswith(".part") for file in place.iterdir()))
             time.sleep(6.0 if command == "calibrate" else 0.5)
-            process.send_signal(signal.SIGINT)
-            out, error = process.communicate(timeout=60)
+            process.send_signal(number)
+            out, error = process.communicate(timeout=120)
         finally:
             process.kill()
     assert (process.returncode, out) == (130, ""), error
