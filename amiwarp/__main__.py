@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import signal
+
 from amiwarp.cli import INTERRUPTED, STOPPED, fail
+
+ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""Signals that end a command as Ctrl-C does."""
 
 
 def main() -> None:
     """Load the command line, which takes a moment, and run it; ends the process."""
     try:
+        for number in ENDING:
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores the terminal's end, and so do we then
+                signal.signal(number, signal.default_int_handler)
         from amiwarp.cli import app
 
         app.main()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -256,6 +255,7 @@ def _file_rows(
     """Whole files by each model, reading and writing included; the error is that of the file that was written."""
     from amiwarp.compensate import compensate
     from amiwarp.io import open_recording, save_recording
+    from amiwarp.io.output import scratch_folder
 
     try:
         peers.library("h5py"), peers.library("hdf5plugin")
@@ -271,8 +271,7 @@ def _file_rows(
         compensate(source, calibration, place / "out.h5", device=device, overwrite=True)
         return place / "out.h5"
 
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".chart-") as name:
-        place = Path(name)
+    with scratch_folder(folder) as place:
         save_recording(place / "in.h5", replace(known.recording, truth=None))
         source = open_recording(place / "in.h5")
         tasks = []

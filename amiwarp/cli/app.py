@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import _thread
-import signal
 import sys
 import threading
 from typing import Any
@@ -36,9 +35,6 @@ from amiwarp.cli.options import command
 from amiwarp.errors import AmiwarpError
 
 BAD_INPUT, USAGE = 1, 2
-
-ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""Signals that end a command as Ctrl-C does."""
 
 _UsageError: Any = typer.BadParameter.__base__
 """Typer carries its own copy of click since 0.2x, and used the real one before: this is either's."""
@@ -95,9 +91,6 @@ for module in (
 def main() -> None:
     """Run the command line; ends the process."""
     sys.unraisablehook = _interrupt_again
-    for number in ENDING:
-        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores the terminal's end, and so do we then
-            signal.signal(number, signal.default_int_handler)
     app(prog_name="amiwarp")
 
 

@@ -124,8 +124,7 @@ class NewFile:
         self._overwrite = overwrite
         target = check_output(self.path, overwrite=overwrite)
         remove_abandoned(target.parent)
-        name = f".{target.name[:40]}.{HOST}-{os.getpid()}-{secrets.token_hex(4)}.part"
-        self.part = target.with_name(name)
+        self.part = _unfinished_name(target)
         """Where to write."""
         _unfinished.add(self.part)
 
@@ -183,6 +182,22 @@ def _link(part: Path, target: Path) -> None:
         part.unlink()
 
 
+@contextlib.contextmanager
+def scratch_folder(folder: Path) -> Iterator[Path]:
+    """Make a folder for temporary files; it is removed at the end, or by the next run if this one is killed."""
+    remove_abandoned(folder.resolve())
+    made = _unfinished_name(folder.resolve() / "scratch")
+    made.mkdir()
+    try:
+        yield made
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _unfinished_name(target: Path) -> Path:
+    return target.with_name(f".{target.name[:40]}.{HOST}-{os.getpid()}-{secrets.token_hex(4)}.part")
+
+
 def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
     """Write a text file, whole or not at all. Raises :class:`AmiwarpError` as :class:`NewFile` does."""
     with NewFile(path, overwrite=overwrite) as new:
@@ -205,7 +220,7 @@ def remove_abandoned(folder: Path) -> None:
             found = UNFINISHED.fullmatch(entry.name)
             if found and found["host"] == HOST and not _is_alive(int(found["pid"])):
                 with contextlib.suppress(OSError):
-                    os.unlink(entry.path)
+                    shutil.rmtree(entry.path) if entry.is_dir(follow_symlinks=False) else os.unlink(entry.path)
 
 
 def _is_alive(pid: int) -> bool:

@@ -1,0 +1,341 @@
+"""What kills and full disks leave behind: every command that writes is ended at random moments, and fills small disks.
+
+    python -m benchmarks.reliability kills --folder FOLDER [--kills 60] [--only NAME …] [--out FILE.json]
+    python -m benchmarks.reliability disks --folder FOLDER [--only NAME …] [--out FILE.json]
+
+``kills`` ends each command by SIGKILL, SIGTERM and SIGINT in turn, at moments spread over its whole run, and looks at
+what is there then. ``disks`` runs each command on disks (tmpfs, which needs root) of sizes from almost nothing to all
+that it needs. Exit status 1 if anything was lost, half written, left over or hung; each such case is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
+from amiwarp.io.output import NewFile, remove_abandoned
+
+LIMIT_S = 180.0
+"""A command that was told to end and lives on hangs."""
+
+COMMANDS = {
+    "simulate": ("simulate OUT/o.h5 --picture IN/pic.png --size 160x120 --duration 0.4", ("o.h5",)),
+    "translate": ("translate IN/v.npy OUT/o.h5 --fps 100", ("o.h5",)),
+    "convert": ("convert IN/r.h5 OUT/o.h5 --encoder IN/enc.csv", ("o.h5",)),
+    "calibrate": ("calibrate IN/s.h5 OUT/c.json --figure OUT/c.png --events 100000", ("c.json", "c.png")),
+    "compensate": (
+        "compensate IN/r.h5 OUT/o.h5 --calibration IN/cal.json --iwe OUT/i.png --iwe OUT/i.npy --iwe-window-ms 100",
+        ("o.h5", "i.npy", *(f"i_{k:05d}.png" for k in range(20))),
+    ),
+    "reconstruct": (
+        "reconstruct IN/s.h5 OUT/p.tif --mask OUT/m.png --calibration IN/cal.json --turns 1",
+        ("p.tif", "m.png"),
+    ),
+    "reconstruct, video": (
+        "reconstruct IN/s.h5 OUT/p.mp4 --calibration IN/cal.json --length 0.04 --fps 20",
+        ("p.mp4",),
+    ),
+    "record": ("record IN/r.h5 OUT/o.h5", ("o.h5",)),
+    "live": (
+        "live IN/r.h5 --calibration IN/cal.json --out OUT/o.h5 --record OUT/raw.h5",
+        ("o.h5", "raw.h5"),
+    ),
+    "view --screenshot": ("view IN/s.h5 --calibration IN/cal.json --screenshot OUT/v.png", ("v.png",)),
+    "design": (
+        "design --out OUT --picture IN/pic.png --size 64x48 --apex-deg 1,2 --rpm 720",
+        ("design.png", "design.svg", "design.json", "design.csv"),
+    ),
+    "chart": (
+        "chart IN/truth.h5 --out OUT --quick",
+        ("chart.json", "chart.csv", "compensation.png", "compensation.svg", "calibration.png", "calibration.svg"),
+    ),
+    "demo": (
+        "demo --out OUT --picture IN/pic.png --size 160x120 --duration 0.2",
+        ("recording.h5", "calibration.json", "compensated.h5", "picture.png", "demo.png"),
+    ),
+}
+"""Each command, and the files it writes. IN is read, OUT is empty before."""
+
+LIVE = ("record", "live")
+"""Keep what had come: the file is whole, and may be shorter."""
+
+
+def prepare(folder: Path) -> Path:
+    """Make the inputs once: a recording of 3 million events, a small simulated one, a calibration and a picture."""
+    from PIL import Image
+
+    inputs = folder / "in"
+    if (inputs / "done").exists():
+        return inputs
+    shutil.rmtree(inputs, ignore_errors=True)
+    inputs.mkdir(parents=True)
+    rng = np.random.default_rng(1)
+    rows, columns = np.mgrid[:240, :320]
+    picture = np.full((240, 320), 90, np.uint8)
+    for _ in range(120):
+        x, y, radius = rng.uniform(0, 320), rng.uniform(0, 240), rng.uniform(6, 30)
+        picture[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = rng.integers(20, 250)
+    Image.fromarray(picture).save(inputs / "pic.png")
+    np.save(inputs / "v.npy", np.stack([np.roll(picture, k, axis=1) for k in range(30)])[:, ::2, ::2])
+    for line in (
+        "simulate IN/s.h5 --picture IN/pic.png --size 160x120 --duration 0.3 --nominal-apex-deg 1.1",
+        "simulate IN/truth.h5 --picture IN/pic.png --size 160x120 --duration 0.5",
+        "calibrate IN/s.h5 IN/cal.json",
+    ):
+        subprocess.run(words(line, inputs, inputs), check=True, stdout=subprocess.DEVNULL)
+    many_events(inputs)
+    t = np.arange(0, 2_100_000, 1000)
+    (inputs / "enc.csv").write_text(
+        "t_us,angle_deg\n" + "".join(f"{a},{b:.6f}\n" for a, b in zip(t, t * 4.32e-3, strict=True))
+    )
+    (inputs / "done").touch()
+    return inputs
+
+
+def many_events(inputs: Path, count: int = 3_000_000) -> None:
+    """Write a recording of two seconds, evenly filled, as large as the time of a kill needs."""
+    from amiwarp.encoder import Encoder
+    from amiwarp.events import Events, MemoryEvents, Recording
+    from amiwarp.io import save_recording
+
+    rng = np.random.default_rng(2)
+    events = Events.from_arrays(
+        rng.integers(0, 160, count), rng.integers(0, 120, count), np.sort(rng.integers(0, 2_000_000, count)),
+        rng.integers(0, 2, count),
+    )  # fmt: skip
+    small = open_recording(inputs / "s.h5")
+    encoder = Encoder.constant_speed(720.0, -1000, 2_001_000)
+    save_recording(inputs / "r.h5", Recording(MemoryEvents(events, 160, 120), small.camera, encoder, small.prism))
+
+
+def words(line: str, inputs: Path, out: Path) -> list[str]:
+    text = [word.replace("IN/", f"{inputs}/").replace("OUT", str(out)) for word in line.split()]
+    return [sys.executable, "-m", "amiwarp", *text]
+
+
+def digest(folder: Path) -> dict[str, str]:
+    return {str(f): hashlib.sha256(f.read_bytes()).hexdigest() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def size_of(path: Path) -> Any:
+    """What tells a whole file of its kind, found by reading all of it."""
+    if path.suffix == ".h5":
+        events = open_recording(path).events
+        return sum(len(block) for block in events.blocks())
+    if path.suffix in (".png", ".tif"):
+        from PIL import Image
+
+        with Image.open(path) as image:
+            image.load()
+            return image.size
+    if path.suffix == ".npy":
+        return np.load(path).shape
+    if path.suffix == ".mp4":
+        import av
+
+        with av.open(str(path)) as container:
+            return sum(1 for _ in container.decode(video=0))
+    text = path.read_text()
+    if path.suffix == ".json":
+        return sorted(json.loads(text))
+    return text[-6:] if path.suffix == ".svg" else text.count("\n")
+
+
+@contextlib.contextmanager
+def begun(line: str, inputs: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
+    """A command in a session of its own, of which nothing is left at the end."""
+    process = subprocess.Popen(
+        words(line, inputs, out), text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def left_alive(group: int, wait_s: float = 30.0) -> list[str]:
+    """Processes of the session that live on ``wait_s`` after its leader."""
+    until = time.monotonic() + wait_s
+    while True:
+        alive = []
+        for process in psutil.process_iter():
+            with contextlib.suppress(psutil.Error, ProcessLookupError):
+                if os.getsid(process.pid) == group and process.status() != psutil.STATUS_ZOMBIE:
+                    alive.append(" ".join(process.cmdline())[:120])
+        if not alive or time.monotonic() > until:
+            return alive
+        time.sleep(0.1)
+
+
+def whole_run(name: str, inputs: Path, out: Path) -> tuple[float, dict[str, Any], int]:
+    """Seconds of an undisturbed run, what its files hold, and their bytes."""
+    line, files = COMMANDS[name]
+    began = time.perf_counter()
+    with begun(line, inputs, out) as process:
+        _, error = process.communicate(timeout=600)
+    seconds = time.perf_counter() - began
+    if process.returncode:
+        raise SystemExit(f"{name}: {error}")
+    return seconds, {f: size_of(out / f) for f in files}, sum(f.stat().st_size for f in out.rglob("*") if f.is_file())
+
+
+def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals, code: int) -> tuple[str, list[str]]:
+    """How a run ended, and all that is wrong with what it left."""
+    wrong = []
+    there = {f.name for f in out.iterdir()}
+    unfinished = {f for f in there if f.startswith(".") and f.endswith(".part")}
+    kept = {f for f in there if f.endswith(".part.h5")}
+    for file in sorted(there - unfinished):
+        try:
+            found = size_of(out / file)
+        except (AmiwarpError, OSError, ValueError) as error:
+            wrong.append(f"{file} is damaged: {error}")
+            continue
+        if file not in kept and file not in expected:
+            wrong.append(f"{file} was left")
+        elif file not in kept and found != expected[file] and not (name in LIVE and found <= expected[file]):
+            wrong.append(f"{file} holds {found}, whole {expected[file]}")
+    if number is not signal.SIGKILL:
+        wrong += [f"{file} was left" for file in unfinished | kept]
+    remove_abandoned.cache_clear()
+    NewFile(out / "next").discard()
+    wrong += [f"{f.name} outlived the next run" for f in out.iterdir() if f.name in unfinished]
+    # -number: Python was starting, or all was done and it was ending
+    if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number}):
+        wrong.append(f"exit status {code}")
+    ended = "finished" if set(expected) <= there else "cut short" if there - unfinished else "nothing"
+    return ended, wrong
+
+
+def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
+    """End a command ``count`` times."""
+    out = emptied(folder)
+    seconds, expected, _ = whole_run(name, inputs, out)
+    before = digest(inputs)
+    ended: Counter[str] = Counter()
+    problems, longest, unfinished = [], 0.0, 0
+    for k in range(count):
+        number = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)[k % 3]
+        after = seconds * (k // 3 + rng.random()) / (count // 3)
+        out = emptied(folder)
+        with begun(COMMANDS[name][0], inputs, out) as process:
+            time.sleep(after)
+            process.send_signal(number)
+            told = time.perf_counter()
+            try:
+                _, error = process.communicate(timeout=LIMIT_S)
+            except subprocess.TimeoutExpired:
+                problems.append(f"{number.name} after {after:.2f} s: lives on")
+                continue
+            longest = max(longest, time.perf_counter() - told)
+            alive = left_alive(process.pid)
+        unfinished += any(f.name.endswith(".part") for f in out.iterdir())
+        how, wrong = judge(name, out, expected, number, process.returncode)
+        wrong += [f"{line} lives on" for line in alive]
+        if "Traceback" in error:
+            wrong.append(f"traceback: {error[-300:]}")
+        ended[f"{number.name}: {how}"] += 1
+        problems += [f"{number.name} after {after:.2f} s: {text}" for text in wrong]
+    if digest(inputs) != before:
+        problems.append("an input was changed")
+    return {"command": name, "kills": count, "run_s": seconds, "ended": dict(sorted(ended.items())),
+            "runs_that_left_unfinished_files_to_the_next": unfinished, "longest_end_s": longest,
+            "problems": problems}  # fmt: skip
+
+
+def emptied(folder: Path) -> Path:
+    out = folder / "out"
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    return out
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[Path]:
+    place = folder / "disk"
+    place.mkdir(exist_ok=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={max(size, 4096)}", "tmpfs", place], check=True)
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
+def disks(name: str, inputs: Path, folder: Path) -> dict[str, Any]:
+    """Run a command on disks of a twentieth to all of what it writes."""
+    _, expected, size = whole_run(name, inputs, emptied(folder))
+    before = digest(inputs)
+    ended: Counter[str] = Counter()
+    problems = []
+    for share in (0.0, 0.05, 0.25, 0.5, 0.75, 0.9, 1.0, 1.5):
+        with small_disk(folder, int(share * size)) as out:
+            with begun(COMMANDS[name][0], inputs, out) as process:
+                _, error = process.communicate(timeout=600)
+            code = process.returncode
+            there = {f.name for f in out.iterdir()}
+            wrong = [f"{f} was left" for f in there - set(expected)]
+            for file in there & set(expected):
+                try:
+                    found = size_of(out / file)
+                except (AmiwarpError, OSError, ValueError) as damage:
+                    wrong.append(f"{file} is damaged: {damage}")
+                    continue
+                if found != expected[file] and not (name in LIVE and found <= expected[file]):
+                    wrong.append(f"{file} holds {found}, whole {expected[file]}")
+            if code == 0 and there != set(expected):
+                wrong.append("exit status 0 without all files")
+            if code not in (0, 1) or (code == 1 and "amiwarp: " not in error.strip().splitlines()[-1]):
+                wrong.append(f"exit status {code}: {error[-300:]}")
+            ended["whole" if code == 0 else "one clear error"] += 1
+            problems += [f"{100 * share:.0f} % of {size} bytes: {text}" for text in wrong]
+    if digest(inputs) != before:
+        problems.append("an input was changed")
+    return {"command": name, "bytes": size, "ended": dict(ended), "problems": problems}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["kills", "disks"])
+    parser.add_argument("--folder", type=Path, required=True, help="where to work; inputs are kept there")
+    parser.add_argument("--kills", type=int, default=60)
+    parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    inputs = prepare(args.folder)
+    rows = []
+    for name in args.only:
+        rng = random.Random(f"{args.seed} {name}")
+        if args.what == "kills":
+            rows.append(kills(name, inputs, args.folder, args.kills, rng))
+        else:
+            rows.append(disks(name, inputs, args.folder))
+        print(json.dumps(rows[-1]), flush=True)
+        if args.out is not None:
+            args.out.write_text(json.dumps(rows, indent=1) + "\n")
+    return 1 if any(row["problems"] for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
