@@ -224,17 +224,24 @@ def test_field_of_view_round_trip() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"width": 0}, "0x180"),
+        ({"width": 0}, "width = 0 "),
         ({"fx": 0.0}, "fx = 0.0"),
         ({"fy": math.nan}, "fy = nan"),
         ({"cx": math.inf}, "cx = inf"),
-        ({"distortion": Fisheye(k2=math.nan)}, "k2=nan"),
+        ({"distortion": "fisheye"}, "distortion is 'fisheye'; expected RadialTangential, Fisheye or None"),
     ],
 )
 def test_impossible_cameras_are_refused(change: dict[str, Any], message: str) -> None:
     values: dict[str, Any] = {"width": 240, "height": 180, "fx": 200.0, "fy": 200.0, "cx": 120.0, "cy": 90.0} | change
     with pytest.raises(AmiwarpError, match=message):
         Camera(**values)
+
+
+@pytest.mark.parametrize("lens", [RadialTangential, Fisheye])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e7, "0.1", None])
+def test_impossible_lenses_are_refused(lens: Any, value: Any) -> None:
+    with pytest.raises(AmiwarpError, match="distortion k2 = "):
+        lens(k2=value)
 
 
 @pytest.mark.parametrize("fov", [0.0, -1.0, math.pi, math.nan])

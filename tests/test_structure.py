@@ -31,6 +31,7 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 
 ORDER = (
     ("errors",),
+    ("values",),
     ("kernels", "camera", "multilevel"),
     ("optics", "events", "encoder", "turning", "machine"),
     ("pictures", "motion", "clouds"),
