@@ -58,7 +58,6 @@ def _check_coefficients(lens: Distortion) -> None:
         object.__setattr__(lens, field.name, value)
 
 
-
 Rows = TypeVar("Rows")
 """A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3, shape (n,): the same kind comes out."""
 

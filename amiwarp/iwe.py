@@ -30,7 +30,7 @@ FILL = 600
 """Events that the fullest word of a batch should get: it has room for 1,023."""
 
 
-class Vote(enum.Enum):
+class Vote(enum.StrEnum):
     """How an event's vote is shared among pixels."""
 
     NEAREST = "nearest"

@@ -31,7 +31,7 @@ OFF_COLOUR, ON_COLOUR = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)
 MOST_WINDOWS = 100_000
 
 
-class Layers(enum.Enum):
+class Layers(enum.StrEnum):
     """What becomes of polarity."""
 
     MERGED = "merged"

@@ -30,7 +30,7 @@ STILLS = (".png", ".tif", ".tiff", ".npy")
 VIDEO = ".mp4"
 
 
-class Tone(enum.Enum):
+class Tone(enum.StrEnum):
     """How intensity becomes a pixel's value."""
 
     MAPPED = "mapped"

@@ -67,7 +67,7 @@ Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is."""
 
 
-class Fill(enum.Enum):
+class Fill(enum.StrEnum):
     """What stands where the events say nothing."""
 
     NONE = "none"

@@ -22,7 +22,7 @@ FEW_SUMS = 256
 """Sums that are left for the host to add."""
 
 
-class Sharpness(enum.Enum):
+class Sharpness(enum.StrEnum):
     """What is measured; higher is sharper for each."""
 
     VARIANCE = "variance"

@@ -60,10 +60,10 @@ def real(value: object, what: str, low: float = -math.inf, high: float = math.in
     """
     plain = _scalar(value)
     number = math.nan
-    if isinstance(plain, numbers.Real) and not isinstance(plain, bool | np.bool_):
+    if not isinstance(plain, bool) and isinstance(plain, numbers.Real):
         try:
             number = float(plain)
-        except UNUSABLE:
+        except UNUSABLE:  # an integer beyond float64
             number = math.nan
     if not (math.isfinite(number) and low <= number <= high):
         raise AmiwarpError(f"{what} = {shown(plain)} is not {_range('a finite number', low, high)}{hint}")
@@ -76,7 +76,7 @@ def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
     Takes Python's and NumPy's integers, no floats and no truth value. Raises :class:`AmiwarpError`, ending in ``hint``.
     """
     plain = _scalar(value)
-    if not isinstance(plain, numbers.Integral) or isinstance(plain, bool) or not low <= int(plain) <= high:
+    if isinstance(plain, bool) or not isinstance(plain, numbers.Integral) or not low <= int(plain) <= high:
         raise AmiwarpError(f"{what} = {shown(plain)} is not {_range('a whole number', low, high)}{hint}")
     return int(plain)
 

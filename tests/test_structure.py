@@ -32,6 +32,7 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 ORDER = (
     ("errors",),
     ("values",),
+    ("prism",),
     ("kernels", "camera", "multilevel"),
     ("optics", "events", "encoder", "turning", "machine"),
     ("pictures", "motion", "clouds"),

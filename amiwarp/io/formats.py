@@ -12,7 +12,7 @@ from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
 
 
-class Format(enum.Enum):
+class Format(enum.StrEnum):
     """Formats that can be read."""
 
     HDF5 = "hdf5"

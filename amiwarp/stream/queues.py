@@ -20,7 +20,7 @@ THIN_FROM = 0.5
 """Fill from which on events are thinned, the more the fuller the queue is."""
 
 
-class Policy(enum.Enum):
+class Policy(enum.StrEnum):
     """What a queue does that is full."""
 
     BLOCK = "block"

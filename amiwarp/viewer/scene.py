@@ -32,7 +32,7 @@ PAPER = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
 """Background and ink, light and dark."""
 
 
-class Colour(enum.Enum):
+class Colour(enum.StrEnum):
     """What a point's colour tells."""
 
     POLARITY = "polarity"
@@ -44,14 +44,14 @@ class Colour(enum.Enum):
     """Distance from the middle of the events about it, up to 2 px: of an edge, from its crest."""
 
 
-class Axis(enum.Enum):
+class Axis(enum.StrEnum):
     """The third axis."""
 
     ANGLE = "angle"
     TIME = "time"
 
 
-class View(enum.Enum):
+class View(enum.StrEnum):
     """Where the camera stands."""
 
     FREE = "free"
