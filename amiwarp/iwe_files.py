@@ -16,6 +16,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import part_path
 from amiwarp.iwe import PIECE, CanvasShape, Votes
+from amiwarp.values import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,6 +56,7 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
     Merged: black to white. Signed: grey is zero, white ON, black OFF. Polarity: blue is OFF, orange ON.
     """
     shown: NDArray[Any]
+    layers = choice(Layers, layers, "layers")
     if layers is Layers.MERGED:
         shown = tone(image)
     elif layers is Layers.SIGNED:
@@ -90,7 +92,7 @@ class IweFiles:
                 raise AmiwarpError(f"{path}: images of events are written as .png or .npy")
             part_path(path)  # raises where there is no folder
         self.written: list[Path] = []
-        self._layers = layers
+        self._layers = layers = choice(Layers, layers, "layers")
         width, height = source.size
         self._votes = Votes(CanvasShape(width, height, per_polarity=layers is not Layers.MERGED), device)
         self._window_us = window_us

@@ -16,6 +16,7 @@ from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import write_text
 from amiwarp.optics import MODELS
+from amiwarp.values import one_of
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -89,8 +90,7 @@ def check(kind: str, settings: Mapping[str, Any]) -> None:
     """Raises :class:`AmiwarpError` naming the field that is unknown, or the value that makes no sense."""
     if kind == "compensation":
         _check_names(settings, ("model",), "")
-        if settings.get("model") not in MODELS:
-            raise AmiwarpError(f"model is {settings.get('model')!r}; choose among {', '.join(MODELS)}")
+        one_of(settings.get("model"), MODELS, "model")
         return
     _check_names(settings, (*CALIBRATION, "photometric"), "")
     photometric = settings.get("photometric", {})
@@ -124,7 +124,7 @@ def simplified(calibration: Calibration, model: str) -> Calibration:
     Of a circle the size is the one that comes nearest over image and turn. Raises :class:`AmiwarpError` where ``model``
     needs more than the calibration found.
     """
-    if model == calibration.model_name:
+    if one_of(model, MODELS, "model") == calibration.model_name:
         return calibration
     calibration = calibration.exact
     found, known = calibration.parameters, size_name(calibration.model_name)

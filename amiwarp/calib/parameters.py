@@ -16,6 +16,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics import (
+    MODELS,
     CircleModel,
     EllipseModel,
     ExactModel,
@@ -24,6 +25,7 @@ from amiwarp.optics import (
     deflection_from_apex,
 )
 from amiwarp.turning import Turning
+from amiwarp.values import instance, one_of, real, shown, vector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -165,6 +167,21 @@ class Space:
         return float(sum((values if n in self.names else self.start)[n] - x for n, x in self.undrifted.items()))
 
 
+def check_names(
+    free: tuple[str, ...] | None, start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> None:
+    """Raise :class:`AmiwarpError` where the names are no texts or their values no finite numbers."""
+    for name in free or ():
+        instance(name, str, "free parameter")
+    for given, what in ((start, "start"), (bounds, "bounds")):
+        if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+            raise AmiwarpError(f"{what} is {shown(given)}; expected values by parameter name")
+    for name, value in start.items():
+        real(value, f"start of {name}")
+    for name, pair in bounds.items():
+        vector(pair, 2, f"bounds of {name}", real)
+
+
 def _difference(name: str, a: float, b: float) -> float:
     return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
 
@@ -183,6 +200,7 @@ def turning_of(values: Mapping[str, float], middle_us: int) -> Turning:
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
     """A model of the ladder from parameter values; what they do not name comes from ``camera`` and ``prism``."""
+    one_of(model, MODELS, "model")
     if "focal_length" in values:
         scale = values["focal_length"] / camera.fx
         camera = replace(camera, fx=values["focal_length"], fy=camera.fy * scale)

@@ -16,6 +16,7 @@ import numpy as np
 
 from amiwarp.clouds import OFF_COLOUR, ON_COLOUR
 from amiwarp.errors import AmiwarpError
+from amiwarp.values import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,6 +85,10 @@ class Look:
     dark: bool = False
     overlaid: bool = False
     """Both in one frame, as recorded grey."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
+        object.__setattr__(self, "axis", choice(Axis, self.axis, "axis"))
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ class Scene:
 
     def look_from(self, view: View, look: Look) -> None:
         """Moves the camera, both clouds in sight."""
-        self.view = view
+        self.view = view = choice(View, view, "view")
         self._draw_frame(look)
         b = self.box
         away, up = (np.array(v) for v in STANDS[view])
