@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,18 +61,15 @@ def read_camera(path: Path, width: int, height: int) -> Camera:
     Raises :class:`AmiwarpError` naming file and field.
     """
     from amiwarp.calib.result import camera_from_json
+    from amiwarp.io.files import errors_name
+    from amiwarp.io.json_files import read_json
     from amiwarp.io.text import read_calib
 
     if path.suffix.lower() != ".json":
         return read_calib(path, width, height)
-    try:
-        data: Any = json.loads(path.read_text())
-        return camera_from_json(data.get("camera", data))
-    except FileNotFoundError as error:
-        raise AmiwarpError(f"{path}: no such file") from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise AmiwarpError(f"{path}: is no camera: {what}; expected width, height, fx, fy, cx, cy") from error
+    data = read_json(path, "a camera")
+    with errors_name(path, lambda: "is no camera"):
+        return camera_from_json(data["camera"], "camera") if "camera" in data else camera_from_json(data)
 
 
 @dataclass(frozen=True)
