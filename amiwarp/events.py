@@ -22,7 +22,7 @@ from amiwarp.values import instance, whole
 if TYPE_CHECKING:
     from amiwarp.camera import Camera
     from amiwarp.encoder import Encoder
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 DEFAULT_BLOCK = 1 << 20
 """Events per block where nothing else is asked for."""
@@ -356,8 +356,8 @@ class Recording:
     """The camera, where known."""
     encoder: Encoder | None = None
     """The prism's angle over time, where known."""
-    prism: Prism | None = None
-    """The nominal prism: what the hardware's sheet says, not what calibration found."""
+    prism: NominalPrism | None = None
+    """The nominal prism: what the hardware's sheet says, not what calibration found; its apex may be unknown."""
     truth: Truth | None = None
     """What made the recording, where it is synthetic."""
     metadata: dict[str, MetadataValue] = field(default_factory=dict)

@@ -24,6 +24,7 @@ from amiwarp.optics import (
     RadialCircleModel,
     deflection_from_apex,
 )
+from amiwarp.prism import UnsizedPrism
 from amiwarp.turning import Turning
 from amiwarp.values import instance, one_of, real, shown, vector
 
@@ -32,9 +33,10 @@ if TYPE_CHECKING:
 
     from amiwarp.camera import Camera
     from amiwarp.optics import Model
+    from amiwarp.prism import NominalPrism
 
-NOMINAL_PRISM = Prism(math.radians(2.0))
-"""What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
+NOMINAL_APEX = math.radians(2.0)
+"""What is assumed where a recording does not say its prism's apex: the apex is sought up to twice this."""
 UNITS = {
     "apex": "rad",
     "deflection": "rad",
@@ -180,6 +182,11 @@ def check_names(
         real(value, f"start of {name}")
     for name, pair in bounds.items():
         vector(pair, 2, f"bounds of {name}", real)
+
+
+def nominal(prism: NominalPrism | None) -> Prism:
+    """Return the prism to start from: what a recording says, and of its apex :data:`NOMINAL_APEX` if it is unknown."""
+    return prism if isinstance(prism, Prism) else (prism or UnsizedPrism()).with_apex(NOMINAL_APEX)
 
 
 def _difference(name: str, a: float, b: float) -> float:

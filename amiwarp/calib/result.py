@@ -362,7 +362,7 @@ def camera_from_json(data: Any, where: str = "") -> Camera:
         numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, f"{prefix}distortion")
         kind = one_of(numbers.pop("kind", None), LENSES, f"field {prefix}distortion.kind")
         distortion = build(LENSES[kind], numbers, f"{prefix}distortion")
-    return Camera(*(given[name] for name in CAMERA), distortion=distortion)
+    return Camera(**{name: given[name] for name in CAMERA}, distortion=distortion)
 
 
 def cost_surface(stages: tuple[StageSummary, ...], size: str) -> NDArray[np.float64]:

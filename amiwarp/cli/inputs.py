@@ -11,7 +11,7 @@ import typer
 
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics import FlatSide, Prism
+from amiwarp.prism import FlatSide, NominalPrism, UnsizedPrism
 
 if TYPE_CHECKING:
     from amiwarp.events import Recording
@@ -84,16 +84,17 @@ class NominalPrismOptions:
         None
     )
 
-    def build(self, known: Prism | None) -> Prism | None:
-        """``known`` with what is given put in its place; None where nothing is known or given."""
-        changes: dict[str, Any] = {"index": self.index, "flat_side": self.flat_side}
-        changes["apex"] = None if self.nominal_apex_deg is None else math.radians(self.nominal_apex_deg)
-        changes = {name: value for name, value in changes.items() if value is not None}
-        if not changes:
-            return known
-        from amiwarp.calib.parameters import NOMINAL_PRISM
+    def build(self, known: NominalPrism | None) -> NominalPrism | None:
+        """Return ``known`` with what is given over it; None where nothing is known or given.
 
-        return replace(known or NOMINAL_PRISM, **changes)
+        An apex that nobody gave stays unknown.
+        """
+        given = {"index": self.index, "flat_side": self.flat_side}
+        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        prism = replace(known or UnsizedPrism(), **changes)
+        if self.nominal_apex_deg is not None:
+            return UnsizedPrism(prism.index, prism.flat_side).with_apex(math.radians(self.nominal_apex_deg))
+        return prism if changes else known
 
 
 def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None) -> Recording:

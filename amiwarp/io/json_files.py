@@ -54,7 +54,7 @@ def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
 
 
 def parse_json(text: bytes) -> Any:
-    """Return JSON's value; :class:`AmiwarpError` for what is no JSON, and for NaN, infinities and numbers beyond them."""
+    """Return JSON's value; :class:`AmiwarpError` for what is no JSON, and for numbers that are not finite."""
     try:
         return json.loads(text.decode("utf-8"), parse_constant=_refuse, parse_float=_finite)
     except AmiwarpError:
@@ -91,7 +91,9 @@ def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = (
             raise AmiwarpError(f"field {prefix}{name} is missing")
     for name in data:
         if name not in needed and name not in optional:
-            raise AmiwarpError(f"field {prefix}{shown(name)} is unknown; expected {', '.join((*needed, *optional))}")
+            raise AmiwarpError(
+                f"field {prefix}{shown(name)[1:-1]} is unknown; expected {', '.join((*needed, *optional))}"
+            )
     return data
 
 
@@ -138,7 +140,7 @@ def _several(kind: Any, value: Any, where: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (dict, Mapping):
         given = value if isinstance(value, dict) else fields_of(value, where)
-        return {name: _value(inner[1], entry, f"{where}.{shown(name)}") for name, entry in given.items()}
+        return {name: _value(inner[1], entry, f"{where}.{shown(name)[1:-1]}") for name, entry in given.items()}
     if not isinstance(value, list):
         raise AmiwarpError(f"field {where} is {shown(value)}; expected a list")
     fixed = origin is tuple and inner[-1] is not ...

@@ -22,7 +22,7 @@ from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name, part_path, refuse_overwriting, same_file
 
 if TYPE_CHECKING:
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 FORMAT = "amiwarp-recording"
 FORMAT_VERSION = 1
@@ -54,7 +54,7 @@ class RecordingWriter:
         width: int,
         height: int,
         camera: Camera | None = None,
-        prism: Prism | None = None,
+        prism: NominalPrism | None = None,
         encoder: Encoder | None = None,
         truth_parameters: Mapping[str, float] | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
@@ -334,7 +334,7 @@ def write_header(
     file: Any,
     size: tuple[int, int],
     camera: Camera | None,
-    prism: Prism | None,
+    prism: NominalPrism | None,
     metadata: Mapping[str, MetadataValue],
 ) -> None:
     """All that is known before the first event."""
