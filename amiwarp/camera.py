@@ -17,6 +17,8 @@ LEAST_FOCAL = 1e-3
 """Least focal length, in widths (fx) or heights (fy) of the image: a field of view of 179.8 deg."""
 LARGEST_FOCAL = 1e6
 """Largest focal length [px]: a microradian per pixel. Beyond it float32 no longer holds the prism's displacement."""
+LEAST_FOV = 1e-9
+"""Least field of view [rad]; the focal length then decides."""
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a coefficient of distortion: those of long lenses run to thousands."""
 
@@ -105,7 +107,7 @@ class Camera:
         width = whole(width, "camera width", 1, LARGEST_SIZE, " pixels")
         height = whole(height, "camera height", 1, LARGEST_SIZE, " pixels")
         hint = " rad, 0 .. 180 deg; is it given in degrees?"
-        fov = real(fov, "camera field of view", math.ulp(0.0), math.nextafter(math.pi, 0.0), hint)
+        fov = real(fov, "camera field of view", LEAST_FOV, math.nextafter(math.pi, 0.0), hint)
         focal = width / (2.0 * math.tan(fov / 2.0))
         return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, distortion)
 
