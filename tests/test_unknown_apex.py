@@ -18,9 +18,9 @@ from amiwarp.cli.inputs import NominalPrismOptions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io import open_recording, save_recording
+from amiwarp.io.attributes import prism_attributes, read_prism
 from amiwarp.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.simulate import simulate
-from amiwarp.stream.packets import decode_hello, encode_hello
 from amiwarp.viewer.inspector import Inspector
 
 APEX, INDEX = math.radians(1.0), 1.55
@@ -71,7 +71,8 @@ def test_convert_info_and_calibrate_with_an_index_alone(bare: Recording, tmp_pat
     }  # fmt: skip
     run("calibrate", converted, tmp_path / "c.json", "--model", "exact")
     found = Calibration.load(tmp_path / "c.json")
-    assert found.parameters["apex"] == pytest.approx(APEX, rel=0.03)
+    away = Prism(found.parameters["apex"], INDEX).deflection - Prism(APEX, INDEX).deflection
+    assert abs(away) * found.camera.fx < 0.1  # px, of an orbit of 1.2 px
     assert found.prism.index == INDEX
 
 
@@ -82,6 +83,6 @@ def test_an_apex_that_was_given_and_is_wrong_is_still_refused(bare: Recording) -
 
 def test_streams_and_the_viewer_know_a_prism_without_apex(bare: Recording) -> None:
     prism = UnsizedPrism(INDEX, FlatSide.CAMERA)
-    assert decode_hello(encode_hello(120, 90, bare.camera, prism)).prism == prism
+    assert read_prism(prism_attributes(prism), "here") == prism
     shown = Inspector(replace(bare, prism=prism))
     assert (shown.prism.index, shown.prism.flat_side) == (INDEX, FlatSide.CAMERA)
