@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.values import array, real, shown, whole
+
+LARGEST_SIZE = 65536
+"""Largest width and height of a sensor [px]: columns and rows of events are uint16."""
+LEAST_FOCAL = 1e-3
+"""Least focal length, in widths (fx) or heights (fy) of the image: a field of view of 179.8 deg."""
+LARGEST_FOCAL = 1e6
+"""Largest focal length [px]: a microradian per pixel. Beyond it float32 no longer holds the prism's displacement."""
+LEAST_FOV = 1e-9
+"""Least field of view [rad]; the focal length then decides."""
+LARGEST_COEFFICIENT = 1e6
+"""Largest magnitude of a coefficient of distortion: those of long lenses run to thousands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +33,9 @@ class RadialTangential:
     p2: float = 0.0
     k3: float = 0.0
 
+    def __post_init__(self) -> None:
+        _check_coefficients(self)
+
 
 @dataclass(frozen=True, slots=True)
 class Fisheye:
@@ -31,8 +46,19 @@ class Fisheye:
     k3: float = 0.0
     k4: float = 0.0
 
+    def __post_init__(self) -> None:
+        _check_coefficients(self)
+
 
 Distortion = RadialTangential | Fisheye
+
+
+def _check_coefficients(lens: Distortion) -> None:
+    for field in fields(lens):
+        what = f"camera distortion {field.name}"
+        value = real(getattr(lens, field.name), what, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
+        object.__setattr__(lens, field.name, value)
+
 
 Rows = TypeVar("Rows")
 """A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3, shape (n,): the same kind comes out."""
@@ -42,7 +68,8 @@ Rows = TypeVar("Rows")
 class Camera:
     """A camera: pixel ``(0, 0)`` has its centre at image coordinate ``(0.0, 0.0)``.
 
-    Raises :class:`AmiwarpError` where a size or focal length is not positive or a number is not finite.
+    Limits: 1 to 65536 px each way; a focal length from 0.001 of the image's width or height (179.8 deg) to 1e6 px; a
+    principal point within 65536 px of the first pixel. Raises :class:`AmiwarpError` for anything else.
     """
 
     width: int
@@ -61,23 +88,26 @@ class Camera:
     """Lens distortion, or None for a pure pinhole."""
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise AmiwarpError(f"camera size {self.width}x{self.height} px is not positive; give width and height")
-        for name in ("fx", "fy"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise AmiwarpError(f"camera {name} = {value} is not a positive focal length in pixels")
+        for name, focal in (("width", "fx"), ("height", "fy")):
+            size = whole(getattr(self, name), f"camera {name}", 1, LARGEST_SIZE, " pixels")
+            length = real(getattr(self, focal), f"camera {focal}", LEAST_FOCAL * size, LARGEST_FOCAL, " pixels")
+            object.__setattr__(self, name, size)
+            object.__setattr__(self, focal, length)
         for name in ("cx", "cy"):
-            if not math.isfinite(getattr(self, name)):
-                raise AmiwarpError(f"camera {name} = {getattr(self, name)} is not finite")
-        if self.distortion is not None and not all(map(math.isfinite, astuple(self.distortion))):
-            raise AmiwarpError(f"camera distortion {self.distortion} has a coefficient that is not finite")
+            value = real(getattr(self, name), f"camera {name}", -LARGEST_SIZE, LARGEST_SIZE, " pixels")
+            object.__setattr__(self, name, value)
+        if not isinstance(self.distortion, Distortion | None):
+            raise AmiwarpError(
+                f"camera distortion is {shown(self.distortion)}; expected RadialTangential, Fisheye or None"
+            )
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov: float, distortion: Distortion | None = None) -> Camera:
         """A centred camera with square pixels and horizontal field of view ``fov`` [rad] (before distortion)."""
-        if not 0.0 < fov < math.pi:
-            raise AmiwarpError(f"field of view {math.degrees(fov):.6g} deg is not between 0 and 180")
+        width = whole(width, "camera width", 1, LARGEST_SIZE, " pixels")
+        height = whole(height, "camera height", 1, LARGEST_SIZE, " pixels")
+        hint = " rad, 0 .. 180 deg; is it given in degrees?"
+        fov = real(fov, "camera field of view", LEAST_FOV, math.nextafter(math.pi, 0.0), hint)
         focal = width / (2.0 * math.tan(fov / 2.0))
         return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, distortion)
 
@@ -89,7 +119,7 @@ class Camera:
     def pixels_to_rays(self, xy: Rows) -> Rows:
         """Unit bearings (n, 3) of pixels (n, 2) [px]; NaN rows where the lens sends no ray.
 
-        Raises :class:`AmiwarpError` for other shapes.
+        Raises :class:`AmiwarpError` for other shapes, and for what are no numbers.
         """
         return _run("pixels_to_rays", self, xy, (2, 3))
 
@@ -117,7 +147,7 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
         params = camera_params(camera, str(rows.device))
         launch(getattr(kernels, kernel_name), len(rows), [params, rows], [out], device=rows.device)
         return out
-    rows = np.asarray(rows)
+    rows = array(rows, "array")
     if rows.ndim != 2 or rows.shape[1] != sizes[0]:
         raise AmiwarpError(f"array has shape {rows.shape}; give (n, {sizes[0]})")
     result = _run(kernel_name, camera, wp.array(rows.astype(np.float32), dtype=given, device="cpu"), sizes)

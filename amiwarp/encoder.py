@@ -15,10 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import as_times
+from amiwarp.events import TIME_LIMIT, as_times
+from amiwarp.values import array, instance, real, whole
 
 TURN = 2.0 * math.pi
 """One turn [rad]."""
+MOST_SAMPLES = 1 << 28
+"""Of a made encoder: three days at a sample per millisecond."""
+LARGEST_ANGLE = 1e10
+"""Largest magnitude of an angle [rad]: 1.6e9 turns, where float64 still resolves 2e-6 rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +40,8 @@ class Encoder:
     """Times of the index pulses on the encoder's clock [us], shape ``(k,)``, where there are any."""
 
     def __post_init__(self) -> None:
+        for name in ("t", "angle"):
+            instance(getattr(self, name), np.ndarray, f"encoder {name}")
         if self.t.ndim != 1 or self.t.shape != self.angle.shape or self.t.size < 2:
             shapes = f"t {self.t.shape}, angle {self.angle.shape}"
             raise AmiwarpError(f"encoder samples have shapes {shapes}; expected two equal lengths of at least 2")
@@ -44,15 +51,22 @@ class Encoder:
         if late.any():
             at = int(np.argmax(late)) + 1
             raise AmiwarpError(f"encoder sample {at} (t = {self.t[at]} us) is not later than the one before; sort them")
-        if not np.isfinite(self.angle).all():
-            at = int(np.argmin(np.isfinite(self.angle)))
-            raise AmiwarpError(f"encoder sample {at} has angle {self.angle[at]}; expected a finite number")
-        if not math.isfinite(self.clock_offset_us):
-            raise AmiwarpError(f"encoder clock_offset_us = {self.clock_offset_us} is not finite")
+        if not (self.t[0] > -TIME_LIMIT and self.t[-1] < TIME_LIMIT):
+            span = f"{self.t[0]} .. {self.t[-1]} us"
+            raise AmiwarpError(f"encoder samples span {span}, beyond {TIME_LIMIT} us either way; they are damaged")
+        good = np.abs(self.angle) <= LARGEST_ANGLE  # NaN fails
+        if not good.all():
+            at = int(np.argmin(good))
+            given = f"encoder sample {at} has angle {self.angle[at]}"
+            raise AmiwarpError(f"{given}; expected a finite number within {LARGEST_ANGLE:g} rad either way")
+        offset = real(self.clock_offset_us, "encoder clock_offset_us", -TIME_LIMIT / 2, TIME_LIMIT / 2, " us")
+        object.__setattr__(self, "clock_offset_us", offset)
         if self.index_t is not None:
             self._check_index(self.index_t)
 
     def _check_index(self, index_t: NDArray[np.int64]) -> None:
+        if instance(index_t, np.ndarray, "encoder index_t").ndim != 1 or index_t.dtype != np.int64:
+            raise AmiwarpError(f"encoder index_t is {index_t.dtype} of shape {index_t.shape}; expected int64, (k,)")
         inside = (index_t >= self.t[0]) & (index_t <= self.t[-1])
         if not inside.all():
             bad = index_t[int(np.argmin(inside))]
@@ -62,7 +76,7 @@ class Encoder:
     def from_angles(cls, t_us: ArrayLike, angle: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
         """Samples of an angle [rad], unwrapped or wrapped to a turn (see :func:`unwrap`)."""
         t = as_times(t_us)
-        return cls(t, unwrap(t, np.asarray(angle, np.float64), TURN), clock_offset_us)
+        return cls(t, unwrap(t, array(angle, "encoder angle").astype(np.float64), TURN), clock_offset_us)
 
     @classmethod
     def from_counts(
@@ -94,15 +108,19 @@ class Encoder:
         cls, rpm: float, t_first: int, t_last: int, *, direction: int = 1, interval_us: int = 1000
     ) -> Encoder:
         """A prism turning at ``rpm``, at angle 0 at ``t_first`` [us], sampled every ``interval_us`` past ``t_last``."""
-        if not (math.isfinite(rpm) and interval_us >= 1 and t_last >= t_first):
-            given = f"{rpm} rpm from {t_first} to {t_last} us every {interval_us} us"
-            raise AmiwarpError(f"no constant speed of {given}; expected a finite speed and a span of time")
+        rpm = real(rpm, "constant speed", hint=" [turns/min]")
+        for t, what in ((t_first, "t_first"), (t_last, "t_last")):
+            whole(t, f"constant speed: {what}", -TIME_LIMIT + 1, TIME_LIMIT - 1, " us")
+        whole(interval_us, "constant speed: interval_us", 1, TIME_LIMIT, " us")
+        if not 0 <= (t_last - t_first) // interval_us < MOST_SAMPLES:
+            given = f"from {t_first} to {t_last} us every {interval_us} us"
+            raise AmiwarpError(f"no constant speed {given}; expected a span of time of up to {MOST_SAMPLES} samples")
         elapsed = np.arange(0, t_last - t_first + 2 * interval_us, interval_us, dtype=np.int64)
         return cls(elapsed + t_first, elapsed.astype(np.float64) * (direction * rpm * TURN / 60e6))
 
     def with_clock_offset(self, clock_offset_us: float) -> Encoder:
         """The same samples with another clock offset [us]."""
-        return dataclasses.replace(self, clock_offset_us=float(clock_offset_us))
+        return dataclasses.replace(self, clock_offset_us=clock_offset_us)
 
     def with_index(self, index_t_us: ArrayLike) -> Encoder:
         """The same samples, shifted to be at a multiple of 2 pi at the index pulses (encoder's clock, [us])."""

@@ -14,15 +14,24 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from amiwarp.camera import LARGEST_SIZE
 from amiwarp.errors import AmiwarpError
+from amiwarp.values import array as as_numbers
+from amiwarp.values import instance, whole
 
 if TYPE_CHECKING:
     from amiwarp.camera import Camera
     from amiwarp.encoder import Encoder
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 DEFAULT_BLOCK = 1 << 20
 """Events per block where nothing else is asked for."""
+
+TIME_LIMIT = 2**62
+"""Times of events, encoder samples and index pulses lie within this, either way [us]: 146,000 years.
+
+The difference and the sum of any two then stay within int64.
+"""
 
 SENSOR = np.dtype(np.uint16)
 """Type of a sensor's pixels."""
@@ -44,6 +53,8 @@ class Events:
     """Polarity, shape ``(n,)``: 1 is ON, 0 is OFF."""
 
     def __post_init__(self) -> None:
+        for name in ("x", "y", "t", "p"):
+            instance(getattr(self, name), np.ndarray, f"events' {name}")
         shapes = {name: getattr(self, name).shape for name in ("x", "y", "t", "p")}
         if any(shape != (self.t.size,) for shape in shapes.values()):
             raise AmiwarpError(f"event arrays have shapes {shapes}; expected one length (n,)")
@@ -56,11 +67,13 @@ class Events:
 
     @classmethod
     def from_arrays(cls, x: ArrayLike, y: ArrayLike, t: ArrayLike, p: ArrayLike) -> Events:
-        """Convert arrays of any numeric type: floating x, y become float32, integers uint16; p > 0 is ON.
+        """Convert arrays of any numeric type: floating x, y become float32, integers uint16; times are rounded.
 
-        Raises :class:`AmiwarpError` where a coordinate does not fit uint16 or a time is not a finite whole number.
+        Polarity is ON where ``p`` is above 0 (or true), else OFF: 0 and 1 as well as -1 and 1. NaN in ``x`` or ``y``
+        marks a compensated event without a place. Raises :class:`AmiwarpError` where an integer coordinate does not fit
+        uint16 or a floating one float32, a time is not finite or not within :data:`TIME_LIMIT`, or a polarity is NaN.
         """
-        return cls(_coordinate("x", x), _coordinate("y", y), as_times(t), (np.asarray(p) > 0).astype(np.uint8))
+        return cls(_coordinate("x", x), _coordinate("y", y), as_times(t), _polarity(p))
 
     @classmethod
     def empty(cls) -> Events:
@@ -87,27 +100,36 @@ class Events:
 
 
 def _coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
-    array = np.asarray(values)
+    array = as_numbers(values, f"events' {name}")
+    if not array.size:
+        return array.astype(array.dtype if array.dtype in (np.uint16, np.float32) else np.uint16)
     if array.dtype.kind == "f":
-        return array.astype(np.float32, copy=False)
+        with np.errstate(over="ignore"):
+            short = array.astype(np.float32, copy=False)
+        if np.isinf(short).any():
+            raise AmiwarpError(f"events' {name} holds a coordinate that float32 cannot hold; drop that event")
+        return short
     if array.dtype == np.uint16:
         return array
-    if array.dtype.kind not in "iub":
-        raise AmiwarpError(f"events' {name} is of type {array.dtype}; expected numbers")
     if array.size and not (array.min() >= 0 and array.max() <= 65535):
         raise AmiwarpError(f"events' {name} spans {array.min()} .. {array.max()}; expected pixels in 0 .. 65535")
     return array.astype(np.uint16)
 
 
-def as_times(values: ArrayLike) -> NDArray[np.int64]:
-    """Times of any numeric type as int64 [us], rounded; :class:`AmiwarpError` for one not finite or not below 2**62.
+def _polarity(values: ArrayLike) -> NDArray[np.uint8]:
+    array = as_numbers(values, "events' p", "iufb")
+    if array.dtype.kind == "f" and np.isnan(array).any():
+        raise AmiwarpError("events' p holds NaN; expected 1 for ON, 0 or -1 for OFF")
+    return (array > 0).astype(np.uint8)
 
-    The margin keeps the difference and the sum of any two times within int64.
+
+def as_times(values: ArrayLike) -> NDArray[np.int64]:
+    """Times of any numeric type as int64 [us], rounded.
+
+    Raises :class:`AmiwarpError` for a time that is not finite or not within :data:`TIME_LIMIT`.
     """
-    array = np.asarray(values)
-    if array.dtype.kind not in "iubf":
-        raise AmiwarpError(f"times are of type {array.dtype}; expected numbers")
-    if array.size and not (array.min() > -(2**62) and array.max() < 2**62):
+    array = as_numbers(values, "times")
+    if array.size and not (array.min() > -TIME_LIMIT and array.max() < TIME_LIMIT):
         raise AmiwarpError(f"times span {array.min()} .. {array.max()} us: not finite or beyond int64")
     return np.asarray(np.rint(array) if array.dtype.kind == "f" else array, np.int64)
 
@@ -130,9 +152,10 @@ def check_events(
     allow_nan: bool = False,
     after_t: int | None = None,
 ) -> None:
-    """Check one block: in the frame (uint16), finite (float32, unless ``allow_nan``), sorted, p in {0, 1}.
+    """Check one block: in the frame (uint16), finite (float32), sorted, within :data:`TIME_LIMIT`, p in {0, 1}.
 
-    Compensated (float32) coordinates may lie outside the frame. ``after_t`` is the time of the event before the block.
+    ``allow_nan`` takes NaN, not infinity, for compensated events without a place. Compensated (float32) coordinates may
+    lie outside the frame. ``after_t`` is the time of the event before the block.
     Raises :class:`AmiwarpError` naming ``where`` and the index of the first bad event (``first_index`` + its place).
     """
     if not len(events):
@@ -146,12 +169,16 @@ def check_events(
     if events.x.dtype == np.uint16:
         if int(events.x.max()) >= width or int(events.y.max()) >= height:
             fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; check the size")
+    elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
+        fail(np.isinf(events.x) | np.isinf(events.y), "has a coordinate that is infinite; drop it")
     elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
         fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
     if bool((events.t[1:] < events.t[:-1]).any()):
         fail(np.concatenate([[False], events.t[1:] < events.t[:-1]]), "is earlier than the one before; sort by time")
     if after_t is not None and events.t[0] < after_t:
         fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
+    if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # they are sorted
+        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; it is damaged")
     if int(events.p.max()) > 1:
         fail(events.p > 1, "has a polarity that is neither 0 nor 1")
 
@@ -191,13 +218,18 @@ class EventSource(Protocol):
 
 
 class MemoryEvents:
-    """Events in memory as a source. Raises :class:`AmiwarpError` where they fail :func:`check_events`."""
+    """Events in memory as a source.
+
+    Raises :class:`AmiwarpError` where they fail :func:`check_events`, or for a size not in 1 .. 65536 pixels.
+    """
 
     def __init__(self, events: Events, width: int, height: int) -> None:
+        instance(events, Events, "events in memory")
+        width, height = (whole(size, "frame size", 1, LARGEST_SIZE, " pixels") for size in (width, height))
         # NaN marks compensated events without a place; only they are float32.
         check_events(events, width, height, where="events in memory", allow_nan=True)
         self._events = events
-        self._size = (int(width), int(height))
+        self._size = (width, height)
 
     def __len__(self) -> int:
         return len(self._events)
@@ -324,8 +356,8 @@ class Recording:
     """The camera, where known."""
     encoder: Encoder | None = None
     """The prism's angle over time, where known."""
-    prism: Prism | None = None
-    """The nominal prism: what the hardware's sheet says, not what calibration found."""
+    prism: NominalPrism | None = None
+    """The nominal prism: what the hardware's sheet says, not what calibration found; its apex may be unknown."""
     truth: Truth | None = None
     """What made the recording, where it is synthetic."""
     metadata: dict[str, MetadataValue] = field(default_factory=dict)

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.camera import LARGEST_SIZE
 from amiwarp.errors import AmiwarpError
 from amiwarp.turning import Turning
 from amiwarp.uploads import DeviceEvents, upload_events
+from amiwarp.values import choice, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +32,7 @@ FILL = 600
 """Events that the fullest word of a batch should get: it has room for 1,023."""
 
 
-class Vote(enum.Enum):
+class Vote(enum.StrEnum):
     """How an event's vote is shared among pixels."""
 
     NEAREST = "nearest"
@@ -56,6 +58,12 @@ class CanvasShape:
     """Disjoint parts of the events, every so manieth, with images of their own."""
     dither: bool = False
     """Put each event somewhere in its pixel, not at its centre: nothing is won then by events on the pixel grid."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vote", choice(Vote, self.vote, "vote"))
+        for name in ("width", "height"):
+            object.__setattr__(self, name, whole(getattr(self, name), f"canvas {name}", 1, LARGEST_SIZE, " pixels"))
+        object.__setattr__(self, "pad", whole(self.pad, "canvas pad", 0, LARGEST_SIZE, " pixels"))
 
     @property
     def layers(self) -> int:

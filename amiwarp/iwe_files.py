@@ -15,6 +15,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.output import NewFile, check_output
 from amiwarp.iwe import PIECE, CanvasShape, Votes
+from amiwarp.values import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +31,7 @@ OFF_COLOUR, ON_COLOUR = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)
 MOST_WINDOWS = 100_000
 
 
-class Layers(enum.Enum):
+class Layers(enum.StrEnum):
     """What becomes of polarity."""
 
     MERGED = "merged"
@@ -54,6 +55,7 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
     Merged: black to white. Signed: grey is zero, white ON, black OFF. Polarity: blue is OFF, orange ON.
     """
     shown: NDArray[Any]
+    layers = choice(Layers, layers, "layers")
     if layers is Layers.MERGED:
         shown = tone(image)
     elif layers is Layers.SIGNED:
@@ -89,7 +91,7 @@ class IweFiles:
             if path.suffix.lower() not in (".png", ".npy"):
                 raise AmiwarpError(f"{path}: images of events are written as .png or .npy")
         self.written: list[Path] = []
-        self._layers = layers
+        self._layers = layers = choice(Layers, layers, "layers")
         width, height = source.size
         self._votes = Votes(CanvasShape(width, height, per_polarity=layers is not Layers.MERGED), device)
         self._window_us = window_us

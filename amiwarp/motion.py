@@ -11,9 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.encoder import TURN, Encoder
 from amiwarp.errors import AmiwarpError
+from amiwarp.prism import check_phase, check_tilt
+from amiwarp.values import array, real, whole
 
 ROTATION_INTERVAL = 1e-3
 """Interval at which a changing rate of rotation is integrated [s]."""
+LARGEST_SPEED = 1e9
+"""Largest speed of a prism [turns/min], and of a camera's rotation [rad/s]: more is a mistake."""
+LONGEST_S = 86400.0
+"""Longest simulation [s]."""
+LARGEST_OFFSET_US = 1e7
+"""Largest offset between the clocks [us]: the encoder is sampled for so much longer on either side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,8 +37,8 @@ class PrismMotion:
 
     def __post_init__(self) -> None:
         _check_table("prism speed", self._table())
-        if not all(map(math.isfinite, (self.phase, *self.tilt))):
-            raise AmiwarpError(f"prism phase {self.phase} or tilt {self.tilt} is not finite")
+        object.__setattr__(self, "phase", check_phase(self.phase, "prism phase"))
+        object.__setattr__(self, "tilt", check_tilt(self.tilt))
 
     @classmethod
     def from_function(
@@ -42,12 +50,16 @@ class PrismMotion:
         tilt: tuple[float, float] = (0.0, 0.0),
     ) -> PrismMotion:
         """Speed as a function of times [s], sampled each millisecond from 0 to past ``duration_s``."""
+        duration_s = real(duration_s, "duration_s", 0.0, LONGEST_S, " s")
         t = np.arange(math.ceil(duration_s * 1e3) + 2, dtype=np.float64) * 1e-3
-        return cls(np.column_stack([t, np.broadcast_to(np.asarray(rpm(t), np.float64), t.shape)]), phase, tilt)
+        speed = array(rpm(t), "prism speed")
+        if speed.shape not in ((), t.shape):
+            raise AmiwarpError(f"prism speed has shape {speed.shape}; return one number, or one per time, {t.shape}")
+        return cls(np.column_stack([t, np.broadcast_to(speed, t.shape)]), phase, tilt)
 
     def _table(self) -> NDArray[np.float64]:
         """Rows (time [s], speed [rad/s])."""
-        rpm = np.asarray(self.rpm, np.float64)
+        rpm = array(self.rpm, "prism speed").astype(np.float64)
         table = np.array([[0.0, rpm], [1.0, rpm]]) if rpm.ndim == 0 else rpm
         return table * np.array([1.0, TURN / 60.0]) if table.ndim == 2 and table.shape[1] == 2 else table
 
@@ -81,7 +93,7 @@ class CameraMotion:
         _check_table("camera rotation", self._table(), columns=4)
 
     def _table(self) -> NDArray[np.float64]:
-        rates = np.asarray(self.rates, np.float64)
+        rates = array(self.rates, "camera rotation").astype(np.float64)
         return np.array([[0.0, *rates], [1.0, *rates]]) if rates.shape == (3,) else rates
 
     @property
@@ -120,8 +132,9 @@ class CameraMotion:
 def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> None:
     if table.ndim != 2 or table.shape[1] != columns or len(table) < 2:
         raise AmiwarpError(f"{what} has shape {table.shape}; give one value or at least 2 rows of {columns} numbers")
-    if not np.isfinite(table).all():
-        raise AmiwarpError(f"{what} holds a number that is not finite")
+    if not (np.abs(table) <= LARGEST_SPEED).all():  # NaN fails
+        worst = table[~(np.abs(table) <= LARGEST_SPEED)][0]
+        raise AmiwarpError(f"{what} holds {worst:g}; expected finite numbers within {LARGEST_SPEED:g} either way")
     if not (np.diff(table[:, 0]) > 0).all():
         raise AmiwarpError(f"{what}: the times of its rows do not rise; sort them")
 
@@ -144,15 +157,13 @@ class EncoderModel:
     """Time for which a drop-out loses all samples [us]."""
 
     def __post_init__(self) -> None:
-        if self.counts_per_turn is not None and self.counts_per_turn < 1:
-            raise AmiwarpError(f"encoder counts_per_turn = {self.counts_per_turn}; expected at least 1, or None")
-        if not 0.1 <= self.rate_hz <= 1e6:
-            raise AmiwarpError(f"encoder rate_hz = {self.rate_hz} is not in 0.1 .. 1e6")
-        for name in ("jitter_us", "dropouts_hz", "dropout_us"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise AmiwarpError(f"encoder {name} = {getattr(self, name)}; expected a finite number, not negative")
-        if not math.isfinite(self.clock_offset_us):
-            raise AmiwarpError(f"encoder clock_offset_us = {self.clock_offset_us} is not finite")
+        if self.counts_per_turn is not None:
+            counts = whole(self.counts_per_turn, "encoder counts_per_turn", 1, 2**31, ", or None")
+            object.__setattr__(self, "counts_per_turn", counts)
+        limits = {"rate_hz": (0.1, 1e6), "jitter_us": (0.0, 1e6), "dropouts_hz": (0.0, 1e5), "dropout_us": (0.0, 1e9),
+                  "clock_offset_us": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US)}  # fmt: skip
+        for name, (low, high) in limits.items():
+            object.__setattr__(self, name, real(getattr(self, name), f"encoder {name}", low, high))
 
     @classmethod
     def ideal(cls) -> EncoderModel:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,9 +11,25 @@ import numpy as np
 
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
+from amiwarp.prism import (
+    FlatSide,
+    Prism,
+    apex_from_deflection,
+    check_index,
+    check_phase,
+    check_tilt,
+    deflection_from_apex,
+)
+from amiwarp.values import array, choice, instance, real
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+__all__ = [
+    "MODELS", "CircleModel", "EllipseModel", "ExactModel", "FlatSide", "Model", "ModelError", "Prism",
+    "RadialCircleModel", "apex_from_deflection", "axis_rotation", "deflection_from_apex", "model_camera",
+    "predicted_error", "wrap_angle",
+]  # fmt: skip
 
 Points = TypeVar("Points")
 """A NumPy array of shape (n, 2) or a Warp array of vec2, shape (n,): the same kind comes out as goes in."""
@@ -22,54 +37,14 @@ Points = TypeVar("Points")
 UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
-class FlatSide(enum.Enum):
-    """Which way the flat face of the prism looks."""
-
-    SCENE = "scene"
-    CAMERA = "camera"
-
-
-@dataclass(frozen=True, slots=True)
-class Prism:
-    """A wedge prism in air. Raises :class:`AmiwarpError` for an apex or index outside what can be built."""
-
-    apex: float
-    """Angle between its two faces [rad]; not the deflection (see :func:`deflection_from_apex`)."""
-    index: float = 1.5168
-    """Refractive index; the default is N-BK7 at the d line, 587.6 nm."""
-    flat_side: FlatSide = FlatSide.SCENE
-    """Where the flat face looks."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.apex < math.radians(30.0):
-            raise AmiwarpError(f"prism apex {self.apex:.6g} rad is not in [0, 0.52), 30 deg; is it given in degrees?")
-        if not 1.0 < self.index < 4.0:
-            raise AmiwarpError(f"prism index {self.index:.6g} is not between 1 and 4; N-BK7 has 1.5168")
-
-    @property
-    def deflection(self) -> float:
-        """Deflection of the ray that the camera sees on its axis [rad]."""
-        return deflection_from_apex(self.apex, self.index, self.flat_side)
-
-
-def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
-    """Deflection [rad] of the camera's axial ray by a wedge of ``apex`` [rad]; about ``(index - 1) * apex``.
-
-    Snell's law at both faces in the plane of the wedge.
-    """
-    if flat_side is FlatSide.SCENE:  # in through the tilted face, out through the flat one
-        return math.asin(index * math.sin(apex - math.asin(math.sin(apex) / index)))
-    return math.asin(index * math.sin(apex)) - apex
-
-
-def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
-    """Apex [rad] that deflects the camera's axial ray by ``deflection`` [rad].
-
-    The inverse of :func:`deflection_from_apex`.
-    """
-    if flat_side is FlatSide.SCENE:
-        return math.atan2(math.sin(deflection), math.sqrt(index**2 - math.sin(deflection) ** 2) - 1.0)
-    return math.atan2(math.sin(deflection), index - math.cos(deflection))
+def _check_circle(model: CircleModel | RadialCircleModel) -> None:
+    """Check and convert what both circles have."""
+    instance(model.camera, Camera, "camera")
+    below = math.nextafter(math.pi / 2.0, 0.0)
+    hint = " rad; where it is negative, add pi to the phase instead"
+    object.__setattr__(model, "deflection", real(model.deflection, "deflection", 0.0, below, hint))
+    object.__setattr__(model, "phase", check_phase(model.phase))
+    object.__setattr__(model, "flat_side", choice(FlatSide, model.flat_side, "flat_side"))
 
 
 class _Model(Protocol):
@@ -112,8 +87,7 @@ def _run(kernel_name: str, model: _Model, xy: Any, theta: Any) -> Any:
         launch(kernel, len(xy), [model.params(xy.device), model_camera(model, xy.device), xy, theta], [out],
                device=xy.device)  # fmt: skip
         return out
-    xy = np.asarray(xy)
-    theta = np.asarray(theta)
+    xy, theta = array(xy, "xy"), array(theta, "theta")
     if xy.ndim != 2 or xy.shape[1] != 2 or theta.shape != xy.shape[:1]:
         raise AmiwarpError(f"xy has shape {xy.shape} and theta {theta.shape}; give (n, 2) and (n,)")
     wrapped = wrap_angle(theta).astype(np.float32)
@@ -154,6 +128,9 @@ class CircleModel(_OnDevice):
     """θ_b, added to the encoder's angle [rad]."""
     flat_side: FlatSide = FlatSide.SCENE
 
+    def __post_init__(self) -> None:
+        _check_circle(self)
+
     @classmethod
     def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> CircleModel:
         """The circle that is right on the optical axis."""
@@ -187,10 +164,8 @@ class RadialCircleModel(_OnDevice):
     flat_side: FlatSide = FlatSide.SCENE
 
     def __post_init__(self) -> None:
-        if not self.deflection >= 0.0:
-            raise AmiwarpError(f"deflection {self.deflection} rad is negative; add pi to the phase instead")
-        if not self.index > 1.0:
-            raise AmiwarpError(f"index {self.index} is not above 1; N-BK7 has 1.5168")
+        _check_circle(self)
+        object.__setattr__(self, "index", check_index(self.index, "index"))
 
     @classmethod
     def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> RadialCircleModel:
@@ -217,6 +192,12 @@ class ExactModel(_OnDevice):
     """θ_b, added to the encoder's angle [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
     """Rotation of the prism's axis of rotation about the camera's x and y [rad]: first x, then y."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        instance(self.prism, Prism, "prism")
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        object.__setattr__(self, "tilt", check_tilt(self.tilt))
 
     @classmethod
     def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> ExactModel:
@@ -260,6 +241,16 @@ class EllipseModel(_OnDevice):
     sine: NDArray[np.float32] = field(repr=False)
     phase: float = 0.0
     """θ_b, added to the encoder's angle [rad]."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        for name in ("offset", "cosine", "sine"):
+            table = array(getattr(self, name), name)
+            shape = (self.camera.height, self.camera.width, 2)
+            if table.shape != shape:
+                raise AmiwarpError(f"{name} has shape {table.shape}; expected {shape}, the camera's rows and columns")
+            object.__setattr__(self, name, table.astype(np.float32, copy=False))
 
     @classmethod
     def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> EllipseModel:

@@ -11,6 +11,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.output import NewFile, check_output
+from amiwarp.values import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +29,7 @@ STILLS = (".png", ".tif", ".tiff", ".npy")
 VIDEO = ".mp4"
 
 
-class Tone(enum.Enum):
+class Tone(enum.StrEnum):
     """How intensity becomes a pixel's value."""
 
     MAPPED = "mapped"
@@ -51,6 +52,7 @@ def tones(
 
     ``contrast``: the ON threshold [log intensity]; ``between``: see :func:`limits`.
     """
+    tone = choice(Tone, tone, "tone")
     dark, bright = between or limits(picture, contrast)
     light = picture.intensity(contrast)
     if tone is Tone.LINEAR:
@@ -72,6 +74,7 @@ def save_picture(
 ) -> None:
     """Writes .png (8 bit, or 16), .tif (16 bit), or .npy: natural log intensity, float32, NaN where not filled."""
     check_path(path, STILLS)
+    tone = choice(Tone, tone, "tone")
     if bits not in (8, 16):
         raise AmiwarpError(f"{path}: {bits} bits; expected 8 or 16")
     ending = path.suffix.lower()

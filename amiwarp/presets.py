@@ -14,8 +14,11 @@ from amiwarp.calib import Settings
 from amiwarp.calib.parameters import size_name
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name
+from amiwarp.io.json_files import fields_of, read_json
 from amiwarp.io.output import write_text
 from amiwarp.optics import MODELS
+from amiwarp.values import one_of, shown
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -47,22 +50,20 @@ class Preset:
     @classmethod
     def load(cls, path: Path, kind: str) -> Preset:
         """Reads a preset of one ``kind``. Raises :class:`AmiwarpError` naming file and field."""
-        try:
-            data = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise AmiwarpError(f"{path}: cannot be read as a preset: {error}") from error
-        if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
+        data = read_json(path, "a preset")
+        if data.get("format") != FORMAT or data.get("version") != VERSION:
             raise AmiwarpError(f"{path}: is no {FORMAT} file of version {VERSION}; make one with 'amiwarp chart'")
         if data.get("kind") != kind:
-            raise AmiwarpError(f"{path}: kind is {data.get('kind')!r}, needed here is a preset for {kind}")
-        settings = data.get("settings")
-        if not isinstance(settings, dict):
-            raise AmiwarpError(f"{path}: settings is {settings!r}, not an object; make it again with 'amiwarp chart'")
-        try:
+            given = shown(data.get("kind"))
+            raise AmiwarpError(f"{path}: kind is {given}, needed here is a preset for {kind}")
+        with errors_name(path, lambda: "damaged preset, make it again with 'amiwarp chart'"):
+            fields_of(data, "", "format", "version", "kind", "settings", optional=("measured",))
+            settings, measured = data["settings"], data.get("measured") or {}
+            for name, value in (("settings", settings), ("measured", measured)):
+                if not isinstance(value, dict):
+                    fields_of(value, name)
             check(kind, settings)
-        except AmiwarpError as error:
-            raise AmiwarpError(f"{path}: {error}") from error
-        return cls(kind, settings, data.get("measured") or {})
+        return cls(kind, settings, measured)
 
     def calibration_settings(self) -> Settings:
         """The settings, what the preset leaves open being the defaults."""
@@ -89,13 +90,12 @@ def check(kind: str, settings: Mapping[str, Any]) -> None:
     """Raises :class:`AmiwarpError` naming the field that is unknown, or the value that makes no sense."""
     if kind == "compensation":
         _check_names(settings, ("model",), "")
-        if settings.get("model") not in MODELS:
-            raise AmiwarpError(f"model is {settings.get('model')!r}; choose among {', '.join(MODELS)}")
+        one_of(settings.get("model"), MODELS, "model")
         return
     _check_names(settings, (*CALIBRATION, "photometric"), "")
     photometric = settings.get("photometric", {})
     if not isinstance(photometric, dict):
-        raise AmiwarpError(f"photometric is {photometric!r}, not an object")
+        raise AmiwarpError(f"photometric is {shown(photometric)}, not an object")
     _check_names(photometric, PHOTOMETRIC, "photometric.")
     plain = {n: v for n, v in settings.items() if n != "photometric"}
     for name, value in plain.items():
@@ -108,14 +108,14 @@ def check(kind: str, settings: Mapping[str, Any]) -> None:
 def _check_names(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise AmiwarpError(f"field {where}{unknown[0]} is unknown; a preset may have {', '.join(known)}")
+        raise AmiwarpError(f"field {where}{shown(unknown[0])[1:-1]} is unknown; a preset may have {', '.join(known)}")
 
 
 def _check_type(name: str, value: Any, default: Any) -> None:
     wanted = (list, tuple) if isinstance(default, tuple) else type(default)
     good = isinstance(value, wanted) and not isinstance(value, bool)
     if not (good or (name == "global_algorithm" and value is None)):
-        raise AmiwarpError(f"{name} is {value!r}; it should look like {default!r}")
+        raise AmiwarpError(f"{name} is {shown(value)}; it should look like {default!r}")
 
 
 def simplified(calibration: Calibration, model: str) -> Calibration:
@@ -124,7 +124,7 @@ def simplified(calibration: Calibration, model: str) -> Calibration:
     Of a circle the size is the one that comes nearest over image and turn. Raises :class:`AmiwarpError` where ``model``
     needs more than the calibration found.
     """
-    if model == calibration.model_name:
+    if one_of(model, MODELS, "model") == calibration.model_name:
         return calibration
     calibration = calibration.exact
     found, known = calibration.parameters, size_name(calibration.model_name)

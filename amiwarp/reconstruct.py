@@ -22,6 +22,7 @@ from amiwarp.encoder import TURN, Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.pairs import EventTable, PairSet
 from amiwarp.turning import Turning, border
+from amiwarp.values import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -67,7 +68,7 @@ Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is."""
 
 
-class Fill(enum.Enum):
+class Fill(enum.StrEnum):
     """What stands where the events say nothing."""
 
     NONE = "none"
@@ -149,7 +150,8 @@ class Reconstruction:
         self.recording, self.model, self.encoder = recording, model, encoder
         if turning is None and calibration is not None:
             turning = calibration.turning
-        self.turning, self.fill, self.device = turning or Turning(), fill, device
+        self.turning, self.device = turning or Turning(), device
+        self.fill = choice(Fill, fill, "fill")
         self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
         self._smoothness: float | None = None
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.iwe import CanvasShape, Image
+from amiwarp.values import array, choice, real
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,11 +19,13 @@ PAPER_ETA = 1.0
 """η of the paper's J [events]; He et al. give none."""
 
 
+LARGEST_SMOOTHING = 1000.0
+"""Largest standard deviation of a Gaussian [px]."""
 FEW_SUMS = 256
 """Sums that are left for the host to add."""
 
 
-class Sharpness(enum.Enum):
+class Sharpness(enum.StrEnum):
     """What is measured; higher is sharper for each."""
 
     VARIANCE = "variance"
@@ -47,7 +50,7 @@ class SharpnessMeter:
         from amiwarp.kernels.iwe import STRIP
 
         weights = gaussian(smoothing)
-        self.kind = kind
+        self.kind = choice(Sharpness, kind, "sharpness")
         self.device = wp.get_device(device)
         self.image = Image(canvas, len(weights), self.device)
         """Where the image to measure is put [events]."""
@@ -109,8 +112,7 @@ class SharpnessMeter:
 
 def gaussian(sigma: float) -> NDArray[np.float32]:
     """Weights of a Gaussian at 0, 1, … 3 sigma, the full symmetric kernel summing to 1; just [1] for sigma 0."""
-    if sigma < 0.0 or not math.isfinite(sigma):
-        raise AmiwarpError(f"smoothing {sigma} px is not a standard deviation; give 0 or more")
+    sigma = real(sigma, "smoothing", 0.0, LARGEST_SMOOTHING, " px, a standard deviation")
     if sigma == 0.0:
         return np.ones(1, dtype=np.float32)
     k = np.arange(math.ceil(3.0 * sigma) + 1)
@@ -129,7 +131,10 @@ def sharpness(
 
     ``smoothing``: standard deviation [px].
     """
-    stack = np.atleast_3d(image) if image.ndim != 2 else image[None]
+    image = array(image, "image")
+    if image.ndim not in (2, 3) or not image.size:
+        raise AmiwarpError(f"image has shape {image.shape}; expected (height, width) or (2, height, width)")
+    stack = image if image.ndim == 3 else image[None]
     canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
     if len(stack) > 2 or not np.all(np.isfinite(image)):
         raise AmiwarpError(f"image of shape {image.shape} is not a finite (height, width) or (2, height, width) image")

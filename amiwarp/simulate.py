@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, MetadataValue, Recording, Truth
-from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
+from amiwarp.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
 from amiwarp.optics import Prism
 from amiwarp.pictures import linear_luminance, read_picture
+from amiwarp.values import instance, real, whole
 
 if TYPE_CHECKING:
     from amiwarp.encoder import Encoder
@@ -54,11 +55,10 @@ class SensorModel:
         limits = {"mismatch": 0.5, "refractory_us": 1e6, "latency_us": 1e4, "latency_jitter_us": 1e3, "leak_hz": 1e3,
                   "shot_noise_hz": 1e5, "hot_fraction": 1.0, "hot_hz": 1e5}  # fmt: skip
         for name, limit in limits.items():
-            if not 0.0 <= getattr(self, name) <= limit:
-                raise AmiwarpError(f"sensor {name} = {getattr(self, name)} is not in 0 .. {limit:g}")
+            object.__setattr__(self, name, real(getattr(self, name), f"sensor {name}", 0.0, limit))
         for name in ("contrast_on", "contrast_off"):
-            if not 0.01 <= getattr(self, name) <= 10.0:
-                raise AmiwarpError(f"sensor {name} = {getattr(self, name)} is not in 0.01 .. 10 (log intensity)")
+            value = real(getattr(self, name), f"sensor {name}", 0.01, 10.0, " (log intensity)")
+            object.__setattr__(self, name, value)
 
     @classmethod
     def ideal(cls, contrast: float = 0.25) -> SensorModel:
@@ -112,10 +112,11 @@ class Scene:
     """Standard deviation of the optical blur, the pixel's aperture included [sensor pixels]."""
 
     def __post_init__(self) -> None:
-        if self.fov is not None and not 0.0 < self.fov < math.pi:
-            raise AmiwarpError(f"scene fov {math.degrees(self.fov):.6g} deg is not between 0 and 180")
-        if not 0.0 <= self.blur <= 20.0:
-            raise AmiwarpError(f"scene blur = {self.blur} px is not in 0 .. 20")
+        if self.fov is not None:
+            below = math.nextafter(math.pi, 0.0)
+            hint = " rad, 0 .. 180 deg; is it given in degrees?"
+            object.__setattr__(self, "fov", real(self.fov, "scene fov", 1e-9, below, hint))
+        object.__setattr__(self, "blur", real(self.blur, "scene blur", 0.0, 20.0, " px"))
 
     @classmethod
     def from_picture(cls, picture: str | Path | NDArray[Any], *, fov: float | None = None, blur: float = 0.5) -> Scene:
@@ -143,12 +144,14 @@ class Simulation:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        if not 1e-3 <= self.duration_s <= 86400.0:
-            raise AmiwarpError(f"duration of {self.duration_s} s is not in 0.001 .. 86400")
+        kinds = {"scene": Scene, "camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
+                 "camera_motion": CameraMotion, "encoder_model": EncoderModel}  # fmt: skip
+        for name, kind in kinds.items():
+            instance(getattr(self, name), kind, f"simulation's {name}")
+        real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
         if self.camera.width * self.camera.height > 1 << 22:
             raise AmiwarpError(f"camera of {self.camera.width}x{self.camera.height} has more than 4194304 pixels")
-        if not 0 <= self.seed < 1 << 31:
-            raise AmiwarpError(f"seed = {self.seed} is not in 0 .. 2147483647")
+        whole(self.seed, "seed", 0, (1 << 31) - 1)
 
     @property
     def duration_us(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from collections.abc import Iterator
@@ -16,15 +17,19 @@ from numpy.typing import NDArray
 
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import register_reader
+from amiwarp.events import TIME_LIMIT
+from amiwarp.io.files import errors_name, register_reader
 from amiwarp.motion import EncoderModel, PrismMotion
 from amiwarp.pictures import linear_luminance, read_picture, srgb_to_linear
 from amiwarp.simulate import Progress, Scene, SensorModel, Simulation
+from amiwarp.values import real, shown
 
 if TYPE_CHECKING:
     from amiwarp.events import Recording
     from amiwarp.optics import Prism
 
+MOST_TABLE_BYTES = 64 << 20
+"""Largest ``times.csv`` that is read: a million pictures."""
 DEFAULT_FOV = math.radians(60.0)
 """Horizontal field of view of the camera where none is given [rad]."""
 
@@ -139,8 +144,8 @@ def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
     that rate instead of its own (a slow-motion film). Raises :class:`AmiwarpError` for what cannot be read.
     """
     path = Path(path)
-    if fps is not None and not (math.isfinite(fps) and 0.0 < fps <= 1e6):
-        raise AmiwarpError(f"fps = {fps} is not in 0 .. 1e6")
+    if fps is not None:
+        fps = real(fps, "fps", 1e-6, 1e6)
     if not path.exists():
         raise AmiwarpError(f"{path} does not exist; give a video, a folder of pictures or an .npy stack")
     if path.is_dir():
@@ -178,14 +183,25 @@ def _natural(file: Path) -> list[tuple[int, int, str]]:
 
 
 def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
-    with table.open(newline="", encoding="utf-8") as lines:
-        rows = list(csv.DictReader(lines))
-    try:
-        files = [table.parent / row["file"] for row in rows]
-        times = np.array([round(float(row["t_us"])) for row in rows], np.int64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise AmiwarpError(f"{table} is not a table with the columns file, t_us ({error!r})") from error
-    return files, times
+    with errors_name(table, lambda: "is not a table with the columns file, t_us"):
+        with table.open("rb") as file:
+            text = file.read(MOST_TABLE_BYTES + 1)
+        if len(text) > MOST_TABLE_BYTES:
+            raise AmiwarpError(f"it is larger than {MOST_TABLE_BYTES >> 20} MiB")
+        rows = csv.DictReader(io.StringIO(text.decode("utf-8"), newline=""))
+        files, times = [], []
+        for row in rows:
+            name, t = row.get("file"), row.get("t_us")
+            if not name or t is None:
+                raise AmiwarpError(f"line {rows.line_num} has no {'t_us' if name else 'file'}")
+            try:
+                files.append(table.parent / name)
+                times.append(round(float(t)))
+            except (ValueError, OverflowError) as error:
+                raise AmiwarpError(f"line {rows.line_num}: t_us is {shown(t)}; expected a finite number") from error
+            if abs(times[-1]) >= TIME_LIMIT:
+                raise AmiwarpError(f"line {rows.line_num}: t_us is {shown(t)}, beyond {TIME_LIMIT} us")
+        return files, np.array(times, np.int64)
 
 
 def _open_stack(path: Path, fps: float | None) -> PictureStack:

@@ -282,7 +282,7 @@ def _replace(name: str, values):
         (lambda f: f.attrs.modify("width", -1), "size -1x240"),
         (lambda f: f.create_group("camera"), "camera has no attribute 'width'"),
         (lambda f: f.create_group("prism").attrs.update(apex=9.0, index=1.5), "prism apex"),
-        (lambda f: f.create_group("prism").attrs.update(apex=0.1, index=1.5, flat_side="up"), "flat_side 'up'"),
+        (lambda f: f.create_group("prism").attrs.update(apex=0.1, index=1.5, flat_side="up"), "flat_side is 'up'"),
         (lambda f: f.create_group("encoder"), "encoder/t"),
         (lambda f: f.update({"encoder/t": [0, 0], "encoder/angle": [0.0, 1.0]}), "sample 1"),
         (lambda f: f.update({"truth/x": np.zeros(9), "truth/y": np.zeros(9)}), "truth has 9 and 9 points"),

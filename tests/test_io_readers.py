@@ -127,7 +127,7 @@ def test_paths_and_formats_that_are_none(tmp_path):
         open_recording(tmp_path / "none.raw")
     with pytest.raises(AmiwarpError, match="is a folder"):
         open_recording(tmp_path)
-    with pytest.raises(AmiwarpError, match="format 'wav' is not one of hdf5, evt"):
+    with pytest.raises(AmiwarpError, match="format is 'wav'; choose among hdf5, evt"):
         open_recording(tmp_path / "none.raw", format="wav")
     (tmp_path / "old.aedat").write_bytes(b"#!AER-DAT2.0\r\n")
     with pytest.raises(AmiwarpError, match=r"is AEDAT 2\.0; only AEDAT 4"):

@@ -449,7 +449,7 @@ def test_a_picture_is_cut_to_the_view() -> None:
         (lambda: CameraMotion((1.0, 2.0)), "camera rotation has shape"),
         (lambda: EncoderModel(rate_hz=0.0), "rate_hz = 0"),
         (lambda: EncoderModel(counts_per_turn=0), "counts_per_turn = 0"),
-        (lambda: base(duration_s=0.0), "duration of 0"),
+        (lambda: base(duration_s=0.0), "duration_s = 0"),
         (lambda: base(seed=-1), "seed = -1"),
         (lambda: base(camera=Camera.from_fov(4000, 4000, 1.0)), "4000x4000"),
         (lambda: Scene.from_picture(np.zeros((4, 4), np.int64)), "int64"),

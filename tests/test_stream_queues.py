@@ -114,5 +114,5 @@ def test_an_empty_queue_answers_in_time() -> None:
     queue = PacketQueue(10, Policy.BLOCK)
     assert queue.get(0.01) is None
     assert not queue.ended
-    with pytest.raises(AmiwarpError, match="1 or more"):
+    with pytest.raises(AmiwarpError, match="most_events = 0"):
         PacketQueue(0, Policy.BLOCK)

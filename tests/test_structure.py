@@ -31,6 +31,8 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 
 ORDER = (
     ("errors",),
+    ("values",),
+    ("prism",),
     ("kernels", "camera", "multilevel"),
     ("optics", "events", "encoder", "turning", "machine"),
     ("pictures", "motion", "clouds"),

@@ -11,7 +11,7 @@ import numpy as np
 
 from amiwarp.calib import checks
 from amiwarp.calib.panning import estimate_rates
-from amiwarp.calib.parameters import MOTION, NOMINAL_PRISM, RATES, Space, make_space, size_name
+from amiwarp.calib.parameters import MOTION, RATES, Space, make_space, nominal, size_name
 from amiwarp.calib.photometric import refine
 from amiwarp.calib.pixels import Masked, strange_pixels, stretch
 from amiwarp.calib.result import Calibration, constant_speed
@@ -20,6 +20,7 @@ from amiwarp.calib.speed import estimate_rpm
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents
+from amiwarp.prism import Prism
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -74,7 +75,7 @@ def calibrate(
     if isinstance(found, AmiwarpError):
         raise found
     _check_confirmed(found, recording.name)
-    if recording.prism is not None and not {"apex", "deflection"} & {*settings.bounds, *settings.start}:
+    if isinstance(recording.prism, Prism) and not {"apex", "deflection"} & {*settings.bounds, *settings.start}:
         checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
     return replace(found, seconds=time.perf_counter() - began)
 
@@ -337,7 +338,7 @@ def _space(
         found = dict(zip(RATES, estimate_rates(events, encoder, camera), strict=True))
         start |= {n: rate for n, rate in found.items() if "motion" in free or n in free}
     return make_space(
-        settings.model, camera, recording.prism or NOMINAL_PRISM, free=free, start=start, bounds=settings.bounds,
+        settings.model, camera, nominal(recording.prism), free=free, start=start, bounds=settings.bounds,
         rad_per_us=turned / max(duration, 1), duration_us=float(duration), middle_us=_middle(recording),
     )  # fmt: skip
 

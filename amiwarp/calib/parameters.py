@@ -16,6 +16,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics import (
+    MODELS,
     CircleModel,
     EllipseModel,
     ExactModel,
@@ -23,16 +24,19 @@ from amiwarp.optics import (
     RadialCircleModel,
     deflection_from_apex,
 )
+from amiwarp.prism import UnsizedPrism
 from amiwarp.turning import Turning
+from amiwarp.values import instance, one_of, real, shown, vector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.camera import Camera
     from amiwarp.optics import Model
+    from amiwarp.prism import NominalPrism
 
-NOMINAL_PRISM = Prism(math.radians(2.0))
-"""What is assumed where a recording says nothing of its prism: the apex is sought up to twice this."""
+NOMINAL_APEX = math.radians(2.0)
+"""What is assumed where a recording does not say its prism's apex: the apex is sought up to twice this."""
 UNITS = {
     "apex": "rad",
     "deflection": "rad",
@@ -165,6 +169,26 @@ class Space:
         return float(sum((values if n in self.names else self.start)[n] - x for n, x in self.undrifted.items()))
 
 
+def check_names(
+    free: tuple[str, ...] | None, start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> None:
+    """Raise :class:`AmiwarpError` where the names are no texts or their values no finite numbers."""
+    for name in free or ():
+        instance(name, str, "free parameter")
+    for given, what in ((start, "start"), (bounds, "bounds")):
+        if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
+            raise AmiwarpError(f"{what} is {shown(given)}; expected values by parameter name")
+    for name, value in start.items():
+        real(value, f"start of {name}")
+    for name, pair in bounds.items():
+        vector(pair, 2, f"bounds of {name}", real)
+
+
+def nominal(prism: NominalPrism | None) -> Prism:
+    """Return the prism to start from: what a recording says, and of its apex :data:`NOMINAL_APEX` if it is unknown."""
+    return prism if isinstance(prism, Prism) else (prism or UnsizedPrism()).with_apex(NOMINAL_APEX)
+
+
 def _difference(name: str, a: float, b: float) -> float:
     return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
 
@@ -183,6 +207,7 @@ def turning_of(values: Mapping[str, float], middle_us: int) -> Turning:
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
     """A model of the ladder from parameter values; what they do not name comes from ``camera`` and ``prism``."""
+    one_of(model, MODELS, "model")
     if "focal_length" in values:
         scale = values["focal_length"] / camera.fx
         camera = replace(camera, fx=values["focal_length"], fy=camera.fy * scale)

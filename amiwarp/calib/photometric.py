@@ -17,10 +17,11 @@ from amiwarp.calib.gauss_newton import GAUSS_NEWTON, Slopes, determined, iterate
 from amiwarp.calib.objective import reach
 from amiwarp.calib.parameters import LATE, MOTION
 from amiwarp.calib.result import Photometric, StageSummary
-from amiwarp.calib.solve import Stage, maximise
+from amiwarp.calib.solve import LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
 from amiwarp.calib.verdict import BESIDE_PX, FAR_PX, verdict
 from amiwarp.errors import AmiwarpError
 from amiwarp.pairs import EventTable, PairSet, Sensor, off_excess
+from amiwarp.values import real, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,6 +71,14 @@ class PhotometricSettings:
     """Nodes of the map per pixel."""
     sensor: Sensor = field(default_factory=Sensor)
     """Known latency and refractory time; what is not known of them stays in the phase."""
+
+    def check(self) -> None:
+        """Raise :class:`AmiwarpError` for an unknown algorithm or a number out of range."""
+        check_algorithm(self.algorithm, (GAUSS_NEWTON, *LOCAL_ALGORITHMS))
+        for name in ("pairs", "evaluations", "steps"):
+            whole(getattr(self, name), f"photometric {name}", 1, 10**12)
+        real(self.tolerance_px, "photometric tolerance_px", 0.0, 1e3, " px")
+        real(self.density, "photometric density", 0.01, 100.0)
 
 
 def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:

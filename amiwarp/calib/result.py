@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import json
 import math
-import operator
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.parameters import MOTION, UNITS, build_model, turning_of
-from amiwarp.camera import Camera, Fisheye, RadialTangential
+from amiwarp.calib.parameters import MOTION, UNITS, build_model, size_name, turning_of
+from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name
+from amiwarp.io.json_files import build, fields_of, read_json
 from amiwarp.io.output import write_text
-from amiwarp.optics import MODELS, FlatSide, Prism
+from amiwarp.optics import MODELS, Prism
+from amiwarp.sharpness import Sharpness
 from amiwarp.turning import Turning
+from amiwarp.values import one_of, real, shown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,6 +33,13 @@ if TYPE_CHECKING:
 
 FORMAT = "amiwarp-calibration"
 VERSION = 1
+NEEDED = ("format", "version", "model", "camera", "prism", "parameters", "sharpness", "zero_us", "photometric",
+          "events", "seconds", "warnings", "stages")  # fmt: skip
+OPTIONAL = ("middle_us", "ladder")
+"""Fields that calibrations of the first days lack."""
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
+LENSES: dict[str, type[Distortion]] = {"radial_tangential": RadialTangential, "fisheye": Fisheye}
+SHARPNESS = [kind.value for kind in Sharpness]
 
 
 @dataclass(frozen=True)
@@ -135,15 +145,6 @@ class Ladder:
     parameters: tuple[Freed, ...]
     seconds: float
     """Beside the exact model's first calibration."""
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> Ladder:
-        rungs = tuple(Rung(**{**rung, "seen_px": tuple(rung["seen_px"])}) for rung in data["rungs"])
-        parameters = tuple(
-            Freed(**{**p, "gain_px": None if p["gain_px"] is None else tuple(p["gain_px"])}) for p in data["parameters"]
-        )
-        exact = {n: _finite(n, x) for n, x in data["exact"].items()}
-        return cls(**{**data, "exact": exact, "rungs": rungs, "parameters": parameters})
 
 
 @dataclass(frozen=True)
@@ -253,51 +254,83 @@ class Calibration:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:
         """Reads a file that :meth:`save` wrote. Raises :class:`AmiwarpError` naming file and field."""
-        try:
-            data = json.loads(Path(path).read_text())
-        except (OSError, ValueError) as error:
-            raise AmiwarpError(f"{path}: cannot be read as a calibration: {error}") from error
-        if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
+        data = read_json(path, "a calibration")
+        if data.get("format") != FORMAT or data.get("version") != VERSION:
             raise AmiwarpError(
                 f"{path}: is not an {FORMAT} file of version {VERSION}; make one with 'amiwarp calibrate'"
             )
-        try:
+        with errors_name(Path(path), lambda: "damaged calibration, calibrate again"):
             return cls._from_json(data)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            what = f"field {error}" if isinstance(error, KeyError) else str(error)
-            raise AmiwarpError(f"{path}: damaged calibration: {what}; calibrate again") from error
 
     @classmethod
     def _from_json(cls, data: dict[str, Any]) -> Calibration:
-        if data["model"] not in MODELS:
-            raise AmiwarpError(f"model {data['model']!r} is unknown")
-        parameters = {name: _finite(name, entry["value"]) for name, entry in data["parameters"].items()}
-        prism = data["prism"]
+        fields_of(data, "", *NEEDED, optional=OPTIONAL)
+        model = one_of(data["model"], MODELS, "field model")
+        given = fields_of(data["parameters"], "parameters", size_name(model), "phase", optional=tuple(UNITS))
+        entries = {name: _entry(name, entry) for name, entry in given.items()}
+        prism = fields_of(data["prism"], "prism", "apex_rad", "index", "flat_side")
+        sharpness = build(_Sharpness, data["sharpness"], "sharpness")
+        names = [f.name for f in fields(_Rest)]
+        rest = build(_Rest, {name: data[name] for name in names if name in data}, "")
         result = cls(
-            model_name=data["model"],
-            camera=camera_from_json(data["camera"]),
-            prism=Prism(prism["apex_rad"], prism["index"], FlatSide(prism["flat_side"])),
-            parameters=parameters,
-            uncertainty={n: _finite(n, e["std"]) for n, e in data["parameters"].items() if "std" in e},
-            free=tuple(n for n, e in data["parameters"].items() if e["free"]),
-            sharpness_name=data["sharpness"]["kind"],
-            sharpness_before=data["sharpness"]["before"],
-            sharpness_after=data["sharpness"]["after"],
-            stages=tuple(StageSummary(**stage) for stage in data["stages"]),
-            events=data["events"],
-            seconds=data["seconds"],
-            warnings=tuple(data["warnings"]),
-            zero_us=None if data["zero_us"] is None else operator.index(data["zero_us"]),
-            photometric=_photometric(data["photometric"]),
-            middle_us=None if data.get("middle_us") is None else operator.index(data["middle_us"]),
-            ladder=None if data.get("ladder") is None else Ladder.from_json(data["ladder"]),
+            model_name=model,
+            camera=camera_from_json(data["camera"], "camera"),
+            prism=Prism(prism["apex_rad"], prism["index"], prism["flat_side"]),
+            parameters={name: entry.value for name, entry in entries.items()},
+            uncertainty={name: entry.std for name, entry in entries.items() if entry.std is not None},
+            free=tuple(name for name, entry in entries.items() if entry.free),
+            sharpness_name=one_of(sharpness.kind, SHARPNESS, "field sharpness.kind"),
+            sharpness_before=sharpness.before,
+            sharpness_after=sharpness.after,
+            **{name: getattr(rest, name) for name in names},
         )
         _ = replace(result, model_name="exact" if result.model_name == "ellipse" else result.model_name).model
         return result
 
 
-def _photometric(data: dict[str, Any] | None) -> Photometric | None:
-    return None if data is None else Photometric(**{**data, "held": tuple(data.get("held", ()))})
+@dataclass(frozen=True)
+class _Entry:
+    """A parameter as the file has it."""
+
+    value: float
+    free: bool
+    unit: str
+    std: float | None = None
+    degrees: float | None = None
+    """For who reads the file; ``value`` counts."""
+
+
+@dataclass(frozen=True)
+class _Sharpness:
+    """The sharpness as the file has it."""
+
+    kind: str
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """Fields that are in the file as in :class:`Calibration`."""
+
+    events: int
+    seconds: float
+    warnings: tuple[str, ...]
+    stages: tuple[StageSummary, ...]
+    zero_us: int | None
+    photometric: Photometric | None
+    middle_us: int | None = None
+    ladder: Ladder | None = None
+
+
+def _entry(name: str, data: Any) -> _Entry:
+    """One parameter; its unit must be the one that amiwarp uses, for nothing is converted."""
+    unit, entry = UNITS[name], build(_Entry, data, f"parameters.{name}")
+    if entry.unit != unit:
+        raise AmiwarpError(f"field parameters.{name}.unit is {shown(entry.unit)}; expected {unit}")
+    if entry.std is not None:
+        real(entry.std, f"field parameters.{name}.std", 0.0)
+    return entry
 
 
 def constant_speed(rpm: float, t_first: int, t_last: int, zero_us: int) -> Encoder:
@@ -306,28 +339,24 @@ def constant_speed(rpm: float, t_first: int, t_last: int, zero_us: int) -> Encod
     return replace(encoder, angle=encoder.angle + (t_first - zero_us) * (rpm * 2.0 * math.pi / 60e6))
 
 
-def _finite(name: str, value: Any) -> float:
-    if name not in UNITS:
-        raise AmiwarpError(f"parameter {name!r} is unknown")
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        raise AmiwarpError(f"parameter {name} is {value!r}, not a finite number")
-    return float(value)
-
-
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    out = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    out = {name: getattr(camera, name) for name in CAMERA}
     if camera.distortion is not None:
         kind = "fisheye" if isinstance(camera.distortion, Fisheye) else "radial_tangential"
         out["distortion"] = {"kind": kind, **asdict(camera.distortion)}
     return out
 
 
-def camera_from_json(data: dict[str, Any]) -> Camera:
-    d = dict(data.get("distortion") or {})
-    kind = d.pop("kind", None)
-    distortion = None if kind is None else (Fisheye(**d) if kind == "fisheye" else RadialTangential(**d))
-    numbers = {name: data[name] for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return Camera(**numbers, distortion=distortion)
+def camera_from_json(data: Any, where: str = "") -> Camera:
+    """A camera from a JSON object, which messages call ``where``. Raises :class:`AmiwarpError` naming the field."""
+    given = fields_of(data, where, *CAMERA, optional=("distortion",))
+    prefix, lens = f"{where}." if where else "", given.get("distortion")
+    distortion: Distortion | None = None
+    if lens is not None:
+        numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, f"{prefix}distortion")
+        kind = one_of(numbers.pop("kind", None), LENSES, f"field {prefix}distortion.kind")
+        distortion = build(LENSES[kind], numbers, f"{prefix}distortion")
+    return Camera(**{name: given[name] for name in CAMERA}, distortion=distortion)
 
 
 def cost_surface(stages: tuple[StageSummary, ...], size: str) -> NDArray[np.float64]:

@@ -11,9 +11,8 @@ import numpy as np
 
 from amiwarp.calib import checks
 from amiwarp.calib.curvature import differences
-from amiwarp.calib.gauss_newton import GAUSS_NEWTON
 from amiwarp.calib.objective import Objective
-from amiwarp.calib.parameters import LATE, MOTION, UNITS
+from amiwarp.calib.parameters import LATE, MOTION, UNITS, check_names
 from amiwarp.calib.photometric import PhotometricSettings
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
@@ -21,6 +20,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics import MODELS
 from amiwarp.sharpness import Sharpness
 from amiwarp.uploads import upload_events
+from amiwarp.values import choice, one_of, real, shown, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,6 +37,9 @@ CANDIDATES = 3
 PARTS = 8
 """Disjoint parts of the events that tell chance from signal."""
 
+LARGEST_BUDGET = 10**12
+"""Of evaluations and events: more is a mistake."""
+LARGEST_FOLD = 1 << 20
 AUTO = "auto"
 STAGES = ("sharpness", "photometric")
 
@@ -78,18 +81,24 @@ class Settings:
     """Without "photometric" the answer of sharpness stands."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sharpness", choice(Sharpness, self.sharpness, "sharpness"))
+
     def check(self) -> None:
-        if self.model not in (AUTO, *MODELS):
-            raise AmiwarpError(f"model {self.model!r} is unknown; choose among {', '.join((AUTO, *MODELS))}")
+        one_of(self.model, (AUTO, *MODELS), "model")
         if self.global_algorithm is not None:
             check_algorithm(self.global_algorithm, GLOBAL_ALGORITHMS)
         check_algorithm(self.local_algorithm, LOCAL_ALGORITHMS)
-        check_algorithm(self.photometric.algorithm, (GAUSS_NEWTON, *LOCAL_ALGORITHMS))
-        if self.stages not in (STAGES, STAGES[:1]):
-            raise AmiwarpError(f"stages {self.stages} are not 'sharpness' or 'sharpness, photometric'")
+        if not isinstance(self.stages, tuple) or [*map(str, self.stages)] not in ([*STAGES], [*STAGES[:1]]):
+            raise AmiwarpError(f"stages {shown(self.stages)} are not 'sharpness' or 'sharpness, photometric'")
         for name in ("global_evaluations", "local_evaluations", "events"):
-            if getattr(self, name) < 1:
-                raise AmiwarpError(f"{name} = {getattr(self, name)}; give 1 or more")
+            whole(getattr(self, name), name, 1, LARGEST_BUDGET)
+        whole(self.fold, "fold", 0, LARGEST_FOLD)
+        whole(self.seed, "seed", 0, 2**31 - 1)
+        real(self.tolerance_px, "tolerance_px", 0.0, 1e3, " px")
+        real(self.smoothing_px, "smoothing_px", 0.0, 1e3, " px")
+        check_names(self.free, self.start, self.bounds)
+        self.photometric.check()
 
 
 @dataclass(frozen=True)

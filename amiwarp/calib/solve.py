@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.values import one_of
 
 GLOBAL_ALGORITHMS = (
     "GN_DIRECT",
@@ -67,8 +68,7 @@ class Stage:
 
 def check_algorithm(name: str, known: tuple[str, ...]) -> None:
     """Raises :class:`AmiwarpError` unless ``name`` is one of ``known``."""
-    if name not in known:
-        raise AmiwarpError(f"algorithm {name!r} is not one of NLopt's derivative-free ones here: {', '.join(known)}")
+    one_of(name, known, "algorithm")
 
 
 def maximise(

@@ -27,7 +27,7 @@ EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.
 _SEARCH, _PARAMETERS = "Search", "Parameters"
 
 
-class Method(enum.Enum):
+class Method(enum.StrEnum):
     """Whose way to calibrate."""
 
     AMIWARP = "amiwarp"

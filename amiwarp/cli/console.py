@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from amiwarp.cli import printable, say
 from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError
 
@@ -54,21 +55,26 @@ def _without(line: str) -> Iterator[None]:
             caught.seek(0)
             for text in caught.read().decode(errors="replace").splitlines():
                 if line not in text:
-                    print(text, file=sys.stderr)
+                    say(text)
 
 
 @contextlib.contextmanager
 def progress(what: str) -> Iterator[Advance]:
     """A progress bar on stderr, gone when it is done; nothing where stderr is no terminal."""
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda share, what=None, /: bar.update(task, completed=share, description=what)
+        task = bar.add_task(printable(what), total=1.0)
+        yield lambda share, what=None, /: bar.update(
+            task, completed=share, description=None if what is None else printable(what)
+        )
 
 
 def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -> None:
-    """The result: ``data`` as one JSON object, or ``lines`` for people. A number that is not finite becomes null."""
+    """Print the result: ``data`` as one JSON object, or ``lines`` for people, each one line (see :func:`printable`).
+
+    In JSON a number that is not finite becomes null.
+    """
     if common.json:
         print(json.dumps(plain(data), allow_nan=False))
         return
@@ -76,7 +82,7 @@ def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 1000)
     with console.capture() as text:
         for line in lines:
-            console.print(line, markup=False)
+            console.print(printable(line) if isinstance(line, str) else line, markup=False)
     print("\n".join(row.rstrip() for row in text.get().splitlines()))
 
 
@@ -94,11 +100,11 @@ def plain(value: Any) -> Any:
 
 
 def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:
-    """Two columns and more, without lines; strings are shown as they are."""
+    """Return two columns and more, without lines; strings are shown without markup, see :func:`printable`."""
     from rich.text import Text
 
     grid = Table(box=None, show_header=bool(headings), pad_edge=False, header_style="bold")
-    cells = [[Text(cell) for cell in row] for row in rows]
+    cells = [[Text(printable(cell)) for cell in row] for row in rows]
     for k in range(max((len(row) for row in cells), default=len(headings))):
         grid.add_column(headings[k] if headings else "", style="dim" if k == 0 and not headings else None)
     for row in cells:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from amiwarp.cli import say
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common
 from amiwarp.cli.streams import stopped_by_interrupt
@@ -107,7 +108,7 @@ def run(
                 break
         if served is not None and served.late_us > LATE_US:
             late = f"events were sent up to {served.late_us * 1e-6:.1f} s late, none lost"
-            print(f"{late}: this machine, or who listens, is slower than the recording", file=sys.stderr)
+            say(f"{late}: this machine, or who listens, is slower than the recording")
 
 
 def _recording(path: Path) -> tuple[Recording, Encoder]:

@@ -11,6 +11,7 @@ import typer
 
 from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import Common
+from amiwarp.prism import Prism
 
 if TYPE_CHECKING:
     from amiwarp.encoder import Encoder
@@ -50,7 +51,8 @@ def describe(recording: Recording, file: str) -> dict[str, Any]:
     }
     if recording.prism is not None:
         p = recording.prism
-        data["prism"] = {"apex_deg": math.degrees(p.apex), "index": p.index, "flat_side": p.flat_side.value}
+        apex = math.degrees(p.apex) if isinstance(p, Prism) else None
+        data["prism"] = {"apex_deg": apex, "index": p.index, "flat_side": p.flat_side.value}
     return data
 
 
@@ -128,10 +130,7 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     lens = "" if c is None else (c.get("distortion") or {}).get("kind", "no distortion").replace("_", "-")
     rows.append(("camera", "unknown" if c is None else f"fx {c['fx']:.6g}, fy {c['fy']:.6g}, cx {c['cx']:.6g}, "
                  f"cy {c['cy']:.6g} px, FOV {c['fov_deg']:.4g} deg, {lens}"))  # fmt: skip
-    flat = "" if p is None else f"flat face to the {p['flat_side']}"
-    rows.append(
-        ("prism", "unknown" if p is None else f"nominal apex {p['apex_deg']:.5g} deg, n {p['index']:.6g}, {flat}")
-    )
+    rows.append(("prism", _prism_text(p)))
     if d["truth"] is not None:
         points = "with a point for each event" if d["truth_points"] else "without points"
         shown = [f"{n} {v:.5g}" for n, v in d["truth"].items() if n in ("apex_deg", "phase_deg", "index")]
@@ -139,6 +138,13 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("repairs", ", ".join(f"{name} {count:,}" for name, count in d["repairs"].items()) or "none"))
     rest = {k: v for k, v in d["metadata"].items() if k != "format" and k not in d["repairs"]}
     return rows + [(name, str(value)) for name, value in rest.items()]
+
+
+def _prism_text(p: dict[str, Any] | None) -> str:
+    if p is None:
+        return "unknown"
+    apex = "apex unknown" if p["apex_deg"] is None else f"nominal apex {p['apex_deg']:.5g} deg"
+    return f"{apex}, n {p['index']:.6g}, flat face to the {p['flat_side']}"
 
 
 def _encoder_text(e: dict[str, Any] | None) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import typer
 
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics import FlatSide, Prism
+from amiwarp.prism import FlatSide, NominalPrism, UnsizedPrism
 
 if TYPE_CHECKING:
     from amiwarp.events import Recording
@@ -62,18 +61,15 @@ def read_camera(path: Path, width: int, height: int) -> Camera:
     Raises :class:`AmiwarpError` naming file and field.
     """
     from amiwarp.calib.result import camera_from_json
+    from amiwarp.io.files import errors_name
+    from amiwarp.io.json_files import read_json
     from amiwarp.io.text import read_calib
 
     if path.suffix.lower() != ".json":
         return read_calib(path, width, height)
-    try:
-        data: Any = json.loads(path.read_text())
-        return camera_from_json(data.get("camera", data))
-    except FileNotFoundError as error:
-        raise AmiwarpError(f"{path}: no such file") from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise AmiwarpError(f"{path}: is no camera: {what}; expected width, height, fx, fy, cx, cy") from error
+    data = read_json(path, "a camera")
+    with errors_name(path, lambda: "is no camera"):
+        return camera_from_json(data["camera"], "camera") if "camera" in data else camera_from_json(data)
 
 
 @dataclass(frozen=True)
@@ -88,16 +84,17 @@ class NominalPrismOptions:
         None
     )
 
-    def build(self, known: Prism | None) -> Prism | None:
-        """``known`` with what is given put in its place; None where nothing is known or given."""
-        changes: dict[str, Any] = {"index": self.index, "flat_side": self.flat_side}
-        changes["apex"] = None if self.nominal_apex_deg is None else math.radians(self.nominal_apex_deg)
-        changes = {name: value for name, value in changes.items() if value is not None}
-        if not changes:
-            return known
-        from amiwarp.calib.parameters import NOMINAL_PRISM
+    def build(self, known: NominalPrism | None) -> NominalPrism | None:
+        """Return ``known`` with what is given over it; None where nothing is known or given.
 
-        return replace(known or NOMINAL_PRISM, **changes)
+        An apex that nobody gave stays unknown.
+        """
+        given = {"index": self.index, "flat_side": self.flat_side}
+        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        prism = replace(known or UnsizedPrism(), **changes)
+        if self.nominal_apex_deg is not None:
+            return UnsizedPrism(prism.index, prism.flat_side).with_apex(math.radians(self.nominal_apex_deg))
+        return prism if changes else known
 
 
 def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None) -> Recording:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
@@ -152,7 +152,8 @@ def run(
         "messages": list(line.messages),
     }
     if "-" in (to, raw_to):  # standard output has packets
-        print(*_lines(data), sep="\n", file=sys.stderr)
+        for text in _lines(data):
+            say(text)
     else:
         report(common, data, _lines(data))
 

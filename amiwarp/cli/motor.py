@@ -23,7 +23,7 @@ WAIT_S = 2.5
 STEP_S = 0.02
 
 
-class Action(enum.Enum):
+class Action(enum.StrEnum):
     """What to do."""
 
     STATUS = "status"

@@ -7,7 +7,6 @@ import functools
 import importlib
 import logging
 import signal
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
@@ -130,7 +130,7 @@ def _run(
             cells = run(axes, seeds, methods, folder, executor, device=device, first=first, progress=tell,
                         until=None if end is None else lambda: time.monotonic() > end)  # fmt: skip
     except KeyboardInterrupt:
-        print(f"amiwarp: what is finished is kept in {folder}; the same command goes on from there", file=sys.stderr)
+        say(f"amiwarp: what is finished is kept in {folder}; the same command goes on from there")
         raise
     return cells, new
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from amiwarp.cli import printable, say
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
@@ -106,9 +106,9 @@ class StatusLine:
     def say(self, message: str) -> None:
         self.messages.append(message)
         if self._console.is_terminal:
-            self._console.print(message, markup=False)
+            self._console.print(printable(message), markup=False)
         else:
-            print(message, file=sys.stderr, flush=True)
+            say(message)
 
     def update(self, status: Status) -> None:
         if self._seconds is not None and status.seconds >= self._seconds:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
 from amiwarp.cli.options import OUTPUT, Common
@@ -116,7 +116,7 @@ def run(
         def ready(url: str) -> None:
             report(common, {"url": url}, [f"{recording.name}: {url}", "Ctrl-C ends it"])
             if host not in ("127.0.0.1", "localhost"):
-                print(f"served on {host}: whoever has this address can see the recording", file=sys.stderr)
+                say(f"served on {host}: whoever has this address can see the recording")
 
         def tab() -> Inspector:
             return served.pop() if served else make()
@@ -163,9 +163,6 @@ def _following(spec: str, controller: str | None) -> Iterator[Callable[[], Recor
     from amiwarp.cli.streams import SourceOptions, check_angles
     from amiwarp.stream.ring import Ring, followed
     from amiwarp.stream.sources import open_source
-
-    def say(message: str) -> None:
-        print(message, file=sys.stderr, flush=True)
 
     with SourceOptions(port=controller).link() as link:
         source = open_source(spec)

@@ -9,9 +9,18 @@ import numpy as np
 
 from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.json_files import LARGEST_INTEGER
+from amiwarp.values import array, instance, one_of, real, shown, whole
 
 if TYPE_CHECKING:
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
+
+
+LENSES: dict[str, tuple[type[RadialTangential] | type[Fisheye], int]] = {
+    "radial_tangential": (RadialTangential, 5),
+    "fisheye": (Fisheye, 4),
+}
+"""Models of distortion by name, and their numbers of coefficients."""
 
 
 def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[Any], default: Any = None) -> Any:
@@ -19,10 +28,18 @@ def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[A
     if name not in attributes and default is None:
         raise AmiwarpError(f"{where} has no attribute '{name}'; add it")
     value = attributes.get(name, default)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    what = f"{where} attribute '{name}'"
+    if kind is int:
+        return whole(value, what, -LARGEST_INTEGER, LARGEST_INTEGER)
+    if kind is float:
+        return real(value, what)
     try:
-        return kind(value.decode() if isinstance(value, bytes) else value)
-    except (TypeError, ValueError) as error:
-        raise AmiwarpError(f"{where} attribute '{name}' is {value!r}; expected {kind.__name__}") from error
+        text = value.decode() if isinstance(value, bytes) else value
+    except UnicodeDecodeError:
+        text = value
+    return instance(text, kind, what)
 
 
 def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[float]]:
@@ -44,34 +61,32 @@ def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[floa
 
 def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
     """A camera from its attributes."""
-    model = attribute(attributes, where, "distortion_model", str, "none")
-    kinds: dict[str, tuple[type[RadialTangential] | type[Fisheye], int]]
-    kinds = {"radial_tangential": (RadialTangential, 5), "fisheye": (Fisheye, 4)}
+    model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*LENSES, "none"),
+                   f"{where} attribute 'distortion_model'")  # fmt: skip
     distortion: Distortion | None = None
-    if model in kinds:
-        kind, length = kinds[model]
-        coefficients = np.asarray(attributes.get("distortion", ()), np.float64)
-        if coefficients.shape != (length,) or not np.isfinite(coefficients).all():
-            raise AmiwarpError(f"camera distortion is {coefficients.tolist()}; expected {length} numbers for {model}")
+    if model in LENSES:
+        kind, length = LENSES[model]
+        coefficients = array(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
+        if coefficients.shape != (length,):
+            raise AmiwarpError(f"camera distortion is {shown(coefficients)}; expected {length} numbers for {model}")
         distortion = kind(*coefficients.tolist())
-    elif model != "none":
-        raise AmiwarpError(f"camera distortion_model '{model}'; expected none, radial_tangential or fisheye")
     width, height = (attribute(attributes, where, name, int) for name in ("width", "height"))
     fx, fy, cx, cy = (attribute(attributes, where, name, float) for name in ("fx", "fy", "cx", "cy"))
     return Camera(width, height, fx, fy, cx, cy, distortion)
 
 
-def prism_attributes(prism: Prism) -> dict[str, float | str]:
-    """A nominal prism's attributes."""
-    return {"apex": float(prism.apex), "index": float(prism.index), "flat_side": prism.flat_side.value}
+def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
+    """A nominal prism's attributes; no apex where it is unknown."""
+    from amiwarp.prism import Prism
+
+    known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
+    return {**known, "index": prism.index, "flat_side": prism.flat_side.value}
 
 
-def read_prism(attributes: Mapping[str, Any], where: str) -> Prism:
-    """A nominal prism from its attributes."""
-    from amiwarp.optics import FlatSide, Prism
+def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
+    """A nominal prism from its attributes; one of unknown apex where that is missing."""
+    from amiwarp.prism import FlatSide, UnsizedPrism
 
     side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
-    if side not in {member.value for member in FlatSide}:
-        raise AmiwarpError(f"prism flat_side '{side}'; expected {' or '.join(member.value for member in FlatSide)}")
-    apex, index = (attribute(attributes, where, name, float) for name in ("apex", "index"))
-    return Prism(apex, index, flat_side=FlatSide(side))
+    prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
+    return prism.with_apex(attribute(attributes, where, "apex", float)) if "apex" in attributes else prism

@@ -15,7 +15,7 @@ from amiwarp.io.formats import open_recording
 from amiwarp.io.native_writer import Progress, RecordingWriter, copy_events
 
 if TYPE_CHECKING:
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 GAP_INTERVALS = 5
 """Neighbouring encoder samples more than so many median intervals apart are reported as a gap."""
@@ -51,7 +51,7 @@ def convert(
     *,
     encoder: Encoder | None = None,
     camera: Camera | None = None,
-    prism: Prism | None = None,
+    prism: NominalPrism | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Summary:

@@ -10,9 +10,10 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
+from amiwarp.values import choice
 
 
-class Format(enum.Enum):
+class Format(enum.StrEnum):
     """Formats that can be read."""
 
     HDF5 = "hdf5"
@@ -78,13 +79,7 @@ def open_recording(path: str | os.PathLike[str], *, format: Format | str | None 
     Raises :class:`AmiwarpError` naming the file and the place for whatever cannot be read.
     """
     path = Path(path)
-    try:
-        chosen = detect_format(path) if format is None else Format(format)
-    except ValueError as error:
-        if isinstance(error, AmiwarpError):
-            raise
-        known = ", ".join(member.value for member in Format)
-        raise AmiwarpError(f"{path}: format '{format}' is not one of {known}") from error
+    chosen = detect_format(path) if format is None else choice(Format, format, f"{path}: format")
     return _opener(chosen)(path)
 
 

@@ -40,7 +40,7 @@ from amiwarp.io.native_writer import (
 from amiwarp.io.output import check_output, put_in_place
 
 if TYPE_CHECKING:
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 SMALL_CHUNK = 4096
 """Elements of a chunk of the small datasets: stored plain, so that they grow in place."""
@@ -72,7 +72,7 @@ class LiveWriter:
         width: int,
         height: int,
         camera: Camera | None = None,
-        prism: Prism | None = None,
+        prism: NominalPrism | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
         compensated: bool = False,
         clock_offset_us: float = 0.0,

@@ -23,7 +23,7 @@ from amiwarp.io.files import errors_name
 from amiwarp.io.output import NewFile
 
 if TYPE_CHECKING:
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 FORMAT = "amiwarp-recording"
 FORMAT_VERSION = 1
@@ -55,7 +55,7 @@ class RecordingWriter:
         width: int,
         height: int,
         camera: Camera | None = None,
-        prism: Prism | None = None,
+        prism: NominalPrism | None = None,
         encoder: Encoder | None = None,
         truth_parameters: Mapping[str, float] | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
@@ -335,7 +335,7 @@ def write_header(
     file: Any,
     size: tuple[int, int],
     camera: Camera | None,
-    prism: Prism | None,
+    prism: NominalPrism | None,
     metadata: Mapping[str, MetadataValue],
 ) -> None:
     """All that is known before the first event."""

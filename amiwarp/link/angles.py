@@ -18,7 +18,7 @@ LATE = 1.5
 """Turns after the last index pulse when the next was missed."""
 
 
-class Fault(enum.Enum):
+class Fault(enum.StrEnum):
     """What does not fit."""
 
     SLIP = "slip"

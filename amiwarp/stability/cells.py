@@ -41,7 +41,7 @@ FORMAT = 1
 """Of a stored cell; part of its identity."""
 
 
-class Outcome(enum.Enum):
+class Outcome(enum.StrEnum):
     """What came of a calibration."""
 
     SUCCESS = "success"

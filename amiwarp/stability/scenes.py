@@ -20,7 +20,7 @@ FRAME_US = 1000
 """Between two pictures of a scene that changes."""
 
 
-class SceneKind(enum.Enum):
+class SceneKind(enum.StrEnum):
     """What the camera looks at."""
 
     TEXTURE = "dense texture"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.camera import Camera
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 POLL_S = 0.0005
 IDLE_S = 0.05
@@ -52,7 +52,7 @@ def _named(camera: str, doing: str) -> Iterator[None]:
 class _CameraSource:
     camera: Camera | None = None
     """Not known to the device; its calibration is the user's."""
-    prism: Prism | None = None
+    prism: NominalPrism | None = None
     has_encoder = False
     size: tuple[int, int]
     name: str

@@ -19,7 +19,7 @@ from amiwarp.io.attributes import attribute, camera_attributes, prism_attributes
 
 if TYPE_CHECKING:
     from amiwarp.camera import Camera
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
 
 MAGIC = b"AMIS"
 VERSION = 1
@@ -75,7 +75,7 @@ class Source(Protocol):
     size: tuple[int, int]
     """Sensor's (width, height) [px]."""
     camera: Camera | None
-    prism: Prism | None
+    prism: NominalPrism | None
     has_encoder: bool
     """Whether encoder samples can come along."""
     name: str
@@ -95,7 +95,7 @@ class Hello:
     width: int
     height: int
     camera: Camera | None = None
-    prism: Prism | None = None
+    prism: NominalPrism | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +121,7 @@ class End:
 Message: TypeAlias = Hello | Events | Compensated | Triggers | Angles | End
 
 
-def encode_hello(width: int, height: int, camera: Camera | None = None, prism: Prism | None = None) -> bytes:
+def encode_hello(width: int, height: int, camera: Camera | None = None, prism: NominalPrism | None = None) -> bytes:
     """The first packet of a stream."""
     fields: dict[str, Any] = {"width": width, "height": height}
     if camera is not None:

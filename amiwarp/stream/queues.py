@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
+from amiwarp.values import choice, whole
 
 if TYPE_CHECKING:
     from amiwarp.stream.packets import Packet
@@ -20,7 +20,7 @@ THIN_FROM = 0.5
 """Fill from which on events are thinned, the more the fuller the queue is."""
 
 
-class Policy(enum.Enum):
+class Policy(enum.StrEnum):
     """What a queue does that is full."""
 
     BLOCK = "block"
@@ -38,9 +38,8 @@ class PacketQueue:
     """
 
     def __init__(self, most_events: int, policy: Policy) -> None:
-        if most_events < 1:
-            raise AmiwarpError(f"queue of {most_events} events; give 1 or more")
-        self.most_events, self.policy = most_events, policy
+        self.most_events = whole(most_events, "queue's most_events", 1, 1 << 40)
+        self.policy = choice(Policy, policy, "policy")
         self.received = self.dropped = 0
         """Events put, and those of them that never come out."""
         self._packets: deque[Packet] = deque()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from amiwarp.camera import Camera
     from amiwarp.link.link import Link
-    from amiwarp.optics import Prism
+    from amiwarp.prism import NominalPrism
     from amiwarp.stream.packets import Source
 
 SECONDS, MOST_EVENTS = 2.0, 1 << 23
@@ -33,7 +33,7 @@ FIRST_S = 15.0
 class Ring:
     """Takes what a :class:`LiveWriter` takes; for one thread that appends and any that ask."""
 
-    def __init__(self, source: Source, camera: Camera | None = None, prism: Prism | None = None) -> None:
+    def __init__(self, source: Source, camera: Camera | None = None, prism: NominalPrism | None = None) -> None:
         self._size, self._name = source.size, source.name
         self._camera, self._prism = camera or source.camera, prism or source.prism
         self._events: deque[Events] = deque()

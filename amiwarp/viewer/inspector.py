@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.parameters import NOMINAL_PRISM, build_model
+from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
@@ -130,7 +130,7 @@ class Inspector:
                 f"camera unknown: {FOV_DEG:g}° field of view assumed; tell it with --fov-deg or --camera",
             )
         self.recording, self.device, self.latest = recording, device, latest
-        self.prism = recording.prism or NOMINAL_PRISM
+        self.prism = nominal(recording.prism)
         """The nominal one."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Where there is no encoder: when the angle is 0."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from amiwarp.clouds import OFF_COLOUR, ON_COLOUR
 from amiwarp.errors import AmiwarpError
+from amiwarp.values import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,7 +33,7 @@ PAPER = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
 """Background and ink, light and dark."""
 
 
-class Colour(enum.Enum):
+class Colour(enum.StrEnum):
     """What a point's colour tells."""
 
     POLARITY = "polarity"
@@ -44,14 +45,14 @@ class Colour(enum.Enum):
     """Distance from the middle of the events about it, up to 2 px: of an edge, from its crest."""
 
 
-class Axis(enum.Enum):
+class Axis(enum.StrEnum):
     """The third axis."""
 
     ANGLE = "angle"
     TIME = "time"
 
 
-class View(enum.Enum):
+class View(enum.StrEnum):
     """Where the camera stands."""
 
     FREE = "free"
@@ -84,6 +85,10 @@ class Look:
     dark: bool = False
     overlaid: bool = False
     """Both in one frame, as recorded grey."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
+        object.__setattr__(self, "axis", choice(Axis, self.axis, "axis"))
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ class Scene:
 
     def look_from(self, view: View, look: Look) -> None:
         """Moves the camera, both clouds in sight."""
-        self.view = view
+        self.view = view = choice(View, view, "view")
         self._draw_frame(look)
         b = self.box
         away, up = (np.array(v) for v in STANDS[view])

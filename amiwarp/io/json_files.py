@@ -1,0 +1,150 @@
+"""JSON from files that anyone may have written: bounded, strict, and turned into dataclasses field by field."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import types
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name
+from amiwarp.values import real, shown, whole
+
+Made = TypeVar("Made")
+
+MOST_BYTES = 64 << 20
+"""Largest JSON file that is read; a calibration with all points of its search takes about 1 MB."""
+LARGEST_INTEGER = 2**62
+"""Largest magnitude of a whole number: that of times, see :data:`amiwarp.events.TIME_LIMIT`."""
+
+
+def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
+    """Return the JSON object of a file.
+
+    Parameters
+    ----------
+    path : path
+        A file of at most :data:`MOST_BYTES`, in UTF-8.
+    what : str
+        What the file should be, for messages: "a calibration".
+
+    Raises
+    ------
+    AmiwarpError
+        For a file that cannot be read, is larger, is no JSON, nests too deeply, is no object, or holds a number that is
+        not finite or has thousands of digits.
+    """
+    path = Path(path)
+    with errors_name(path, lambda: f"cannot be read as {what}"):
+        if path.is_dir():
+            raise AmiwarpError(f"{path}: is a folder; give a file")
+        with path.open("rb") as file:
+            text = file.read(MOST_BYTES + 1)
+        if len(text) > MOST_BYTES:
+            raise AmiwarpError(f"{path}: is larger than {MOST_BYTES >> 20} MiB, so it is not {what}; give another file")
+        data = parse_json(text)
+        if not isinstance(data, dict):
+            raise AmiwarpError(f"the file holds {shown(data)}; expected an object in braces")
+    return data
+
+
+def parse_json(text: bytes) -> Any:
+    """Return JSON's value; :class:`AmiwarpError` for what is no JSON, and for numbers that are not finite."""
+    try:
+        return json.loads(text.decode("utf-8"), parse_constant=_refuse, parse_float=_finite)
+    except AmiwarpError:
+        raise
+    except RecursionError as error:
+        raise AmiwarpError("the JSON nests too deeply") from error
+    except UnicodeDecodeError as error:
+        raise AmiwarpError(f"byte {error.start} is no UTF-8") from error
+    except ValueError as error:
+        raise AmiwarpError(f"is no JSON: {error}") from error
+
+
+def _refuse(word: str) -> NoReturn:
+    raise AmiwarpError(f"the JSON holds {word}; expected finite numbers")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise AmiwarpError(f"the JSON holds {shown(digits)}, beyond the largest float64")
+    return value
+
+
+def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return a JSON object with all ``needed`` fields and none but the ``optional`` ones besides.
+
+    ``where`` names the object for messages; empty for the whole file. Raises :class:`AmiwarpError` naming the field.
+    """
+    if not isinstance(data, dict):
+        raise AmiwarpError(f"field {where} is {shown(data)}; expected an object")
+    prefix = f"{where}." if where else ""
+    for name in needed:
+        if name not in data:
+            raise AmiwarpError(f"field {prefix}{name} is missing")
+    for name in data:
+        if name not in needed and name not in optional:
+            raise AmiwarpError(
+                f"field {prefix}{shown(name)[1:-1]} is unknown; expected {', '.join((*needed, *optional))}"
+            )
+    return data
+
+
+def build(kind: type[Made], data: Any, where: str) -> Made:
+    """Return a dataclass from a JSON object, each field checked against its annotation.
+
+    Fields with a default may be missing. Takes str, bool, int, float, None, dataclasses, and lists, tuples and mappings
+    of these. Raises :class:`AmiwarpError` naming the field.
+    """
+    hints = get_type_hints(kind)
+    known: tuple[Any, ...] = dataclasses.fields(kind)  # type: ignore[arg-type]
+    has_default = {
+        f.name: f.default is not dataclasses.MISSING or f.default_factory is not dataclasses.MISSING for f in known
+    }
+    needed = [name for name, has in has_default.items() if not has]
+    optional = tuple(name for name, has in has_default.items() if has)
+    given = fields_of(data, where, *needed, optional=optional)
+    prefix = f"{where}." if where else ""
+    return kind(**{name: _value(hints[name], value, f"{prefix}{name}") for name, value in given.items()})
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    """One value of an annotated type."""
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        return build(kind, value, where)
+    if get_origin(kind) is types.UnionType:
+        parts = [part for part in get_args(kind) if part is not types.NoneType]
+        return None if value is None else _value(parts[0], value, where)
+    if kind is float:
+        return real(value, f"field {where}")
+    if kind is int:
+        return whole(value, f"field {where}", -LARGEST_INTEGER, LARGEST_INTEGER)
+    if kind in (str, bool):
+        if not isinstance(value, kind):
+            raise AmiwarpError(
+                f"field {where} is {shown(value)}; expected {'text' if kind is str else 'true or false'}"
+            )
+        return value
+    return _several(kind, value, where)
+
+
+def _several(kind: Any, value: Any, where: str) -> Any:
+    """A list, a tuple or a mapping of an annotated type."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (dict, Mapping):
+        given = value if isinstance(value, dict) else fields_of(value, where)
+        return {name: _value(inner[1], entry, f"{where}.{shown(name)[1:-1]}") for name, entry in given.items()}
+    if not isinstance(value, list):
+        raise AmiwarpError(f"field {where} is {shown(value)}; expected a list")
+    fixed = origin is tuple and inner[-1] is not ...
+    if fixed and len(value) != len(inner):
+        raise AmiwarpError(f"field {where} has {len(value)} entries; expected {len(inner)}")
+    kinds = inner if fixed else (inner[0],) * len(value)
+    return origin(_value(k, entry, f"{where}[{i}]") for i, (k, entry) in enumerate(zip(kinds, value, strict=True)))

@@ -1,0 +1,123 @@
+"""Checks of single values at the public door: each returns the value in its plain type, or says what was expected."""
+
+from __future__ import annotations
+
+import enum
+import math
+import numbers
+import reprlib
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+
+Choice = TypeVar("Choice", bound=enum.StrEnum)
+Kind = TypeVar("Kind")
+
+UNUSABLE = (TypeError, ValueError, OverflowError, RecursionError)
+"""What Python and NumPy raise for a value of a foreign kind."""
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = _short.maxlong = 80
+_short.maxlevel = 2
+
+
+def shown(value: object) -> str:
+    """Return a value as at most a line of text, for a message."""
+    try:
+        return " ".join(_short.repr(value).split())
+    except Exception:  # a foreign class may raise anything, and a number of 5000 digits does
+        return f"a value of type {type(value).__name__}"
+
+
+def choice(kind: type[Choice], value: object, what: str) -> Choice:
+    """Return the member of ``kind`` that ``value`` is or names; :class:`AmiwarpError` lists the choices."""
+    return kind(one_of(value, [member.value for member in kind], what))
+
+
+def one_of(value: object, names: Iterable[str], what: str) -> str:
+    """Return ``value`` if it is among ``names``; :class:`AmiwarpError` lists them."""
+    names = list(names)
+    if not isinstance(value, str) or value not in names:
+        raise AmiwarpError(f"{what} is {shown(value)}; choose among {', '.join(names)}")
+    return str(value)
+
+
+def instance(value: object, kind: type[Kind], what: str) -> Kind:
+    """Return ``value`` if it is a ``kind``. Raises :class:`AmiwarpError`."""
+    if not isinstance(value, kind):
+        raise AmiwarpError(f"{what} is {shown(value)}; expected a {kind.__name__}")
+    return value
+
+
+def real(value: object, what: str, low: float = -math.inf, high: float = math.inf, hint: str = "") -> float:
+    """Return a finite number within ``low`` .. ``high``, both included, as float.
+
+    Takes Python's and NumPy's numbers, no text and no truth value. Raises :class:`AmiwarpError`, ending in ``hint``.
+    """
+    plain = _scalar(value)
+    number = math.nan
+    if not isinstance(plain, bool) and isinstance(plain, numbers.Real):
+        try:
+            number = float(plain)
+        except UNUSABLE:  # an integer beyond float64
+            number = math.nan
+    if not (math.isfinite(number) and low <= number <= high):
+        raise AmiwarpError(f"{what} = {shown(plain)} is not {_range('a finite number', low, high)}{hint}")
+    return number
+
+
+def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
+    """Return a whole number within ``low`` .. ``high``, both included, as int.
+
+    Takes Python's and NumPy's integers, no floats and no truth value. Raises :class:`AmiwarpError`, ending in ``hint``.
+    """
+    plain = _scalar(value)
+    if isinstance(plain, bool) or not isinstance(plain, numbers.Integral) or not low <= int(plain) <= high:
+        raise AmiwarpError(f"{what} = {shown(plain)} is not {_range('a whole number', low, high)}{hint}")
+    return int(plain)
+
+
+def vector(value: object, count: int, what: str, check: Callable[[object, str], float]) -> tuple[float, ...]:
+    """Return ``count`` numbers, each passed through ``check``. Raises :class:`AmiwarpError`."""
+    axes = value.ndim if isinstance(value, np.ndarray) else 1
+    if not isinstance(value, list | tuple | np.ndarray) or axes != 1 or len(value) != count:
+        raise AmiwarpError(f"{what} is {shown(value)}; expected {count} numbers")
+    return tuple(check(entry, what) for entry in value)
+
+
+def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
+    """Return an array of numbers, as it is given where it is one already. Raises :class:`AmiwarpError`.
+
+    ``kinds``: NumPy's letters of the kinds of numbers that are taken; ``b``, truth values, only where listed.
+    """
+    try:
+        found = np.asarray(value)
+    except UNUSABLE:
+        found = np.zeros(0, object)
+    if isinstance(value, list | tuple) and not value:
+        return np.zeros(0)
+    if found.dtype.kind not in kinds:
+        raise AmiwarpError(f"{what} is {shown(value)}, of type {found.dtype}; expected numbers")
+    return found
+
+
+def _scalar(value: object) -> Any:
+    """An array without axes as the number it holds, anything else as it is."""
+    return value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+
+
+def _range(what: str, low: float, high: float) -> str:
+    """Words for a range whose ends may be infinite."""
+    if math.isinf(low) and math.isinf(high):
+        return what
+    if math.isinf(high):
+        return f"{what} of at least {_plain(low)}"
+    return f"{what} in {_plain(low)} .. {_plain(high)}"
+
+
+def _plain(number: float) -> str:
+    return str(number) if isinstance(number, int) else f"{number:.6g}"

@@ -1,0 +1,88 @@
+"""What reaches the terminal: names from outside are shown, never obeyed, and a message is one line."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from amiwarp.cli import printable
+from amiwarp.cli.console import report, table
+from amiwarp.cli.options import Common
+from amiwarp.events import Events
+from amiwarp.io import RecordingWriter
+
+NASTY = "a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
+"""A name that sets a terminal's title, turns it red, breaks the line and turns the direction of writing round."""
+SHOWN = r"a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
+
+
+def run(*words: str) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run([sys.executable, "-m", "amiwarp", *words], capture_output=True, timeout=300, check=False)
+
+
+def obeyed(output: bytes) -> list[str]:
+    """Characters that a terminal would obey, newlines at the ends of lines aside."""
+    return [c for c in output.decode() if not c.isprintable() and c != "\n"]
+
+
+def test_a_name_in_an_error_is_shown_and_not_obeyed(tmp_path: Path) -> None:
+    ended = run("info", str(tmp_path / NASTY))
+    assert ended.returncode == 1
+    assert obeyed(ended.stderr) == []
+    assert ended.stderr.count(b"\n") == 1
+    assert f"{SHOWN}: no such file" in ended.stderr.decode()
+
+
+def test_a_name_that_is_no_utf8_is_shown(tmp_path: Path) -> None:
+    ended = run("info", os.fsdecode(os.fsencode(tmp_path) + b"/\xff.h5"))
+    assert ended.returncode == 1
+    assert rb"\udcff.h5: " in ended.stderr
+
+
+def test_wrong_usage_is_one_line() -> None:
+    ended = run("motor")
+    assert ended.returncode == 2
+    assert ended.stderr.decode().splitlines() == [
+        "amiwarp: Missing argument 'action'. Choose from: status, set, stop; see amiwarp motor --help"
+    ]
+    strange = run("simulate", "--fl\x1b]0;x\x07at")
+    assert strange.returncode == 2
+    assert obeyed(strange.stderr) == []
+
+
+def test_texts_within_a_recording_are_shown_and_not_obeyed(tmp_path: Path) -> None:
+    path = tmp_path / NASTY
+    column = np.zeros(1, np.uint16)
+    with RecordingWriter(path, width=4, height=4, metadata={"made\x1b[2Jby": "one\ntwo\x1b[5m"}) as writer:
+        writer.append(Events(column, column, np.zeros(1, np.int64), np.zeros(1, np.uint8)))
+    ended = run("info", str(path))
+    assert ended.returncode == 0, ended.stderr
+    assert obeyed(ended.stdout) == []
+    assert SHOWN in ended.stdout.decode()
+    assert r"one\ntwo\x1b[5m" in ended.stdout.decode()
+    data = json.loads(run("info", str(path), "--json").stdout)
+    assert data["file"] == str(path)
+    assert data["metadata"]["made\x1b[2Jby"] == "one\ntwo\x1b[5m"
+
+
+def test_lines_and_cells_keep_their_markup_and_their_line(capsys: pytest.CaptureFixture[str]) -> None:
+    report(Common(), {}, ["[bold]x[/bold]\x1b[1m\nnot a line of its own", table([("cell\r\n", "[red]\x9b")])])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == r"[bold]x[/bold]\x1b[1m\nnot a line of its own"
+    assert lines[1].split() == [r"cell\r\n", r"[red]\x9b"]
+
+
+@settings(deadline=None)
+@given(st.text())
+def test_any_text_becomes_a_printable_line(text: str) -> None:
+    shown = printable(text)
+    assert shown.isprintable()
+    assert printable(shown) == shown
+    if text.isprintable():
+        assert shown == text
