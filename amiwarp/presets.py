@@ -42,7 +42,7 @@ class Preset:
     measured: Mapping[str, Any]
 
     def save(self, path: Path) -> None:
-        """Writes the JSON file, beside first and then by renaming."""
+        """Write the JSON file. Raises :class:`AmiwarpError` if it exists or cannot be made."""
         data = {"format": FORMAT, "version": VERSION, "kind": self.kind, "settings": dict(self.settings),
                 "measured": dict(self.measured)}  # fmt: skip
         write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")

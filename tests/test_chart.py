@@ -326,6 +326,7 @@ def test_presets_are_taken(charted: tuple[Path, dict[str, Any]], tmp_path: Path)
     assert found["stages"][0]["evaluations"] == 30  # what is given beside a preset wins
     assert "photometric" not in [stage["name"] for stage in found["stages"]]
     for model in MODELS:
+        preset = tmp_path / f"{model}.json"
         Preset("compensation", {"model": model}, {}).save(preset)
         words = ("compensate", folder / "recording.h5", tmp_path / f"{model}.h5", "--calibration", tmp_path / "c.json")
         result = run(*words, "--preset", preset)

@@ -3,6 +3,7 @@
 import enum
 import importlib
 import inspect
+import os
 import pkgutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -72,7 +73,7 @@ TAKES: list[tuple[str, type[enum.StrEnum], Callable[[Any], Any]]] = [
     ("iwe", Vote, lambda vote: float(iwe(EVENTS, 8, 6, vote=vote).sum())),
     ("Reconstruction", Fill, reconstruction),
     ("tones", Tone, lambda tone: float(tones(picture(), tone).sum())),
-    ("save_picture", Tone, lambda tone: save_picture(picture(), Path("out.png"), tone=tone)),
+    ("save_picture", Tone, lambda tone: save_picture(picture(), Path(f"out{len(os.listdir())}.png"), tone=tone)),
     ("IweFiles", Layers, layers_of),
     ("to_picture", Layers, lambda layers: float(to_picture(np.stack([IMAGE] * 2), layers).sum())),
     ("PacketQueue", Policy, lambda policy: PacketQueue(10, policy).policy),
