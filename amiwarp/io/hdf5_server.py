@@ -197,7 +197,7 @@ def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) 
     if dataset.chunks is None:
         count = _plain_length(dataset, name, path)
     else:
-        chunks = _chunks(dataset, name, filters, path)
+        chunks = _chunks(dataset, name, filters, path, unfinished)
         count = _chunked_length(dataset, name, chunks, unfinished)
         places = stored_places(dataset, filters, chunks[: -(-count // CHUNK)])
     if name in WHOLE and count * dtype.itemsize > max(WHOLE_BYTES, WHOLE_RATIO * dataset.id.get_storage_size()):
@@ -230,7 +230,7 @@ def _chunked_length(dataset: Any, name: str, chunks: list[Any], unfinished: bool
     return count
 
 
-def _chunks(dataset: Any, name: str, filters: list[Any], path: str) -> list[Any]:
+def _chunks(dataset: Any, name: str, filters: list[Any], path: str, unfinished: bool) -> list[Any]:
     """All chunks, sorted, each checked: neither HDF5 nor its Blosc filter looks, and would read beyond one."""
     if dataset.chunks[0] * dataset.dtype.itemsize > CHUNK_BYTES:
         raise AmiwarpError(f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller ones")
@@ -238,6 +238,8 @@ def _chunks(dataset: Any, name: str, filters: list[Any], path: str) -> list[Any]
     dataset.id.chunk_iter(chunks.append)
     chunks.sort(key=lambda chunk: chunk.chunk_offset[0])
     file_bytes = os.path.getsize(path)
+    # A plain chunk of a recording that was cut off may end beyond the file: HDF5 reads zeros there.
+    file_bytes += dataset.chunks[0] * dataset.dtype.itemsize if unfinished and not filters else 0
     damaged = sum(chunk.size for chunk in chunks) > file_bytes or _blosc_disagrees(dataset, filters)
     with open(path, "rb") as raw:
         for chunk in chunks:
