@@ -168,14 +168,16 @@ def run(function: str, *arguments: Any) -> Any:
         give_back(process)
 
 
-def packets(function: str, notes: dict[str, int], *arguments: Any) -> Iterator[Any]:
+def packets(function: str, *arguments: Any) -> Iterator[Any]:
     """Yield what a generator ``module:function`` yields in a process: tuples of arrays, put together to large ones.
 
-    The process decodes one packet ahead. ``notes`` is updated from the dictionary that the generator is given.
+    The process decodes one packet ahead. The last argument is a dictionary of counts; it is updated from the one that
+    the generator is given first.
     """
+    *given, notes = arguments
     process = borrow()
     try:
-        process.call("amiwarp.io.reading_server:begin", function, *arguments)
+        process.call("amiwarp.io.reading_server:begin", function, *given)
         process.send("amiwarp.io.reading_server:advance")
         waiting = True
         try:

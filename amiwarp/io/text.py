@@ -19,6 +19,7 @@ from amiwarp.camera import Camera, RadialTangential
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
+from amiwarp.io.regular import check_regular
 from amiwarp.io.scan import FileEvents, Packet
 
 READ_BYTES = 1 << 22
@@ -30,16 +31,18 @@ LONGEST_LINE = 1000
 
 def open_text(path: Path) -> Recording:
     """Open a text recording, with the camera of the ``calib.txt`` beside it where there is one."""
+    check_regular(path)
     with errors_name(path, lambda: "line 1"), path.open("rb") as file:
         size, _ = _read_size(path, file)
     events = FileEvents(path, partial(_packets, path), size=size)
     calib = path.with_name("calib.txt")
-    camera = read_calib(calib, *events.size) if calib.is_file() and calib != path else None
+    camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
     return Recording(events=events, camera=camera, metadata={"format": "text", **events.repairs}, name=path.stem)
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
     """The camera of a ``calib.txt``. Raises :class:`AmiwarpError` where it does not hold nine finite numbers."""
+    check_regular(path)
     with errors_name(path, lambda: "reading the calibration"):
         with path.open("rb") as file:
             words = file.read(10_000).decode("utf-8").split()
