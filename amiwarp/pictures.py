@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.regular import check_regular
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue (ITU-R BT.709)."""
 
 DARK = 0.02
 """Added to the intensity (white is 1) before the logarithm: stray light and dark current, which tame the shadows."""
+
+MOST_PIXELS = 1 << 26
+"""Largest picture that is read, 67 megapixels: a small file may unpack to one of any size."""
+
+PICTURE_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "TIFF", "WEBP", "PPM", "GIF")
+"""Formats in Pillow's names. Others are left out, because some of them run other programs."""
 
 LARGEST_MAP = 8192
 """Texels along a side of a map; a wider scene is resampled more coarsely."""
@@ -25,12 +33,18 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
     """Linear luminance of a picture file, shape (height, width), white is 1. Raises :class:`AmiwarpError`."""
     from PIL import Image
 
+    check_regular(Path(path))
     try:
-        with Image.open(path) as image:
-            wide = image.mode.startswith(("I", "F"))
-            pixels = np.asarray(image if wide else image.convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise AmiwarpError(f"{path} cannot be read as a picture ({error}); give a JPEG, PNG, TIFF ...") from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Pillow's own, larger limits, and of damage that it reads over
+            with Image.open(path, formats=PICTURE_FORMATS) as image:
+                if image.width * image.height > MOST_PIXELS:
+                    raise ValueError(f"{image.width}x{image.height} is over {MOST_PIXELS} pixels; make it smaller")
+                wide = image.mode.startswith(("I", "F"))
+                pixels = np.asarray(image if wide else image.convert("RGB"))
+    except Exception as error:  # Pillow raises errors of many types for damaged files
+        what = " ".join(str(error).split()) or type(error).__name__
+        raise AmiwarpError(f"{path} cannot be read as a picture ({what}); give a JPEG, PNG, TIFF ...") from error
     if pixels.dtype.kind == "i":  # Pillow hands 16-bit pictures out as int32
         pixels = pixels.astype(np.uint16)
     return linear_luminance(pixels, name=str(path))

@@ -18,6 +18,7 @@ from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.motion import EncoderModel, PrismMotion
 from amiwarp.pictures import linear_luminance, read_picture, srgb_to_linear
+from amiwarp.regular import check_regular
 from amiwarp.simulate import Progress, Scene, SensorModel, Simulation
 
 if TYPE_CHECKING:
@@ -141,12 +142,13 @@ def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
         raise AmiwarpError(f"{path} does not exist; give a video, a folder of pictures or an .npy stack")
     if path.is_dir():
         return _open_folder(path, fps)
+    check_regular(path)
     return _open_stack(path, fps) if path.suffix == ".npy" else _open_video(path, fps)
 
 
 def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
     table = folder / "times.csv"
-    if table.is_file() and fps is None:
+    if table.exists() and fps is None:
         files, times = _read_times(table)
     else:
         files = sorted((f for f in folder.iterdir() if f.suffix.lower() in PICTURE_SUFFIXES), key=_natural)
@@ -170,12 +172,13 @@ def _natural(file: Path) -> list[tuple[int, int, str]]:
 
 
 def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
-    with table.open(newline="", encoding="utf-8") as lines:
-        rows = list(csv.DictReader(lines))
+    check_regular(table)
     try:
+        with table.open(newline="", encoding="utf-8") as lines:
+            rows = list(csv.DictReader(lines))
         files = [table.parent / row["file"] for row in rows]
         times = np.array([round(float(row["t_us"])) for row in rows], np.int64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise AmiwarpError(f"{table} is not a table with the columns file, t_us ({error!r})") from error
     return files, times
 
@@ -183,8 +186,9 @@ def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
 def _open_stack(path: Path, fps: float | None) -> PictureStack:
     try:
         pictures = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise AmiwarpError(f"{path} cannot be read as an array ({error})") from error
+    except Exception as error:  # NumPy parses the header as Python: errors of many types
+        what = " ".join(str(error).split())
+        raise AmiwarpError(f"{path} cannot be read as an array ({what}); give a stack saved by numpy.save") from error
     if pictures.ndim not in (3, 4) or len(pictures) < 2:
         raise AmiwarpError(f"{path} has shape {pictures.shape}; expected (n, height, width), n at least 2")
     if fps is None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name
-from amiwarp.io.regular import check_regular
+from amiwarp.regular import check_regular
 
 
 def read_encoder_csv(

@@ -10,7 +10,7 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
-from amiwarp.io.regular import check_regular
+from amiwarp.regular import check_regular
 
 
 class Format(enum.Enum):

@@ -19,8 +19,8 @@ from amiwarp.io.chunks import CHUNK, in_order
 from amiwarp.io.files import errors_name, register_reader
 from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.native_writer import FORMAT, FORMAT_VERSION
-from amiwarp.io.regular import check_regular
 from amiwarp.io.scan import smallest_sensor
+from amiwarp.regular import check_regular
 
 DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px]; its files do not tell."""

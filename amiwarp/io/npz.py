@@ -20,8 +20,8 @@ from numpy.lib import format as npy
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import DEFAULT_BLOCK, Recording
 from amiwarp.io.files import errors_name
-from amiwarp.io.regular import check_regular
 from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.regular import check_regular
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What NumPy writes; other compressions may take any amount of memory."""

@@ -19,8 +19,8 @@ from amiwarp.camera import Camera, RadialTangential
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
-from amiwarp.io.regular import check_regular
 from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.regular import check_regular
 
 READ_BYTES = 1 << 22
 """Text that is parsed at once: some 200,000 events."""
