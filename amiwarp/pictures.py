@@ -22,6 +22,9 @@ DARK = 0.02
 MOST_PIXELS = 1 << 26
 """Largest picture that is read, 67 megapixels: a small file may unpack to one of any size."""
 
+BAND = 1 << 24
+"""Values that are converted at a time."""
+
 PICTURE_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "TIFF", "WEBP", "PPM", "GIF")
 """Formats in Pillow's names. Others are left out, because some of them run other programs."""
 
@@ -62,18 +65,22 @@ def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[
         raise AmiwarpError(f"{name} has shape {pixels.shape}; expected (height, width) or (height, width, 3)")
     if pixels.dtype in (np.uint8, np.uint16):
         top = np.iinfo(pixels.dtype).max
-        light = srgb_to_linear(np.arange(top + 1, dtype=np.float32) / top)[pixels]
+        table = srgb_to_linear(np.arange(top + 1, dtype=np.float32) / top)
     elif pixels.dtype.kind == "f":
-        light = pixels.astype(np.float32)
+        table = None
     else:
         raise AmiwarpError(f"{name} is of type {pixels.dtype}; expected uint8, uint16 (sRGB) or float (linear)")
-    if colours in (3, 4):
-        light = light[..., :3] @ np.array(LUMINANCE, np.float32)
-    elif colours == 1:
-        light = light[..., 0]
+    light = np.empty(pixels.shape[:2], np.float32)
+    rows = max(1, BAND // pixels[0].size)
+    for start in range(0, len(pixels), rows):
+        part = pixels[start : start + rows]
+        values = part.astype(np.float32) if table is None else table[part]
+        if colours in (3, 4):
+            values = values[..., :3] @ np.array(LUMINANCE, np.float32)
+        light[start : start + rows] = values[..., 0] if colours == 1 else values
     if not (np.isfinite(light).all() and light.min() >= 0.0):
         raise AmiwarpError(f"{name} has intensities that are negative or not finite; expected 0 .. 1")
-    return np.ascontiguousarray(light, np.float32)
+    return light
 
 
 def srgb_to_linear(value: NDArray[Any]) -> NDArray[np.float32]:
