@@ -25,7 +25,7 @@ MOST_PIXELS = 1 << 26
 BAND = 1 << 24
 """Values that are converted at a time."""
 
-PICTURE_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "TIFF", "WEBP", "PPM", "GIF")
+PICTURE_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
 """Formats in Pillow's names. Others are left out, because some of them run other programs."""
 
 LARGEST_MAP = 8192

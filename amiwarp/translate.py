@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.motion import EncoderModel, PrismMotion
-from amiwarp.pictures import linear_luminance, read_picture, srgb_to_linear
+from amiwarp.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear
 from amiwarp.regular import check_regular
 from amiwarp.simulate import Progress, Scene, SensorModel, Simulation
 
@@ -117,10 +117,14 @@ class VideoFile:
                     stamp = Fraction(i) / Fraction(self.fps) if frame.pts is None else frame.pts * frame.time_base
                     first = stamp if first is None else first
                     t = round((stamp - first) * 1_000_000 * Fraction(self.stretch))
+                    if frame.width * frame.height > MOST_PIXELS:
+                        raise AmiwarpError(f"{self.path}: frame {i} is {frame.width}x{frame.height}; make it smaller")
                     if t > last:
                         last = t
                         yield t, linear_luminance(frame.to_ndarray(format="rgb24"), name=f"{self.path}: frame {i}")
-        except (av.error.FFmpegError, OSError) as error:
+        except AmiwarpError:
+            raise
+        except Exception as error:  # damage shows in errors of many types
             raise AmiwarpError(f"{self.path} breaks off after {last / 1e6:.3f} s ({error}); cut it there") from error
         if last < 0:
             raise AmiwarpError(f"{self.path} holds no picture that can be decoded")
@@ -207,8 +211,12 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
             own = float(stream.average_rate or stream.guessed_rate or 0.0)
             length = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) * 1e-6
             size = (stream.width, stream.height)
-    except (av.error.FFmpegError, OSError) as error:
+    except AmiwarpError:
+        raise
+    except Exception as error:  # damage shows in errors of many types
         raise AmiwarpError(f"{path} cannot be read as a video ({error}); give a file that FFmpeg knows") from error
+    if size[0] * size[1] > MOST_PIXELS:
+        raise AmiwarpError(f"{path}: is {size[0]}x{size[1]}, over {MOST_PIXELS} pixels; make it smaller")
     if own <= 0.0 or min(size) < 2:
         raise AmiwarpError(f"{path} has no frame rate or no picture size; convert it to a common format")
     stretch = own / fps if fps else 1.0

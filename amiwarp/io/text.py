@@ -60,7 +60,7 @@ def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]
         file.seek(0)
         return None, 0
     if not (words[0].isdigit() and words[1].isdigit()):
-        given = b" ".join(words).decode("ascii", "replace")
+        given = b" ".join(words)[:80].decode("ascii", "replace")
         raise AmiwarpError(f"{path}: line 1 '{given}' is not a size in pixels; expected 'width height' or 't x y p'")
     return (int(words[0]), int(words[1])), 1
 
