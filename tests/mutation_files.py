@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import unicodedata
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -257,7 +258,10 @@ def check(path: Path, name: str) -> str | None:
     Whatever else it raises is a defect, as is a refusal of several lines or without the file's name.
     """
     said = refusal(KINDS[name][2], path)
-    assert said is None or (str(path) in said and "\n" not in said and said.isprintable()), said
+    if said is not None:
+        assert str(path) in said, said
+        assert all(character.isprintable() or unicodedata.category(character) == "Zs" for character in said), repr(said)
+        assert len(said) < 1000 + len(str(path)), said
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert used < MEMORY_KIB, f"{used} KiB of memory"
     return said

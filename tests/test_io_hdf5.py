@@ -16,7 +16,7 @@ from io_samples import make_events, refusal, to_faery, write_dsec, write_native
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording, reading_process
-from amiwarp.io.chunks import CHUNK
+from amiwarp.io.chunks import CHUNK, checksum, decode
 from amiwarp.io.reading_process import borrow, give_back, run
 from amiwarp.io.reading_server import Reply
 
@@ -151,11 +151,11 @@ def all_huge(file: h5py.File) -> None:
 
 
 def zeros_encoder(file: h5py.File) -> None:
-    """Some kilobytes that unpack to a gigabyte."""
+    """Some kilobytes that unpack to 256 MiB."""
     for name, kind in (("t", "i8"), ("angle", "f8")):
         blosc = hdf5plugin.Zstd()
-        stored = file.create_dataset(f"encoder/{name}", (1 << 27,), kind, chunks=(1 << 22,), **blosc)
-        for at in range(0, 1 << 27, 1 << 22):
+        stored = file.create_dataset(f"encoder/{name}", (1 << 24,), kind, chunks=(1 << 22,), **blosc)
+        for at in range(0, 1 << 24, 1 << 22):
             stored[at : at + (1 << 22)] = 0
 
 
@@ -167,7 +167,7 @@ def zeros_encoder(file: h5py.File) -> None:
         (declare("ms_to_idx", 1 << 40), "'ms_to_idx' declares 1099511627776 elements, which the file does not hold"),
         (declare("encoder/t", 5000), "'encoder/t' declares 5000 elements, which the file does not hold"),
         (declare("encoder/t", 1 << 30, chunks=(1 << 26,)), "'encoder/t' has chunks of over 256 MiB"),
-        (zeros_encoder, "'encoder/t' declares 134217728 elements, too many for its size"),
+        (zeros_encoder, "'encoder/t' declares 16777216 elements, too many for its size"),
     ],
 )
 def test_a_length_that_the_file_cannot_hold_is_refused_at_opening(dsec, edit, message):
@@ -396,3 +396,33 @@ def test_damaged_chunks_of_any_filter(dsec, name):
         assert said is None or ("a.h5: " in said and "\n" not in said)
         outcomes.add(said is None)
     assert False in outcomes
+
+
+def test_a_filter_that_hangs(monkeypatch, dsec):
+    """The bzip2 filter goes round for ever in a stream that breaks off."""
+    monkeypatch.setattr(reading_process, "CPU_SECONDS", 2)
+    with h5py.File(dsec, "r+") as file:
+        del file["events/x"]
+        file.create_dataset("events/x", data=EVENTS.x, chunks=(600,), **hdf5plugin.BZip2())
+        _, stored = file["events/x"].id.read_direct_chunk((0,))
+        file["events/x"].id.write_direct_chunk((0,), stored[: len(stored) // 2])
+    message = r"a\.h5: .*dataset 'events/x' \(bzip2\), elements 0 \.\. 1: reading took over 2 s"
+    with pytest.raises(AmiwarpError, match=message):
+        open_recording(dsec).events.slice(0, 600)
+
+
+def test_a_forged_chunk_of_the_native_layout(tmp_path):
+    """Damage under a checksum that fits is decoded in this process: Blosc itself must refuse it, or read it."""
+    write_native(tmp_path / "a.h5", EVENTS)
+    source = open_recording(tmp_path / "a.h5").events
+    offset, size = source._columns["t"]._stored._places[0]
+    whole = (tmp_path / "a.h5").read_bytes()
+    frame = whole[offset : offset + size - 4]
+    rng, out = np.random.default_rng(0), np.empty(CHUNK, np.int64)
+    outcomes = set()
+    for _ in range(300):
+        forged = bytearray(frame)
+        at = int(rng.integers(16, 100) if rng.random() < 0.5 else rng.integers(16, len(frame)))
+        forged[at : at + 4] = rng.bytes(len(forged[at : at + 4]))
+        outcomes.add(decode(bytes(forged) + checksum(forged).to_bytes(4, "little"), out))
+    assert outcomes <= {True, False}

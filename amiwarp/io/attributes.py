@@ -21,8 +21,8 @@ def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[A
     value = attributes.get(name, default)
     try:
         return kind(value.decode() if isinstance(value, bytes) else value)
-    except (TypeError, ValueError) as error:
-        raise AmiwarpError(f"{where} attribute '{name}' is {value!r}; expected {kind.__name__}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise AmiwarpError(f"{where} attribute '{name}' is {repr(value)[:80]}; expected {kind.__name__}") from error
 
 
 def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[float]]:
@@ -50,12 +50,17 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
     distortion: Distortion | None = None
     if model in kinds:
         kind, length = kinds[model]
-        coefficients = np.asarray(attributes.get("distortion", ()), np.float64)
+        try:
+            coefficients = np.asarray(attributes.get("distortion", ()), np.float64)
+        except (TypeError, ValueError) as error:
+            raise AmiwarpError(f"{where} distortion is not numbers; expected {length} for {model}") from error
         if coefficients.shape != (length,) or not np.isfinite(coefficients).all():
-            raise AmiwarpError(f"camera distortion is {coefficients.tolist()}; expected {length} numbers for {model}")
+            raise AmiwarpError(
+                f"camera distortion is {str(coefficients.tolist())[:80]}; expected {length} numbers for {model}"
+            )
         distortion = kind(*coefficients.tolist())
     elif model != "none":
-        raise AmiwarpError(f"camera distortion_model '{model}'; expected none, radial_tangential or fisheye")
+        raise AmiwarpError(f"camera distortion_model '{model[:40]}'; expected none, radial_tangential or fisheye")
     width, height = (attribute(attributes, where, name, int) for name in ("width", "height"))
     fx, fy, cx, cy = (attribute(attributes, where, name, float) for name in ("fx", "fy", "cx", "cy"))
     return Camera(width, height, fx, fy, cx, cy, distortion)
@@ -72,6 +77,8 @@ def read_prism(attributes: Mapping[str, Any], where: str) -> Prism:
 
     side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
     if side not in {member.value for member in FlatSide}:
-        raise AmiwarpError(f"prism flat_side '{side}'; expected {' or '.join(member.value for member in FlatSide)}")
+        raise AmiwarpError(
+            f"prism flat_side '{side[:40]}'; expected {' or '.join(member.value for member in FlatSide)}"
+        )
     apex, index = (attribute(attributes, where, name, float) for name in ("apex", "index"))
     return Prism(apex, index, flat_side=FlatSide(side))

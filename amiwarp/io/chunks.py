@@ -81,7 +81,10 @@ def decode(stored: bytes, out: NDArray[Any]) -> bool:
     sizes = [int.from_bytes(frame[at : at + 4], "little") for at in (4, 12)]
     if sizes != [out.nbytes, len(frame)] or checksum(frame).to_bytes(4, "little") != stored[-4:]:
         return False
-    _blosc().decode(frame, out=out)
+    try:
+        _blosc().decode(frame, out=out)
+    except RuntimeError:  # what Blosc raises for a frame that it cannot decode
+        return False
     return True
 
 

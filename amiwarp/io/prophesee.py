@@ -52,7 +52,7 @@ def open_evt(path: Path) -> Recording:
     version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
     word = {"2.0": 4, "2": 4, "3.0": 2, "3": 2}.get(version)
     if word is None:
-        raise AmiwarpError(f"{path}: header tells no EVT version this reads (it says '{version}'); expected 2.0 or 3.0")
+        raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0 or 3.0")
     source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", os.path.abspath(path))
     events = FileEvents(path, source, size=_evt_size(fields))
     truncated = (path.stat().st_size - offset) % word
@@ -96,7 +96,7 @@ def open_dat(path: Path) -> Recording:
         raise AmiwarpError(f"{path}: byte {offset}: {kind.hex() or 'nothing'} is not a DAT event type (0008 or 0c08)")
     version = fields.get("version", "2")
     if version not in ("1", "2"):
-        raise AmiwarpError(f"{path}: DAT version '{version}' is not 1 or 2")
+        raise AmiwarpError(f"{path}: DAT version '{version[:40]}' is not 1 or 2")
     width, height = fields.get("width", ""), fields.get("height", "")
     size = (int(width), int(height)) if width.isdecimal() and height.isdecimal() else None
     events = FileEvents(path, partial(_dat_packets, path, offset + 2, version), size=size)
