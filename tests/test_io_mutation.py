@@ -1,4 +1,4 @@
-"""Damaged files of every input: each is read or refused by one AmiwarpError; never a crash, a hang or half an output."""
+"""Damaged files of every input: each is read or refused by one AmiwarpError; no crash, no hang, no half output."""
 
 import os
 import random

@@ -56,11 +56,13 @@ class ReadingProcess:
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             start_new_session=True,
         )
+        self._requests: Any = self._child.stdin
+        self._replies: Any = self._child.stdout
         self.close = weakref.finalize(self, _end, self._child, self.owner)
         with contextlib.suppress(ImportError, AttributeError, OSError):
             import fcntl
 
-            fcntl.fcntl(self._stream(self._child.stdout), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+            fcntl.fcntl(self._replies, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
     @property
     def usable(self) -> bool:
@@ -82,10 +84,9 @@ class ReadingProcess:
         """Start a call whose result :meth:`receive` returns."""
         limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
         request = json.dumps({"function": function, "arguments": arguments, **limits}).encode()
-        stream = self._stream(self._child.stdin)
         try:
-            stream.write(request + b"\n")
-            stream.flush()
+            self._requests.write(request + b"\n")
+            self._requests.flush()
         except OSError as error:
             raise self._ended() from error
 
@@ -106,7 +107,7 @@ class ReadingProcess:
         return reply["result"], arrays
 
     def _fill(self, buffer: Any) -> Any:
-        if self._stream(self._child.stdout).readinto(buffer) != len(buffer):
+        if self._replies.readinto(buffer) != len(buffer):
             raise self._ended()
         return buffer
 
@@ -118,10 +119,6 @@ class ReadingProcess:
         if code < 0:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
         return AmiwarpError(f"the process that reads ended with code {code}; check that '{sys.executable}' is Python")
-
-    @staticmethod
-    def _stream(stream: Any) -> Any:
-        return stream
 
 
 def _end(child: subprocess.Popen[bytes], owner: int) -> None:
