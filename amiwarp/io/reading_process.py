@@ -62,7 +62,8 @@ class ReadingProcess:
         with contextlib.suppress(ImportError, AttributeError, OSError):
             import fcntl
 
-            fcntl.fcntl(self._replies, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+            assert self._child.stdout is not None
+            fcntl.fcntl(self._child.stdout, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
     @property
     def usable(self) -> bool:
