@@ -52,7 +52,7 @@ WHOLE_BYTES, WHOLE_RATIO = 1 << 24, 1000
 CHUNK_BYTES = 1 << 28
 """Largest chunk that is read: HDF5 holds a chunk in memory, decoded."""
 
-CACHE_BYTES = 1 << 25
+CACHE_BYTES = 1 << 22
 """Decoded chunks that HDF5 keeps per data set: chunks of other writers may exceed its usual 1 MB."""
 
 ATTRIBUTE_BYTES = 1 << 16
