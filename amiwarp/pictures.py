@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.regular import check_regular
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue (ITU-R BT.709)."""
 
 DARK = 0.02
 """Added to the intensity (white is 1) before the logarithm: stray light and dark current, which tame the shadows."""
+
+MOST_PIXELS = 1 << 26
+"""Largest picture that is read, 67 megapixels: a small file may unpack to one of any size."""
+
+BAND = 1 << 24
+"""Values that are converted at a time."""
+
+PICTURE_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
+"""Formats in Pillow's names. Others are left out, because some of them run other programs."""
 
 LARGEST_MAP = 8192
 """Texels along a side of a map; a wider scene is resampled more coarsely."""
@@ -25,12 +36,18 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
     """Linear luminance of a picture file, shape (height, width), white is 1. Raises :class:`AmiwarpError`."""
     from PIL import Image
 
+    check_regular(Path(path))
     try:
-        with Image.open(path) as image:
-            wide = image.mode.startswith(("I", "F"))
-            pixels = np.asarray(image if wide else image.convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise AmiwarpError(f"{path} cannot be read as a picture ({error}); give a JPEG, PNG, TIFF ...") from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Pillow's own, larger limits, and of damage that it reads over
+            with Image.open(path, formats=PICTURE_FORMATS) as image:
+                if image.width * image.height > MOST_PIXELS:
+                    raise ValueError(f"{image.width}x{image.height} is over {MOST_PIXELS} pixels; make it smaller")
+                wide = image.mode.startswith(("I", "F"))
+                pixels = np.asarray(image if wide else image.convert("RGB"))
+    except Exception as error:  # Pillow raises errors of many types for damaged files
+        what = " ".join(str(error).split()) or type(error).__name__
+        raise AmiwarpError(f"{path} cannot be read as a picture ({what}); give a JPEG, PNG, TIFF ...") from error
     if pixels.dtype.kind == "i":  # Pillow hands 16-bit pictures out as int32
         pixels = pixels.astype(np.uint16)
     return linear_luminance(pixels, name=str(path))
@@ -48,18 +65,22 @@ def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[
         raise AmiwarpError(f"{name} has shape {pixels.shape}; expected (height, width) or (height, width, 3)")
     if pixels.dtype in (np.uint8, np.uint16):
         top = np.iinfo(pixels.dtype).max
-        light = srgb_to_linear(np.arange(top + 1, dtype=np.float32) / top)[pixels]
+        table = srgb_to_linear(np.arange(top + 1, dtype=np.float32) / top)
     elif pixels.dtype.kind == "f":
-        light = pixels.astype(np.float32)
+        table = None
     else:
         raise AmiwarpError(f"{name} is of type {pixels.dtype}; expected uint8, uint16 (sRGB) or float (linear)")
-    if colours in (3, 4):
-        light = light[..., :3] @ np.array(LUMINANCE, np.float32)
-    elif colours == 1:
-        light = light[..., 0]
+    light = np.empty(pixels.shape[:2], np.float32)
+    rows = max(1, BAND // pixels[0].size)
+    for start in range(0, len(pixels), rows):
+        part = pixels[start : start + rows]
+        values = part.astype(np.float32) if table is None else table[part]
+        if colours in (3, 4):
+            values = values[..., :3] @ np.array(LUMINANCE, np.float32)
+        light[start : start + rows] = values[..., 0] if colours == 1 else values
     if not (np.isfinite(light).all() and light.min() >= 0.0):
         raise AmiwarpError(f"{name} has intensities that are negative or not finite; expected 0 .. 1")
-    return np.ascontiguousarray(light, np.float32)
+    return light
 
 
 def srgb_to_linear(value: NDArray[Any]) -> NDArray[np.float32]:

@@ -20,7 +20,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import TIME_LIMIT
 from amiwarp.io.files import errors_name, register_reader
 from amiwarp.motion import EncoderModel, PrismMotion
-from amiwarp.pictures import linear_luminance, read_picture, srgb_to_linear
+from amiwarp.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear
+from amiwarp.regular import check_regular
 from amiwarp.simulate import Progress, Scene, SensorModel, Simulation
 from amiwarp.values import real, shown
 
@@ -125,10 +126,14 @@ class VideoFile:
                     stamp = Fraction(i) / Fraction(self.fps) if frame.pts is None else frame.pts * frame.time_base
                     first = stamp if first is None else first
                     t = round((stamp - first) * 1_000_000 * Fraction(self.stretch))
+                    if frame.width * frame.height > MOST_PIXELS:
+                        raise AmiwarpError(f"{self.path}: frame {i} is {frame.width}x{frame.height}; make it smaller")
                     if t > last:
                         last = t
                         yield t, linear_luminance(frame.to_ndarray(format="rgb24"), name=f"{self.path}: frame {i}")
-        except (av.error.FFmpegError, OSError) as error:
+        except AmiwarpError:
+            raise
+        except Exception as error:  # damage shows in errors of many types
             raise AmiwarpError(f"{self.path} breaks off after {last / 1e6:.3f} s ({error}); cut it there") from error
         if last < 0:
             raise AmiwarpError(f"{self.path} holds no picture that can be decoded")
@@ -152,6 +157,7 @@ def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
         folder = _open_folder(path, fps)
         register_reader(folder, path / TIMES, *folder.files)
         return folder
+    check_regular(path)
     opened = _open_stack(path, fps) if path.suffix == ".npy" else _open_video(path, fps)
     register_reader(opened, path)
     return opened
@@ -159,7 +165,7 @@ def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
 
 def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
     table = folder / TIMES
-    if table.is_file() and fps is None:
+    if table.exists() and fps is None:
         files, times = _read_times(table)
     else:
         files = sorted((f for f in folder.iterdir() if f.suffix.lower() in PICTURE_SUFFIXES), key=_natural)
@@ -183,6 +189,7 @@ def _natural(file: Path) -> list[tuple[int, int, str]]:
 
 
 def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
+    check_regular(table)
     with errors_name(table, lambda: "is not a table with the columns file, t_us"):
         with table.open("rb") as file:
             text = file.read(MOST_TABLE_BYTES + 1)
@@ -207,8 +214,9 @@ def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
 def _open_stack(path: Path, fps: float | None) -> PictureStack:
     try:
         pictures = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise AmiwarpError(f"{path} cannot be read as an array ({error})") from error
+    except Exception as error:  # NumPy parses the header as Python: errors of many types
+        what = " ".join(str(error).split())
+        raise AmiwarpError(f"{path} cannot be read as an array ({what}); give a stack saved by numpy.save") from error
     if pictures.ndim not in (3, 4) or len(pictures) < 2:
         raise AmiwarpError(f"{path} has shape {pictures.shape}; expected (n, height, width), n at least 2")
     if fps is None:
@@ -227,8 +235,12 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
             own = float(stream.average_rate or stream.guessed_rate or 0.0)
             length = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) * 1e-6
             size = (stream.width, stream.height)
-    except (av.error.FFmpegError, OSError) as error:
+    except AmiwarpError:
+        raise
+    except Exception as error:  # damage shows in errors of many types
         raise AmiwarpError(f"{path} cannot be read as a video ({error}); give a file that FFmpeg knows") from error
+    if size[0] * size[1] > MOST_PIXELS:
+        raise AmiwarpError(f"{path}: is {size[0]}x{size[1]}, over {MOST_PIXELS} pixels; make it smaller")
     if own <= 0.0 or min(size) < 2:
         raise AmiwarpError(f"{path} has no frame rate or no picture size; convert it to a common format")
     stretch = own / fps if fps else 1.0

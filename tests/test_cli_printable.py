@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amiwarp.cli import printable
 from amiwarp.cli.console import report, table
 from amiwarp.cli.options import Common
+from amiwarp.errors import printable
 from amiwarp.events import Events
 from amiwarp.io import RecordingWriter
 

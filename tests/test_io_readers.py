@@ -283,7 +283,10 @@ def test_evt_headers(tmp_path):
         recording = open_recording(path)
         assert (recording.events.size, recording.metadata["truncated_bytes"]) == (size, 1)
         assert_equal(recording.events.slice(0, 999), EVENTS)
-    for header, message in ((b"% evt 9.0\n", "no EVT version"), (b"% evt 2.0\n% geometry 10x10\n", "after|before")):
+    for header, message in (
+        (b"% evt 9.0\n", "version in the header is '9.0'"),
+        (b"% evt 2.0\n% geometry 10x10\n", "after|before"),
+    ):
         path.write_bytes(header + body)
         with pytest.raises(AmiwarpError, match=f"a.raw: .*{message}"):
             open_recording(path)

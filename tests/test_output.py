@@ -236,7 +236,7 @@ def test_one_name_for_two_outputs_is_refused(place: Path, line: str) -> None:
 
 
 def special(kind: str, path: Path) -> Path:
-    if kind == "FIFO":
+    if kind == "named pipe (FIFO)":
         os.mkfifo(path)
     elif kind == "socket":
         with socket.socket(socket.AF_UNIX) as server:
@@ -248,7 +248,7 @@ def special(kind: str, path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", ["FIFO", "socket", "folder", "device"])
+@pytest.mark.parametrize("kind", ["named pipe (FIFO)", "socket", "folder", "character device"])
 @pytest.mark.parametrize("line", ["convert a.h5 {}", "calibrate a.h5 {}", "record a.h5 {} --fast",
                                   "compensate a.h5 x.h5 --calibration cal.json --iwe {}"])  # fmt: skip
 def test_outputs_that_are_no_files_are_refused(place: Path, kind: str, line: str) -> None:

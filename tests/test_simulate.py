@@ -455,7 +455,7 @@ def test_a_picture_is_cut_to_the_view() -> None:
         (lambda: Scene.from_picture(np.zeros((4, 4), np.int64)), "int64"),
         (lambda: Scene.from_picture(np.zeros(4, np.float32)), "shape"),
         (lambda: Scene.from_picture(np.full((4, 4), -1.0)), "negative"),
-        (lambda: read_picture("nowhere.png"), "nowhere.png cannot be read"),
+        (lambda: read_picture("nowhere.png"), "nowhere.png: no such file"),
         (lambda: base(camera_motion=CameraMotion((0.0, 30.0, 0.0))).run(), "turn it less far"),
         (lambda: base(motion=PrismMotion(1e9)).run(), "slow it down"),
     ],

@@ -30,7 +30,7 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 """Kernels turn host objects to structs, so they know the camera; nothing of files, users or recordings."""
 
 ORDER = (
-    ("errors",),
+    ("errors", "regular"),
     ("values",),
     ("prism",),
     ("kernels", "camera", "multilevel"),

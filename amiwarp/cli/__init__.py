@@ -6,17 +6,10 @@ Results go to stdout, progress and errors to stderr. Exit codes: 0 done, 1 bad i
 import sys
 from typing import NoReturn
 
+from amiwarp.errors import printable
+
 INTERRUPTED = 130
 STOPPED = "interrupted; nothing was left half-written"
-
-
-def printable(text: str) -> str:
-    """Return text as one line that a terminal shows and does not obey.
-
-    Names of files, cameras and streams, and texts in files, may hold escape sequences, newlines, marks that turn the
-    direction of writing round, or bytes that are no UTF-8. All of these come out escaped, as in ``\\x1b``.
-    """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def say(message: str) -> None:

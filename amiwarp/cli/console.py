@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from amiwarp.cli import printable, say
+from amiwarp.cli import say
 from amiwarp.cli.options import Common
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, printable
 
 
 class Advance(Protocol):

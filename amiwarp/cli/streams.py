@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from amiwarp.cli import printable, say
-from amiwarp.errors import AmiwarpError
+from amiwarp.cli import say
+from amiwarp.errors import AmiwarpError, printable
 
 if TYPE_CHECKING:
     from amiwarp.link.link import Link

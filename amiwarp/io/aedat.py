@@ -6,32 +6,34 @@ first.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 from xml.etree import ElementTree
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
+from amiwarp.io.reading_process import packets, run
+from amiwarp.io.reading_server import Reply
 from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.regular import check_regular
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 
 
 def open_aedat4(path: Path) -> Recording:
     """Open the first event stream of an AEDAT 4 file."""
-    from faery.extension import aedat
-
+    check_regular(path)
     with errors_name(path, lambda: "reading the header"):
         with path.open("rb") as file:
             _check_frame(path, file)
-        with aedat.Decoder(path) as decoder:
-            track = _event_track(path, decoder)
-            width, height, number = int(track.dimensions[0]), int(track.dimensions[1]), track.id
-    events = FileEvents(path, partial(_packets, path, number), size=(width, height))
+        width, height, number = run("amiwarp.io.aedat:read_head", os.path.abspath(path))
+    source = partial(packets, "amiwarp.io.aedat:read_packets", os.path.abspath(path), number)
+    events = FileEvents(path, source, size=(width, height))
     return Recording(events=events, metadata={"format": "aedat4", **events.repairs}, name=path.stem)
 
 
@@ -79,14 +81,19 @@ def _check_header(path: Path, header: bytes) -> int:
         raise AmiwarpError(f"{path}: header is damaged: {error}") from error
 
 
-def _event_track(path: Path, decoder: Any) -> Any:
-    for track in decoder.tracks():
-        if track.data_type == "events" and track.dimensions is not None:
-            return track
-    raise AmiwarpError(f"{path}: has no stream of events")
+def read_head(path: str) -> Reply:
+    """Read width, height and number of the first stream of events; for the reading process."""
+    from faery.extension import aedat
+
+    with aedat.Decoder(path) as decoder:
+        for track in decoder.tracks():
+            if track.data_type == "events" and track.dimensions is not None:
+                return (int(track.dimensions[0]), int(track.dimensions[1]), track.id), []
+    raise AmiwarpError("has no stream of events")
 
 
-def _packets(path: Path, number: int, notes: dict[str, int]) -> Iterator[Packet]:
+def read_packets(notes: dict[str, int], path: str, number: int) -> Iterator[Packet]:
+    """Decode a stream of events; for the reading process."""
     from faery.extension import aedat
 
     with aedat.Decoder(path) as decoder:

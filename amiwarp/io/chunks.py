@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import Any, TypeVar
@@ -24,6 +24,9 @@ CHUNK = 1 << 18
 
 BLOSC, FLETCHER32 = 32001, 3
 """Numbers of the filters in HDF5."""
+
+BLOSC_HEAD = 16
+"""Bytes of a Blosc frame's header."""
 
 MOST_THREADS = 16
 """More would wait for each other in Python, and each holds events in memory."""
@@ -71,12 +74,17 @@ def encode(values: NDArray[Any]) -> bytes:
 
 def decode(stored: bytes, out: NDArray[Any]) -> bool:
     """Whether the stored bytes are sound; ``out``, a chunk long, then holds what they say."""
+    if len(stored) < BLOSC_HEAD + 4:
+        return False
     frame = memoryview(stored)[:-4]
     # Blosc's header: four bytes, then the bytes before and after compression; it would read and write as told.
     sizes = [int.from_bytes(frame[at : at + 4], "little") for at in (4, 12)]
     if sizes != [out.nbytes, len(frame)] or checksum(frame).to_bytes(4, "little") != stored[-4:]:
         return False
-    _blosc().decode(frame, out=out)
+    try:
+        _blosc().decode(frame, out=out)
+    except RuntimeError:  # what Blosc raises for a frame that it cannot decode
+        return False
     return True
 
 
@@ -112,38 +120,36 @@ def _folded(total: int) -> int:
 class StoredColumn:
     """A dataset of the native layout whose chunks threads read past HDF5, each on its own."""
 
-    def __init__(self, dataset: Any, places: list[tuple[int, int]]) -> None:
-        self._dataset = dataset  # keeps the file open
-        self._handle = dataset.file.id.get_vfd_handle()
-        self._places = places
-
-    @classmethod
-    def of(cls, dataset: Any) -> StoredColumn | None:
-        """None for any other layout."""
-        creation, file = dataset.id.get_create_plist(), dataset.file
-        filters = [creation.get_filter(at)[0] for at in range(creation.get_nfilters())]
-        plain = hasattr(os, "pread") and file.driver == "sec2" and file.userblock_size == 0 and dataset.dtype.isnative
-        if not plain or dataset.chunks != (CHUNK,) or filters != [BLOSC, FLETCHER32]:
-            return None
-        found: dict[int, tuple[int, int]] = {}
-
-        def visit(chunk: Any) -> None:
-            if chunk.filter_mask == 0:
-                found[chunk.chunk_offset[0]] = chunk.byte_offset, chunk.size
-
-        dataset.id.chunk_iter(visit)
-        starts = range(0, dataset.shape[0], CHUNK)
-        return cls(dataset, [found[start] for start in starts]) if found.keys() == set(starts) else None
+    def __init__(self, handle: int, dtype: np.dtype[Any], count: int, places: Sequence[Sequence[int]]) -> None:
+        """``handle``: of the open file. ``places``: offset and size of each chunk [bytes]."""
+        self._handle, self._dtype, self._count, self._places = handle, dtype, count, places
+        self._last: tuple[int, NDArray[Any]] | None = None
 
     def read(self, start: int, stop: int) -> NDArray[Any] | None:
-        """Elements ``start <= index < stop``, ``start`` a chunk's; None where a chunk is damaged."""
-        chunks = range(start // CHUNK, -(-stop // CHUNK))
-        out = np.empty(len(chunks) * CHUNK, self._dataset.dtype)
-        for at, chunk in zip(range(0, out.size, CHUNK), chunks, strict=True):
-            offset, size = self._places[chunk]
-            if not decode(os.pread(self._handle, size, offset), out[at : at + CHUNK]):
+        """Elements ``start <= index < stop``, at least one; None where a chunk is damaged."""
+        first, last = start // CHUNK, (stop - 1) // CHUNK
+        if first == last and (stop - start < CHUNK and stop != self._count):
+            chunk = self._chunk(first)
+            return None if chunk is None else chunk[start - first * CHUNK : stop - first * CHUNK].copy()
+        out = np.empty((last + 1 - first) * CHUNK, self._dtype)
+        for at in range(first, last + 1):
+            if not self._decode(at, out[(at - first) * CHUNK : (at + 1 - first) * CHUNK]):
                 return None
-        return out[: stop - start]
+        return out[start - first * CHUNK : stop - first * CHUNK]
+
+    def _chunk(self, at: int) -> NDArray[Any] | None:
+        """A whole chunk; the last one is kept, because a search reads many times within one."""
+        if self._last is not None and self._last[0] == at:
+            return self._last[1]
+        out = np.empty(CHUNK, self._dtype)
+        if not self._decode(at, out):
+            return None
+        self._last = at, out
+        return out
+
+    def _decode(self, at: int, out: NDArray[Any]) -> bool:
+        offset, size = self._places[at]
+        return decode(os.pread(self._handle, size, offset), out)
 
 
 def append_chunk(dataset: Any, start: int, stored: bytes, count: int) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name
+from amiwarp.regular import check_regular
 
 
 def read_encoder_csv(
@@ -23,6 +24,7 @@ def read_encoder_csv(
     ``direction`` -1 turns the sign. Raises :class:`AmiwarpError` naming the file and line for anything else.
     """
     path = Path(path)
+    check_regular(path)
     with errors_name(path, lambda: "reading the encoder"):
         names, table, lines = _read_table(path)
         columns = {name: table[:, at] for at, name in enumerate(names)}

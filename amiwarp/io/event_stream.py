@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -9,23 +10,35 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
+from amiwarp.io.reading_process import packets, run
+from amiwarp.io.reading_server import Reply
 from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.regular import check_regular
 
 
 def open_es(path: Path) -> Recording:
     """Open an Event Stream file; its rows count from the bottom and are turned."""
-    from faery.extension import es
-
-    with errors_name(path, lambda: "reading the header"), es.Decoder(path, 0) as decoder:
-        kind, size = decoder.event_type, decoder.dimensions
-        if kind not in ("dvs", "atis") or size is None:
-            raise AmiwarpError(f"{path}: holds {kind} events; expected dvs or atis")
-    width, height = int(size[0]), int(size[1])
-    events = FileEvents(path, partial(_packets, path, height), size=(width, height))
+    check_regular(path)
+    with errors_name(path, lambda: "reading the header"):
+        width, height = run("amiwarp.io.event_stream:read_head", os.path.abspath(path))
+    source = partial(packets, "amiwarp.io.event_stream:read_packets", os.path.abspath(path), height)
+    events = FileEvents(path, source, size=(width, height))
     return Recording(events=events, metadata={"format": "es", **events.repairs}, name=path.stem)
 
 
-def _packets(path: Path, height: int, notes: dict[str, int]) -> Iterator[Packet]:
+def read_head(path: str) -> Reply:
+    """Read width and height; for the reading process."""
+    from faery.extension import es
+
+    with es.Decoder(path, 0) as decoder:
+        kind, size = decoder.event_type, decoder.dimensions
+        if kind not in ("dvs", "atis") or size is None:
+            raise AmiwarpError(f"holds {kind} events; expected dvs or atis")
+        return (int(size[0]), int(size[1])), []
+
+
+def read_packets(notes: dict[str, int], path: str, height: int) -> Iterator[Packet]:
+    """Decode events; for the reading process."""
     from faery.extension import es
 
     with es.Decoder(path, 0) as decoder:

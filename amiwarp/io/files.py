@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, printable
 
 _sources: weakref.WeakKeyDictionary[object, tuple[Path, ...]] = weakref.WeakKeyDictionary()
 _noted: set[Path] | None = None
@@ -57,7 +57,7 @@ def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except AmiwarpError as error:
-        if str(path) in str(error):
+        if printable(str(path)) in str(error):
             raise
         raise AmiwarpError(f"{path}: {place()}: {error}") from error
     except (KeyboardInterrupt, SystemExit, GeneratorExit):

@@ -10,6 +10,7 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name
+from amiwarp.regular import check_regular
 from amiwarp.values import choice
 
 
@@ -34,11 +35,9 @@ class Format(enum.StrEnum):
 
 def detect_format(path: Path) -> Format:
     """Tell a file's format from its first bytes. Raises :class:`AmiwarpError` where it is none of them."""
-    with errors_name(path, lambda: "opening"):
-        if path.is_dir():
-            raise AmiwarpError(f"{path}: is a folder; give a file")
-        with path.open("rb") as file:
-            head = file.read(4096)
+    check_regular(path)
+    with errors_name(path, lambda: "opening"), path.open("rb") as file:
+        head = file.read(4096)
     if not head:
         raise AmiwarpError(f"{path}: is empty")
     for magic, found in (

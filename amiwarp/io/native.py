@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,13 +15,12 @@ from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import DEFAULT_BLOCK, Events, MetadataValue, Recording, Truth, as_times, check_events, regroup
 from amiwarp.io.attributes import attribute, read_camera, read_prism
-from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32, StoredColumn, in_order
+from amiwarp.io.chunks import CHUNK, in_order
 from amiwarp.io.files import errors_name, register_reader
+from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.native_writer import FORMAT, FORMAT_VERSION
 from amiwarp.io.scan import smallest_sensor
-
-ATTEMPTS = 24
-"""To read what is being written: from 1 ns between two on, each twice as long, 17 ms in all."""
+from amiwarp.regular import check_regular
 
 DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px]; its files do not tell."""
@@ -32,38 +29,38 @@ DSEC_SIZE = (640, 480)
 class NativeEvents:
     """Events of an HDF5 recording, read only where asked for. Raises :class:`AmiwarpError` for a damaged file."""
 
-    def __init__(self, path: Path, file: Any, *, unfinished: bool = False) -> None:
-        """``unfinished``: its writer is at work, or was cut off; the events that are whole now are taken."""
+    def __init__(self, path: Path, file: Hdf5File) -> None:
+        """Of an ``unfinished`` file the events that are whole now are taken."""
         self.path = path
         self._file = file
-        self._columns = {name: _dataset(file, f"events/{name}", "iub") for name in ("t", "p")}
-        self._columns |= {name: _dataset(file, f"events/{name}", "iuf") for name in ("x", "y")}
+        self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
         for name in ("inside", "extrapolated"):
-            if name in file["events"]:
-                self._columns[name] = _dataset(file, f"events/{name}", "iub")
-        lengths = {name: _length(column, unfinished) for name, column in self._columns.items()}
-        if len(set(lengths.values())) != 1 and not unfinished:
+            if f"events/{name}" in file.columns:
+                self._columns[name] = file.columns[f"events/{name}"]
+        lengths = {name: len(column) for name, column in self._columns.items()}
+        if len(set(lengths.values())) != 1 and not file.unfinished:
             raise AmiwarpError(f"{path}: events differ in length: {lengths}; the file is damaged")
         self._count = min(lengths.values())
-        self._stored = {name: StoredColumn.of(column) for name, column in self._columns.items()}
-        self._offset = as_times(file["t_offset"][()]).item() if "t_offset" in file else 0
+        offset = file.columns.get("t_offset")
+        self._offset = 0 if offset is None else as_times(offset.read(0, 1)).item()
         # Of an unfinished file it may end anywhere: bisection does without.
-        self._ms_to_idx = _dataset(file, "ms_to_idx", "iu") if "ms_to_idx" in file and not unfinished else None
+        self._ms_to_idx = None if file.unfinished else file.columns.get("ms_to_idx")
         self._size = self._find_size()
         self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
         register_reader(self, self.path)
 
     def _find_size(self) -> tuple[int, int]:
-        attributes = self._file.attrs
+        attributes = self._file.attributes("/") or {}
         if "width" in attributes and "height" in attributes:
-            width, height = int(attributes["width"]), int(attributes["height"])
+            width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
             if not (1 <= width <= 65536 and 1 <= height <= 65536):
                 raise AmiwarpError(f"{self.path}: size {width}x{height}; expected 1 .. 65536 pixels each way")
             return width, height
         largest = [0, 0]
         for start in range(0, self._count, DEFAULT_BLOCK):
             for axis, name in enumerate(("x", "y")):
-                largest[axis] = max(largest[axis], int(self._columns[name][start : start + DEFAULT_BLOCK].max()))
+                values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
+                largest[axis] = max(largest[axis], int(values.max()))
         width, height = smallest_sensor(*largest)
         return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
 
@@ -149,20 +146,13 @@ class NativeEvents:
         return as_times(self._read("t", start, stop)) + self._offset
 
     def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """A part of a column; whole chunks of our own layout past HDF5, which lets one thread at a time read."""
-        stored = self._stored[name]
-        if stored is not None and start < stop and start % CHUNK == 0 and (stop % CHUNK == 0 or stop == self._count):
-            values = stored.read(start, stop)
-            if values is not None:
-                return values
-        # HDF5 reads any layout, and says what is wrong with a damaged one.
-        return np.asarray(self._columns[name][start:stop])
+        return self._columns[name].read(start, stop)
 
     def _bracket(self, t: int) -> tuple[int, int]:
         """A short range of indices in which ``t`` falls: from the index, or by bisection without one."""
         ms = (t - self._offset) // 1000
-        if self._ms_to_idx is not None and 0 <= ms < self._ms_to_idx.shape[0]:
-            ends = self._ms_to_idx[ms : ms + 2].tolist()
+        if self._ms_to_idx is not None and 0 <= ms < len(self._ms_to_idx):
+            ends = self._ms_to_idx.read(ms, min(ms + 2, len(self._ms_to_idx))).tolist()
             return max(0, min(ends[0], self._count)), max(
                 0, min(ends[1] if len(ends) > 1 else self._count, self._count)
             )
@@ -176,157 +166,89 @@ class NativeEvents:
 class _StoredPoints:
     """truth/x and truth/y as one ``(n, 2)`` array, read where asked for."""
 
-    def __init__(self, path: Path, x: Any, y: Any) -> None:
-        self._path, self._x, self._y = path, x, y
+    def __init__(self, path: Path, file: Hdf5File) -> None:
+        self._path, self._file = path, file
 
     def __getitem__(self, which: slice, /) -> NDArray[np.float32]:
         with errors_name(self._path, lambda: f"truth {which.start} .. {which.stop}"):
-            return np.stack([self._x[which], self._y[which]], axis=1).astype(np.float32, copy=False)
+            columns = [self._file.columns[f"truth/{name}"] for name in ("x", "y")]
+            start, stop, _ = which.indices(len(columns[0]))
+            return np.stack([column.read(start, stop) for column in columns], axis=1).astype(np.float32, copy=False)
 
 
 def open_native(path: Path) -> Recording:
     """Open a native recording or a DSEC event file. Raises :class:`AmiwarpError` for anything else."""
+    check_regular(path)
     with errors_name(path, lambda: "opening HDF5"):
-        file, unfinished = _open(path)
+        file = Hdf5File(path)
         try:
-            return _read_recording(path, file, unfinished)
+            return _read_recording(path, file)
         except BaseException:
             file.close()
             raise
 
 
-def _open(path: Path) -> tuple[Any, bool]:
-    """The file, and whether its writer is still at work or was cut off: HDF5 opens only a live recording then."""
-    # Imported for its effect: it registers the Blosc filter.
-    import h5py
-    import hdf5plugin  # noqa: F401
-
-    try:
-        return h5py.File(path, "r"), False
-    except OSError:
-        access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-        access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
-        # HDF5 reads what does not match its checksum again, after twice the time: 100 times, for ever. h5py has no name
-        # for this setting.
-        with contextlib.suppress(AttributeError):
-            attempts = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
-            attempts(ctypes.c_int64(access.id), ctypes.c_uint(ATTEMPTS))
-        with contextlib.suppress(OSError):
-            how = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
-            return h5py.File(h5py.h5f.open(os.fsencode(path), how, fapl=access)), True
-        raise
-
-
-def _read_recording(path: Path, file: Any, unfinished: bool) -> Recording:
-    import h5py
-
-    version = _attribute(file, "format_version", int, FORMAT_VERSION)
+def _read_recording(path: Path, file: Hdf5File) -> Recording:
+    root = _attributes(file, "/")
+    version = attribute(root, f"{path}: /", "format_version", int, FORMAT_VERSION)
     if version > FORMAT_VERSION:
         raise AmiwarpError(f"{path}: format_version {version} is newer than {FORMAT_VERSION}; update amiwarp")
-    if not isinstance(file.get("events"), h5py.Group):
-        raise AmiwarpError(f"{path}: HDF5 without a group 'events'; expected events/x, y, t, p")
-    events = NativeEvents(path, file, unfinished=unfinished)
-    stored = file["metadata"].attrs.items() if "metadata" in file else ()
-    metadata: dict[str, MetadataValue] = {name: _plain(value) for name, value in stored}
-    metadata["format"] = "native" if _attribute(file, "format", str, "") == FORMAT else "dsec"
-    camera = read_camera(file["camera"].attrs, _named(file["camera"])) if "camera" in file else None
-    if camera is not None and (camera.width, camera.height) != events.size:
-        raise AmiwarpError(f"{path}: camera is {camera.width}x{camera.height}, events are {events.size}; give one size")
-    return Recording(
+    events = NativeEvents(path, file)
+    metadata: dict[str, MetadataValue] = {
+        name: value if isinstance(value, (str, int, float, bool)) else str(value)
+        for name, value in _attributes(file, "metadata").items()
+    }
+    metadata["format"] = "native" if attribute(root, f"{path}: /", "format", str, "") == FORMAT else "dsec"
+    camera, prism = file.attributes("camera"), file.attributes("prism")
+    found = None if camera is None else read_camera(camera, f"{path}: /camera")
+    if found is not None and (found.width, found.height) != events.size:
+        raise AmiwarpError(f"{path}: camera is {found.width}x{found.height}, events are {events.size}; give one size")
+    recording = Recording(
         events=events,
-        camera=camera,
-        encoder=_read_encoder(file, unfinished) if "encoder" in file else None,
-        prism=read_prism(file["prism"].attrs, _named(file["prism"])) if "prism" in file else None,
-        truth=_read_truth(path, file, len(events)) if "truth" in file else None,
+        camera=found,
+        encoder=None if file.attributes("encoder") is None else _read_encoder(path, file),
+        prism=None if prism is None else read_prism(prism, f"{path}: /prism"),
+        truth=None if file.attributes("truth") is None else _read_truth(path, file, len(events)),
         metadata=metadata,
         name=path.stem,
     )
+    file.settle()
+    return recording
 
 
-def _length(column: Any, unfinished: bool) -> int:
-    """Elements of a column; of one that was growing those whose chunks are there."""
-    count = int(column.shape[0])
-    return min(count, column.id.get_num_chunks() * column.chunks[0]) if unfinished and column.chunks else count
+def _attributes(file: Hdf5File, group: str) -> Mapping[str, Any]:
+    return file.attributes(group) or {}
 
 
-def _dataset(file: Any, name: str, kinds: str) -> Any:
-    import h5py
-
-    dataset = file.get(name)
-    if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1:
-        raise AmiwarpError(f"{file.filename}: no one-dimensional dataset '{name}'; the file is incomplete")
-    if dataset.dtype.kind not in kinds:
-        raise AmiwarpError(f"{file.filename}: dataset '{name}' is {dataset.dtype}; see docs/recording-format.md")
-    if dataset.chunks is not None and _chunks_are_damaged(dataset):
-        raise AmiwarpError(f"{file.filename}: dataset '{name}' has a damaged chunk; copy the file anew")
-    return dataset
+def _column(file: Hdf5File, name: str) -> Column:
+    if name not in file.columns:
+        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
+    return file.columns[name]
 
 
-def _chunks_are_damaged(dataset: Any) -> bool:
-    """Whether HDF5 or its Blosc filter would read beyond a chunk: neither looks, and the process would die of it."""
-    creation = dataset.id.get_create_plist()
-    filters = [creation.get_filter(at) for at in range(creation.get_nfilters())]
-    chunk_bytes = dataset.chunks[0] * dataset.dtype.itemsize
-    for code, _, values, _ in filters:
-        # The filter's parameters: two versions, bytes per element, bytes per chunk.
-        if code == BLOSC and tuple(values[2:4]) != (dataset.dtype.itemsize, chunk_bytes):
-            return True
-    if not filters or filters[0][0] != BLOSC:
-        return False
-    file_bytes = os.path.getsize(dataset.file.filename)
-    damaged = False
-    with open(dataset.file.filename, "rb") as raw:
-
-        def visit(chunk: Any) -> None:
-            nonlocal damaged
-            raw.seek(chunk.byte_offset)
-            header = raw.read(16)
-            if chunk.filter_mask == 1:  # Blosc, the first filter, left out what it could not shorten
-                plain = chunk_bytes + 4 * (FLETCHER32 in [code for code, *_ in filters])
-                damaged |= chunk.byte_offset + plain > file_bytes or chunk.size != plain
-                return
-            # Blosc's header: four bytes, then the bytes before and after decompression, little-endian.
-            fits = chunk.byte_offset + chunk.size <= file_bytes and len(header) == 16
-            damaged |= not fits or int.from_bytes(header[4:8], "little") != chunk_bytes or chunk.filter_mask != 0
-
-        dataset.id.chunk_iter(visit)
-    return damaged
-
-
-def _attribute(group: Any, name: str, kind: type[Any], default: Any = None) -> Any:
-    return attribute(group.attrs, _named(group), name, kind, default)
-
-
-def _named(group: Any) -> str:
-    return f"{group.file.filename}: {group.name}"
-
-
-def _plain(value: Any) -> MetadataValue:
-    plain = value.item() if isinstance(value, np.generic) else value
-    plain = plain.decode(errors="replace") if isinstance(plain, bytes) else plain
-    return plain if isinstance(plain, (str, int, float, bool)) else str(plain)
-
-
-def _read_encoder(file: Any, unfinished: bool) -> Encoder | None:
-    t = as_times(_dataset(file, "encoder/t", "iu")[:])
-    angle = _dataset(file, "encoder/angle", "f")[:].astype(np.float64)
-    index_t = as_times(_dataset(file, "encoder/index_t", "iu")[:]) if "index_t" in file["encoder"] else None
-    if unfinished:
+def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
+    columns = {name: _column(file, f"encoder/{name}") for name in ("t", "angle")}
+    t, angle = (column.read(0, len(column)) for column in columns.values())
+    t, angle = as_times(t), angle.astype(np.float64)
+    pulses = file.columns.get("encoder/index_t")
+    index_t = None if pulses is None else as_times(pulses.read(0, len(pulses)))
+    if file.unfinished:
         count = min(t.size, angle.size)
         t, angle = t[:count], angle[:count]
         index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])] if index_t is not None and count else None
     # A live recording has room for an encoder before it is known whether there is one.
-    if t.size < 2 and (unfinished or t.size == angle.size == 0):
+    if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
         return None
-    return Encoder(t, angle, _attribute(file["encoder"], "clock_offset_us", float, 0.0), index_t)
+    offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
+    return Encoder(t, angle, offset, index_t)
 
 
-def _read_truth(path: Path, file: Any, count: int) -> Truth:
-    group = file["truth"]
-    parameters = {name: _attribute(group, name, float) for name in group.attrs}
-    if "x" not in group:
+def _read_truth(path: Path, file: Hdf5File, count: int) -> Truth:
+    attributes = _attributes(file, "truth")
+    parameters = {name: attribute(attributes, f"{path}: /truth", name, float) for name in attributes}
+    if "truth/x" not in file.columns:
         return Truth(parameters)
-    x, y = (_dataset(file, f"truth/{name}", "f") for name in ("x", "y"))
-    if x.shape != (count,) or y.shape != (count,):
-        raise AmiwarpError(f"{path}: truth has {x.shape[0]} and {y.shape[0]} points for {count} events")
-    return Truth(parameters, _StoredPoints(path, x, y))
+    x, y = (_column(file, f"truth/{name}") for name in ("x", "y"))
+    if len(x) != count or len(y) != count:
+        raise AmiwarpError(f"{path}: truth has {len(x)} and {len(y)} points for {count} events")
+    return Truth(parameters, _StoredPoints(path, file))

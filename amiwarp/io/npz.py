@@ -1,53 +1,85 @@
 """NumPy archives with arrays x, y [px], t [us] and p (1 is ON, 0 or -1 OFF), all integers of one length.
 
 Optional numbers ``width`` and ``height`` give the sensor's size; else it is the smallest sensor in use that holds all.
+The arrays are read piece by piece: what an archive unpacks to, or says that it does, takes no memory.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
+import zipfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import IO
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
+from numpy.lib import format as npy
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events import DEFAULT_BLOCK, Recording
 from amiwarp.io.files import errors_name
 from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.regular import check_regular
+
+PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""What NumPy writes; other compressions may take any amount of memory."""
 
 
 def open_npz(path: Path) -> Recording:
-    """Open an archive of events; its arrays are read whole, and anew each time where they are too large to keep."""
-    with errors_name(path, lambda: "reading width and height"), _open(path) as archive:
+    """Open an archive of events; its arrays are read in pieces, and anew each time if they are too large to keep."""
+    check_regular(path)
+    with errors_name(path, lambda: "reading width and height"), zipfile.ZipFile(path) as archive:
         size = None
-        if "width" in archive and "height" in archive:
-            size = (int(archive["width"]), int(archive["height"]))
+        if {"width.npy", "height.npy"} <= set(archive.namelist()):
+            size = (_number(archive, "width"), _number(archive, "height"))
     events = FileEvents(path, partial(_packets, path), size=size)
     return Recording(events=events, metadata={"format": "npz", **events.repairs}, name=path.stem)
 
 
 @contextlib.contextmanager
-def _open(path: Path) -> Iterator[NpzFile]:
-    # Given a path, np.load leaves the file open where it is no archive.
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        if not isinstance(archive, NpzFile):
-            raise AmiwarpError(f"{path}: is not an archive of arrays")
-        yield archive
+def _array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], tuple[int, ...], np.dtype[np.generic]]]:
+    """An array's bytes, shape and type; its header must agree with the archive's directory."""
+    about = archive.getinfo(f"{name}.npy")
+    if about.compress_type not in PACKED:
+        raise AmiwarpError(f"array {name} is compressed by method {about.compress_type}; save it with numpy.savez")
+    with archive.open(about) as stream:
+        version = npy.read_magic(stream)
+        read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
+        if read is None:
+            raise AmiwarpError(f"array {name} has a header of version {version}; expected 1.0 or 2.0")
+        shape, _, dtype = read(stream)
+        # Floating times could be seconds or microseconds: guessing wrong would go unnoticed. Objects would be pickles.
+        if dtype.kind not in "iub":
+            raise AmiwarpError(f"array {name} is {dtype}; expected integers (t in microseconds), no pickled objects")
+        if math.prod(shape) * dtype.itemsize != about.file_size - stream.tell():
+            raise AmiwarpError(f"array {name} declares shape {shape}, which the archive does not hold; it is damaged")
+        yield stream, shape, dtype
+
+
+def _number(archive: zipfile.ZipFile, name: str) -> int:
+    with _array(archive, name) as (stream, shape, dtype):
+        if math.prod(shape) != 1:
+            raise AmiwarpError(f"{name} has shape {shape}; expected one number")
+        return int(np.frombuffer(stream.read(dtype.itemsize), dtype)[0])
 
 
 def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
-    with _open(path) as archive:
-        missing = [name for name in "xytp" if name not in archive]
+    with contextlib.ExitStack() as opened:
+        archive = opened.enter_context(zipfile.ZipFile(path))
+        missing = [name for name in "xytp" if f"{name}.npy" not in archive.namelist()]
         if missing:
             raise AmiwarpError(f"{path}: no array {', '.join(missing)}; expected x, y, t, p")
-        x, y, t, p = (archive[name] for name in "xytp")
-    for name, array in (("x", x), ("y", y), ("t", t), ("p", p)):
-        # Floating times could be seconds or microseconds: guessing wrong would go unnoticed.
-        if array.dtype.kind not in "iub":
-            raise AmiwarpError(f"{path}: array {name} is {array.dtype}; expected integers (t in microseconds)")
-        if array.shape != (t.size,):
-            raise AmiwarpError(f"{path}: array {name} has shape {array.shape}, t {t.shape}; expected one length (n,)")
-    yield x, y, t, p
+        arrays = {name: opened.enter_context(_array(archive, name)) for name in "xytp"}
+        count = arrays["t"][1]
+        for name, (_, shape, _) in arrays.items():
+            if len(shape) != 1 or shape != count:
+                raise AmiwarpError(f"{path}: array {name} has shape {shape}, t {count}; expected one length (n,)")
+        for start in range(0, count[0], DEFAULT_BLOCK):
+            length = min(DEFAULT_BLOCK, count[0] - start)
+            x, y, t, p = (
+                np.frombuffer(stream.read(length * dtype.itemsize), dtype, length)
+                for stream, _, dtype in arrays.values()
+            )
+            yield x, y, t, p

@@ -19,21 +19,13 @@ from types import TracebackType
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import inputs_in_use, inputs_noted, same_file
+from amiwarp.regular import KINDS
 
 HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:32]
 """Names the machine in the names of unfinished files: process ids mean nothing on another one."""
 
 UNFINISHED = re.compile(r"\..+\.(?P<host>\w+)-(?P<pid>\d+)-[0-9a-f]{8}\.part")
 """What the name of an unfinished file looks like."""
-
-KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a FIFO",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
-"""What can have a name besides a file."""
 
 
 @dataclass

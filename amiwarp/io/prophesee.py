@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from functools import partial
@@ -12,7 +13,9 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import DEFAULT_BLOCK, Recording
 from amiwarp.io.files import errors_name
+from amiwarp.io.reading_process import packets
 from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.regular import check_regular
 
 WIDEST = (2048, 2048)
 """What EVT's coordinates can hold [px]: for the decoder where the header tells no size, so that it refuses nothing."""
@@ -29,6 +32,7 @@ GENERATIONS = {
 
 def _read_header(path: Path) -> tuple[dict[str, str], int]:
     """The ``% key value`` lines, keys in small letters, and the offset of the first byte after them."""
+    check_regular(path)
     with errors_name(path, lambda: "reading the header"), path.open("rb") as file:
         fields: dict[str, str] = {}
         offset = 0
@@ -48,8 +52,9 @@ def open_evt(path: Path) -> Recording:
     version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
     word = {"2.0": 4, "2": 4, "3.0": 2, "3": 2}.get(version)
     if word is None:
-        raise AmiwarpError(f"{path}: header tells no EVT version this reads (it says '{version}'); expected 2.0 or 3.0")
-    events = FileEvents(path, partial(_evt_packets, path), size=_evt_size(fields))
+        raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0 or 3.0")
+    source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", os.path.abspath(path))
+    events = FileEvents(path, source, size=_evt_size(fields))
     truncated = (path.stat().st_size - offset) % word
     noted = {"truncated_bytes": truncated} if truncated else {}
     return Recording(events=events, metadata={"format": f"evt{version}", **noted, **events.repairs}, name=path.stem)
@@ -67,7 +72,8 @@ def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
     return GENERATIONS[match[0]] if match else None
 
 
-def _evt_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
+def read_evt_packets(notes: dict[str, int], path: str) -> Iterator[Packet]:
+    """Decode events of a RAW file; for the reading process."""
     from faery.extension import evt
 
     notes["triggers"] = 0
@@ -90,7 +96,7 @@ def open_dat(path: Path) -> Recording:
         raise AmiwarpError(f"{path}: byte {offset}: {kind.hex() or 'nothing'} is not a DAT event type (0008 or 0c08)")
     version = fields.get("version", "2")
     if version not in ("1", "2"):
-        raise AmiwarpError(f"{path}: DAT version '{version}' is not 1 or 2")
+        raise AmiwarpError(f"{path}: DAT version '{version[:40]}' is not 1 or 2")
     width, height = fields.get("width", ""), fields.get("height", "")
     size = (int(width), int(height)) if width.isdecimal() and height.isdecimal() else None
     events = FileEvents(path, partial(_dat_packets, path, offset + 2, version), size=size)

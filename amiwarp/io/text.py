@@ -20,6 +20,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import Recording
 from amiwarp.io.files import errors_name, note_input
 from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.regular import check_regular
 
 READ_BYTES = 1 << 22
 """Text that is parsed at once: some 200,000 events."""
@@ -30,17 +31,19 @@ LONGEST_LINE = 1000
 
 def open_text(path: Path) -> Recording:
     """Open a text recording, with the camera of the ``calib.txt`` beside it where there is one."""
+    check_regular(path)
     with errors_name(path, lambda: "line 1"), path.open("rb") as file:
         size, _ = _read_size(path, file)
     events = FileEvents(path, partial(_packets, path), size=size)
     calib = path.with_name("calib.txt")
-    camera = read_calib(calib, *events.size) if calib.is_file() and calib != path else None
+    camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
     return Recording(events=events, camera=camera, metadata={"format": "text", **events.repairs}, name=path.stem)
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
     """The camera of a ``calib.txt``. Raises :class:`AmiwarpError` where it does not hold nine finite numbers."""
     note_input(path)
+    check_regular(path)
     with errors_name(path, lambda: "reading the calibration"):
         with path.open("rb") as file:
             words = file.read(10_000).decode("utf-8").split()
@@ -58,7 +61,7 @@ def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]
         file.seek(0)
         return None, 0
     if not (words[0].isdigit() and words[1].isdigit()):
-        given = b" ".join(words).decode("ascii", "replace")
+        given = b" ".join(words)[:80].decode("ascii", "replace")
         raise AmiwarpError(f"{path}: line 1 '{given}' is not a size in pixels; expected 'width height' or 't x y p'")
     return (int(words[0]), int(words[1])), 1
 

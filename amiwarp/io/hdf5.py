@@ -1,0 +1,133 @@
+"""HDF5 files of events, as the rest reads them: opened by the reading process, chunks of our own layout read here.
+
+What amiwarp wrote carries checksums on each chunk: it is read and decoded here, on all cores. Other layouts and filters
+are read by HDF5 in the reading process, as is all that is read once, when a file is opened.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.chunks import StoredColumn
+from amiwarp.io.reading_process import ReadingProcess, borrow, give_back
+
+PIECE = 1 << 20
+"""Elements that the reading process reads at once."""
+
+LATER = ("events/", "truth/", "ms_to_idx")
+"""Data sets that are read after a file was opened."""
+
+SERVER = "amiwarp.io.hdf5_server"
+
+
+class Hdf5File:
+    """An open file of events. Threads may read its columns at once.
+
+    Raises :class:`AmiwarpError` for what cannot be opened, refers to other files, or declares what it cannot hold.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._absolute = os.path.abspath(path)
+        self._lock = threading.Lock()
+        self._process: list[ReadingProcess] = []  # one, or none that is needed; shared with the finalizer
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        self.close = weakref.finalize(self, _close, handle, self._process)
+        found = os.fstat(handle)
+        self._identity = [found.st_dev, found.st_ino]
+        try:
+            about = self._start()
+        except BaseException:
+            self.close()
+            raise
+        self._attributes = about["attributes"]
+        self.unfinished = bool(about["unfinished"])
+        """Whether its writer is at work, or was cut off."""
+        self.columns = {name: Column(self, handle, name, column) for name, column in about["columns"].items()}
+        """Data sets by name. They refer to the file weakly: who reads them keeps it."""
+
+    def attributes(self, group: str) -> Mapping[str, Any] | None:
+        """Attributes of a group, None if the file has no such group."""
+        found: Mapping[str, Any] | None = self._attributes.get(group)
+        return found
+
+    def settle(self) -> None:
+        """End the opening: from now on only events and truth are read. Give the process back if they need no HDF5."""
+        if all(column.is_stored for name, column in self.columns.items() if name.startswith(LATER)):
+            with self._lock:
+                _give_back(self._process)
+
+    def ask(self, function: str, *arguments: Any) -> list[NDArray[Any]]:
+        """Call the reading process, which is started again after Ctrl-C and in a fork of this process."""
+        with self._lock:
+            if not self._process or not self._process[0].usable:
+                self._start()
+            return self._process[0].call(f"{SERVER}:{function}", *arguments)[1]
+
+    def _start(self) -> Any:
+        self._process[:] = [borrow()]
+        about, _ = self._process[0].call(f"{SERVER}:open_file", self._absolute)
+        if about["identity"] != self._identity:
+            raise AmiwarpError("was replaced by another file while it was read; open it again")
+        return about
+
+
+class Column:
+    """A one-dimensional data set."""
+
+    def __init__(self, file: Hdf5File, handle: int, name: str, about: Mapping[str, Any]) -> None:
+        self._file = weakref.proxy(file)
+        self._name = name
+        self._count = int(about["count"])
+        self._filters = ", ".join(about["filters"]) or "no filter"
+        self.dtype = np.dtype(about["dtype"])
+        places = about["places"]
+        self._stored = None if places is None else StoredColumn(handle, self.dtype, self._count, places)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether it is read without HDF5."""
+        return self._stored is not None
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Elements ``start <= index < stop``, within the column. Raises :class:`AmiwarpError` for damaged ones."""
+        if start >= stop:
+            return np.empty(0, self.dtype)
+        if self._stored is not None:
+            values = self._stored.read(start, stop)
+            if values is None:
+                raise AmiwarpError(f"dataset '{self._name}' has a damaged chunk: its checksum is wrong; copy the file")
+            return values
+        parts = [self._ask(at, min(at + PIECE, stop)) for at in range(start, stop, PIECE)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _ask(self, start: int, stop: int) -> NDArray[Any]:
+        try:
+            (values,) = self._file.ask("read", self._name, start, stop)
+        except AmiwarpError as error:
+            where = f"dataset '{self._name}' ({self._filters}), elements {start} .. {stop}"
+            raise AmiwarpError(f"{where}: {error}") from error
+        if values.shape != (stop - start,) or values.dtype != self.dtype:
+            raise AmiwarpError(f"dataset '{self._name}' changed while it was read; open the file again")
+        return values
+
+
+def _close(handle: int, process: list[ReadingProcess]) -> None:
+    os.close(handle)
+    _give_back(process)
+
+
+def _give_back(process: list[ReadingProcess]) -> None:
+    if process:
+        give_back(process.pop())

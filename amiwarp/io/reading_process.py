@@ -1,0 +1,196 @@
+"""Reading files in a process of its own: a damaged file that crashes a decoder, or hangs it, costs one error.
+
+HDF5 with its filters and the compiled decoders of other formats follow what a file says. The process that runs them is
+started by ``subprocess``, not ``multiprocessing``, so that a user's script is not imported again. It runs functions of
+amiwarp that return a JSON value and arrays; both travel through pipes. See :mod:`amiwarp.io.reading_server` for what
+runs in it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+
+CPU_SECONDS = 30
+"""Processor time [s] of one request beyond which a decoder hangs. A busy machine does not use it up faster."""
+
+MEMORY_BYTES = 1 << 30
+"""Memory that one request may take beyond what the process had before it."""
+
+PIPE_BYTES = 1 << 20
+"""Size of the pipe from the process, where the system lets it be set: fewer turns between writer and reader."""
+
+START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_server import serve; serve()"
+
+
+class ReadingProcess:
+    """A process that serves one reader at a time. Not for several threads at once."""
+
+    def __init__(self) -> None:
+        """Start the process. Raises :class:`OSError` if it cannot be started."""
+        root = str(Path(__file__).resolve().parents[2])
+        # The module path is handed over, so that the process imports what this one does, without site's start-up time.
+        paths = [root, *(os.path.abspath(path) for path in sys.path if path != root)]
+        self.owner = os.getpid()
+        # Its own session: Ctrl-C reaches this process only, which then ends the other.
+        self._child = subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", START, *paths],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            start_new_session=True,
+        )
+        self._requests: Any = self._child.stdin
+        self._replies: Any = self._child.stdout
+        self.close = weakref.finalize(self, _end, self._child, self.owner)
+        with contextlib.suppress(ImportError, AttributeError, OSError):
+            import fcntl
+
+            assert self._child.stdout is not None
+            fcntl.fcntl(self._child.stdout, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the process lives and belongs to this one, which a fork of its owner does not have."""
+        return self.close.alive and self.owner == os.getpid() and self._child.poll() is None
+
+    def call(self, function: str, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
+        """Run ``module:function`` of amiwarp; returns its JSON value and its arrays, each of shape ``(n,)``.
+
+        Raises
+        ------
+        AmiwarpError
+            If the function raises anything, or if the process crashes or exceeds :data:`CPU_SECONDS`.
+        """
+        self.send(function, *arguments)
+        return self.receive()
+
+    def send(self, function: str, *arguments: Any) -> None:
+        """Start a call whose result :meth:`receive` returns."""
+        limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
+        request = json.dumps({"function": function, "arguments": arguments, **limits}).encode()
+        try:
+            self._requests.write(request + b"\n")
+            self._requests.flush()
+        except OSError as error:
+            raise self._ended() from error
+
+    def receive(self) -> tuple[Any, list[NDArray[Any]]]:
+        """Wait for the result of the call that was sent."""
+        try:
+            (length,) = struct.unpack("<I", self._fill(bytearray(4)))
+            reply = json.loads(self._fill(bytearray(length)))
+            arrays = [np.empty(count, dtype) for dtype, count in reply.get("arrays", ())]
+            for array in arrays:
+                if array.size:
+                    self._fill(array.view(np.uint8).data)
+        except BaseException:
+            self.close()  # what is still in the pipe belongs to no later call
+            raise
+        if "error" in reply:
+            raise AmiwarpError(reply["error"])
+        return reply["result"], arrays
+
+    def _fill(self, buffer: Any) -> Any:
+        if self._replies.readinto(buffer) != len(buffer):
+            raise self._ended()
+        return buffer
+
+    def _ended(self) -> AmiwarpError:
+        code = self._child.wait()
+        self.close()
+        if code == -getattr(signal, "SIGXCPU", 0):
+            return AmiwarpError(f"reading took over {CPU_SECONDS} s of processor time; the file is damaged")
+        if code < 0:
+            return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
+        return AmiwarpError(f"the process that reads ended with code {code}; check that '{sys.executable}' is Python")
+
+
+def _end(child: subprocess.Popen[bytes], owner: int) -> None:
+    """End a process, which has nothing to lose; a fork of its owner leaves it alone."""
+    if owner == os.getpid():
+        child.kill()
+        child.wait()
+    for stream in (child.stdin, child.stdout):
+        with contextlib.suppress(OSError):
+            stream.close()  # type: ignore[union-attr]
+
+
+_idle: list[ReadingProcess] = []
+_idle_lock = threading.RLock()  # the collector may run a finalizer, which gives back, at any point
+
+
+def borrow() -> ReadingProcess:
+    """Take the idle process, or start one."""
+    with _idle_lock:
+        process = _idle.pop() if _idle else None
+    if process is not None and process.usable:
+        return process
+    return ReadingProcess()
+
+
+def give_back(process: ReadingProcess) -> None:
+    """Keep one usable process for the next reader; starting one takes some 0.3 s."""
+    if process.usable:
+        with contextlib.suppress(AmiwarpError):
+            process.call("amiwarp.io.reading_server:forget")
+            with _idle_lock:
+                if not _idle:
+                    _idle.append(process)
+                    return
+    process.close()
+
+
+def run(function: str, *arguments: Any) -> Any:
+    """Run one function in a process; returns its JSON value."""
+    process = borrow()
+    try:
+        return process.call(function, *arguments)[0]
+    finally:
+        give_back(process)
+
+
+def packets(function: str, *arguments: Any) -> Iterator[Any]:
+    """Yield what a generator ``module:function`` yields in a process: tuples of arrays, put together to large ones.
+
+    The process decodes one packet ahead. The last argument is a dictionary of counts; it is updated from the one that
+    the generator is given first.
+    """
+    *given, notes = arguments
+    process = borrow()
+    try:
+        process.call("amiwarp.io.reading_server:begin", function, *given)
+        process.send("amiwarp.io.reading_server:advance")
+        waiting = True
+        try:
+            while True:
+                waiting = False
+                found, arrays = process.receive()
+                notes.update(found)
+                if not arrays:
+                    return
+                process.send("amiwarp.io.reading_server:advance")
+                waiting = True
+                yield tuple(arrays)
+        finally:
+            if waiting and process.usable:
+                with contextlib.suppress(AmiwarpError):
+                    process.receive()
+    finally:
+        give_back(process)

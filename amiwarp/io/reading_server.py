@@ -1,0 +1,121 @@
+"""What runs in the process of :mod:`amiwarp.io.reading_process`: it reads requests, runs functions, sends results."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import struct
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+
+PACKET = 1 << 17
+"""Events that are put together before they are sent."""
+
+Reply = tuple[Any, list[NDArray[Any]]]
+"""A JSON value and arrays of shape ``(n,)``."""
+
+_state: dict[str, Any] = {}
+
+
+def serve() -> None:
+    """Serve requests until the other side closes its pipe or dies."""
+    requests = sys.stdin.buffer
+    replies = os.fdopen(os.dup(1), "wb")
+    # What a library prints must not get between the replies.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    with contextlib.suppress(BrokenPipeError):
+        while line := requests.readline():
+            request = json.loads(line)
+            _limit(request["cpu_s"], request["memory_bytes"])
+            head, arrays = _answer(request)
+            encoded = json.dumps(head).encode()
+            replies.write(struct.pack("<I", len(encoded)) + encoded)
+            for array in arrays:
+                replies.write(array.data if array.size else b"")
+            replies.flush()
+    os._exit(0)
+
+
+def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    module, _, name = request["function"].partition(":")
+    try:
+        result, arrays = getattr(importlib.import_module(module), name)(*request["arguments"])
+        arrays = [np.ascontiguousarray(array) for array in arrays]
+        return {"result": result, "arrays": [(array.dtype.str, array.size) for array in arrays]}, arrays
+    except AmiwarpError as error:
+        return {"error": str(error)}, []
+    except MemoryError:
+        return {"error": f"needs over {request['memory_bytes'] >> 20} MiB of memory at once; the file is damaged"}, []
+    except BaseException as error:  # panics of compiled decoders derive from it only
+        return {"error": " ".join(str(error).split())[:300] or type(error).__name__}, []
+
+
+def _limit(cpu_s: int, memory_bytes: int) -> None:
+    """Limit what one request may use; on systems without such limits it may use anything."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        soft = int(used.ru_utime + used.ru_stime) + 1 + cpu_s
+        resource.setrlimit(resource.RLIMIT_CPU, (soft if hard < 0 else min(soft, hard), hard))
+        with open("/proc/self/statm") as sizes:
+            taken = int(sizes.read().split()[0]) * resource.getpagesize()
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        soft = taken + memory_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (soft if hard < 0 else min(soft, hard), hard))
+
+
+def keep(name: str, value: Any) -> None:
+    """Keep a value between requests, until :func:`forget`."""
+    _state[name] = value
+
+
+def kept(name: str) -> Any:
+    """Return a value that was kept."""
+    return _state[name]
+
+
+def forget() -> Reply:
+    """Close and drop all that was kept for a reader."""
+    for value in _state.values():
+        with contextlib.suppress(Exception):
+            value.close()
+    _state.clear()
+    return None, []
+
+
+def begin(function: str, *arguments: Any) -> Reply:
+    """Start a generator of packets; it is given a dictionary for counts first."""
+    module, _, name = function.partition(":")
+    notes: dict[str, int] = {}
+    keep("notes", notes)
+    keep("packets", getattr(importlib.import_module(module), name)(notes, *arguments))
+    return None, []
+
+
+def advance() -> Reply:
+    """Return the counts and the next packets put together; no array at the end."""
+    found: list[tuple[NDArray[Any], ...]] = []
+    for packet in _some(kept("packets")):
+        found.append(packet)
+    return kept("notes"), [np.concatenate(parts) for parts in zip(*found, strict=True)]
+
+
+def _some(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield packets until there are :data:`PACKET` events; a single packet may hold more."""
+    count = 0
+    for packet in source:
+        count += len(packet[0])
+        yield packet
+        if count >= PACKET:
+            return
