@@ -108,8 +108,8 @@ def large(file: h5py.File) -> None:
         (region, "metadata attribute 'x' is neither"),
         (varying, "metadata attribute 'x' is neither"),
         (lambda f: f.create_group("metadata").attrs.create("x", h5py.Empty("f8")), "metadata attribute 'x' is neither"),
-        (lambda f: f.attrs.create("width", [1, 2]), "attribute 'width' is \\[1, 2\\]"),
-        (lambda f: f.create_group("truth").attrs.create("apex", "wide"), "attribute 'apex' is 'wide'"),
+        (lambda f: f.attrs.create("width", [1, 2]), r"attribute 'width' = \[1, 2\] is not a whole"),
+        (lambda f: f.create_group("truth").attrs.create("apex", "wide"), "attribute 'apex' = 'wide' is not"),
     ],
 )
 def test_attributes_are_numbers_or_strings(dsec, edit, message):
