@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from amiwarp.events import Events
     from amiwarp.io.live_writer import LiveWriter
     from amiwarp.link.clocks import Clock
-    from amiwarp.link.following import News
     from amiwarp.link.link import Link
+    from amiwarp.link.news import News
     from amiwarp.stream.packets import Packet, Source
     from amiwarp.stream.speed import SpeedKeeper
 

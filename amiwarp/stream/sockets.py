@@ -281,7 +281,6 @@ class SocketSink:
             try:
                 connection, _ = self._server.accept()
             except BlockingIOError:
-                self._said = ""
                 return
             except OSError as error:
                 if error.errno in EXHAUSTED:
@@ -307,6 +306,7 @@ class SocketSink:
         client = _Client(connection)
         client.put(self._hello)
         self._clients.append(client)
+        self._said = ""
 
     def _say_once(self, sentence: str) -> None:
         if sentence != self._said:
