@@ -1,6 +1,7 @@
 """The link: whatever the controller and the line do, angles are right again, and what happened is said."""
 
 import itertools
+import contextlib
 import math
 import random
 import socket
@@ -490,9 +491,10 @@ def test_lines_over_a_socket_take_no_commands() -> None:
 
 def test_answers_to_no_command_are_not_kept() -> None:
     """One that came before its command would be taken for the answer to it."""
-    with socket.create_server(("127.0.0.1", 0)) as server, Link(
-        f"socket://127.0.0.1:{server.getsockname()[1]}", counts_per_turn=1000
-    ) as link, server.accept()[0] as peer:  # fmt: skip
+    with socket.create_server(("127.0.0.1", 0)) as server, contextlib.ExitStack() as held:
+        link = Link(f"socket://127.0.0.1:{server.getsockname()[1]}", counts_per_turn=1000)
+        peer = held.enter_context(server.accept()[0])
+        held.callback(link.close)
         answers = [encode(Answer(k, 2), k) for k in range(500)]
         peer.sendall(b"".join(answers) + encode(Status(0, 1, 0, 720.0, 720.0, 4096), 500))
         wait(lambda: link.status is not None)

@@ -186,9 +186,12 @@ def test_a_sender_that_connects_may_return(tmp_path: Path) -> None:
 
     thread = threading.Thread(target=read, daemon=True)
     thread.start()
-    for stream in (HELLO + part(0), HELLO + part(400_000) + END):
+    for k, stream in enumerate((HELLO + part(0), HELLO + part(400_000) + END)):
         with socket.socket(socket.AF_UNIX) as ours:
             until = time.monotonic() + LONG_S
+            while len(said) < k:  # it listens again after that
+                assert time.monotonic() < until
+                time.sleep(0.01)
             while ours.connect_ex(str(path)):
                 assert time.monotonic() < until
                 time.sleep(0.01)
