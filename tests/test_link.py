@@ -1,7 +1,7 @@
 """The link: whatever the controller and the line do, angles are right again, and what happened is said."""
 
-import itertools
 import contextlib
+import itertools
 import math
 import random
 import socket

@@ -9,22 +9,28 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_session import KNOWN, MODEL, Made
+from test_session import KNOWN, MODEL, Made, points, world
 
 from amiwarp.compensator import Compensated, Compensator, held_bytes
 from amiwarp.encoder import Encoder, EncoderStream
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
+from amiwarp.link.emulator import MOST_OUT, Controller, Fault
+from amiwarp.link.news import News
+from amiwarp.link.rotors import MOST_PIECES, Motor, Played
+from amiwarp.link.terminal import RETRY_S, PseudoTerminal
 from amiwarp.stream import ring as ring_module
 from amiwarp.stream import speed as speed_module
 from amiwarp.stream import watch as watch_module
 from amiwarp.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.stream.beside import Beside
+from amiwarp.stream.emulated import EmulatedCamera
 from amiwarp.stream.packets import Packet, encode_hello, packet
 from amiwarp.stream.queues import PacketQueue, Policy
 from amiwarp.stream.ring import Ring
@@ -273,6 +279,91 @@ def test_a_window_that_never_ends_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
     for _ in range(3000):
         keeper.put([Compensated(events(1, 50_000), np.zeros(1, np.uint8))], encoder)
         assert keeper.held_bytes <= MOST
+
+
+def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A controller that sends without end while the camera sends nothing."""
+    monkeypatch.setattr("amiwarp.stream.session.MOST_HELD", 1000)
+    said: list[str] = []
+
+    class Sending:
+        polls = 0
+
+        def poll(self) -> News:
+            self.polls += 1
+            t = np.arange(100 * self.polls, 100 * (self.polls + 1), dtype=np.int64)
+            return News(t, t * 1e-5, t[:1], (), False, ())
+
+        def clock(self) -> None:
+            return None
+
+    class Silent(Flood):
+        def packets(self) -> Iterator[Packet]:
+            while controller.polls < 50:
+                yield packet(0)
+
+    controller = Sending()
+    session = Session(Silent(samples, 0), link=controller, say=said.append)  # type: ignore[arg-type]
+    session.run(threading.Event(), lambda _: None)
+    assert controller.polls >= 50
+    assert session._held_samples == sum(len(news.t_us) + len(news.index_t_us) for news in session._held)
+    assert 900 <= session._held_samples <= 1000
+    assert [message for message in said if "clock is not known" in message] == said
+    assert len(said) == 1
+
+
+def test_a_motor_remembers_a_bounded_past() -> None:
+    """However often its speed is set."""
+    motor = Motor(720.0)
+    for k in range(5000):
+        motor.set_speed(700.0 + k % 40, 500.0, 1000 * k)
+    assert len(motor._pieces) <= MOST_PIECES + 2
+    assert motor.target_rpm(5_000_000) == 700.0 + 4999 % 40
+
+
+def test_an_emulator_that_was_suspended_sends_a_bounded_rest() -> None:
+    controller = Controller(Motor(720.0))
+    assert len(controller.advance(1_000_000_000)) < MOST_OUT + 1000
+
+
+def test_an_emulated_port_comes_back_after_a_lack_of_descriptors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its thread lives on, and waits in between."""
+    openpty, failed = os.openpty, []
+
+    def exhausted() -> tuple[int, int]:
+        if len(failed) < 3:
+            failed.append(time.monotonic())
+            raise OSError(24, "Too many open files")
+        return openpty()
+
+    controller = Controller(Motor(720.0), faults=[Fault.parse("unplug@0.1+0.1")])
+    with PseudoTerminal(controller, tmp_path / "prism"):
+        monkeypatch.setattr(os, "openpty", exhausted)
+        reached(lambda: len(failed) == 3)
+        reached(lambda: (tmp_path / "prism").exists())
+    assert min(np.diff(failed)) >= RETRY_S
+
+
+def test_a_recording_that_cannot_be_read_ends_its_emulated_camera(tmp_path: Path) -> None:
+    """With the error, not with a thread that is gone while others wait for it."""
+    recording = points(2000, 0.2)
+    assert recording.encoder is not None
+
+    def broken(**_: object) -> Iterator[Events]:
+        yield recording.events.slice(0, 10)
+        raise AmiwarpError("recording.h5: damaged")
+
+    rotor = Played(recording.encoder)
+    events = type("Damaged", (), {"size": (64, 48), "blocks": staticmethod(broken), "__len__": lambda _: 2000})()
+    played = replace(recording, events=events)
+    camera = EmulatedCamera(played, rotor, Controller(rotor), f"unix:{tmp_path}/c", world())
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(f"{tmp_path}/c")
+        assert camera.done.wait(LONG_S)
+    with pytest.raises(AmiwarpError, match=r"recording\.h5: damaged"):
+        camera.close()
 
 
 def test_a_client_that_reads_nothing_is_bounded(tmp_path: Path) -> None:

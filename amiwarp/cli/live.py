@@ -126,8 +126,9 @@ def run(
                     _writer(record, opened, found, compensated=False, offset_us=clock_offset(opened, link))
                 )
             )
-        if raw_to is not None:
-            raw.append(Forward(_sink(raw_to, found, held, stop, line.say)))
+        handed = None if raw_to is None else _sink(raw_to, found, held, stop, line.say)
+        if handed is not None:
+            raw.append(Forward(handed))
         written = None if out is None else held.enter_context(_writer(out, opened, found, compensated=True))
         served = None if to is None else _sink(to, found, held, stop, line.say)
         keeper = adaptive.build(found.model, link, line.say)
@@ -144,7 +145,7 @@ def run(
                 served.tick()
 
         status = session.run(stop, update)
-        line.end(served)
+        line.end(served, handed)
     data: dict[str, Any] = {
         "files": [str(path) for path in (record, out) if path is not None],
         **summary(status, opened),

@@ -125,10 +125,11 @@ class StatusLine:
         if self._console.is_terminal:
             self._live.update(Text(describe(status), no_wrap=True, overflow="ellipsis"))
 
-    def end(self, served: SocketSink | PipeSink | None = None) -> None:
-        """Says how much receivers did not get."""
-        if served is not None and served.lost:
-            self.say(f"{served.lost:,} packets were not sent: who listens is too slow")
+    def end(self, *sinks: SocketSink | PipeSink | None) -> None:
+        """Say how much receivers did not get."""
+        for served in sinks:
+            if served is not None and served.lost:
+                self.say(f"{served.lost:,} packets were not sent: who listens is too slow")
 
 
 def describe(s: Status) -> str:

@@ -133,7 +133,7 @@ class Session:
         known = {} if calibration is None else calibration.parameters
         self.encoder = EncoderStream(known.get("clock_offset", own) - own)
         self._held: deque[News] = deque()
-        self._held_samples = 0
+        self._held_samples, self._told_held = 0, False
         self._hasty = False
         self._compensator: Compensator | None = None
         self._meter: SharpnessMeter | None = None
@@ -270,6 +270,9 @@ class Session:
             self._held_samples += len(news.t_us) + len(news.index_t_us)
         clock = self.status.clock = self._camera_clock.clock(self._link.clock())
         if clock is None:
+            if self._held_samples > MOST_HELD and not self._told_held:
+                self._told_held = True
+                self._say("the camera's clock is not known yet: the oldest of the samples that wait for it are dropped")
             while self._held_samples > MOST_HELD:
                 oldest = self._held.popleft()
                 self._held_samples -= len(oldest.t_us) + len(oldest.index_t_us)
