@@ -26,6 +26,8 @@ MANY = 2
 """Batches that a call gives at least before it leaves those that a GPU works on to the next."""
 AHEAD_US = 100_000
 """Of encoder samples that are put on the device at once, where there are so many [us]."""
+OVERHEAD = 1024
+"""Bytes that a packet counts for beyond its arrays: the Python objects that hold them."""
 Waiting: TypeAlias = tuple[Events, int, int, int]
 """A packet, its last time, when it was put, and when it had come [us]."""
 
@@ -42,12 +44,18 @@ class Compensated:
     """When the first of them came, by the caller's clock [us]."""
 
 
+def held_bytes(events: Events) -> int:
+    """Return the memory that a waiting packet of events takes [bytes], its Python objects included."""
+    return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
+
+
 class Compensator:
     """Compensates a stream: put packets and encoder samples as they come, take what is ready.
 
     A packet waits until the encoder covers it, at most ``wait_us`` by the caller's clock, or ``start_us`` while the
-    encoder has given no two samples yet; past that, or while more than ``most_waiting`` events wait, its angles are
-    guessed and marked. Everything comes out once, in the order it was put. ``encoder``: the caller appends its samples.
+    encoder has given no two samples yet; past that, or while more than ``most_waiting`` events or ``most_bytes`` wait,
+    its angles are guessed and marked. Everything comes out once, in the order it was put. ``encoder``: the caller
+    appends its samples.
 
     Buffers are allocated once, for ``batch`` events: what is ready is worked through so many at a time. For one thread.
     """
@@ -60,13 +68,15 @@ class Compensator:
         wait_us: int = 10_000,
         start_us: int = 5_000_000,
         most_waiting: int = 1 << 24,
+        most_bytes: int = 1 << 28,
         batch: int | None = None,
         device: Any = "cpu",
     ) -> None:
         import warp as wp
 
         self.encoder = encoder
-        self.wait_us, self.start_us, self.most_waiting = wait_us, start_us, most_waiting
+        self.wait_us, self.start_us = wait_us, start_us
+        self.most_waiting, self.most_bytes = most_waiting, most_bytes
         self._device = wp.get_device(device)
         self.batch = batch or (1 << 16 if self._device.is_cpu else 1 << 20)
         self._work = Batches(model, self.batch, self._device)
@@ -74,6 +84,8 @@ class Compensator:
         self._queue: deque[Waiting] = deque()
         self.waiting = 0
         """Events put that are not worked on yet."""
+        self.waiting_bytes = 0
+        """Memory that these take [bytes], see :func:`held_bytes`."""
         self._started: Started | None = None
         self._begun: tuple[Begun, NDArray[np.bool_] | None] | None = None
         self._t_last = -(2**62)
@@ -99,6 +111,7 @@ class Compensator:
         self._t_last = t.item(-1)
         self.waiting += t.size
         arrived = now_us if arrived_us is None else arrived_us
+        self.waiting_bytes += sum(map(held_bytes, parts))
         self._queue.extend((part, part.t.item(-1), now_us, arrived) for part in parts)
 
     def take(self, now_us: int) -> list[Compensated]:
@@ -140,12 +153,14 @@ class Compensator:
         patience = self.start_us if covered is None else self.wait_us
         while self._queue:
             events, last, put_us, _ = self._queue[0]
-            n, overdue = events.t.size, now_us - put_us >= patience or self.waiting > self.most_waiting
+            full = self.waiting > self.most_waiting or self.waiting_bytes > self.most_bytes
+            n, overdue = events.t.size, full or now_us - put_us >= patience
             if count + n > self.batch or not (overdue or (covered is not None and last <= covered)):
                 break
             packets.append(self._queue.popleft())
             count += n
             self.waiting -= n
+            self.waiting_bytes -= held_bytes(events)
         return packets
 
     def _start(self, packets: list[Waiting]) -> Started:

@@ -1,5 +1,6 @@
 """The link: whatever the controller and the line do, angles are right again, and what happened is said."""
 
+import contextlib
 import itertools
 import math
 import random
@@ -22,7 +23,7 @@ from amiwarp.link.emulator import LASTING, Controller, Fault
 from amiwarp.link.following import Follower, News
 from amiwarp.link.link import Link
 from amiwarp.link.port import open_port, usb_id
-from amiwarp.link.protocol import Decoder, Index, Message, Ping, Samples, Status, encode
+from amiwarp.link.protocol import Answer, Decoder, Index, Message, Ping, Samples, Status, encode
 from amiwarp.link.rotors import Motor
 from amiwarp.link.terminal import PseudoTerminal
 
@@ -486,6 +487,21 @@ def test_lines_over_a_socket_take_no_commands() -> None:
         assert seen == list(range(0, S, 1000))
         with pytest.raises(AmiwarpError, match="lines of text, which take no commands"):
             link.stop()
+
+
+def test_answers_to_no_command_are_not_kept() -> None:
+    """One that came before its command would be taken for the answer to it."""
+    with socket.create_server(("127.0.0.1", 0)) as server, contextlib.ExitStack() as held:
+        link = Link(f"socket://127.0.0.1:{server.getsockname()[1]}", counts_per_turn=1000)
+        peer = held.enter_context(server.accept()[0])
+        held.callback(link.close)
+        answers = [encode(Answer(k, 2), k) for k in range(500)]
+        peer.sendall(b"".join(answers) + encode(Status(0, 1, 0, 720.0, 720.0, 4096), 500))
+        wait(lambda: link.status is not None)
+        assert link._answers == {}
+        with pytest.raises(AmiwarpError, match="no answer in 1 s"):
+            link.stop()
+        assert link._answers == {}
 
 
 def motor(*args: object) -> tuple[int, str, BaseException | None]:

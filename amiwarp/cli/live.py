@@ -13,7 +13,7 @@ import typer
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import OUTPUT, Common
-from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
+from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 from amiwarp.errors import AmiwarpError
 from amiwarp.stream.queues import Policy
 
@@ -100,6 +100,8 @@ def run(
 ) -> None:
     """Compensate events as they come, with rate, latency, coverage and sharpness on one line; Ctrl-C ends it.
 
+    A stream that breaks off ends it with exit code 1; what came is in the files.
+
     Every event comes out once, in order, marked where it left the image or its angle had to be extrapolated.
     """
     from amiwarp.calib import Calibration
@@ -114,7 +116,7 @@ def run(
         stop = threading.Event()
         line = held.enter_context(StatusLine(stop, stream.seconds))
         link = held.enter_context(stream.link())
-        opened = stream.open(source)
+        opened = stream.open(source, line.say)
         check_angles(opened, link)
         check_size(found, opened.size, opened.name)
         raw: list[Raw] = []
@@ -124,10 +126,11 @@ def run(
                     _writer(record, opened, found, compensated=False, offset_us=clock_offset(opened, link))
                 )
             )
-        if raw_to is not None:
-            raw.append(Forward(_sink(raw_to, found, held)))
+        handed = None if raw_to is None else _sink(raw_to, found, held, stop, line.say)
+        if handed is not None:
+            raw.append(Forward(handed))
         written = None if out is None else held.enter_context(_writer(out, opened, found, compensated=True))
-        served = None if to is None else _sink(to, found, held)
+        served = None if to is None else _sink(to, found, held, stop, line.say)
         keeper = adaptive.build(found.model, link, line.say)
         held.enter_context(stopped_by_interrupt(stop))
         session = Session(
@@ -142,10 +145,10 @@ def run(
                 served.tick()
 
         status = session.run(stop, update)
-        line.end(opened, served)
+        line.end(served, handed)
     data: dict[str, Any] = {
         "files": [str(path) for path in (record, out) if path is not None],
-        **summary(status),
+        **summary(status, opened),
         "latency_ms": status.latency_ms,
         "model": found.model_name,
         "device": device,
@@ -156,13 +159,17 @@ def run(
             say(text)
     else:
         report(common, data, _lines(data))
+    check_whole(opened, status)
 
 
-def _sink(to: str, found: Calibration, held: contextlib.ExitStack) -> SocketSink | PipeSink:
+def _sink(
+    to: str, found: Calibration, held: contextlib.ExitStack, stop: threading.Event, say: Callable[[str], None]
+) -> SocketSink | PipeSink:
     from amiwarp.stream.packets import encode_hello
     from amiwarp.stream.sockets import open_sink
 
-    sink = open_sink(to, encode_hello(found.camera.width, found.camera.height, found.camera, found.prism))
+    hello = encode_hello(found.camera.width, found.camera.height, found.camera, found.prism)
+    sink = open_sink(to, hello, stop=stop, say=say)
     held.push(sink)
     return sink
 

@@ -11,7 +11,7 @@ import typer
 from amiwarp.cli.console import report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
 from amiwarp.cli.options import OUTPUT, Common
-from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, stopped_by_interrupt, summary
+from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
@@ -27,6 +27,8 @@ def run(
 ) -> None:
     """Record events with the prism's angles, until the source ends, --seconds are over, or Ctrl-C.
 
+    A stream that breaks off ends it with exit code 1; what came is in the file.
+
     The file can be opened at any moment, also after a crash: NAME.part.h5 then, without at most its last second.
     """
     from amiwarp.io.live_writer import LiveWriter
@@ -35,7 +37,7 @@ def run(
 
     stop = threading.Event()
     with StatusLine(stop, stream.seconds) as line, stream.link() as link:
-        opened = stream.open(source)
+        opened = stream.open(source, line.say)
         check_angles(opened, link)
         width, height = opened.size
         writer = LiveWriter(
@@ -45,7 +47,7 @@ def run(
         )  # fmt: skip
         with writer, stopped_by_interrupt(stop):
             status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
-        line.end(opened)
-    data = {"file": str(out), **summary(status), "messages": list(line.messages)}
+    data = {"file": str(out), **summary(status, opened), "messages": list(line.messages)}
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
     report(common, data, [text, *([f"{status.late:,} events came late"] if status.late else [])])
+    check_whole(opened, status)

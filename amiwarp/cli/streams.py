@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -50,10 +50,19 @@ class SourceOptions:
         float | None, typer.Option(min=0.001, help="End after so long. Default: with the source, or by Ctrl-C.")
     ] = None
 
-    def open(self, spec: str) -> Source:
+    wait_for_source: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help="When the stream of a socket breaks off, wait for its sender to return (s). Default: end.",
+            rich_help_panel=_SOURCE,
+        ),
+    ] = 0.0
+
+    def open(self, spec: str, say: Callable[[str], None]) -> Source:
         from amiwarp.stream.sources import open_source
 
-        return open_source(spec, pace=None if self.fast else 1.0)
+        return open_source(spec, pace=None if self.fast else 1.0, wait_s=self.wait_for_source, say=say)
 
     @contextlib.contextmanager
     def link(self) -> Iterator[Link | None]:
@@ -69,7 +78,7 @@ class SourceOptions:
 
 @contextlib.contextmanager
 def stopped_by_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C sets the event: once to finish what has come, twice to give up."""
+    """Let SIGINT (Ctrl-C) and SIGTERM set the event: once to finish what has come, twice to give up at once."""
 
     def interrupted(number: int, frame: Any) -> None:
         if stop.is_set():
@@ -116,13 +125,11 @@ class StatusLine:
         if self._console.is_terminal:
             self._live.update(Text(describe(status), no_wrap=True, overflow="ellipsis"))
 
-    def end(self, source: Source, served: SocketSink | PipeSink | None = None) -> None:
-        """Says what fell short on either side."""
-        problem = getattr(source, "problem", None)  # of a stream that broke off
-        if problem:
-            self.say(problem)
-        if served is not None and served.lost:
-            self.say(f"{served.lost:,} packets were not sent: who listens is too slow")
+    def end(self, *sinks: SocketSink | PipeSink | None) -> None:
+        """Say how much receivers did not get."""
+        for served in sinks:
+            if served is not None and served.lost:
+                self.say(f"{served.lost:,} packets were not sent: who listens is too slow")
 
 
 def describe(s: Status) -> str:
@@ -149,10 +156,22 @@ def check_angles(source: Source, link: Link | None) -> None:
         raise AmiwarpError(f"{source.name}: gives no encoder samples; give the controller's --port")
 
 
-def summary(s: Status) -> dict[str, Any]:
+def check_whole(source: Source, status: Status) -> None:
+    """Raises :class:`AmiwarpError` if the stream broke off: for when all that came is in the files."""
+    problem = getattr(source, "problem", None)
+    if problem is None:
+        return
+    socket = source.name.partition(":")[0].removesuffix("-listen") in ("tcp", "unix")
+    hint = "; --wait-for-source S waits for its sender to return" if socket and not hasattr(source, "returns") else ""
+    kept = f"the {status.events:,} events until then were kept"
+    raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
+
+
+def summary(s: Status, source: Source) -> dict[str, Any]:
     """For ``--json``."""
     return {
         "seconds": s.seconds, "events": s.events, "mev_per_s": s.events / max(s.seconds, 1e-9) / 1e6,
         "compensated": s.done, "outside": s.outside, "extrapolated": s.guessed, "without_angle": s.unknown,
-        "dropped": s.dropped, "late": s.late,
+        "dropped": s.dropped, "late": s.late, "returns": getattr(source, "returns", 0),
+        "broke_off": getattr(source, "problem", None),
     }  # fmt: skip

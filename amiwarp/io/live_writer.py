@@ -51,6 +51,12 @@ END_AT = 28
 SPARE = 1 << 19
 """Bytes that finishing a file takes beyond its data: for HDF5's own use, and for chunks that are not full."""
 
+MOST_WAITING = 1 << 24
+"""Bytes of encoder samples that wait for the next flush; more of them are written at once."""
+
+MOST_PULSES = 1 << 16
+"""Index pulses that wait for the encoder's samples; of more the last ones are kept."""
+
 WASTE = 1 << 24
 """Bytes of chunks written anew that are left in a finished file in any case; a copy without them would gain little."""
 
@@ -211,7 +217,10 @@ class LiveWriter:
             first, last = self._encoder_span
             pulses = np.append(self._pulses, as_times(index_t_us) + late)
             self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
-            self._pulses = pulses[pulses > last]
+            self._pulses = pulses[pulses > last][-MOST_PULSES:]
+        if sum(small.waiting_bytes for small in self._small.values()) > MOST_WAITING:
+            with errors_name(self.path, lambda: f"after {len(self)} events"):
+                self._flush()
         self.tick()
 
     def set_encoder(self, encoder: Encoder) -> None:
@@ -289,6 +298,7 @@ class LiveWriter:
             self._small["ms_to_idx"].add(np.array([len(self)], np.int64))
             self._flush()
             stored = sum(int(dataset.id.get_storage_size()) for dataset in self._columns.values())
+            stored += sum(small.stored_bytes for small in self._small.values())
             self._close()
             with open(self.part, "r+b") as file:
                 file.seek(END_AT)
@@ -340,7 +350,11 @@ class _Growing:
 
     def replace(self, values: NDArray[Any]) -> None:
         self._dataset.resize(0, axis=0)
-        self._waiting, self._written = [values], 0
+        self._waiting, self._written, self.waiting_bytes = [values], 0, values.nbytes
+
+    @property
+    def stored_bytes(self) -> int:
+        return int(self._dataset.id.get_storage_size())
 
     def write(self) -> None:
         if self._waiting:

@@ -53,6 +53,8 @@ BATCH_US = 5_000
 MOST_RPM = 6000.0
 HOST_US = 3_000_000
 """Without a frame for so long the host is lost."""
+MOST_OUT = 1 << 20
+"""Bytes that wait to be sent; more are lost, as on any line without flow control, after the program was suspended."""
 STOP_RAMP = 2000.0
 """[rpm/s]"""
 
@@ -277,7 +279,7 @@ class Controller:
             self._flush()
         frame = encode(message, self._sequence)
         self._sequence = (self._sequence + 1) % (1 << 16)
-        if self.plugged:
+        if self.plugged and len(self._out) < MOST_OUT:
             self._out += self._wire(bytearray(frame))
 
     def _wire(self, frame: bytearray) -> bytearray:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from amiwarp.link.angles import Angles, Fault, Report
 from amiwarp.link.clocks import FEWEST, WRAP, Clock, Unwrapped, from_round_trips
+from amiwarp.link.news import MOST_PARTS, MOST_PULSES, News, Part
 from amiwarp.link.protocol import FAULTS, Answer, Decoder, Index, Message, Pong, Samples, Status, Sync
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MOST = 100_000
 """Samples kept for who does not ask, over a minute and a half at 1 kHz; then the oldest are dropped."""
@@ -40,40 +37,6 @@ FROM_FIRST = "angles are from where the encoder was first read"
 HOST_LOST = 1 << FAULTS.index("host lost")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class News:
-    """What came from the controller since one asked last, or until it began anew."""
-
-    t_us: NDArray[np.int64]
-    """Times of the encoder's samples [us], controller's clock made whole, strictly increasing, shape ``(n,)``."""
-    angle: NDArray[np.float64]
-    """Unwrapped prism angle [rad] at them, whole turns at the index once it was seen, shape ``(n,)``."""
-    index_t_us: NDArray[np.int64]
-    """Times of the index pulses among them, or between those before and these [us]."""
-    sync: tuple[tuple[int, int, int], ...]
-    """Sync pulses: number, controller's time, host's time when it was told [us]."""
-    restarted: bool
-    """The controller's clock or counts began anew before these samples: what was known of its clock is void."""
-    messages: tuple[str, ...]
-    """Sentences for the user: slip, missed index, reversal, stall, faults, losses, resets, the port gone and back."""
-
-
-class _Part:
-    """News in the making."""
-
-    def __init__(self, restarted: bool) -> None:
-        self.restarted = restarted
-        self.samples: deque[tuple[int, float]] = deque()
-        self.index: deque[int] = deque(maxlen=MOST)
-        self.sync: deque[tuple[int, int, int]] = deque(maxlen=MOST)
-        self.messages: deque[str] = deque(maxlen=1000)
-
-    def news(self) -> News:
-        t = np.array([t for t, _ in self.samples], np.int64)
-        angle = np.array([a for _, a in self.samples], np.float64)
-        return News(t, angle, np.array(self.index, np.int64), tuple(self.sync), self.restarted, tuple(self.messages))
-
-
 class Follower:
     """Feed it what the port gives, take the news. ``name``: the port, for messages. Raises nothing, holds little.
 
@@ -88,7 +51,7 @@ class Follower:
         """Of pings: sent (host), answered (controller), received (host) [us]."""
         self._given_per_turn = counts_per_turn
         self._per_turn: int | None = None
-        self._parts: deque[_Part] = deque([_Part(False)])
+        self._parts: deque[Part] = deque([Part(False)])
         self._kept = 0
         self._dropped = 0
         self._begin()
@@ -109,7 +72,7 @@ class Follower:
         self._angles = None if self._per_turn is None else Angles(self._per_turn)
         self._waiting: deque[tuple[bool, int, int]] = deque(maxlen=MOST)  # for the counts per turn: index?, time, count
         self._holding: deque[tuple[int, int]] | None = deque(maxlen=MOST)  # for the index
-        self._pulses: deque[int] = deque(maxlen=MOST)
+        self._pulses: deque[int] = deque(maxlen=MOST_PULSES)
         self._suspect: tuple[int, int] | None = None
         self._counted: tuple[int, int] | None = None  # time and count, made whole
         self._given: int | None = None
@@ -153,7 +116,7 @@ class Follower:
         """What came since the last call; where the controller began anew in between, first what was before that."""
         part = self._parts.popleft()
         if not self._parts:
-            self._parts.append(_Part(False))
+            self._parts.append(Part(False))
         self._kept -= len(part.samples)
         if self._dropped:
             part.messages.append(f"{self._dropped:,} samples were dropped, the oldest: nobody asked for them")
@@ -264,7 +227,11 @@ class Follower:
     def _restart(self, why: str) -> None:
         self._release()
         if self._parts[-1].samples:
-            self._parts.append(_Part(True))
+            self._parts.append(Part(True))
+        if len(self._parts) > MOST_PARTS:
+            gone = len(self._parts[0].samples)
+            self._kept, self._dropped = self._kept - gone, self._dropped + gone
+            self._join()
         self._parts[-1].restarted = True
         self._parts[-1].sync.clear()  # by the clock that is void
         self.say(f"{self.name}: {why}; angles begin anew")
@@ -340,7 +307,7 @@ class Follower:
                 self._join()
 
     def _join(self) -> None:
-        """A part whose samples were all dropped goes into the next."""
+        """Merge the first part, whose samples are dropped, into the next."""
         gone, part = self._parts.popleft(), self._parts[0]
         part.restarted |= gone.restarted
         part.messages.extendleft(reversed(gone.messages))

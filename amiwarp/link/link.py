@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from amiwarp.link.clocks import Clock
-    from amiwarp.link.following import News
+    from amiwarp.link.news import News
     from amiwarp.link.protocol import Status
 
+READ_BYTES = 1 << 16
+"""Most that is taken from the port at once."""
 RETRY_S = 0.2
 """Between attempts to open a port that is gone."""
 ANSWER_S = 1.0
@@ -49,7 +51,7 @@ class Link:
         self._follower.opened(host_us())
         self._changed = threading.Condition()  # guards the follower and the answers
         self._writing = threading.Lock()  # guards the port and the sequence
-        self._answers: dict[int, int] = {}  # to the command of a sequence number
+        self._answers: dict[int, int | None] = {}  # by the sequence number of the command; None: not come yet
         self._sequence = self._number = 0
         self._ping_us = host_us()
         self._ended = threading.Event()
@@ -105,28 +107,40 @@ class Link:
         if self._follower.text:
             raise AmiwarpError(f"{self.name}: {what}: it sends lines of text, which take no commands")
         try:
-            sequence = self._send(message)
+            sequence = self._send(message, answered=True)
         except ValueError as error:
             raise AmiwarpError(f"{self.name}: {what}: {error}") from error
         except OSError as error:
             raise AmiwarpError(f"{self.name}: {what}: not sent, {error}") from error
         with self._changed:
-            if not self._changed.wait_for(lambda: sequence in self._answers, ANSWER_S):
-                raise AmiwarpError(f"{self.name}: {what}: no answer in {ANSWER_S:g} s; see 'amiwarp motor status'")
+            self._changed.wait_for(lambda: self._answers[sequence] is not None, ANSWER_S)
             refused = self._answers.pop(sequence)
+        if refused is None:
+            raise AmiwarpError(f"{self.name}: {what}: no answer in {ANSWER_S:g} s; see 'amiwarp motor status'")
         if refused:
             why = REFUSALS[refused] if refused < len(REFUSALS) else f"reason {refused}"
             raise AmiwarpError(f"{self.name}: {what}: refused by the controller, {why}")
 
-    def _send(self, message: Message) -> int:
-        """Its sequence number. Raises OSError where the port is gone or takes nothing, ValueError for bad numbers."""
+    def _send(self, message: Message, *, answered: bool = False) -> int:
+        """Its sequence number; ``answered``: its answer is kept.
+
+        Raises OSError where the port is gone or takes nothing, ValueError for bad numbers.
+        """
         with self._writing:
             sequence = self._sequence
             frame = encode(message, sequence)
             if self._port is None:
                 raise OSError("the port is gone")
             self._sequence = (sequence + 1) & 0xFFFF
-            self._port.write(frame)
+            if answered:
+                with self._changed:
+                    self._answers[sequence] = None
+            try:
+                self._port.write(frame)
+            except BaseException:
+                with self._changed:
+                    self._answers.pop(sequence, None)
+                raise
             return sequence
 
     def _run(self) -> None:
@@ -144,11 +158,12 @@ class Link:
         """Reads what is there, waiting a little; pings when it is time."""
         data = self._port.read(1)
         if data:
-            data += self._port.read(self._port.in_waiting)
+            data += self._port.read(min(self._port.in_waiting, READ_BYTES))
         now = self._host_us()
         with self._changed:
             for answer in self._follower.feed(data, now):
-                self._answers[answer.sequence] = answer.refused
+                if answer.sequence in self._answers:  # any other answers nothing that waits
+                    self._answers[answer.sequence] = answer.refused
             self._changed.notify_all()
             due = self._follower.speaks and now >= self._ping_us
             quick = len(self._follower.trips) < QUICK

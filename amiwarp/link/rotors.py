@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from amiwarp.encoder import Encoder
 
+MOST_PIECES = 1024
+"""Of a motor's past that are kept: speeds it was set to. What came before them is taken for even."""
 RPM = math.tau / 60.0
 """A turn a minute [rad/s]."""
 
@@ -79,7 +81,7 @@ class Motor:
         """See :class:`Rotor`."""
         t = t_us * 1e-6
         before = self._pieces[max(bisect.bisect_right([p.start for p in self._pieces], t) - 1, 0)]
-        self._pieces = [p for p in self._pieces if p.start <= t]
+        self._pieces = [p for p in self._pieces if p.start <= t][-MOST_PIECES:]
         wanted = before.wanted + before.slope * (t - before.start)
         slope = math.copysign(ramp * RPM, rpm * RPM - wanted)
         angle, speed = self._moved(before, np.asarray(t))

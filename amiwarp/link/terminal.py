@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from amiwarp.link.emulator import Controller
 
 STEP_S = 1e-3
+RETRY_S = 0.2
+"""Between attempts to open a pseudo-terminal while none can be had."""
 
 
 class PseudoTerminal:
@@ -69,12 +71,15 @@ class PseudoTerminal:
 
     def _run(self) -> None:
         while not self._ended.is_set():
-            data = b"" if self._master is None else self._read(self._master)
+            data = self._read(self._master)
             now = self._now_us()
             self._controller.feed(data, now)
             out = self._controller.advance(now)
             if self._controller.plugged and self._master is None:
-                self._plug()
+                try:
+                    self._plug()
+                except OSError:  # no descriptor is free now
+                    self._ended.wait(RETRY_S)
             elif not self._controller.plugged and self._master is not None:
                 self._unplug()
             # Nobody there, or too slow: bytes are lost, as on any line without flow control.
@@ -82,12 +87,14 @@ class PseudoTerminal:
                 with contextlib.suppress(OSError):
                     os.write(self._master, out)
 
-    def _read(self, master: int) -> bytes:
+    def _read(self, master: int | None) -> bytes:
         """Bytes from the other end, waited for until the next step."""
-        if self._alone(master):
+        if master is None or self._alone(master):
             self._ended.wait(STEP_S)
             return b""
-        if not select.select([master], [], [], STEP_S)[0]:
+        poll = select.poll()
+        poll.register(master, select.POLLIN)
+        if not poll.poll(round(1e3 * STEP_S)):
             return b""
         with contextlib.suppress(OSError):
             return os.read(master, 4096)
@@ -101,11 +108,17 @@ class PseudoTerminal:
     def _plug(self) -> None:
         import tty
 
-        self._master, port = os.openpty()
-        self._port = os.ttyname(port)
-        tty.setraw(port)
-        os.close(port)
-        os.set_blocking(self._master, False)
+        master, port = os.openpty()
+        try:
+            self._port = os.ttyname(port)
+            tty.setraw(port)
+            os.set_blocking(master, False)
+        except BaseException:
+            os.close(master)
+            raise
+        finally:
+            os.close(port)
+        self._master = master
         if self._path is not None:
             self._path.unlink(missing_ok=True)
             self._path.symlink_to(self._port)

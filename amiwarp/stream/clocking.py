@@ -55,14 +55,23 @@ class CameraClock:
         self._pairs.clear()
         self._found = None
 
+    def returned(self) -> None:
+        """Forget what is known of the camera's clock: it was away and may have begun anew."""
+        self.restart()
+        self._trigger.clear()
+        self._ahead.clear()
+
     def sync(self, t_us: int, host_us: int) -> None:
         """The controller sent a pulse at ``t_us`` of its clock; the host heard of it at ``host_us``."""
         self._sync.append((t_us, host_us))
         self._pair()
 
     def triggers(self, t_us: ArrayLike, host_us: int) -> None:
-        """The camera saw pulses at ``t_us`` of its clock; the host heard of them at ``host_us``."""
-        for t in np.atleast_1d(np.asarray(t_us, np.int64)).tolist():
+        """The camera saw pulses at ``t_us`` of its clock; the host heard of them at ``host_us``.
+
+        Of more than :data:`UNPAIRED` at once, the last ones count: no earlier one would still wait.
+        """
+        for t in np.atleast_1d(np.asarray(t_us, np.int64))[-UNPAIRED:].tolist():
             self._trigger.append((t, host_us))
             self._pair()
 

@@ -51,7 +51,8 @@ class EmulatedCamera:
         self.address = self._sink.address
         self._ended = threading.Event()
         self.done = threading.Event()
-        """Set when all has been sent."""
+        """Set when all has been sent, or the recording cannot be read any further."""
+        self._failed: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="amiwarp-camera", daemon=True)
         self._thread.start()
 
@@ -64,11 +65,21 @@ class EmulatedCamera:
         self.close()
 
     def close(self) -> None:
-        """Ends it, and the stream of whoever listens."""
+        """End it, and the stream of whoever listens. Raises what reading the recording raised."""
         self._ended.set()
         self._thread.join()
+        failed, self._failed = self._failed, None
+        if failed is not None:
+            raise failed
 
     def _run(self) -> None:
+        try:
+            self._play()
+        except Exception as error:
+            self._failed = error
+            self.done.set()
+
+    def _play(self) -> None:
         with self._sink:
             while not self._sink.clients:
                 if self._ended.wait(STEP_US * 1e-6):

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.compensator import Compensated
+from amiwarp.compensator import Compensated, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
-from amiwarp.io.attributes import attribute, camera_attributes, prism_attributes, read_camera, read_prism
+from amiwarp.io.attributes import camera_attributes, prism_attributes, read_camera, read_prism
+from amiwarp.stream.hello import read_fields
 
 if TYPE_CHECKING:
     from amiwarp.camera import Camera
@@ -52,6 +53,19 @@ class Packet:
     """Their angles, unwrapped [rad]."""
     arrived_us: int
     """The host's monotonic clock."""
+    returned: bool = False
+    """Whether it is the first after the source was lost and came back, see :class:`ReturningSource`."""
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory that it takes while it waits [bytes], see :func:`~amiwarp.compensator.held_bytes`."""
+        samples = self.triggers.nbytes + self.encoder_t.nbytes + self.encoder_angle.nbytes
+        return held_bytes(self.events) + samples
+
+    @property
+    def bare(self) -> bool:
+        """Whether it carries nothing at all."""
+        return not (len(self.events) or self.triggers.size or self.encoder_t.size or self.returned)
 
 
 NO_TIMES = np.zeros(0, np.int64)
@@ -259,14 +273,12 @@ class Decoder:
 
     def _hello(self, held: bytearray) -> Hello:
         try:
-            fields = json.loads(held)
-            width, height = (attribute(fields, "its hello", name, int) for name in ("width", "height"))
+            fields = read_fields(held)
+            width, height = fields["width"], fields["height"]
             camera = read_camera(fields["camera"], "its hello's camera") if fields.get("camera") else None
             prism = read_prism(fields["prism"], "its hello's prism") if fields.get("prism") else None
-        except (ValueError, TypeError, AttributeError) as error:
+        except AmiwarpError as error:
             raise self._wrong(f"{error}") from error
-        if not (1 <= width <= 65536 and 1 <= height <= 65536):
-            raise self._wrong(f"its hello tells a size of {width}x{height}; expected 1 .. 65536 pixels each way")
         if camera is not None and (camera.width, camera.height) != (width, height):
             raise self._wrong(f"its hello has a camera of {camera.width}x{camera.height} for {width}x{height} pixels")
         return Hello(width, height, camera, prism)

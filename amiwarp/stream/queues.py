@@ -1,4 +1,4 @@
-"""A bounded queue of packets between a sensor and whoever works on them, and what it does when that one is slower."""
+"""A queue of packets, bounded in events and in bytes, between a source and a consumer."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.events import Events
+from amiwarp.stream.beside import QUEUE_BYTES
 from amiwarp.values import choice, whole
 
 if TYPE_CHECKING:
@@ -32,18 +33,25 @@ class Policy(enum.StrEnum):
 
 
 class PacketQueue:
-    """Holds at most ``most_events``; a packet's triggers and encoder samples are always kept.
+    """Hold at most ``most_events`` and ``most_bytes``, whichever is less.
 
+    The policy decides over events alone: triggers and encoder samples are never dropped. If these alone fill the bytes,
+    the source waits under every policy. A single packet larger than the bounds still passes, alone.
     For one thread that puts and one that gets. Raises :class:`AmiwarpError` for a size under 1.
     """
 
-    def __init__(self, most_events: int, policy: Policy) -> None:
+    def __init__(self, most_events: int, policy: Policy, most_bytes: int = QUEUE_BYTES) -> None:
         self.most_events = whole(most_events, "queue's most_events", 1, 1 << 40)
+        self.most_bytes = whole(most_bytes, "queue's most_bytes", 1, 1 << 40)
         self.policy = choice(Policy, policy, "policy")
         self.received = self.dropped = 0
         """Events put, and those of them that never come out."""
         self._packets: deque[Packet] = deque()
         self._held = 0
+        self._spent = 0
+        """Packets at the front whose events were dropped."""
+        self.held_bytes = 0
+        """Memory that the packets take [bytes], see :attr:`Packet.held_bytes`."""
         self._phase = 0.0
         self._closed = False
         self._changed = threading.Condition()
@@ -56,7 +64,7 @@ class PacketQueue:
     @property
     def fill(self) -> float:
         """Share of the room that is taken; above 1 while a single packet is larger than all of it."""
-        return self._held / self.most_events
+        return self._share(self._held, self.held_bytes)
 
     @property
     def ended(self) -> bool:
@@ -65,17 +73,19 @@ class PacketQueue:
             return self._closed and not self._packets
 
     def put(self, packet: Packet) -> None:
-        """Takes a packet, at once or, under :attr:`Policy.BLOCK`, when there is room or the queue is closed."""
+        """Take a packet once there is room, which dropping makes if the policy says so, or the queue is closed."""
         with self._changed:
             self.received += len(packet.events)
-            if self.policy is Policy.BLOCK:
-                self._changed.wait_for(lambda: not self._held or self._fits(packet) or self._closed)
-            elif self.policy is Policy.THIN:
+            if self.policy is Policy.THIN:
                 packet = self._thinned(packet)
             while self.policy is Policy.DROP_OLDEST and self._held and not self._fits(packet):
                 self._drop_oldest()
+            if packet.bare:  # a source's sign of life: nothing to consume
+                return
+            self._changed.wait_for(lambda: not self._packets or self._fits(packet) or self._closed)
             self._packets.append(packet)
             self._held += len(packet.events)
+            self.held_bytes += packet.held_bytes
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> Packet | None:
@@ -85,7 +95,9 @@ class PacketQueue:
             if not self._packets:
                 return None
             packet = self._packets.popleft()
+            self._spent = max(0, self._spent - 1)
             self._held -= len(packet.events)
+            self.held_bytes -= packet.held_bytes
             self._changed.notify_all()
             return packet
 
@@ -96,29 +108,28 @@ class PacketQueue:
             self._changed.notify_all()
 
     def _fits(self, packet: Packet) -> bool:
-        return self._held + len(packet.events) <= self.most_events
+        return self._share(self._held + len(packet.events), self.held_bytes + packet.held_bytes) <= 1.0
+
+    def _share(self, events: int, held_bytes: int) -> float:
+        return max(events / self.most_events, held_bytes / self.most_bytes)
 
     def _drop_oldest(self) -> None:
-        """Empties the first packet that has events; what else it carries goes with the next."""
-        first = next(k for k, packet in enumerate(self._packets) if len(packet.events))
-        packet = self._packets[first]
+        """Empty the first packet that has events; what else it carries stays."""
+        while not len(self._packets[self._spent].events):
+            self._spent += 1
+        packet = self._packets[self._spent]
         self._held -= len(packet.events)
         self.dropped += len(packet.events)
-        if first + 1 < len(self._packets):
-            after = self._packets[first + 1]
-            self._packets[first + 1] = replace(
-                after,
-                triggers=np.concatenate([packet.triggers, after.triggers]),
-                encoder_t=np.concatenate([packet.encoder_t, after.encoder_t]),
-                encoder_angle=np.concatenate([packet.encoder_angle, after.encoder_angle]),
-            )
-            del self._packets[first]
+        rest = replace(packet, events=Events.empty())
+        self.held_bytes -= packet.held_bytes - (0 if rest.bare else rest.held_bytes)
+        if rest.bare:
+            del self._packets[self._spent]
         else:
-            self._packets[first] = replace(packet, events=Events.empty())
+            self._packets[self._spent] = rest
 
     def _thinned(self, packet: Packet) -> Packet:
         n = len(packet.events)
-        free = 1.0 - (self._held + n) / self.most_events
+        free = 1.0 - self._share(self._held + n, self.held_bytes + packet.held_bytes)
         share = min(max(free / (1.0 - THIN_FROM), 0.0), 1.0)
         if share == 1.0 or not n:
             return packet

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from amiwarp.compensator import OVERHEAD, held_bytes
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, Recording
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from amiwarp.prism import NominalPrism
     from amiwarp.stream.packets import Source
 
-SECONDS, MOST_EVENTS = 2.0, 1 << 23
-"""Kept, whichever is less."""
+SECONDS, MOST_BYTES = 2.0, 1 << 27
+"""Kept of events, whichever is less: about eight million. Samples may take as many bytes again."""
 FIRST_S = 15.0
 """Longest wait for the first turn."""
 
@@ -37,27 +38,30 @@ class Ring:
         self._size, self._name = source.size, source.name
         self._camera, self._prism = camera or source.camera, prism or source.prism
         self._events: deque[Events] = deque()
-        self._count = 0
         self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
+        self.event_bytes = self.sample_bytes = 0
+        """Memory that events and samples take [bytes]."""
         self._lock = threading.Lock()
 
     def append(self, events: Events) -> None:
         """Events in order."""
         with self._lock:
             self._events.append(events)
-            self._count += len(events)
+            self.event_bytes += held_bytes(events)
             since = int(events.t[-1]) - round(SECONDS * 1e6)
-            while self._count > MOST_EVENTS or self._events[0].t[-1] < since:
-                self._count -= len(self._events.popleft())
+            while len(self._events) > 1 and (self.event_bytes > MOST_BYTES or self._events[0].t[-1] < since):
+                self.event_bytes -= held_bytes(self._events.popleft())
 
     def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
         """Samples in order, on the events' clock; index pulses are in the angles."""
         if len(t_us):
             with self._lock:
                 self._samples.append((t_us, angle))
+                self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
                 since = int(t_us[-1]) - round(2e6 * SECONDS)
-                while self._samples[0][0][-1] < since:
-                    self._samples.popleft()
+                while len(self._samples) > 1 and (self.sample_bytes > MOST_BYTES or self._samples[0][0][-1] < since):
+                    t_us, angle = self._samples.popleft()
+                    self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
 
     def tick(self) -> None:
         """Nothing waits here."""
@@ -94,8 +98,10 @@ def followed(source: Source, link: Link | None, ring: Ring, say: Callable[[str],
     def run() -> None:
         session = Session(source, link=link, raw=[ring], policy=Policy.DROP_OLDEST, say=say)
         try:
-            session.run(stop, lambda status: None)
-            say(f"{source.name}: the stream has ended")
+            ended = session.run(stop, lambda status: None)
+            problem = getattr(source, "problem", None)
+            how = "has ended" if problem is None else f"broke off: {problem}"
+            say(f"{source.name}: the stream {how}; what is shown are the last of its {ended.events:,} events")
         except Exception as error:
             failed.append(error)
             say(str(error))
@@ -106,7 +112,10 @@ def followed(source: Source, link: Link | None, ring: Ring, say: Callable[[str],
         until = time.monotonic() + FIRST_S
         while ring.recording() is None:
             if not thread.is_alive() or time.monotonic() > until:
-                raise failed[0] if failed else AmiwarpError(f"{source.name}: gave no whole turn in {FIRST_S:g} s")
+                how = f"in {FIRST_S:g} s" if thread.is_alive() else "before the stream ended"
+                problem = getattr(source, "problem", None)
+                why = "" if problem is None else f": it broke off, {problem}"
+                raise failed[0] if failed else AmiwarpError(f"{source.name}: gave no whole turn {how}{why}")
             time.sleep(0.05)
         yield
     finally:

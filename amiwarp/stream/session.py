@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
+from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator, held_bytes
 from amiwarp.encoder import EncoderStream
 from amiwarp.iwe import CanvasShape
 from amiwarp.link.clocks import monotonic_us
 from amiwarp.sharpness import Sharpness, SharpnessMeter
-from amiwarp.stream.beside import QUEUE_EVENTS, Beside
+from amiwarp.stream.beside import Beside
 from amiwarp.stream.clocking import CameraClock, clock_offset
 from amiwarp.stream.packets import NO_TIMES, Sorter
 from amiwarp.stream.queues import PacketQueue, Policy
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
     from amiwarp.events import Events
     from amiwarp.io.live_writer import LiveWriter
     from amiwarp.link.clocks import Clock
-    from amiwarp.link.following import News
     from amiwarp.link.link import Link
+    from amiwarp.link.news import News
     from amiwarp.stream.packets import Packet, Source
     from amiwarp.stream.speed import SpeedKeeper
 
@@ -41,8 +42,12 @@ PATIENCE_S = 1.0
 """A source that was told to stop gives up its thread within this, and samples of the last events come."""
 POLL_S = 0.001
 """Longest wait for a packet, between two looks at the encoder."""
-MOST_HELD = 10_000
-"""Polls of the link that wait for the camera's clock to be known."""
+QUEUE_EVENTS = 1 << 23
+"""Events between the source and the compensator: most of a second of the busiest sensor."""
+STEP_BYTES = 1 << 22
+"""Packets taken in at once, before the controller and a wish to stop are looked at again [bytes]."""
+MOST_HELD = 1 << 20
+"""Encoder samples and index pulses that wait for the camera's clock to be known; the oldest are dropped."""
 
 
 @dataclass(slots=True)
@@ -127,7 +132,9 @@ class Session:
         own = clock_offset(source, link)
         known = {} if calibration is None else calibration.parameters
         self.encoder = EncoderStream(known.get("clock_offset", own) - own)
-        self._held: list[News] = []
+        self._held: deque[News] = deque()
+        self._held_samples, self._told_held = 0, False
+        self._hasty = False
         self._compensator: Compensator | None = None
         self._meter: SharpnessMeter | None = None
         self._watch: PhaseWatch | None = None
@@ -149,6 +156,7 @@ class Session:
         """Until the source has ended or ``stop`` is set, and then to the end of what had come by then.
 
         Raises :class:`AmiwarpError` where source or a writer failed, after all that came before was worked through.
+        KeyboardInterrupt ends it at once: what still waits is dropped.
         """
         reader = threading.Thread(target=self._read, args=(stop,), name="amiwarp-source", daemon=True)
         self._stop = stop
@@ -165,30 +173,47 @@ class Session:
                     if self._seconds - told > PATIENCE_S:  # the source does not let go of its thread
                         self._queue.close()
             self._finish()
+        except KeyboardInterrupt:
+            self._abandon()
+            raise
         finally:
             stop.set()
             self._queue.close()
-            reader.join(PATIENCE_S)
-            if not reader.is_alive():
-                self._source.close()
-            for aside in (self._watch, self._keeper):
-                if aside is not None:
-                    aside.close()
-            for _, beside in self._takers:
-                beside.end()
+            try:
+                self._end(reader)
+            except KeyboardInterrupt:
+                self._abandon()
+                raise
         self._report(on_status)
         if self._failed is not None:
             raise self._failed
         return self.status
 
+    def _end(self, reader: threading.Thread) -> None:
+        """Wait for the threads."""
+        reader.join(PATIENCE_S)
+        if not reader.is_alive():
+            self._source.close()
+        for aside in (self._watch, self._keeper):
+            if aside is not None and not self._hasty:
+                aside.close()
+        for _, beside in self._takers:
+            beside.end()
+
+    def _abandon(self) -> None:
+        """Drop what waits for the takers, so that the caller can finish their files at once."""
+        self._hasty = True
+        for _, beside in self._takers:
+            beside.abandon()
+
     @property
     def _takers(self) -> list[tuple[Raw | LiveWriter, Beside]]:
         return [*self._raw, *([] if self._out is None else [self._out])]
 
-    def _hand(self, taker: tuple[Raw | LiveWriter, Beside], job: Callable[[], object], events: int = 0) -> None:
+    def _hand(self, taker: tuple[Raw | LiveWriter, Beside], job: Callable[[], object], held: int = 0) -> None:
         """To a taker; of one that failed no more is asked, the others get all that came until the session ends."""
         try:
-            taker[1].put(job, events)
+            taker[1].put(job, held)
         except Exception as error:
             self._fail(error)
             taker[1].end()
@@ -218,12 +243,12 @@ class Session:
 
     def _step(self) -> None:
         self._follow()
-        packet, events = self._queue.get(POLL_S), 0
+        packet, events, held = self._queue.get(POLL_S), 0, 0
         most = 1 if self._compensator is None else self._compensator.batch
         while packet is not None:  # what waits is compensated together, which is faster
             self._take_in(packet)
-            events += len(packet.events)
-            packet = self._queue.get(0.0) if events < most else None
+            events, held = events + len(packet.events), held + packet.held_bytes
+            packet = self._queue.get(0.0) if events < most and held < STEP_BYTES else None
         if self._compensator is not None:
             self._give_out(self._compensator.take(monotonic_us()))
 
@@ -237,29 +262,44 @@ class Session:
         if news.restarted:
             self._camera_clock.restart()
             self.encoder.restart()
-            self._held.clear()
+            self._let_go()
         for _number, t_us, host_us in news.sync:
             self._camera_clock.sync(t_us, host_us)
         if len(news.t_us) or len(news.index_t_us):
             self._held.append(news)
+            self._held_samples += len(news.t_us) + len(news.index_t_us)
         clock = self.status.clock = self._camera_clock.clock(self._link.clock())
         if clock is None:
-            del self._held[:-MOST_HELD]
+            if self._held_samples > MOST_HELD and not self._told_held:
+                self._told_held = True
+                self._say("the camera's clock is not known yet: the oldest of the samples that wait for it are dropped")
+            while self._held_samples > MOST_HELD:
+                oldest = self._held.popleft()
+                self._held_samples -= len(oldest.t_us) + len(oldest.index_t_us)
             return
         for held in self._held:
             self._sample(clock(held.t_us), held.angle, clock(held.index_t_us))
+        self._let_go()
+
+    def _let_go(self) -> None:
         self._held.clear()
+        self._held_samples = 0
 
     def _sample(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
         t, angle = self.encoder.append(t, angle)
         for taker in self._takers:
-            self._hand(taker, partial(taker[0].append_encoder, t, angle, index_t))
+            append = partial(taker[0].append_encoder, t, angle, index_t)
+            self._hand(taker, append, t.nbytes + angle.nbytes + index_t.nbytes)
 
     def _take_in(self, packet: Packet) -> None:
+        if packet.returned:
+            self._camera_clock.returned()
+            self.encoder.restart()
         if len(packet.events):
             self._camera_clock.packet(int(packet.events.t[-1]), packet.arrived_us)
-        self._camera_clock.triggers(packet.triggers, packet.arrived_us)
-        if self._link is None and len(packet.encoder_t):
+        if self._link is not None:
+            self._camera_clock.triggers(packet.triggers, packet.arrived_us)
+        elif len(packet.encoder_t):
             self._sample(packet.encoder_t, packet.encoder_angle, NO_TIMES)
         self._pass_on(self._sorter.put(packet.events), packet.arrived_us)
 
@@ -270,7 +310,7 @@ class Session:
         self.status.events += len(events)
         self._last_us = int(events.t[-1])
         for taker in list(self._raw):
-            self._hand(taker, partial(taker[0].append, events), len(events))
+            self._hand(taker, partial(taker[0].append, events), held_bytes(events))
         if self._watch is not None:
             self._watch.put(events)
         if self._compensator is not None:
@@ -289,7 +329,7 @@ class Session:
             if self._out is not None:
                 inside, guessed = (flags & OUTSIDE) == 0, (flags & (EXTRAPOLATED | NO_ANGLE)) != 0
                 append = partial(self._out[0].append, packet.events, inside=inside, extrapolated=guessed)
-                self._hand(self._out, append, len(packet.events))
+                self._hand(self._out, append, held_bytes(packet.events) + flags.nbytes)
             for sink in list(self._sinks):
                 try:
                     sink(packet)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import select
+import socket
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -26,30 +26,45 @@ from amiwarp.stream.packets import (
     Triggers,
     packet,
 )
-from amiwarp.stream.sockets import accept, connect
+from amiwarp.stream.sockets import Unreachable, accept, connect, ready
 
 IDLE_S = 0.05
 """Longest time without a packet, empty or not."""
+LAST_US, LARGEST_RAD = 1 << 60, 1e12
+"""Largest time [us] and angle [rad] of a stream, either sign: differences stay exact; thirty thousand years, turns."""
 HELLO_S = 10.0
 """How long a sender may take to say what it sends."""
 
 
-def open_source(spec: str, *, pace: float | None = 1.0, packet_us: int = 1000) -> Source:
-    """A source by its name.
+def open_source(
+    spec: str,
+    *,
+    pace: float | None = 1.0,
+    packet_us: int = 1000,
+    wait_s: float = 0.0,
+    say: Callable[[str], None] = lambda _: None,
+) -> Source:
+    """Open a source by its name.
 
     FILE: a recording, ``pace`` times as fast as it was (None: as fast as it can be read), in packets of ``packet_us``.
     ``-``, ``tcp:HOST:PORT``, ``unix:PATH``: a stream of packets (``docs/stream-format.md``); ``tcp-listen:HOST:PORT``,
     ``unix-listen:PATH`` wait for its sender. ``dv`` or ``dv:SERIAL``, ``prophesee`` or ``prophesee:SERIAL``: a camera.
-    Raises :class:`AmiwarpError` for a source that cannot be opened.
+    ``wait_s``: how long the sender of a socket is waited for when its stream broke off [s]; ``say`` then gets a
+    sentence.
+    Raises :class:`AmiwarpError` for a source that cannot be opened, or not waited for.
     """
     kind, _, rest = spec.partition(":")
+    if wait_s > 0.0:
+        from amiwarp.stream.returning import ReturningSource
+
+        return ReturningSource(spec, wait_s, say)
     if spec == "-":
         # past the buffer of sys.stdin, and without closing the descriptor at the end
         return StreamSource("standard input", open(0, "rb", buffering=0, closefd=False))
     if kind in ("tcp", "unix"):
-        return _from_socket(spec, connect)
+        return from_connection(spec, connect(spec))
     if kind in ("tcp-listen", "unix-listen"):
-        return _from_socket(spec, lambda spec: accept(spec.replace("-listen", "", 1)))
+        return from_connection(spec, accept(spec.replace("-listen", "", 1)))
     if kind == "dv":
         from amiwarp.stream.cameras import DvSource
 
@@ -61,10 +76,11 @@ def open_source(spec: str, *, pace: float | None = 1.0, packet_us: int = 1000) -
     return FileSource(spec, pace=pace, packet_us=packet_us)
 
 
-def _from_socket(spec: str, reach: Callable[[str], Any]) -> StreamSource:
-    with reach(spec) as connection:
+def from_connection(spec: str, connection: socket.socket, *, hello_s: float | None = None) -> StreamSource:
+    """Read the stream that comes over a connection, which the source closes."""
+    with connection:
         connection.settimeout(None)
-        return StreamSource(spec, connection.makefile("rb", buffering=0))
+        return StreamSource(spec, connection.makefile("rb", buffering=0), hello_s=hello_s)
 
 
 class FileSource:
@@ -141,14 +157,15 @@ class StreamSource:
     Raises :class:`AmiwarpError` for a stream that is none, or does not begin with a hello within :data:`HELLO_S`.
     """
 
-    def __init__(self, name: str, file: Any) -> None:
+    def __init__(self, name: str, file: Any, *, hello_s: float | None = None) -> None:
         self.name, self._file = name, file
+        self._hello_s = HELLO_S if hello_s is None else hello_s
         self._decoder = Decoder(name)
         self._ended = False
         self.problem: str | None = None
         """How the stream ended, where it did not end as it should: one line."""
         try:
-            hello = self._hello()
+            self._said = hello = self._hello()
         except BaseException:
             self.close()
             raise
@@ -160,6 +177,8 @@ class StreamSource:
         given = time.monotonic()
         while not self._ended:
             message = self._next(IDLE_S)
+            if isinstance(message, Hello) and message != self._said:
+                raise AmiwarpError(f"{self.name}: a second hello says another camera; correct its sender")
             if message is not None and not isinstance(message, (Hello, End)):
                 yield self._packet(message)
                 given = time.monotonic()
@@ -172,18 +191,18 @@ class StreamSource:
         self._file.close()
 
     def _hello(self) -> Hello:
-        until = time.monotonic() + HELLO_S
+        until = time.monotonic() + self._hello_s
         while time.monotonic() < until and not self._ended:
             message = self._next(IDLE_S)
             if isinstance(message, Hello):
                 return message
             if message is not None:
                 raise AmiwarpError(f"{self.name}: begins without a hello; see docs/stream-format.md")
-        raise AmiwarpError(f"{self.name}: {self.problem or 'sent no hello'}; see docs/stream-format.md")
+        raise Unreachable(f"{self.name}: {self.problem or 'sent no hello'}; see docs/stream-format.md")
 
     def _next(self, timeout_s: float) -> Message | None:
         """The next message; None where it is not complete in time, or the stream has ended."""
-        if not select.select([self._file], [], [], timeout_s)[0]:
+        if not ready(self._file, timeout_s):
             return None
         try:
             count = self._file.readinto(self._decoder.room())
@@ -203,14 +222,18 @@ class StreamSource:
 
     def _packet(self, message: Events | Compensated | Triggers | Angles) -> Packet:
         now = monotonic_us()
+        if isinstance(message, Compensated):
+            raise AmiwarpError(f"{self.name}: sends compensated events; give the stream of a sensor")
+        if len(message.t) and not (message.t.min() >= -LAST_US and message.t.max() <= LAST_US):
+            given = f"times of {message.t.min()} .. {message.t.max()} us, not in +-{LAST_US}"
+            raise AmiwarpError(f"{self.name}: {given}; correct its sender")
         if isinstance(message, Triggers):
             return packet(now, triggers=message.t)
         if isinstance(message, Angles):
-            if not np.isfinite(message.angle).all():
-                raise AmiwarpError(f"{self.name}: an encoder sample is not finite; correct its sender")
+            if not (np.abs(message.angle) <= LARGEST_RAD).all():
+                what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
+                raise AmiwarpError(f"{self.name}: {what}; correct its sender")
             return packet(now, encoder_t=message.t, encoder_angle=message.angle)
-        if isinstance(message, Compensated):
-            raise AmiwarpError(f"{self.name}: sends compensated events; give the stream of a sensor")
         width, height = self.size
         if len(message) and (message.x.max() >= width or message.y.max() >= height or message.p.max() > 1):
             what = f"an event outside the {width}x{height} frame, or of a polarity that is neither 0 nor 1"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from amiwarp.compensator import held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events
 from amiwarp.stream.adaptive import CoverageMeter, SpeedController, prism_path
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 WINDOW_US, MOST_WINDOWS = 33_333, 10
 """Length of a window [us], and how many are measured of what comes at once: the last ones, the others are long past."""
+MOST_BYTES = 1 << 26
+"""Memory of the packets of a window that is not over; of more, the oldest are left out of its coverage."""
 
 
 class SpeedKeeper:
@@ -37,7 +41,9 @@ class SpeedKeeper:
         self.controller = controller
         self._model, self._set_speed, self._say = model, set_speed, say
         self._meter = CoverageMeter(model.camera.width, model.camera.height)
-        self._packets: list[Events] = []
+        self._packets: deque[Events] = deque()
+        self.held_bytes = 0
+        """Memory that the packets take whose window is not over [bytes]."""
         self._begins: int | None = None
         self._asking: threading.Thread | None = None
         self._asked = controller.rpm
@@ -46,20 +52,24 @@ class SpeedKeeper:
 
     def put(self, packets: list[Compensated], encoder: EncoderStream) -> None:
         """Compensated packets, in order."""
-        self._packets += [packet.events for packet in packets]
+        self._begins = int(packets[0].events.t[0]) if self._begins is None else self._begins
+        for packet in packets:
+            self._packets.append(packet.events)
+            self.held_bytes += held_bytes(packet.events)
+            while self.held_bytes > MOST_BYTES and len(self._packets) > 1:
+                self.held_bytes -= held_bytes(self._packets.popleft())
         last = int(self._packets[-1].t[-1])
-        self._begins = int(self._packets[0].t[0]) if self._begins is None else self._begins
         windows = (last - self._begins) // WINDOW_US
         if windows < 1:
             return
-        events = Events.concatenate(self._packets)
+        events = Events.concatenate(list(self._packets))
         self._begins += WINDOW_US * max(0, windows - MOST_WINDOWS)
         while last - self._begins >= WINDOW_US:
             end = self._begins + WINDOW_US
             first, after = np.searchsorted(events.t, [self._begins, end])
             self._window(events[first:after], self._begins, end, encoder)
             events, self._begins = events[after:], end
-        self._packets = [events]
+        self._packets, self.held_bytes = deque([events]), held_bytes(events)
 
     def _window(self, events: Events, start: int, end: int, encoder: EncoderStream) -> None:
         if encoder.first is None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from amiwarp.compensator import held_bytes
 from amiwarp.encoder import TURN
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents, Recording
@@ -24,8 +25,8 @@ MUCH, FAR = math.radians(1.5), math.radians(5.0)
 """Changes since the first look, and distances from the calibrated phase, that are told; its bias is up to 3 deg."""
 LEAST = 20_000
 """Events, and at least half a turn of them, without which nothing is said."""
-MOST = 1 << 20
-"""Events that are remembered, the last ones."""
+MOST_BYTES = 1 << 24
+"""Memory of the events that are remembered, the last ones: about a million."""
 EVALUATIONS = 40
 
 
@@ -50,7 +51,8 @@ class PhaseWatch:
         self._calibration, self._every_s, self._say = calibration, every_s, say
         self._due, self._closed = 0.0, False
         self._recent: deque[Events] = deque()
-        self._held = 0
+        self.held_bytes = 0
+        """Memory that these take [bytes]."""
         self._thread: threading.Thread | None = None
         self._found: Phase | None = None
         self._first: Phase | None = None
@@ -84,9 +86,9 @@ class PhaseWatch:
     def put(self, events: Events) -> None:
         """Events as the sensor gave them."""
         self._recent.append(events)
-        self._held += len(events)
-        while self._held - len(self._recent[0]) > MOST:
-            self._held -= len(self._recent.popleft())
+        self.held_bytes += held_bytes(events)
+        while self.held_bytes - held_bytes(self._recent[0]) > MOST_BYTES:
+            self.held_bytes -= held_bytes(self._recent.popleft())
 
     def begin(self, encoder: EncoderStream) -> bool:
         """Starts a look at the last turn, unless one is under way or there is too little; whether it did."""
