@@ -4,6 +4,7 @@ import json
 import math
 import os
 import shutil
+import signal
 import socket
 import stat
 import subprocess
@@ -258,6 +259,59 @@ def test_outputs_that_are_no_files_are_refused(place: Path, kind: str, line: str
         result = run(*line.format(path).split(), *more)
         assert (result.exit_code, f"is a {kind}; give the name of a file" in result.stderr) == (1, True), result.output
     assert stat.S_IFMT(os.stat(path).st_mode) == mode
+
+
+@pytest.fixture
+def impatient() -> Iterator[None]:
+    """A command that waits for what never comes fails."""
+
+    def late(number: int, frame: object) -> None:
+        raise AssertionError("still waiting after two minutes")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(120)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize(
+    "line",
+    [
+        "info {}",
+        "convert {} out.h5",
+        "convert a.h5 out.h5 --encoder {}",
+        "convert a.h5 out.h5 --camera {}.json",
+        "convert a.h5 out.h5 --camera {}.txt",
+        "calibrate {} out.json",
+        "calibrate a.h5 out.json --preset {}",
+        "compensate {} out.h5 --calibration cal.json",
+        "compensate a.h5 out.h5 --calibration {}",
+        "compensate a.h5 out.h5 --calibration cal.json --preset {}",
+        "reconstruct {} out.png --calibration cal.json",
+        "reconstruct a.h5 out.png --calibration {}",
+        "simulate out.h5 --picture {}",
+        "simulate out.h5 --picture pic.png --speed {}",
+        "translate {} out.h5 --fps 100",
+        "translate {}.npy out.h5 --fps 100",
+        "record {} out.h5 --fast",
+        "live {} --calibration cal.json --out out.h5",
+        "live a.h5 --calibration {} --out out.h5",
+        "view {} --screenshot out.png",
+        "view a.h5 --calibration {} --screenshot out.png",
+        "demo --out out --picture {}",
+        "design --out out --picture {}",
+        "chart {} --out out --quick",
+    ],
+)
+def test_inputs_that_never_end_are_refused(place: Path, line: str) -> None:
+    name = next(word for word in line.split() if "{}" in word).format("pipe")
+    os.mkfifo(place / name)
+    result = run(*line.format("pipe").split())
+    assert result.exit_code == 1, result.output
+    assert f"{name}: is a named pipe (FIFO); give a file" in result.stderr
+    assert not any(f.name.startswith("out.") for f in place.iterdir())
 
 
 @pytest.mark.parametrize("exists", [True, False])

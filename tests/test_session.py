@@ -350,8 +350,8 @@ def test_the_clock_offset_of_a_file_is_applied_once(tmp_path: Path, offset: floa
         Session(source, known, raw=[raw], sinks=(out.append,)).run(threading.Event(), lambda _: None)
     live = Events.concatenate([p.events for p in out])
     for name in ("file.h5", "raw.h5"):
-        compensate(open_recording(tmp_path / name), known, tmp_path / "offline.h5")
-        offline = open_recording(tmp_path / "offline.h5").events.slice(0, 20_000)
+        compensate(open_recording(tmp_path / name), known, tmp_path / f"offline-{name}")
+        offline = open_recording(tmp_path / f"offline-{name}").events.slice(0, 20_000)
         assert np.nanmax(np.hypot(live.x - offline.x, live.y - offline.y)) < 1e-3
 
 

@@ -14,7 +14,7 @@ import typer
 
 from amiwarp.cli import say
 from amiwarp.cli.console import report
-from amiwarp.cli.options import Common
+from amiwarp.cli.options import NO_FILE, Common
 from amiwarp.cli.streams import stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 
@@ -33,7 +33,9 @@ LATE_US = 100_000
 def run(
     *,
     link: Annotated[
-        Path | None, typer.Option(help="Link to the port: its name also after a fault 'unplug'. Default: none.")
+        Path | None,
+        typer.Option(help="Link to the port: its name also after a fault 'unplug'. Default: none."),
+        NO_FILE,
     ] = None,
     counts_per_turn: Annotated[int, typer.Option(min=1, max=1 << 24, help="Of the encoder.")] = 4096,
     rpm: Annotated[float, typer.Option(min=-6000.0, max=6000.0, help="Speed to begin with (turns/min).")] = 0.0,

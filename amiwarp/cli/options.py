@@ -12,11 +12,15 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from amiwarp.io import output
+from amiwarp.regular import check_regular
 
 OUTPUT = "output"
 """Marks, in ``Annotated``, an option that names a file to write; every other path is read."""
 OUTPUT_FOLDER = "output folder"
 """Marks an option that names a folder to write to; the command checks its files."""
+
+NO_FILE = "no file"
+"""Marks an option that names something that is neither read nor written as a file."""
 
 _FORCE = Annotated[
     bool,
@@ -64,7 +68,10 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
     def run(**values: Any) -> None:
         force = writes and values.pop("force")
         paths = list(_paths(values))
-        inputs = [path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER} & set(marks[name])]
+        inputs = [path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER, NO_FILE} & set(marks[name])]
+        for path in inputs:
+            if path.exists() and not path.is_dir():  # what is not there, and folders, the command explains better
+                check_regular(path)
         outputs = [path for name, path in paths if OUTPUT in marks[name]]
         for key, (kind, names) in groups.items():
             values[key] = kind(**{n: values.pop(n) for n in names})

@@ -13,6 +13,7 @@ from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name
+from amiwarp.regular import check_regular
 from amiwarp.values import real, shown, whole
 
 Made = TypeVar("Made")
@@ -41,8 +42,7 @@ def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
     """
     path = Path(path)
     with errors_name(path, lambda: f"cannot be read as {what}"):
-        if path.is_dir():
-            raise AmiwarpError(f"{path}: is a folder; give a file")
+        check_regular(path)
         with path.open("rb") as file:
             text = file.read(MOST_BYTES + 1)
         if len(text) > MOST_BYTES:

@@ -120,12 +120,15 @@ class PseudoTerminal:
             os.close(port)
         self._master = master
         if self._path is not None:
-            self._path.unlink(missing_ok=True)
+            self._remove_link()
             self._path.symlink_to(self._port)
 
+    def _remove_link(self) -> None:
+        if self._path is not None and self._path.is_symlink():  # a file that was put there meanwhile stays
+            self._path.unlink()
+
     def _unplug(self) -> None:
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
+        self._remove_link()
         if self._master is not None:
             os.close(self._master)
             self._master = None
