@@ -32,7 +32,7 @@ KERNELS_MAY_IMPORT = {"amiwarp.camera", "amiwarp.errors", "amiwarp.kernels"}
 ORDER = (
     ("errors",),
     ("kernels", "camera", "multilevel"),
-    ("optics", "events", "encoder", "turning", "machine"),
+    ("optics", "events", "encoder", "unwrapping", "turning", "machine"),
     ("pictures", "motion", "clouds"),
     ("io", "uploads", "link"),
     ("iwe", "peers"),
