@@ -123,9 +123,13 @@ class Encoder:
 
     def slip(self) -> NDArray[np.float64]:
         """Angle at each index pulse [rad], in -pi .. pi, shape ``(k,)``: 0 throughout where no count was lost."""
+        return _wrap(self.pulse_angles())
+
+    def pulse_angles(self) -> NDArray[np.float64]:
+        """Unwrapped angle at each index pulse [rad], shape ``(k,)``; empty without pulses."""
         if self.index_t is None:
             return np.zeros(0)
-        return _wrap(np.interp(self.index_t - self.t[0], self.t - self.t[0], self.angle))
+        return np.asarray(np.interp(self.index_t - self.t[0], self.t - self.t[0], self.angle))
 
     def angle_at(self, t: ArrayLike) -> NDArray[np.float64]:
         """Unwrapped angle [rad] at event times ``t`` [us], any shape, interpolated linearly.

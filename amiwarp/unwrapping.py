@@ -211,7 +211,7 @@ def _find(log: _Log, periods: Iterable[float]) -> _Steps:
             raise UnwrapError.at(int(np.argmax(at)) + 1, _maybe(log, best))
         _check_period(log, best, [found.period for found in wrapped])
         return _checked(log, best)
-    rival = next((found for found in wrapped if found.surprise <= CLEARLY * plain.surprise), None)
+    rival = next((found for found in wrapped if found.surprise <= CLEARLY * plain.surprise + log.grain), None)
     if rival is not None:
         at = int(np.argmax(rival.wraps != 0.0)) + 1
         raise UnwrapError.at(at, _maybe(log, rival))

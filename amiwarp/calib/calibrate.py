@@ -16,7 +16,7 @@ from amiwarp.calib.photometric import refine
 from amiwarp.calib.pixels import Masked, strange_pixels, stretch
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.calib.search import AUTO, Material, Progress, Search, Settings
-from amiwarp.calib.speed import estimate_rpm
+from amiwarp.calib.speed import estimate_rpm, turns_per_turn
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents
@@ -39,6 +39,8 @@ LEAST_SHARPNESS_KEPT = 0.7
 """The truth is nearly as sharp as the sharpest (0.93 to 0.99 of the gain, 0.8 with many hot pixels, measured)."""
 STILL_COST, TURNING_GAIN = 0.2, 0.75
 """Where more of the cost remains, the camera may turn; it did where its motion brings that down to this share."""
+LEAST_SCALE_ERROR = 0.003
+"""Of an encoder, relative, that the events tell: within two turns they repeat to 0.0005 of a turn (measured)."""
 
 
 def calibrate(
@@ -69,6 +71,8 @@ def calibrate(
     found = _try(recording, settings, device, progress)
     if recording.encoder is not None and _doubtful(found):
         recording, found = _without_strange(recording, settings, found, device, progress)
+        if _doubtful(found):
+            _check_scale(recording, settings, found, device, progress)
         if settings.free is None and _doubtful(found):
             found = _turning(recording, settings, found, device, progress)
     if isinstance(found, AmiwarpError):
@@ -123,6 +127,35 @@ def _doubtful(found: Calibration | AmiwarpError) -> bool:
     if isinstance(found, AmiwarpError):
         return isinstance(found, checks.NotSharp)
     return found.photometric is not None and found.photometric.cost > STILL_COST
+
+
+def _check_scale(
+    recording: Recording,
+    settings: Settings,
+    found: Calibration | AmiwarpError,
+    device: Any,
+    progress: Progress | None,
+) -> None:
+    """Refuse an encoder of a wrong scale: a camera that turns would explain some of what it does to the events.
+
+    The events of a still scene repeat every turn. If they do so at another angle of the encoder, and a prism that is
+    scaled accordingly explains them much better, the encoder is wrong.
+    """
+    encoder = recording.encoder
+    assert encoder is not None
+    try:
+        turns = turns_per_turn(recording, encoder)
+    except AmiwarpError:
+        return  # the events do not repeat: the scene or the camera moves
+    if abs(turns - 1.0) < LEAST_SCALE_ERROR:
+        return
+    scaled = replace(encoder, angle=encoder.angle / turns, index_t=None)
+    again = _try(replace(recording, encoder=scaled), settings, device, progress)
+    if isinstance(again, AmiwarpError) or again.photometric is None or not _sure(again):
+        return
+    cost = 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
+    if again.photometric.cost <= TURNING_GAIN * cost:
+        raise checks.wrong_scale(recording.name, turns, "the events repeat", cost, again.photometric.cost)
 
 
 def _turning(
@@ -207,7 +240,8 @@ def _second_stage(recording: Recording, search: Search, result: Calibration, pro
     after = search.fine.values(dict(found.parameters))
     kept = (after - result.sharpness_before) / max(result.sharpness_after - result.sharpness_before, 1e-12)
     if found.accepted and kept < LEAST_SHARPNESS_KEPT:
-        verdict = f"keeps only {100 * kept:.0f} % of what sharpness gained: events are missing, or the scene moved"
+        much = f"keeps only {100 * kept:.0f} %" if kept > 0.005 else "keeps nothing"
+        verdict = f"{much} of what sharpness gained: events are missing, or the scene moved"
         found = replace(found, accepted=False, verdict=verdict)
     if found.held:
         vain = f"the events do not determine {', '.join(found.held)}: not moved by the photometric stage"
@@ -231,9 +265,12 @@ def prepare(
     checks.check_events(len(recording.events), name)
     encoders, free = _encoders(recording, settings)
     events = thin(recording, settings.events)
+    if isinstance(recording.events, Masked) and len(events) < settings.events:
+        checks.check_left(len(events), recording.events.mask, name)
     searches = []
     for encoder in encoders:
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
+        checks.check_pulses(encoder, name)
         space = _space(recording, camera, encoder, events, settings, free)
         material = _material(events, encoder, space, _middle(recording), settings.fold)
         if space.sized:

@@ -47,6 +47,8 @@ FIRST_SCALE = 1.0
 """Of Cauchy's weights while the map is cold [thresholds]."""
 FAR_MOVING_PX = 4.0
 """The stage looks no further in the camera's motion from the sharpness optimum than this."""
+RESTARTS = 3
+"""Searches from places that turned out to cost less than the result, at most."""
 FIRST_STEP_PX = 0.2
 POLISH_STEP_PX = 0.05
 SLOPE_PX = 0.02
@@ -279,8 +281,7 @@ def refine(
     v = space.to_vector({**space.start, **search.best})
     if held:
         cost.warm_up(v)
-    stage = _search(cost, v, settings, progress)
-    result = _conclude(cost, stage.x, v, left)
+    stage, result = _settle(cost, v, left, settings, progress)
     found = replace(result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held)
     return found, StageSummary.of("photometric", stage, space)
 
@@ -292,7 +293,32 @@ def limits(space: Space, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
     return np.clip(low, v - far, v + far), np.clip(high, v - far, v + far)
 
 
-def _search(cost: Cost, v: NDArray[np.float64], settings: PhotometricSettings, progress: Progress | None) -> Stage:
+def _settle(
+    cost: Cost, v: NDArray[np.float64], left: float, settings: PhotometricSettings, progress: Progress | None
+) -> tuple[Stage, Photometric]:
+    """Searches from the first stage's answer, and again from any place near the result that costs less.
+
+    The map of few events follows a wrong answer so far that no step from there helps: that is no optimum.
+    """
+    stage = _search(cost, v, v, settings, progress)
+    result, around = _conclude(cost, stage.x, v, left)
+    for _ in range(RESTARTS):
+        lower = [at for at, there in around if there < result.cost]
+        if not lower:
+            break
+        stage = joined(stage, _search(cost, v, lower[0], settings, progress))
+        result, around = _conclude(cost, stage.x, v, left)
+    return stage, result
+
+
+def _search(
+    cost: Cost,
+    v: NDArray[np.float64],
+    start: NDArray[np.float64],
+    settings: PhotometricSettings,
+    progress: Progress | None,
+) -> Stage:
+    """One search from ``start``, in the box about the first stage's answer ``v``."""
     low, high = limits(cost.space, v)
 
     def tell(done: int, budget: int) -> None:
@@ -304,7 +330,7 @@ def _search(cost: Cost, v: NDArray[np.float64], settings: PhotometricSettings, p
         return cost(at)
 
     if settings.algorithm == GAUSS_NEWTON:
-        return iterate(cost.settled, cost.slopes, v, low, high, settings.tolerance_px, tell)
+        return iterate(cost.settled, cost.slopes, start, low, high, settings.tolerance_px, tell)
 
     def run(at: NDArray[np.float64], step: float) -> Stage:
         return maximise(
@@ -312,7 +338,7 @@ def _search(cost: Cost, v: NDArray[np.float64], settings: PhotometricSettings, p
             tolerance=settings.tolerance_px, step=step,
         )  # fmt: skip
 
-    stage = run(v, FIRST_STEP_PX)
+    stage = run(start, FIRST_STEP_PX)
     # the map lags the parameters while they move far: once more from near, with a better map
     cost.steps *= 2
     return joined(stage, run(stage.x, POLISH_STEP_PX))
@@ -334,8 +360,11 @@ def _conclude(
     best: NDArray[np.float64],
     v: NDArray[np.float64],
     left: float,
-) -> Photometric:
-    """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`."""
+) -> tuple[Photometric, list[tuple[NDArray[np.float64], float]]]:
+    """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`.
+
+    Returns the places around, and what each costs, the least first.
+    """
     space = cost.space
     # like with like: the map had longer by now than when the search began
     cost.residuals(v, rounds=2)
@@ -347,10 +376,11 @@ def _conclude(
     asked = np.array([n not in LATE for n in space.names])
     near = np.array([n not in (*LATE, *MOTION) for n in space.names])
     leak, excess = (float(x) for x in cost.brightness.extra)  # before the map follows elsewhere
-    rise = min(_beside(cost, best), default=math.inf) - final
+    around = sorted(_around(cost, best), key=lambda place: place[1])
+    rise = (around[0][1] if around else math.inf) - final
     ahead = float(np.linalg.norm(slopes.step()[near]))
     accepted, words = verdict(final, rise, float(np.linalg.norm((best - v)[near])), ahead)
-    return Photometric(
+    found = Photometric(
         accepted=accepted,
         verdict=words,
         parameters=space.to_values(best),
@@ -364,17 +394,25 @@ def _conclude(
         off_over_on=1.0 + excess,
         leak=leak,
     )
+    return found, around
 
 
-def _beside(cost: Cost, best: NDArray[np.float64]) -> list[float]:
-    """The cost where the orbit is larger, and smaller, by :data:`BESIDE_PX`, the map at its best there."""
-    if cost.space.size_name not in cost.space.names:
-        return []
-    along = np.zeros(len(best))
-    many = 2 if cost.space.cartesian else 1
-    along[:many] = best[:many] / max(float(np.linalg.norm(best[:many])), 1e-9)
+def _around(cost: Cost, best: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]]:
+    """Places :data:`BESIDE_PX` from ``best`` in size and in phase, either way, and their costs with the best maps."""
+    space = cost.space
     found = []
-    for side in (BESIDE_PX, -BESIDE_PX):
-        cost.residuals(best + side * along, rounds=2)
-        found.append(cost.mean())
+    for along in _directions(space, best):
+        for side in (BESIDE_PX, -BESIDE_PX):
+            cost.residuals(best + side * along, rounds=2)
+            found.append((best + side * along, cost.mean()))
     return found
+
+
+def _directions(space: Space, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Unit vectors along the size and the phase, of those that are free."""
+    if space.cartesian:
+        x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)
+        rest = np.zeros(len(best) - 2)
+        return [np.array([x, y, *rest]), np.array([-y, x, *rest])]
+    unit = np.eye(len(best))
+    return [unit[k] for k, name in enumerate(space.names) if name in (space.size_name, "phase")]
