@@ -12,28 +12,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.brightness import BrightnessMap, Tiles
+from amiwarp.brightness import BrightnessMap
+from amiwarp.calib.around import around_optimum
 from amiwarp.calib.gauss_newton import GAUSS_NEWTON, Slopes, determined, iterate
 from amiwarp.calib.objective import reach
 from amiwarp.calib.parameters import LATE, MOTION
 from amiwarp.calib.result import Photometric, StageSummary
 from amiwarp.calib.solve import Stage, maximise
-from amiwarp.calib.verdict import BESIDE_PX, FAR_PX, verdict
+from amiwarp.calib.tiling import choose_tiles, one_tile
+from amiwarp.calib.verdict import FAR_PX, verdict
 from amiwarp.errors import AmiwarpError
 from amiwarp.pairs import EventTable, PairSet, Sensor, off_excess
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.brightness import Tiles
     from amiwarp.calib.parameters import Space
     from amiwarp.calib.search import Progress, Search
     from amiwarp.encoder import Encoder
     from amiwarp.events import Recording
 
-TILE = 32
-"""Side of a tile of the scene [px]."""
-GRID = (4, 3)
-"""One tile, the busiest, from each of so many columns and rows of the image."""
 MARGIN_PX, MOVING_MARGIN_PX = 3, 8
 """By which the map of a tile is grown: the parameters may move events so far."""
 LONGEST_GAP_US = 60_000
@@ -72,35 +71,6 @@ class PhotometricSettings:
     """Nodes of the map per pixel."""
     sensor: Sensor = field(default_factory=Sensor)
     """Known latency and refractory time; what is not known of them stays in the phase."""
-
-
-def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
-    """The busiest cell of :data:`TILE` px from each part of the scene: tile of each pixel (or -1), and the tiles.
-
-    ``image``: of events at the first stage's answer, shape (height, width).
-    """
-    height, width = image.shape
-    columns, rows = max(1, width // TILE), max(1, height // TILE)
-    cells = image[: rows * TILE, : columns * TILE]
-    counts = cells.reshape(rows, cells.shape[0] // rows, columns, cells.shape[1] // columns).sum(axis=(1, 3))
-    tile_of = np.full((height, width), -1, dtype=np.int32)
-    corners: list[tuple[int, int]] = []
-    for part_rows in np.array_split(np.arange(rows), min(GRID[1], rows)):
-        for part_columns in np.array_split(np.arange(columns), min(GRID[0], columns)):
-            part = counts[np.ix_(part_rows, part_columns)]
-            row, column = np.unravel_index(int(part.argmax()), part.shape)
-            x, y = int(part_columns[column]) * TILE, int(part_rows[row]) * TILE
-            tile_of[y : y + TILE, x : x + TILE] = len(corners)
-            corners.append((x - margin, y - margin))
-    side = math.ceil((TILE + 2 * margin) * density) + 2
-    return tile_of, Tiles(np.array(corners, dtype=np.float32), side, side, density)
-
-
-def one_tile(width: int, height: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
-    """The whole image as one tile: where there are few events none is left out."""
-    origin = np.array([[-margin, -margin]], dtype=np.float32)
-    rows, columns = (math.ceil((n + 2 * margin) * density) + 2 for n in (height, width))
-    return np.zeros((height, width), dtype=np.int32), Tiles(origin, rows, columns, density)
 
 
 class _Gatherer:
@@ -207,6 +177,14 @@ class Cost:
         self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
 
+    def renew(self, v: NDArray[np.float64]) -> None:
+        """Forget the map, which remembers where it was fitted, and make another at ``v``."""
+        unknowns = self.brightness.unknowns
+        unknowns[: self.brightness.tiles.nodes] = 0.0
+        self.brightness.unknowns = unknowns
+        self.brightness.place(**self.at(v))
+        self.brightness.solve(FIRST_SCALE, steps=2 * self.steps, rounds=3)
+
     def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
         """Arguments of :meth:`BrightnessMap.place`."""
         values = self.space.to_values(v)
@@ -303,9 +281,10 @@ def _settle(
     stage = _search(cost, v, v, settings, progress)
     result, around = _conclude(cost, stage.x, v, left)
     for _ in range(RESTARTS):
-        lower = [at for at, there in around if there < result.cost]
+        lower = [place for place, rise in around if rise < 0.0]
         if not lower:
             break
+        cost.renew(lower[0])
         stage = joined(stage, _search(cost, v, lower[0], settings, progress))
         result, around = _conclude(cost, stage.x, v, left)
     return stage, result
@@ -363,7 +342,7 @@ def _conclude(
 ) -> tuple[Photometric, list[tuple[NDArray[np.float64], float]]]:
     """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`.
 
-    Returns the places around, and what each costs, the least first.
+    Returns the places around, and by how much each costs more, the least first.
     """
     space = cost.space
     # like with like: the map had longer by now than when the search began
@@ -376,8 +355,8 @@ def _conclude(
     asked = np.array([n not in LATE for n in space.names])
     near = np.array([n not in (*LATE, *MOTION) for n in space.names])
     leak, excess = (float(x) for x in cost.brightness.extra)  # before the map follows elsewhere
-    around = sorted(_around(cost, best), key=lambda place: place[1])
-    rise = (around[0][1] if around else math.inf) - final
+    around = around_optimum(cost, best, final)
+    rise = around[0][1] if around else math.inf
     ahead = float(np.linalg.norm(slopes.step()[near]))
     accepted, words = verdict(final, rise, float(np.linalg.norm((best - v)[near])), ahead)
     found = Photometric(
@@ -395,24 +374,3 @@ def _conclude(
         leak=leak,
     )
     return found, around
-
-
-def _around(cost: Cost, best: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]]:
-    """Places :data:`BESIDE_PX` from ``best`` in size and in phase, either way, and their costs with the best maps."""
-    space = cost.space
-    found = []
-    for along in _directions(space, best):
-        for side in (BESIDE_PX, -BESIDE_PX):
-            cost.residuals(best + side * along, rounds=2)
-            found.append((best + side * along, cost.mean()))
-    return found
-
-
-def _directions(space: Space, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Unit vectors along the size and the phase, of those that are free."""
-    if space.cartesian:
-        x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)
-        rest = np.zeros(len(best) - 2)
-        return [np.array([x, y, *rest]), np.array([-y, x, *rest])]
-    unit = np.eye(len(best))
-    return [unit[k] for k, name in enumerate(space.names) if name in (space.size_name, "phase")]
