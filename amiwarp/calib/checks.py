@@ -29,7 +29,7 @@ LARGEST_FLICKER = 0.7
 """Share of the pixels that may see a lamp."""
 LARGEST_DRIFT = 0.02
 """Turns by which index pulses may drift over a recording."""
-FEWEST_PULSES = 4
+FEWEST_PULSES = 3
 STEADY = 0.2
 """Of a drift: pulses that lie no further from a line drift steadily."""
 LARGEST_COHERENCE = 0.97
