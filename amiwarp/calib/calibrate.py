@@ -17,13 +17,12 @@ from amiwarp.calib.pixels import Masked, strange_pixels, stretch
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.calib.search import AUTO, Material, Progress, Search, Settings
 from amiwarp.calib.speed import estimate_rpm, turns_per_turn
+from amiwarp.calib.thinning import thin
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.camera import Camera
     from amiwarp.events import Recording
 
@@ -31,8 +30,6 @@ LINEAR = ("off_ratio", "leak")
 """Names that are free in the photometric stage alone: unknowns of its linear equations."""
 STRANGE_SHARE = 0.01
 """Of the events, that must lie on hot or flickering pixels for these to matter."""
-RUN = 8
-"""Events that stay together where a recording is thinned: a cache line of times."""
 MOVING_TURNS, MOVING_US = 2.1, 100_000.0
 """Length of the window where the camera's motion is free: in turns, or without a prism."""
 LEAST_SHARPNESS_KEPT = 0.7
@@ -40,7 +37,7 @@ LEAST_SHARPNESS_KEPT = 0.7
 STILL_COST, TURNING_GAIN = 0.2, 0.75
 """Where more of the cost remains, the camera may turn; it did where its motion brings that down to this share."""
 LEAST_SCALE_ERROR = 0.003
-"""Of an encoder, relative, that the events tell: within two turns they repeat to 0.0005 of a turn (measured)."""
+"""Of an encoder, relative, that the events tell: three turns tell it to about 0.001 (measured)."""
 
 
 def calibrate(
@@ -72,9 +69,7 @@ def calibrate(
     if recording.encoder is not None and _doubtful(found):
         recording, found = _without_strange(recording, settings, found, device, progress)
         if _doubtful(found):
-            _check_scale(recording, settings, found, device, progress)
-        if settings.free is None and _doubtful(found):
-            found = _turning(recording, settings, found, device, progress)
+            found = _why_doubtful(recording, settings, found, device, progress)
     if isinstance(found, AmiwarpError):
         raise found
     _check_confirmed(found, recording.name)
@@ -129,33 +124,52 @@ def _doubtful(found: Calibration | AmiwarpError) -> bool:
     return found.photometric is not None and found.photometric.cost > STILL_COST
 
 
-def _check_scale(
+def _why_doubtful(
     recording: Recording,
     settings: Settings,
     found: Calibration | AmiwarpError,
     device: Any,
     progress: Progress | None,
-) -> None:
-    """Refuse an encoder of a wrong scale: a camera that turns would explain some of what it does to the events.
+) -> Calibration | AmiwarpError:
+    """The answer with the camera's motion free, or ``found``; or the error that the encoder's scale is wrong.
 
-    The events of a still scene repeat every turn. If they do so at another angle of the encoder, and a prism that is
-    scaled accordingly explains them much better, the encoder is wrong.
+    A slow camera motion explains some of what a wrong scale does to the events, and the reverse, so the cause that
+    leaves less of the cost is named.
+    """
+    scaled = _scaled(recording, settings, found, device, progress)
+    turning = found if settings.free is not None else _turning(recording, settings, found, device, progress)
+    if scaled is None or (turning is not found and _cost(turning) <= scaled[1]):
+        return turning
+    turns, cost = scaled
+    return checks.wrong_scale(recording.name, turns, "the events repeat", _cost(found), cost)
+
+
+def _cost(found: Calibration | AmiwarpError) -> float:
+    return 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
+
+
+def _scaled(
+    recording: Recording,
+    settings: Settings,
+    found: Calibration | AmiwarpError,
+    device: Any,
+    progress: Progress | None,
+) -> tuple[float, float] | None:
+    """Turns of the encoder in which the events repeat, and the cost if that is one turn; None if it explains no more.
+
+    The events of a still scene repeat every turn; if they do so at another angle, the encoder's scale may be wrong.
     """
     encoder = recording.encoder
     assert encoder is not None
     try:
         turns = turns_per_turn(recording, encoder)
     except AmiwarpError:
-        return  # the events do not repeat: the scene or the camera moves
+        return None  # the events do not repeat: the scene or the camera moves
     if abs(turns - 1.0) < LEAST_SCALE_ERROR:
-        return
-    scaled = replace(encoder, angle=encoder.angle / turns, index_t=None)
-    again = _try(replace(recording, encoder=scaled), settings, device, progress)
-    if isinstance(again, AmiwarpError) or again.photometric is None or not _sure(again):
-        return
-    cost = 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
-    if again.photometric.cost <= TURNING_GAIN * cost:
-        raise checks.wrong_scale(recording.name, turns, "the events repeat", cost, again.photometric.cost)
+        return None
+    right = replace(encoder, angle=encoder.angle / turns, index_t=None)
+    again = _try(replace(recording, encoder=right), settings, device, progress)
+    return (turns, _cost(again)) if _sure(again) and _cost(again) <= TURNING_GAIN * _cost(found) else None
 
 
 def _turning(
@@ -170,8 +184,7 @@ def _turning(
     turning = _try(recording, replace(settings, free=free), device, progress)
     if isinstance(turning, AmiwarpError) or turning.photometric is None or not turning.photometric.accepted:
         return found
-    still = 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
-    if turning.photometric.cost > TURNING_GAIN * still:
+    if turning.photometric.cost > TURNING_GAIN * _cost(found):
         return found
     speed = math.degrees(math.hypot(*(turning.parameters[n] for n in RATES)))
     # the prism is what the calibration is for; the camera's motion was that of two turns in the middle
@@ -324,35 +337,6 @@ def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], 
 def _middle(recording: Recording) -> int:
     """Where a change of speed changes the phase least [us]."""
     return (recording.events.t_first + recording.events.t_last) // 2
-
-
-def thin(recording: Recording, most: int) -> Events:
-    """At most ``most`` events, evenly: every k-th run of the recording's; of a file read in blocks."""
-    source = recording.events
-    step = max(1, -(-len(source) // most))
-    if step == 1:
-        return Events.concatenate(list(source.blocks()))
-    if isinstance(source, MemoryEvents):
-        return _runs(source.slice(0, len(source)), step)
-    # blocks of whole periods, so that every run but the last is whole
-    blocks = source.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
-    return Events.concatenate([_runs(block, step) for block in blocks])
-
-
-def _runs(block: Events, step: int) -> Events:
-    """The first of every ``step`` runs, copied, so that the block itself can go."""
-    from amiwarp.kernels.launch import pool
-
-    whole = len(block) // (step * RUN) * step * RUN
-
-    def pick(values: NDArray[Any]) -> NDArray[Any]:
-        runs, rest = values[:whole].reshape(-1, step * RUN)[:, :RUN], values[whole : whole + RUN]
-        out = np.empty(runs.size + rest.size, values.dtype)
-        out[: runs.size].reshape(runs.shape)[:] = runs
-        out[runs.size :] = rest
-        return out
-
-    return Events(*pool().map(pick, (block.x, block.y, block.t, block.p)))
 
 
 def _space(

@@ -112,7 +112,8 @@ def make_trial(
     budget_px: float | None,
 ) -> Trial:
     """Both halves of the events on the device, and the sharpness about the exact answer; ``names``: what to try."""
-    from amiwarp.calib.calibrate import moving_window, thin
+    from amiwarp.calib.calibrate import moving_window
+    from amiwarp.calib.thinning import thin
 
     events = thin(moving_window(recording, settings), settings.events)
     first, last = int(events.t[0]), int(events.t[-1])
