@@ -16,6 +16,7 @@ from amiwarp.calib.checks import edge_coherence
 from amiwarp.calib.parameters import make_space
 from amiwarp.calib.search import PARTS
 from amiwarp.calib.speed import estimate_rpm
+from amiwarp.calib.thinning import RUN, thin
 from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
