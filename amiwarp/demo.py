@@ -13,8 +13,8 @@ import numpy as np
 
 from amiwarp import metrics
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.calibrate import thin
 from amiwarp.calib.photometric import PhotometricSettings
+from amiwarp.calib.thinning import thin
 from amiwarp.camera import Camera
 from amiwarp.compensate import compensate, compensate_events
 from amiwarp.figures import Reconstructed, draw_demo

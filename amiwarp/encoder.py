@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import TIME_LIMIT, as_times
+from amiwarp.unwrapping import unwrap_angles, unwrap_counts
 from amiwarp.values import array, instance, real, whole
 
 TURN = 2.0 * math.pi
@@ -74,9 +75,9 @@ class Encoder:
 
     @classmethod
     def from_angles(cls, t_us: ArrayLike, angle: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
-        """Samples of an angle [rad], unwrapped or wrapped to a turn (see :func:`unwrap`)."""
+        """Samples of an angle [rad], unwrapped, or wrapped to a turn or to whole turns (see :func:`unwrap_angles`)."""
         t = as_times(t_us)
-        return cls(t, unwrap(t, array(angle, "encoder angle").astype(np.float64), TURN), clock_offset_us)
+        return cls(t, unwrap_angles(t, array(angle, "encoder angle").astype(np.float64)), clock_offset_us)
 
     @classmethod
     def from_counts(
@@ -85,21 +86,24 @@ class Encoder:
         count: ArrayLike,
         *,
         counts_per_turn: int,
+        counter_bits: int | None = None,
         direction: int = 1,
         index_t_us: ArrayLike | None = None,
         clock_offset_us: float = 0.0,
     ) -> Encoder:
-        """Samples of a counter, running on or starting anew each turn; ``direction`` -1 where it counts backwards.
+        """Samples of a counter that runs on, starts anew each turn, or wraps at its width.
 
+        ``counter_bits``: that width, 0 for a counter that starts anew each turn; without it, the counts tell which of
+        these it is, or are refused (see :func:`unwrap_counts`). ``direction``: -1 for a counter that counts backwards.
         Index pulses make the angle absolute: it is a multiple of 2 pi at them (at their median, see :meth:`slip`).
-        Raises :class:`AmiwarpError` for a ``counts_per_turn`` below 1 or a ``direction`` other than 1 and -1.
+        Raises :class:`AmiwarpError` for a ``counts_per_turn`` below 1, a ``direction`` other than 1 and -1, and counts
+        from which the rotation cannot be told.
         """
-        if counts_per_turn < 1:
-            raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; expected the encoder's positive counts per turn")
+        whole(counts_per_turn, "counts_per_turn", 1, 1 << 40)
         if direction not in (1, -1):
             raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
         t = as_times(t_us)
-        counts = unwrap(t, np.asarray(count, np.float64), float(counts_per_turn))
+        counts = unwrap_counts(t, array(count, "encoder count").astype(np.float64), counts_per_turn, counter_bits)
         encoder = cls(t, counts * (direction * TURN / counts_per_turn), clock_offset_us)
         return encoder if index_t_us is None else encoder.with_index(index_t_us)
 
@@ -136,9 +140,13 @@ class Encoder:
 
     def slip(self) -> NDArray[np.float64]:
         """Angle at each index pulse [rad], in -pi .. pi, shape ``(k,)``: 0 throughout where no count was lost."""
+        return _wrap(self.pulse_angles())
+
+    def pulse_angles(self) -> NDArray[np.float64]:
+        """Unwrapped angle at each index pulse [rad], shape ``(k,)``; empty without pulses."""
         if self.index_t is None:
             return np.zeros(0)
-        return _wrap(np.interp(self.index_t - self.t[0], self.t - self.t[0], self.angle))
+        return np.asarray(np.interp(self.index_t - self.t[0], self.t - self.t[0], self.angle))
 
     def angle_at(self, t: ArrayLike) -> NDArray[np.float64]:
         """Unwrapped angle [rad] at event times ``t`` [us], any shape, interpolated linearly.
@@ -349,30 +357,6 @@ class EncoderStream:
             if low < t[-1] and t[0] < high:
                 out[int(np.searchsorted(t, low, side="right")) : int(np.searchsorted(t, high))] = True
         return out
-
-
-def unwrap(t: NDArray[np.int64], value: NDArray[np.float64], period: float) -> NDArray[np.float64]:
-    """Unwrap samples of a periodic value; samples that span more than one period count as unwrapped already.
-
-    Each step is taken as the one nearest to what the median speed predicts, so that a gap of many turns in an otherwise
-    well sampled rotation is bridged right; at least two samples per turn are needed elsewhere.
-    Raises :class:`AmiwarpError` for shapes that differ or values that are not finite.
-    """
-    if value.shape != t.shape or value.ndim != 1:
-        raise AmiwarpError(f"encoder t has shape {t.shape}, its values {value.shape}; expected one length")
-    if not np.isfinite(value).all():
-        at = int(np.argmin(np.isfinite(value)))
-        raise AmiwarpError(f"encoder sample {at} is {value[at]}; expected a finite number")
-    if value.size < 2 or np.ptp(value) > period * (1 + 1e-9):
-        return value
-    interval = np.diff(t).astype(np.float64)
-    if not (interval > 0).all():
-        return value  # Encoder's own check names the sample.
-    step = np.diff(value)
-    step -= period * np.round(step / period)
-    predicted = np.median(step / interval) * interval
-    step += period * np.round((predicted - step) / period)
-    return np.asarray(value[0] + np.concatenate([[0.0], np.cumsum(step)]))
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:

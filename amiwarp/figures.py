@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from amiwarp import clouds
-from amiwarp.calib.calibrate import thin
 from amiwarp.calib.parameters import size_name
 from amiwarp.calib.result import cost_surface
+from amiwarp.calib.thinning import thin
 from amiwarp.io.output import write_text
 from amiwarp.iwe import iwe
 from amiwarp.iwe_files import PERCENTILE, save_png

@@ -58,7 +58,10 @@ class Turning:
         xy = border(camera)
         rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
         moved = [camera.rays_to_pixels(Rotation.from_rotvec(r).apply(rays).astype(np.float32)) for r in rotations]
-        return np.asarray(np.nanmax(np.abs(np.concatenate([np.asarray(m) - xy for m in moved])), axis=0))
+        far = np.abs(np.concatenate([np.asarray(m) - xy for m in moved]))
+        seen = far[np.isfinite(far).all(axis=1)]
+        # turned out of view altogether: by more than the image
+        return seen.max(axis=0) if len(seen) else np.array([camera.width, camera.height], np.float64)
 
 
 def border(camera: Camera) -> NDArray[np.float64]:

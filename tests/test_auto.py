@@ -11,10 +11,10 @@ from scipy.optimize import minimize
 
 from amiwarp.calib import Calibration, Settings, auto
 from amiwarp.calib.auto import calibrate_auto
-from amiwarp.calib.calibrate import thin
 from amiwarp.calib.held_out import halves
 from amiwarp.calib.rungs import Places, encoder_noise, fit, rung_space
 from amiwarp.calib.search import Material
+from amiwarp.calib.thinning import thin
 from amiwarp.calib.trial import FACTOR, make_trial
 from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder

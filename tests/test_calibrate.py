@@ -11,11 +11,12 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.calibrate import RUN, prepare, thin
+from amiwarp.calib.calibrate import prepare
 from amiwarp.calib.checks import edge_coherence
 from amiwarp.calib.parameters import make_space
 from amiwarp.calib.search import PARTS
 from amiwarp.calib.speed import estimate_rpm
+from amiwarp.calib.thinning import RUN, thin
 from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError

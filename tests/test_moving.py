@@ -12,10 +12,10 @@ from conftest import TRUE_PRISM
 from numpy.typing import NDArray
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.calibrate import thin
 from amiwarp.calib.panning import estimate_rates
 from amiwarp.calib.parameters import RATES
 from amiwarp.calib.photometric import PhotometricSettings
+from amiwarp.calib.thinning import thin
 from amiwarp.camera import Camera
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError

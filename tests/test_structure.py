@@ -34,7 +34,7 @@ ORDER = (
     ("values",),
     ("prism",),
     ("kernels", "camera", "multilevel"),
-    ("optics", "events", "encoder", "turning", "machine"),
+    ("optics", "events", "encoder", "unwrapping", "turning", "machine"),
     ("pictures", "motion", "clouds"),
     ("io", "uploads", "link"),
     ("iwe", "peers"),

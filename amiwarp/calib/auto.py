@@ -17,7 +17,7 @@ from amiwarp.calib.objective import padding
 from amiwarp.calib.result import Calibration, Ladder, Rung
 from amiwarp.calib.rungs import fit
 from amiwarp.calib.search import Progress, Settings
-from amiwarp.calib.trial import FACTOR, Trial, by_sharpness, make_trial
+from amiwarp.calib.trial import FACTOR, Trial, by_sharpness, in_pixels, make_trial
 from amiwarp.errors import AmiwarpError
 from amiwarp.iwe import CanvasShape, Votes
 from amiwarp.optics import MODELS, predicted_error
@@ -165,12 +165,11 @@ def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float
     if name == "exact":
         return "the others are measured by it"
     if seen[1] < -trial.tells_px:
-        return (
-            f"sharper on held-out turns than the exact model, by {-seen[1]:.3f} px: is index, flat side or lens wrong?"
-        )
+        by = in_pixels(-seen[1])
+        return f"sharper on held-out turns than the exact model, by {by}: is index, flat side or lens wrong?"
     if predicted <= budget:
         if seen[0] > trial.tells_px:
-            return f"under the budget as predicted, but held-out turns miss what {seen[0]:.3f} px are worth"
+            return f"under the budget as predicted, but held-out turns miss what {in_pixels(seen[0])} are worth"
         return f"under the budget; held-out turns {'agree' if seen[1] <= trial.tells_px else 'cannot tell better'}"
     if seen[1] < budget / FACTOR:
         return "over the budget as predicted, though held-out turns miss nothing"

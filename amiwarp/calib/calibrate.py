@@ -16,15 +16,14 @@ from amiwarp.calib.photometric import refine
 from amiwarp.calib.pixels import Masked, strange_pixels, stretch
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.calib.search import AUTO, Material, Progress, Search, Settings
-from amiwarp.calib.speed import estimate_rpm
+from amiwarp.calib.speed import estimate_rpm, turns_per_turn
+from amiwarp.calib.thinning import thin
 from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import Events, MemoryEvents
 from amiwarp.prism import Prism
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.camera import Camera
     from amiwarp.events import Recording
 
@@ -32,14 +31,14 @@ LINEAR = ("off_ratio", "leak")
 """Names that are free in the photometric stage alone: unknowns of its linear equations."""
 STRANGE_SHARE = 0.01
 """Of the events, that must lie on hot or flickering pixels for these to matter."""
-RUN = 8
-"""Events that stay together where a recording is thinned: a cache line of times."""
 MOVING_TURNS, MOVING_US = 2.1, 100_000.0
 """Length of the window where the camera's motion is free: in turns, or without a prism."""
 LEAST_SHARPNESS_KEPT = 0.7
 """The truth is nearly as sharp as the sharpest (0.93 to 0.99 of the gain, 0.8 with many hot pixels, measured)."""
 STILL_COST, TURNING_GAIN = 0.2, 0.75
 """Where more of the cost remains, the camera may turn; it did where its motion brings that down to this share."""
+LEAST_SCALE_ERROR = 0.003
+"""Of an encoder, relative, that the events tell: three turns tell it to about 0.001 (measured)."""
 
 
 def calibrate(
@@ -70,8 +69,8 @@ def calibrate(
     found = _try(recording, settings, device, progress)
     if recording.encoder is not None and _doubtful(found):
         recording, found = _without_strange(recording, settings, found, device, progress)
-        if settings.free is None and _doubtful(found):
-            found = _turning(recording, settings, found, device, progress)
+        if _doubtful(found):
+            found = _why_doubtful(recording, settings, found, device, progress)
     if isinstance(found, AmiwarpError):
         raise found
     _check_confirmed(found, recording.name)
@@ -126,6 +125,54 @@ def _doubtful(found: Calibration | AmiwarpError) -> bool:
     return found.photometric is not None and found.photometric.cost > STILL_COST
 
 
+def _why_doubtful(
+    recording: Recording,
+    settings: Settings,
+    found: Calibration | AmiwarpError,
+    device: Any,
+    progress: Progress | None,
+) -> Calibration | AmiwarpError:
+    """The answer with the camera's motion free, or ``found``; or the error that the encoder's scale is wrong.
+
+    A slow camera motion explains some of what a wrong scale does to the events, and the reverse, so the cause that
+    leaves less of the cost is named.
+    """
+    scaled = _scaled(recording, settings, found, device, progress)
+    turning = found if settings.free is not None else _turning(recording, settings, found, device, progress)
+    if scaled is None or (turning is not found and _cost(turning) <= scaled[1]):
+        return turning
+    turns, cost = scaled
+    return checks.wrong_scale(recording.name, turns, "the events repeat", _cost(found), cost)
+
+
+def _cost(found: Calibration | AmiwarpError) -> float:
+    return 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
+
+
+def _scaled(
+    recording: Recording,
+    settings: Settings,
+    found: Calibration | AmiwarpError,
+    device: Any,
+    progress: Progress | None,
+) -> tuple[float, float] | None:
+    """Turns of the encoder in which the events repeat, and the cost if that is one turn; None if it explains no more.
+
+    The events of a still scene repeat every turn; if they do so at another angle, the encoder's scale may be wrong.
+    """
+    encoder = recording.encoder
+    assert encoder is not None
+    try:
+        turns = turns_per_turn(recording, encoder)
+    except AmiwarpError:
+        return None  # the events do not repeat: the scene or the camera moves
+    if abs(turns - 1.0) < LEAST_SCALE_ERROR:
+        return None
+    right = replace(encoder, angle=encoder.angle / turns, index_t=None)
+    again = _try(replace(recording, encoder=right), settings, device, progress)
+    return (turns, _cost(again)) if _sure(again) and _cost(again) <= TURNING_GAIN * _cost(found) else None
+
+
 def _turning(
     recording: Recording,
     settings: Settings,
@@ -138,8 +185,7 @@ def _turning(
     turning = _try(recording, replace(settings, free=free), device, progress)
     if isinstance(turning, AmiwarpError) or turning.photometric is None or not turning.photometric.accepted:
         return found
-    still = 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
-    if turning.photometric.cost > TURNING_GAIN * still:
+    if turning.photometric.cost > TURNING_GAIN * _cost(found):
         return found
     speed = math.degrees(math.hypot(*(turning.parameters[n] for n in RATES)))
     # the prism is what the calibration is for; the camera's motion was that of two turns in the middle
@@ -208,7 +254,8 @@ def _second_stage(recording: Recording, search: Search, result: Calibration, pro
     after = search.fine.values(dict(found.parameters))
     kept = (after - result.sharpness_before) / max(result.sharpness_after - result.sharpness_before, 1e-12)
     if found.accepted and kept < LEAST_SHARPNESS_KEPT:
-        verdict = f"keeps only {100 * kept:.0f} % of what sharpness gained: events are missing, or the scene moved"
+        much = f"keeps only {100 * kept:.0f} %" if kept > 0.005 else "keeps nothing"
+        verdict = f"{much} of what sharpness gained: events are missing, or the scene moved"
         found = replace(found, accepted=False, verdict=verdict)
     if found.held:
         vain = f"the events do not determine {', '.join(found.held)}: not moved by the photometric stage"
@@ -232,9 +279,12 @@ def prepare(
     checks.check_events(len(recording.events), name)
     encoders, free = _encoders(recording, settings)
     events = thin(recording, settings.events)
+    if isinstance(recording.events, Masked) and len(events) < settings.events:
+        checks.check_left(len(events), recording.events.mask, name)
     searches = []
     for encoder in encoders:
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
+        checks.check_pulses(encoder, name)
         space = _space(recording, camera, encoder, events, settings, free)
         material = _material(events, encoder, space, _middle(recording), settings.fold)
         if space.sized:
@@ -288,35 +338,6 @@ def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], 
 def _middle(recording: Recording) -> int:
     """Where a change of speed changes the phase least [us]."""
     return (recording.events.t_first + recording.events.t_last) // 2
-
-
-def thin(recording: Recording, most: int) -> Events:
-    """At most ``most`` events, evenly: every k-th run of the recording's; of a file read in blocks."""
-    source = recording.events
-    step = max(1, -(-len(source) // most))
-    if step == 1:
-        return Events.concatenate(list(source.blocks()))
-    if isinstance(source, MemoryEvents):
-        return _runs(source.slice(0, len(source)), step)
-    # blocks of whole periods, so that every run but the last is whole
-    blocks = source.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
-    return Events.concatenate([_runs(block, step) for block in blocks])
-
-
-def _runs(block: Events, step: int) -> Events:
-    """The first of every ``step`` runs, copied, so that the block itself can go."""
-    from amiwarp.kernels.launch import pool
-
-    whole = len(block) // (step * RUN) * step * RUN
-
-    def pick(values: NDArray[Any]) -> NDArray[Any]:
-        runs, rest = values[:whole].reshape(-1, step * RUN)[:, :RUN], values[whole : whole + RUN]
-        out = np.empty(runs.size + rest.size, values.dtype)
-        out[: runs.size].reshape(runs.shape)[:] = runs
-        out[runs.size :] = rest
-        return out
-
-    return Events(*pool().map(pick, (block.x, block.y, block.t, block.p)))
 
 
 def _space(

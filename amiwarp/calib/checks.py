@@ -27,6 +27,11 @@ LARGEST_FROM_NOMINAL = 0.18
 """Relative distance of the prism's size from the nominal one."""
 LARGEST_FLICKER = 0.7
 """Share of the pixels that may see a lamp."""
+LARGEST_DRIFT = 0.02
+"""Turns by which index pulses may drift over a recording."""
+FEWEST_PULSES = 3
+STEADY = 0.2
+"""Of a drift: pulses that lie no further from a line drift steadily."""
 LARGEST_COHERENCE = 0.97
 """Of the edge directions: 0 where all are as frequent, 1 where all edges are parallel."""
 
@@ -40,6 +45,16 @@ def check_events(count: int, name: str) -> None:
         raise AmiwarpError(f"{name}: {count} events are too few to calibrate; record at least {FEWEST_EVENTS}")
 
 
+def check_left(count: int, left_out: NDArray[np.bool_], name: str) -> None:
+    """Enough events must remain without the hot and flickering pixels, True in ``left_out``."""
+    if count < FEWEST_EVENTS:
+        pixels = int(np.count_nonzero(left_out))
+        raise AmiwarpError(
+            f"{name}: {pixels:,} pixels flicker or fire at random, and without them {count} events are left; "
+            f"calibration needs at least {FEWEST_EVENTS}, of edges all over the image that the prism moves"
+        )
+
+
 def check_coverage(encoder: Encoder, t_first: int, t_last: int, name: str) -> None:
     """The encoder must know the angle of every event."""
     if not encoder.covers(t_first, t_last):
@@ -48,6 +63,44 @@ def check_coverage(encoder: Encoder, t_first: int, t_last: int, name: str) -> No
             f"{name}: encoder samples cover {first} .. {last} us, the events {t_first} .. {t_last} us; "
             "record the encoder for as long as the events, or cut the events with a window"
         )
+
+
+def check_pulses(encoder: Encoder, name: str) -> None:
+    """Index pulses must come a turn apart: a steady drift is a wrong scale, counts per turn that are not the encoder's.
+
+    Pulses may be missing, or come too often; what drifts in jumps is lost counts, which is not judged here.
+    """
+    if encoder.index_t is None or len(encoder.index_t) < FEWEST_PULSES:
+        return
+    at = encoder.pulse_angles() / math.tau
+    steps = np.diff(at)
+    turns = float(np.median(np.abs(steps)))
+    if not turns > 0.0:
+        return
+    number = np.concatenate([[0.0], np.cumsum(np.rint(steps / turns))])
+    slope, start = np.polyfit(number, at, 1)
+    drift = abs(abs(slope) - 1.0) * float(np.ptp(number))
+    off = float(np.abs(at - (start + slope * number)).max())
+    # pulses of which every other is missing come a whole number of turns apart
+    whole = abs(turns - max(1.0, round(turns))) * float(np.ptp(number)) <= LARGEST_DRIFT
+    if drift > LARGEST_DRIFT and off <= STEADY * drift and not whole:
+        raise wrong_scale(name, float(abs(slope)), "the index pulses come")
+
+
+def wrong_scale(
+    name: str, turns: float, what: str, cost: float | None = None, scaled: float | None = None
+) -> AmiwarpError:
+    """The error of an encoder in whose ``turns`` the prism turns once; ``what`` says so, costs are shares."""
+    so = (
+        "the encoder slips, or"
+        if cost is None or scaled is None
+        else f"with its angles divided by {turns:.4f} a still camera explains the events ({100 * scaled:.0f} % of the "
+        f"residual remains instead of {100 * min(cost, 1.0):.0f} %):"
+    )
+    return AmiwarpError(
+        f"{name}: {what} every {turns:.4f} turns of the encoder, not every turn; {so} its scale is off by a factor of "
+        f"{turns:.4f}: read its log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
+    )
 
 
 def check_turn(theta: NDArray[np.float64], name: str) -> None:
@@ -90,6 +143,11 @@ def significance(best: NDArray[np.float64], other: NDArray[np.float64]) -> float
     return float(gain.mean()) / max(spread, 1e-12)
 
 
+def _by(sure: float) -> str:
+    """A significance in words; far below 0 its number says nothing."""
+    return f"{sure:.1f} standard deviations" if sure > 0.0 else "it is less sharp, or the same"
+
+
 def check_texture(
     best: NDArray[np.float64], turned: NDArray[np.float64], still: NDArray[np.float64], name: str
 ) -> None:
@@ -100,13 +158,13 @@ def check_texture(
     sure = significance(best, turned)
     if not sure >= LEAST_SIGNIFICANCE:
         raise NotSharp(
-            f"{name}: no motion of a prism makes the image sharper than chance does ({sure:.1f} standard "
-            "deviations): no texture, too few events, or a wrong encoder; show the camera a scene with edges"
+            f"{name}: no motion of a prism makes the image sharper than chance does ({_by(sure)}): "
+            "no texture, too few events, or a wrong encoder; show the camera a scene with edges"
         )
     sure = significance(best, still)
     if not sure >= LEAST_SIGNIFICANCE:
         raise NotSharp(
-            f"{name}: the image is as sharp with no motion taken out ({sure:.1f} standard deviations between them): "
+            f"{name}: the image is as sharp with no motion taken out ({_by(sure)}): "
             "no prism turned, its apex is too small for these events, or the encoder is wrong; record more events"
         )
 

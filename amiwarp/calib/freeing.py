@@ -11,7 +11,7 @@ import numpy as np
 from amiwarp.calib.gauss_newton import LEAST_CURVATURE, UNDETERMINED_PX
 from amiwarp.calib.parameters import MOTION
 from amiwarp.calib.result import Calibration, Freed
-from amiwarp.calib.trial import SURE, Trial
+from amiwarp.calib.trial import FARTHEST_PX, SURE, Trial, in_pixels
 
 if TYPE_CHECKING:
     from amiwarp.calib.search import Settings
@@ -62,13 +62,14 @@ def _judge(trial: Trial, group: str) -> Freed:
     std = float((trial.bend.of(which).deviations()[2:] * longer).max())
     share = float(1.0 / longer.max() ** 2)
     if not (std <= UNDETERMINED_PX and share >= LEAST_CURVATURE):
-        why = f"± {std:.2g} px, {share:.1g} of the largest curvature"
+        how = f"± {std:.2g} px" if std < FARTHEST_PX else f"over ± {FARTHEST_PX:g} px"
+        why = f"{how}, {share:.1g} of the largest curvature"
         return Freed(group, False, False, std, None, f"not determined ({why}): {REMEDY[group]}")
     held, freed = (trial.test.each(space, trial.sharpest(k)) for k in ([0, 1], which))
     _, _, gain = trial.seen(freed - held)
     moved = float(np.linalg.norm(trial.bend.of(which).top()[2:]))
     wins = gain[0] > 0.0 and moved > trial.budget_px
-    worth = f"{max(gain[0], 0.0):.3f} to {max(gain[1], 0.0):.3f} px"
+    worth = f"{max(gain[0], 0.0):.3f} to {in_pixels(max(gain[1], 0.0))}"
     what = f"moved by {moved:.3f} px; held-out turns gain what {worth} are worth"
     return Freed(group, wins, True, std, gain, f"{'freed' if wins else 'held'}: {what}")
 

@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.brightness import BrightnessMap, Tiles
+from amiwarp.brightness import BrightnessMap
+from amiwarp.calib.around import around_optimum
 from amiwarp.calib.gauss_newton import GAUSS_NEWTON, Slopes, determined, iterate
 from amiwarp.calib.objective import reach
 from amiwarp.calib.parameters import LATE, MOTION
 from amiwarp.calib.result import Photometric, StageSummary
 from amiwarp.calib.solve import LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
-from amiwarp.calib.verdict import BESIDE_PX, FAR_PX, verdict
+from amiwarp.calib.tiling import choose_tiles, one_tile
+from amiwarp.calib.verdict import FAR_PX, verdict
 from amiwarp.errors import AmiwarpError
 from amiwarp.pairs import EventTable, PairSet, Sensor, off_excess
 from amiwarp.values import real, whole
@@ -26,15 +28,12 @@ from amiwarp.values import real, whole
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.brightness import Tiles
     from amiwarp.calib.parameters import Space
     from amiwarp.calib.search import Progress, Search
     from amiwarp.encoder import Encoder
     from amiwarp.events import Recording
 
-TILE = 32
-"""Side of a tile of the scene [px]."""
-GRID = (4, 3)
-"""One tile, the busiest, from each of so many columns and rows of the image."""
 MARGIN_PX, MOVING_MARGIN_PX = 3, 8
 """By which the map of a tile is grown: the parameters may move events so far."""
 LONGEST_GAP_US = 60_000
@@ -48,6 +47,8 @@ FIRST_SCALE = 1.0
 """Of Cauchy's weights while the map is cold [thresholds]."""
 FAR_MOVING_PX = 4.0
 """The stage looks no further in the camera's motion from the sharpness optimum than this."""
+RESTARTS = 3
+"""Searches from places that turned out to cost less than the result, at most."""
 FIRST_STEP_PX = 0.2
 POLISH_STEP_PX = 0.05
 SLOPE_PX = 0.02
@@ -79,35 +80,6 @@ class PhotometricSettings:
             whole(getattr(self, name), f"photometric {name}", 1, 10**12)
         real(self.tolerance_px, "photometric tolerance_px", 0.0, 1e3, " px")
         real(self.density, "photometric density", 0.01, 100.0)
-
-
-def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
-    """The busiest cell of :data:`TILE` px from each part of the scene: tile of each pixel (or -1), and the tiles.
-
-    ``image``: of events at the first stage's answer, shape (height, width).
-    """
-    height, width = image.shape
-    columns, rows = max(1, width // TILE), max(1, height // TILE)
-    cells = image[: rows * TILE, : columns * TILE]
-    counts = cells.reshape(rows, cells.shape[0] // rows, columns, cells.shape[1] // columns).sum(axis=(1, 3))
-    tile_of = np.full((height, width), -1, dtype=np.int32)
-    corners: list[tuple[int, int]] = []
-    for part_rows in np.array_split(np.arange(rows), min(GRID[1], rows)):
-        for part_columns in np.array_split(np.arange(columns), min(GRID[0], columns)):
-            part = counts[np.ix_(part_rows, part_columns)]
-            row, column = np.unravel_index(int(part.argmax()), part.shape)
-            x, y = int(part_columns[column]) * TILE, int(part_rows[row]) * TILE
-            tile_of[y : y + TILE, x : x + TILE] = len(corners)
-            corners.append((x - margin, y - margin))
-    side = math.ceil((TILE + 2 * margin) * density) + 2
-    return tile_of, Tiles(np.array(corners, dtype=np.float32), side, side, density)
-
-
-def one_tile(width: int, height: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
-    """The whole image as one tile: where there are few events none is left out."""
-    origin = np.array([[-margin, -margin]], dtype=np.float32)
-    rows, columns = (math.ceil((n + 2 * margin) * density) + 2 for n in (height, width))
-    return np.zeros((height, width), dtype=np.int32), Tiles(origin, rows, columns, density)
 
 
 class _Gatherer:
@@ -214,6 +186,14 @@ class Cost:
         self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
 
+    def renew(self, v: NDArray[np.float64]) -> None:
+        """Forget the map, which remembers where it was fitted, and make another at ``v``."""
+        unknowns = self.brightness.unknowns
+        unknowns[: self.brightness.tiles.nodes] = 0.0
+        self.brightness.unknowns = unknowns
+        self.brightness.place(**self.at(v))
+        self.brightness.solve(FIRST_SCALE, steps=2 * self.steps, rounds=3)
+
     def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
         """Arguments of :meth:`BrightnessMap.place`."""
         values = self.space.to_values(v)
@@ -288,8 +268,7 @@ def refine(
     v = space.to_vector({**space.start, **search.best})
     if held:
         cost.warm_up(v)
-    stage = _search(cost, v, settings, progress)
-    result = _conclude(cost, stage.x, v, left)
+    stage, result = _settle(cost, v, left, settings, progress)
     found = replace(result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held)
     return found, StageSummary.of("photometric", stage, space)
 
@@ -301,7 +280,33 @@ def limits(space: Space, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
     return np.clip(low, v - far, v + far), np.clip(high, v - far, v + far)
 
 
-def _search(cost: Cost, v: NDArray[np.float64], settings: PhotometricSettings, progress: Progress | None) -> Stage:
+def _settle(
+    cost: Cost, v: NDArray[np.float64], left: float, settings: PhotometricSettings, progress: Progress | None
+) -> tuple[Stage, Photometric]:
+    """Searches from the first stage's answer, and again from any place near the result that costs less.
+
+    The map of few events follows a wrong answer so far that no step from there helps: that is no optimum.
+    """
+    stage = _search(cost, v, v, settings, progress)
+    result, around = _conclude(cost, stage.x, v, left)
+    for _ in range(RESTARTS):
+        lower = [place for place, rise in around if rise < 0.0]
+        if not lower:
+            break
+        cost.renew(lower[0])
+        stage = joined(stage, _search(cost, v, lower[0], settings, progress))
+        result, around = _conclude(cost, stage.x, v, left)
+    return stage, result
+
+
+def _search(
+    cost: Cost,
+    v: NDArray[np.float64],
+    start: NDArray[np.float64],
+    settings: PhotometricSettings,
+    progress: Progress | None,
+) -> Stage:
+    """One search from ``start``, in the box about the first stage's answer ``v``."""
     low, high = limits(cost.space, v)
 
     def tell(done: int, budget: int) -> None:
@@ -313,7 +318,7 @@ def _search(cost: Cost, v: NDArray[np.float64], settings: PhotometricSettings, p
         return cost(at)
 
     if settings.algorithm == GAUSS_NEWTON:
-        return iterate(cost.settled, cost.slopes, v, low, high, settings.tolerance_px, tell)
+        return iterate(cost.settled, cost.slopes, start, low, high, settings.tolerance_px, tell)
 
     def run(at: NDArray[np.float64], step: float) -> Stage:
         return maximise(
@@ -321,7 +326,7 @@ def _search(cost: Cost, v: NDArray[np.float64], settings: PhotometricSettings, p
             tolerance=settings.tolerance_px, step=step,
         )  # fmt: skip
 
-    stage = run(v, FIRST_STEP_PX)
+    stage = run(start, FIRST_STEP_PX)
     # the map lags the parameters while they move far: once more from near, with a better map
     cost.steps *= 2
     return joined(stage, run(stage.x, POLISH_STEP_PX))
@@ -343,8 +348,11 @@ def _conclude(
     best: NDArray[np.float64],
     v: NDArray[np.float64],
     left: float,
-) -> Photometric:
-    """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`."""
+) -> tuple[Photometric, list[tuple[NDArray[np.float64], float]]]:
+    """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`.
+
+    Returns the places around, and by how much each costs more, the least first.
+    """
     space = cost.space
     # like with like: the map had longer by now than when the search began
     cost.residuals(v, rounds=2)
@@ -356,10 +364,11 @@ def _conclude(
     asked = np.array([n not in LATE for n in space.names])
     near = np.array([n not in (*LATE, *MOTION) for n in space.names])
     leak, excess = (float(x) for x in cost.brightness.extra)  # before the map follows elsewhere
-    rise = min(_beside(cost, best), default=math.inf) - final
+    around = around_optimum(cost, best, final)
+    rise = around[0][1] if around else math.inf
     ahead = float(np.linalg.norm(slopes.step()[near]))
     accepted, words = verdict(final, rise, float(np.linalg.norm((best - v)[near])), ahead)
-    return Photometric(
+    found = Photometric(
         accepted=accepted,
         verdict=words,
         parameters=space.to_values(best),
@@ -373,17 +382,4 @@ def _conclude(
         off_over_on=1.0 + excess,
         leak=leak,
     )
-
-
-def _beside(cost: Cost, best: NDArray[np.float64]) -> list[float]:
-    """The cost where the orbit is larger, and smaller, by :data:`BESIDE_PX`, the map at its best there."""
-    if cost.space.size_name not in cost.space.names:
-        return []
-    along = np.zeros(len(best))
-    many = 2 if cost.space.cartesian else 1
-    along[:many] = best[:many] / max(float(np.linalg.norm(best[:many])), 1e-9)
-    found = []
-    for side in (BESIDE_PX, -BESIDE_PX):
-        cost.residuals(best + side * along, rounds=2)
-        found.append(cost.mean())
-    return found
+    return found, around

@@ -1,7 +1,9 @@
-"""The prism's speed from the events alone: a still scene repeats itself every turn."""
+"""The prism's speed from the events alone: a still scene repeats itself every turn. And whether an encoder agrees."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -11,6 +13,7 @@ from amiwarp.errors import AmiwarpError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.encoder import Encoder
     from amiwarp.events import Recording
 
 CELL = 8
@@ -22,6 +25,8 @@ LONGEST_US = 3_000_000
 FASTEST_BINS = 5
 """Shortest period sought [bins]: 12,000 rpm."""
 LEAST_CORRELATION = 0.1
+ANGLE_BINS, MOST_TURNS = 96, 24
+"""Bins of a turn, and turns looked at, for comparing an encoder with the events."""
 
 
 def estimate_rpm(recording: Recording) -> float:
@@ -29,27 +34,57 @@ def estimate_rpm(recording: Recording) -> float:
 
     Raises :class:`AmiwarpError` where the events do not repeat, or the recording has under two turns.
     """
-    correlation = autocorrelation(signed_counts(recording))
-    period = _first_period(correlation, recording.name)
-    multiple = 1
-    while 2 * multiple * period < 0.6 * len(correlation):
-        multiple *= 2
-        period = _peak_near(correlation, multiple * period, 0.1 * period) / multiple
-    return 60e6 / (period * BIN_US)
+    counts = signed_counts(recording)
+    if len(counts) < 2 * FASTEST_BINS:
+        raise AmiwarpError(
+            f"{recording.name}: {len(counts) * BIN_US * 1e-3:g} ms of events are too short to find the prism's speed; "
+            "record two turns or more, or give rpm or an encoder"
+        )
+    return 60e6 / (_period(autocorrelation(counts), recording.name) * BIN_US)
+
+
+def turns_per_turn(recording: Recording, encoder: Encoder) -> float:
+    """Turns by the encoder in which the events of a still scene repeat: 1 if the encoder's scale is right.
+
+    Raises :class:`AmiwarpError` if the events do not repeat, or the recording has under two turns.
+    """
+    first, last = _looked_at(recording)
+    covered = encoder.coverage
+    first, last = max(first, covered[0]), min(last, covered[1])
+    last = min(last, first + int(MOST_TURNS * 60e6 / max(abs(encoder.rpm), 1.0)))
+    begin = float(encoder.angle_at(first))
+
+    def bin_of(t: NDArray[np.int64]) -> NDArray[np.int64]:
+        return (np.abs(encoder.angle_at(t) - begin) * (ANGLE_BINS / math.tau)).astype(np.int64)
+
+    counts = _signed_counts(recording, first, last, bin_of)
+    return _period(autocorrelation(counts), recording.name) / ANGLE_BINS
 
 
 def signed_counts(recording: Recording) -> NDArray[np.float32]:
     """ON minus OFF events, shape (bins, cells)."""
+    first, last = _looked_at(recording)
+    return _signed_counts(recording, first, last, lambda t: (t - first) // BIN_US)
+
+
+def _looked_at(recording: Recording) -> tuple[int, int]:
     first = recording.events.t_first
-    last = min(recording.events.t_last, first + LONGEST_US - 1)
+    return first, min(recording.events.t_last, first + LONGEST_US - 1)
+
+
+def _signed_counts(
+    recording: Recording, first: int, last: int, bin_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+) -> NDArray[np.float32]:
+    """ON minus OFF events between two times [us], shape (bins, cells); ``bin_of`` gives the bins of times."""
     width, height = recording.events.size
     columns, rows = -(-width // CELL), -(-height // CELL)
-    bins = (last - first) // BIN_US + 1
+    bins = int(bin_of(np.array([last]))[0]) + 1
     counts = np.zeros(bins * rows * columns, dtype=np.float32)
     for start in range(first, last + 1, 100 * BIN_US):
         e = recording.events.between(start, min(start + 100 * BIN_US, last + 1))
         cell = (e.y // CELL).astype(np.int64) * columns + e.x // CELL
-        flat = (e.t - first) // BIN_US * (rows * columns) + cell
+        # a prism that turns back leads no further than the last bin
+        flat = np.minimum(bin_of(e.t), bins - 1) * (rows * columns) + cell
         counts += np.bincount(flat, weights=2.0 * e.p - 1.0, minlength=len(counts)).astype(np.float32)
     return counts.reshape(bins, rows * columns)
 
@@ -63,6 +98,16 @@ def autocorrelation(counts: NDArray[np.float32]) -> NDArray[np.float64]:
     raw = np.fft.irfft(power)[: max(2, 3 * n // 4)]
     unbiased = raw / (n - np.arange(len(raw)))
     return cast("NDArray[np.float64]", unbiased / max(unbiased[0], 1e-30))
+
+
+def _period(correlation: NDArray[np.float64], name: str) -> float:
+    """First period of a correlation [bins], refined at its multiples."""
+    period = _first_period(correlation, name)
+    multiple = 1
+    while 2 * multiple * period < 0.6 * len(correlation):
+        multiple *= 2
+        period = _peak_near(correlation, multiple * period, 0.1 * period) / multiple
+    return period
 
 
 def _first_period(correlation: NDArray[np.float64], name: str) -> float:

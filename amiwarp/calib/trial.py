@@ -29,6 +29,8 @@ FACTOR = 2.0
 """To which sharpness tells pixels: it counts an error where the edges are, and across them."""
 BIAS_PX = 0.1
 """Sharpness prefers parameters that are off by about so much, so that motion which costs less says nothing."""
+FARTHEST_PX = 3.0
+"""A loss of sharpness is not converted to more motion than this: the curvature holds only near the optimum."""
 ROOM = {"clock_offset": 20_000.0, "tilt_x": math.radians(15.0), "tilt_y": math.radians(15.0), "index": 0.4}
 """Half width of what is tried of each parameter that may be freed."""
 
@@ -81,12 +83,23 @@ class Trial:
     def seen(self, loss: Vector) -> tuple[float, float, tuple[float, float]]:
         """Mean of a loss of sharpness over disjoint parts, its deviation, and what motion [px rms] the two amount to.
 
-        By the curvature; negative where it is a gain.
+        By the curvature; negative if it is a gain. At most :data:`FARTHEST_PX` either way, and both of these if
+        sharpness is not curved.
         """
         mean, std = float(loss.mean()), float(loss.std(ddof=1)) / math.sqrt(len(loss))
-        bend = max(self.bend.of([0, 1]).curvature, 1e-12)
-        low, high = (math.copysign(math.sqrt(2.0 * abs(x) / bend), x) for x in (mean - SURE * std, mean + SURE * std))
+        bend = self.bend.of([0, 1]).curvature
+        if not bend > 0.0:
+            return mean, std, (-FARTHEST_PX, FARTHEST_PX)
+        low, high = (
+            math.copysign(min(math.sqrt(2.0 * abs(x) / bend), FARTHEST_PX), x)
+            for x in (mean - SURE * std, mean + SURE * std)
+        )
         return mean, std, (low, high)
+
+
+def in_pixels(px: float) -> str:
+    """Motion in words: its size, or that it is beyond what sharpness can tell."""
+    return f"{px:.3f} px" if px < FARTHEST_PX else f"more than {FARTHEST_PX:g} px"
 
 
 def make_trial(
@@ -99,7 +112,8 @@ def make_trial(
     budget_px: float | None,
 ) -> Trial:
     """Both halves of the events on the device, and the sharpness about the exact answer; ``names``: what to try."""
-    from amiwarp.calib.calibrate import moving_window, thin
+    from amiwarp.calib.calibrate import moving_window
+    from amiwarp.calib.thinning import thin
 
     events = thin(moving_window(recording, settings), settings.events)
     first, last = int(events.t[0]), int(events.t[-1])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import Advance, choose_device, progress, report, table
-from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, number, span
+from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, interval, number, span
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.sharpness import Sharpness
@@ -143,7 +143,7 @@ class ParameterOptions:
     bound: Annotated[
         list[str] | None,
         typer.Option(
-            help="Bounds of a free parameter, as phase=-10deg:10deg; can be given more than once.",
+            help="Bounds of a free parameter, as phase=-10:10deg; can be given more than once.",
             metavar="NAME=LOW:HIGH",
             rich_help_panel=_PARAMETERS,
         ),
@@ -160,12 +160,7 @@ class ParameterOptions:
     def changes(self) -> dict[str, Any]:
         """Fields of the settings that were given. Raises :class:`AmiwarpError` for names and values that are none."""
         start = {name: number(text, unit, f"--start {name}") for name, unit, text in map(_named, self.start or ())}
-        bounds = {}
-        for name, unit, text in map(_named, self.bound or ()):
-            low, colon, high = text.partition(":")
-            if not colon:
-                raise AmiwarpError(f"--bound {name}: {text!r} has no colon; write {name}=LOW:HIGH")
-            bounds[name] = (number(low, unit, f"--bound {name}"), number(high, unit, f"--bound {name}"))
+        bounds = {name: interval(text, unit, f"--bound {name}") for name, unit, text in map(_named, self.bound or ())}
         if self.rpm is not None:
             start["rpm"] = self.rpm
         free = None if self.free is None else tuple(name.strip() for name in self.free.split(",") if name.strip())
@@ -334,8 +329,10 @@ def _exact(ladder: Ladder) -> list[str]:
 
 
 def _range(px: tuple[float, float]) -> str:
+    from amiwarp.calib.trial import in_pixels
+
     low, high = (max(x, 0.0) for x in px)
-    return f"{low:.3f} to {high:.3f} px"
+    return f"{low:.3f} to {in_pixels(high)}"
 
 
 def _photometric(c: Calibration) -> list[str]:
@@ -348,5 +345,8 @@ def _photometric(c: Calibration) -> list[str]:
 def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:
     angle = entry["unit"].startswith("rad")
     scale = 180.0 / math.pi if angle else 1.0
-    std = f"{entry['std'] * scale:.2g}" if "std" in entry else "" if entry["free"] else "given"
+    std = "" if entry["free"] else "given"
+    if "std" in entry:
+        whole_turn = entry["unit"] == "rad" and entry["std"] > math.pi
+        std = "undetermined" if whole_turn else f"{entry['std'] * scale:.2g}"
     return f"{entry['value'] * scale:.6g}", std, entry["unit"].replace("rad", "deg")

@@ -37,6 +37,16 @@ class EncoderOptions:
     counts_per_turn: Annotated[
         int | None, typer.Option(min=1, help="Counts of the encoder per turn.", rich_help_panel=_PANEL)
     ] = None
+    counter_bits: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=64,
+            help="Width of the encoder's counter, 0 for a counter that starts anew each turn. "
+            "Default: found in the counts.",
+            rich_help_panel=_PANEL,
+        ),
+    ] = None
     direction: Annotated[
         Literal["1", "-1"], typer.Option(help="-1 where the encoder counts backwards.", rich_help_panel=_PANEL)
     ] = "1"
@@ -44,12 +54,18 @@ class EncoderOptions:
     def build(self) -> Encoder | None:
         """The encoder of the log, or None where none is given."""
         if self.encoder is None:
-            if self.counts_per_turn is not None or self.direction != "1":
-                raise AmiwarpError("--counts-per-turn and --direction describe an encoder log; give --encoder too")
+            if self != EncoderOptions():
+                what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
+                raise AmiwarpError(f"{what}; give --encoder too")
             return None
         from amiwarp.io import read_encoder_csv
 
-        return read_encoder_csv(self.encoder, counts_per_turn=self.counts_per_turn, direction=int(self.direction))
+        return read_encoder_csv(
+            self.encoder,
+            counts_per_turn=self.counts_per_turn,
+            counter_bits=self.counter_bits,
+            direction=int(self.direction),
+        )
 
 
 def run(

@@ -134,19 +134,34 @@ FORMS = {
 
 
 def number(text: str, unit: str, name: str) -> float:
-    """A value such as ``1.2deg``; angles need their unit. Raises :class:`AmiwarpError`.
+    """A value such as ``1.2deg``; angles other than 0 need their unit. Raises :class:`AmiwarpError`.
 
     ``unit``: the parameter's own, as in ``amiwarp.calib.parameters.UNITS``.
     """
-    kinds, form = FORMS[unit]
-    suffix = next((k for k in kinds if text.strip().endswith(k)), "")
+    form, suffix = FORMS[unit][1], _suffix(text, unit)
     try:
         value = float(text.strip().removesuffix(suffix))
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or (unit.startswith("rad") and not suffix):
+    if not math.isfinite(value) or (value and unit.startswith("rad") and not suffix):
         raise AmiwarpError(f"{name}: {text!r} is not a value; write it like {form}")
     return value * SCALES.get(suffix, 1.0)
+
+
+def interval(text: str, unit: str, name: str) -> tuple[float, float]:
+    """``LOW:HIGH`` such as ``-10:10deg``: the lower end takes the unit of the upper one if it has none.
+
+    ``unit`` as of :func:`number`. Raises :class:`AmiwarpError`.
+    """
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise AmiwarpError(f"{name}: {text!r} has no colon; write LOW:HIGH, as 0:{FORMS[unit][1].partition(' ')[0]}")
+    shared = "" if _suffix(low, unit) else _suffix(high, unit)
+    return number(low.strip() + shared, unit, name), number(high, unit, name)
+
+
+def _suffix(text: str, unit: str) -> str:
+    return next((k for k in FORMS[unit][0] if text.strip().endswith(k)), "")
 
 
 def numbers(text: str, count: int, name: str) -> tuple[float, ...]:

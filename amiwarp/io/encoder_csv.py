@@ -12,15 +12,21 @@ from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name
 from amiwarp.regular import check_regular
+from amiwarp.unwrapping import UnwrapError
 
 
 def read_encoder_csv(
-    path: str | os.PathLike[str], *, counts_per_turn: int | None = None, direction: int = 1
+    path: str | os.PathLike[str],
+    *,
+    counts_per_turn: int | None = None,
+    counter_bits: int | None = None,
+    direction: int = 1,
 ) -> Encoder:
     """Read an encoder log; its header names the columns, in any order.
 
     ``t_us``: time [us], strictly increasing. ``angle_deg``: angle [deg], wrapped or not; or ``count``: the counter,
-    which needs ``counts_per_turn``. ``index``: 1 in the samples at the index pulse, which becomes angle 0.
+    which needs ``counts_per_turn``, and its width in ``counter_bits`` if its wraps do not tell it (see
+    :meth:`Encoder.from_counts`). ``index``: 1 in the samples at the index pulse, which becomes angle 0.
     ``direction`` -1 turns the sign. Raises :class:`AmiwarpError` naming the file and line for anything else.
     """
     path = Path(path)
@@ -33,7 +39,10 @@ def read_encoder_csv(
         if late.size:
             line = lines[int(late[0]) + 1]
             raise AmiwarpError(f"{path}: line {line}: t_us is not later than in the line before; sort and deduplicate")
-        encoder = _encoder(path, columns, t, counts_per_turn, direction)
+        try:
+            encoder = _encoder(path, columns, t, counts_per_turn, counter_bits, direction)
+        except UnwrapError as error:
+            raise AmiwarpError(f"{path}: line {lines[error.sample]}: {error.problem}") from error
         if "index" not in columns:
             return encoder
         bad = np.flatnonzero((columns["index"] != 0) & (columns["index"] != 1))
@@ -50,12 +59,17 @@ def _encoder(
     columns: dict[str, NDArray[np.float64]],
     t: NDArray[np.int64],
     counts_per_turn: int | None,
+    counter_bits: int | None,
     direction: int,
 ) -> Encoder:
     if "count" in columns:
         if counts_per_turn is None:
             raise AmiwarpError(f"{path}: holds counts; give counts_per_turn")
-        return Encoder.from_counts(t, columns["count"], counts_per_turn=counts_per_turn, direction=direction)
+        return Encoder.from_counts(
+            t, columns["count"], counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
+        )
+    if counter_bits is not None:
+        raise AmiwarpError(f"{path}: holds angles, which no counter_bits apply to; leave counter_bits out")
     if direction not in (1, -1):
         raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
     return Encoder.from_angles(t, direction * np.radians(columns["angle_deg"]))

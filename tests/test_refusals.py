@@ -1,0 +1,200 @@
+"""What a recording cannot tell is refused with the reason: encoders of a wrong scale, and events of no use."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import TRUE_PRISM
+
+from amiwarp.calib import calibrate
+from amiwarp.calib.calibrate import prepare
+from amiwarp.calib.checks import check_pulses, check_texture
+from amiwarp.calib.search import Settings
+from amiwarp.calib.speed import turns_per_turn
+from amiwarp.calib.trial import FARTHEST_PX, in_pixels
+from amiwarp.calib.verdict import verdict
+from amiwarp.camera import Camera
+from amiwarp.cli.inputs import interval, number
+from amiwarp.encoder import TURN, Encoder
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.motion import CameraMotion
+from amiwarp.optics import Prism
+from amiwarp.simulate import simulate
+
+WIDTH, HEIGHT, LENGTH_US = 96, 72, 500_000
+CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(50.0))
+
+
+def scaled(recording: Recording, factor: float) -> Recording:
+    assert recording.encoder is not None
+    return replace(recording, encoder=Encoder(recording.encoder.t, recording.encoder.angle * factor))
+
+
+# -- an encoder whose scale is wrong
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.024])
+def test_a_wrong_scale_is_found_in_the_events(recording: Recording, factor: float) -> None:
+    """It was taken for a camera that turns slowly, or confirmed."""
+    with pytest.raises(AmiwarpError, match=r"a still camera explains the events.*counts_per_turn") as caught:
+        calibrate(scaled(recording, factor), model="exact")
+    assert float(str(caught.value).rpartition(" times ")[2]) == pytest.approx(factor, abs=0.002)
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.024, 0.5])
+def test_a_wrong_scale_is_found_at_the_index_pulses(recording: Recording, factor: float) -> None:
+    assert recording.encoder is not None
+    true = recording.encoder
+    turns = np.arange(math.ceil(true.angle[0] / TURN), math.floor(true.angle[-1] / TURN) + 1)
+    pulses = np.interp(turns * TURN, true.angle, true.t).astype(np.int64)
+    assert len(pulses) >= 3
+    good = replace(recording, encoder=true.with_index(pulses))
+    prepare(good, Settings())
+    wrong = replace(recording, encoder=Encoder(true.t, true.angle * factor).with_index(pulses))
+    with pytest.raises(AmiwarpError, match=rf"index pulses come every {factor:.2f}.*counts_per_turn"):
+        calibrate(wrong)
+
+
+def test_pulses_that_are_missing_or_counts_that_are_lost_are_no_scale() -> None:
+    encoder = Encoder.constant_speed(720.0, 0, 1_000_000)
+    pulses = np.arange(1, 12) * 250_000 // 3
+    check_pulses(encoder.with_index(np.delete(pulses, [3, 4, 8])), "missing")
+    check_pulses(encoder.with_index(pulses[::2]), "every other")
+    lost = Encoder(encoder.t, encoder.angle - np.where(encoder.t > 400_000, 1.0, 0.0))
+    check_pulses(lost.with_index(pulses), "lost")
+    with pytest.raises(AmiwarpError, match=r"every 0\.99"):
+        check_pulses(Encoder(encoder.t, encoder.angle * 0.99).with_index(np.delete(pulses, [3, 8])), "scale")
+
+
+@pytest.mark.parametrize("rate", [10.0, 40.0])
+def test_a_turning_camera_is_no_wrong_scale(texture: np.ndarray, rate: float) -> None:
+    camera = Camera.from_fov(200, 150, math.radians(50))
+    turning = CameraMotion((0.0, math.radians(rate), 0.0))
+    recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.25, camera_motion=turning, seed=2)
+    found = calibrate(recording, model="exact", events=150_000)
+    assert any(f"turned at {rate:.1f} deg/s" in w for w in found.warnings)
+
+
+def test_the_events_repeat_once_a_turn_of_a_good_encoder(recording: Recording) -> None:
+    assert recording.encoder is not None
+    for factor in (0.5, 0.98, 1.0, 1.024, 2.0):
+        wrong = scaled(recording, factor)
+        assert wrong.encoder is not None
+        assert turns_per_turn(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
+
+
+# -- events of no use
+
+
+def events(x: object, y: object, t: object, p: object) -> Events:
+    n = max(map(np.size, (x, y, t, p)))  # type: ignore[arg-type]
+    columns = [np.broadcast_to(np.asarray(a), n) for a in (x, y, np.sort(np.asarray(t)), p)]
+    return Events(*(a.astype(kind) for a, kind in zip(columns, ("u2", "u2", "i8", "u1"), strict=True)))
+
+
+def scattered(n: int, width: int = WIDTH, height: int = HEIGHT, length_us: int = LENGTH_US) -> list[np.ndarray]:
+    rng = np.random.default_rng(n)
+    return [rng.integers(0, most, n) for most in (width, height, length_us, 2)]
+
+
+def flicker() -> Events:
+    """A still scene whose every eighth pixel fires at each of 40 flashes, ON and OFF in turn."""
+    at = np.arange(WIDTH * HEIGHT // 8) * 8
+    flashes = np.repeat(np.arange(40), len(at))
+    return events(np.tile(at % WIDTH, 40), np.tile(at // WIDTH, 40), flashes * 12_500, flashes % 2)
+
+
+def row() -> Events:
+    at = np.arange(20_000)
+    return events(at % WIDTH, 30, at * 25, at // WIDTH % 2)
+
+
+N = 20_000
+USELESS: dict[str, Callable[[], Events]] = {
+    **{f"{n} events": lambda n=n: events(*scattered(n)) for n in (0, 1, 2, 10)},
+    "one pixel": lambda: events(40, 30, *scattered(N)[2:]),
+    "a pixel that alternates": lambda: events(40, 30, np.arange(N) * 25, np.arange(N) % 2),
+    "a corner": lambda: events(0, 0, *scattered(N)[2:]),
+    "one time": lambda: events(*scattered(N)[:2], np.full(N, 5000), scattered(N)[3]),
+    "one polarity": lambda: events(*scattered(N)[:3], 1),
+    "one row": row,
+    "one row at random": lambda: events(scattered(N)[0], 30, *scattered(N)[2:]),
+    "noise": lambda: events(*scattered(N)),
+    "a moment": lambda: events(*scattered(N, length_us=200)),
+    "a block": lambda: events(40 + scattered(N, 4)[0], 30 + scattered(N, 4, 4)[1], *scattered(N)[2:]),
+    "flicker": flicker,
+}
+ENCODERS: dict[str, Callable[[], Encoder | None]] = {
+    "good": lambda: Encoder.constant_speed(720.0, -2000, LENGTH_US + 2000),
+    "none": lambda: None,
+    "two samples": lambda: Encoder(np.array([-10, LENGTH_US + 10]), np.array([0.0, 40.0])),
+    "still": lambda: Encoder.constant_speed(0.0, -2000, LENGTH_US + 2000),
+    "a part": lambda: Encoder.constant_speed(720.0, 100_000, 200_000),
+    "creeping": lambda: Encoder.constant_speed(1e-3, -2000, LENGTH_US + 2000),
+}
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+@pytest.mark.parametrize("what", USELESS)
+def test_events_of_no_use_are_refused_with_a_reason(what: str, encoder: str) -> None:
+    made = MemoryEvents(USELESS[what](), WIDTH, HEIGHT)
+    recording = Recording(made, CAMERA, ENCODERS[encoder](), Prism(math.radians(2.0)), name="recording")
+    with pytest.raises(AmiwarpError, match=r"^recording: ") as caught:
+        calibrate(recording)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("what", ["one pixel", "flicker", "one row at random"])
+def test_pixels_that_flicker_are_named(what: str) -> None:
+    made = MemoryEvents(USELESS[what](), WIDTH, HEIGHT)
+    recording = Recording(made, CAMERA, ENCODERS["good"](), Prism(math.radians(2.0)), name="recording")
+    with pytest.raises(AmiwarpError, match=r"flicker or fire at random, and without them \d+ events are left"):
+        calibrate(recording)
+
+
+def test_a_motion_that_turns_all_out_of_view_is_refused() -> None:
+    made = MemoryEvents(USELESS["one pixel"](), WIDTH, HEIGHT)
+    recording = Recording(made, CAMERA, None, Prism(math.radians(2.0)), name="recording")
+    with pytest.raises(AmiwarpError, match=r"^recording: "):
+        calibrate(recording, free=("apex", "phase", "motion", "rpm"), local_evaluations=40, global_evaluations=20)
+
+
+# -- numbers out of their range are not printed
+
+
+def test_words_for_numbers_that_mean_nothing() -> None:
+    assert in_pixels(0.25) == "0.250 px"
+    assert in_pixels(27_431.659) == f"more than {FARTHEST_PX:g} px"
+    assert "over 1.5 px" in verdict(0.1, 0.1, 0.1, 3e5)[1]
+    assert "100 %" in verdict(1.7, 0.1, 0.1, 0.0)[1]
+    assert "explains the events better" in verdict(0.1, -0.02, 0.1, 0.0)[1]
+    assert "0.4 % of the residual more" in verdict(0.1, 0.004, 0.1, 0.0)[1]
+    worse = np.linspace(0.0, 1.0, 8)
+    with pytest.raises(AmiwarpError, match="it is less sharp, or the same"):
+        check_texture(worse, worse + 3.0, worse, "recording")
+
+
+@pytest.mark.parametrize(
+    ("text", "low", "high"),
+    [
+        ("0:4deg", 0.0, math.radians(4.0)),
+        ("-10:10deg", -math.radians(10.0), math.radians(10.0)),
+        ("-0.2rad:10deg", -0.2, math.radians(10.0)),
+        ("-1deg:0", -math.radians(1.0), 0.0),
+        (" 1 : 2 rad", 1.0, 2.0),
+    ],
+)
+def test_bounds_share_a_unit_and_zero_needs_none(text: str, low: float, high: float) -> None:
+    assert interval(text, "rad", "--bound apex") == pytest.approx((low, high))
+
+
+def test_bounds_that_are_none() -> None:
+    assert number("0", "rad", "--start phase") == 0.0
+    assert number("0", "rad/s", "--start rate_x") == 0.0
+    assert interval("-5:5ms", "us", "--bound clock_offset") == (-5000.0, 5000.0)
+    for text in ("1:4", "1deg:4", "4deg", ":4deg", "nan:4deg", "0:infdeg"):
+        with pytest.raises(AmiwarpError, match="--bound apex: "):
+            interval(text, "rad", "--bound apex")
