@@ -230,8 +230,8 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
 
 def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
     """End a command ``count`` times."""
-    out = emptied(folder)
-    seconds, expected, _ = whole_run(name, inputs, out)
+    whole_run(name, inputs, emptied(folder))  # compiles
+    seconds, expected, _ = whole_run(name, inputs, emptied(folder))
     before = digest(inputs)
     ended: Counter[str] = Counter()
     problems, longest, unfinished = [], 0.0, 0
