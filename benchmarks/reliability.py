@@ -222,7 +222,7 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
     NewFile(out / "next").discard()
     wrong += [f"{f.name} outlived the next run" for f in out.iterdir() if f.name in unfinished]
     # -number: Python was starting, or all was done and it was ending
-    if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number}):
+    if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number, -signal.SIGINT}):
         wrong.append(f"exit status {code}")
     ended = "finished" if set(expected) <= there else "cut short" if there - unfinished else "nothing"
     return ended, wrong
