@@ -6,7 +6,7 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from http.client import HTTPConnection
 from typing import Any
@@ -15,22 +15,30 @@ from urllib.parse import urlsplit
 import pytest
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.viewer.gate import Check, number
 from amiwarp.viewer.serve import Session, serve
 
 pytest.importorskip("trame_vuetify")
 TOKEN = "s3cret & more"
-WAIT_S = 30.0
+WAIT_S = 120.0
+"""For what takes no second on a machine that does nothing else."""
+COUNT = {"count": number()}
 
 
 @contextmanager
-def served(build: Session) -> Iterator[tuple[str, asyncio.AbstractEventLoop]]:
+def served(
+    build: Session, settable: Mapping[str, Check] = COUNT, **more: Any
+) -> Iterator[tuple[str, asyncio.AbstractEventLoop]]:
     """Serves in a thread; gives the URL and the event loop."""
     urls: list[str] = []
     started: list[tuple[asyncio.AbstractEventLoop, asyncio.Task[None]]] = []
     listening = threading.Event()
 
     async def main() -> None:
-        task = asyncio.ensure_future(serve(build, token=TOKEN, ready=lambda url: (urls.append(url), listening.set())))
+        serving = serve(
+            build, settable=settable, token=TOKEN, ready=lambda url: (urls.append(url), listening.set()), **more
+        )
+        task = asyncio.ensure_future(serving)
         started.append((asyncio.get_running_loop(), task))
         await asyncio.wait([task])
 
@@ -120,7 +128,7 @@ def test_files_outside_are_not_found(path: str) -> None:
 
 def test_an_empty_token_is_refused() -> None:
     with pytest.raises(AmiwarpError, match="token is empty"):
-        asyncio.run(serve(Counters(), token=""))
+        asyncio.run(serve(Counters(), settable=COUNT, token=""))
 
 
 def test_tabs_have_states_of_their_own_and_are_forgotten(browser: Any, capfd: pytest.CaptureFixture[str]) -> None:

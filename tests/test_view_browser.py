@@ -27,6 +27,7 @@ from amiwarp.simulate import simulate
 from amiwarp.viewer import jobs
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.layout import KEYS
+from amiwarp.viewer.values import SETTABLE
 
 pytest.importorskip("trame_vuetify")
 APEX_DEG, NOMINAL_DEG, RPM = 1.0, 1.2, 720.0
@@ -101,7 +102,7 @@ class Tabs:
 @pytest.fixture(scope="module")
 def tabs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tabs]:
     build = Tabs(tmp_path_factory.mktemp("exports"))
-    with served(build) as (build.url, build.loop):
+    with served(build, SETTABLE) as (build.url, build.loop):
         yield build
 
 

@@ -70,7 +70,7 @@ class Calibrating:
         settings = Settings(start={} if inspector.has_encoder or not rpm else {"rpm": rpm})
         try:
             async with panel.warp:
-                found = await asyncio.to_thread(
+                found = await panel.in_thread(
                     calibrate, inspector.recording, settings, device=inspector.device, progress=tell
                 )
             if self._cancelled:
@@ -108,7 +108,7 @@ class Playing:
     """The panel's window moving through the recording, on the page or into a film."""
 
     def __init__(self, panel: Panel) -> None:
-        self._panel, self._ended = panel, False
+        self._panel, self._ended, self._runs = panel, False, False
 
     def end(self) -> None:
         """Also of a film that is being written."""
@@ -118,12 +118,18 @@ class Playing:
         """Runs through the recording from here, or follows a live stream, or stops."""
         state = self._panel.state
         state.playing = not state.playing
-        if state.playing and self._panel.inspector.latest is not None:
-            self._panel.begin(self._follow())
-        elif state.playing:
-            if self._panel.move(float(state.start_ms)):  # at the end: from the beginning
-                self._panel.move(0.0)
-            self._panel.begin(self._run())
+        if not state.playing or self._runs:
+            return
+        if self._panel.inspector.latest is None and self._panel.move(float(state.start_ms)):
+            self._panel.move(0.0)  # at the end: from the beginning
+        self._runs = True
+        self._panel.begin(self._play())
+
+    async def _play(self) -> None:
+        try:
+            await (self._run() if self._panel.inspector.latest is None else self._follow())
+        finally:
+            self._runs = False
 
     async def _run(self) -> None:
         panel, state, loop = self._panel, self._panel.state, asyncio.get_running_loop()
@@ -159,6 +165,8 @@ class Playing:
     async def _film(self, what: str, frames: Callable[[], Iterator[NDArray[np.uint8]]]) -> None:
         """Drawn one by one in this loop, which serves the pages in between, and written in a thread."""
         panel, state, loop, pictures = self._panel, self._panel.state, asyncio.get_running_loop(), frames()
+        if state.busy:
+            return
 
         async def draw() -> NDArray[np.uint8] | None:
             await panel.settled()
@@ -176,8 +184,8 @@ class Playing:
             state.update({"busy": f"writing the {what}", "progress": 0})
         try:
             with panel.reported("export"):
-                path = panel.path(f".{what}.mp4")
-                count = await asyncio.to_thread(save_film, drawn(), path, fps=FPS)
+                path = panel.path(what, ".mp4", ".gif")
+                count = await panel.in_thread(save_film, drawn(), path, fps=FPS)
                 panel.say(f"{path}: {count} frames written", "success")
             panel.server.controller.view_update()
         finally:
