@@ -48,6 +48,13 @@ def reachable(host: str) -> str:
         return socket.gethostname()
 
 
+def address(host: str, port: int, token: str) -> str:
+    """Return what to open in a browser."""
+    from yarl import URL
+
+    return str(URL.build(scheme="http", host=reachable(host), port=port, path="/") % {"token": token})
+
+
 def warning(host: str) -> str | None:
     """Return what to say before others can reach the server; None if only this machine can."""
     if is_local(host):
@@ -66,7 +73,7 @@ class Names:
         if not is_local(host):
             own = socket.gethostname().lower()
             names |= {own, f"{own}.local", own.partition(".")[0]}
-        self._names = LOCAL | (names - ANYWHERE.keys())
+        self.known = LOCAL | (names - ANYWHERE.keys())
 
     def are_of(self, request: web.Request) -> bool:
         """Return whether the request is for this server, under a name it has or the address at which it arrived."""
@@ -77,7 +84,7 @@ class Names:
         except ValueError:
             return False
         arrived = request.transport.get_extra_info("sockname") if request.transport is not None else None
-        return asked in self._names or (arrived is not None and asked == plain(str(arrived[0])))
+        return asked in self.known or (arrived is not None and asked == plain(str(arrived[0])))
 
 
 def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:

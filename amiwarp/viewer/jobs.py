@@ -108,7 +108,9 @@ class Playing:
     """The panel's window moving through the recording, on the page or into a film."""
 
     def __init__(self, panel: Panel) -> None:
-        self._panel, self._ended, self._runs = panel, False, False
+        self._panel, self._ended = panel, False
+        self.runs = False
+        """Until it has noticed that it was stopped, too."""
 
     def end(self) -> None:
         """Also of a film that is being written."""
@@ -118,18 +120,18 @@ class Playing:
         """Runs through the recording from here, or follows a live stream, or stops."""
         state = self._panel.state
         state.playing = not state.playing
-        if not state.playing or self._runs:
+        if not state.playing or self.runs:
             return
         if self._panel.inspector.latest is None and self._panel.move(float(state.start_ms)):
             self._panel.move(0.0)  # at the end: from the beginning
-        self._runs = True
+        self.runs = True
         self._panel.begin(self._play())
 
     async def _play(self) -> None:
         try:
             await (self._run() if self._panel.inspector.latest is None else self._follow())
         finally:
-            self._runs = False
+            self.runs = False
 
     async def _run(self) -> None:
         panel, state, loop = self._panel, self._panel.state, asyncio.get_running_loop()

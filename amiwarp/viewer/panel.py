@@ -81,7 +81,7 @@ class Panel:
             self.playing.toggle()
 
     def close(self) -> None:
-        """Ends what is going on; its threads end with what they are at."""
+        """Ends what is going on; its threads end with their work."""
         self.calibrating.cancel()
         self.playing.end()
         for task in [*self._tasks, *filter(None, [self._quick, self._slow])]:
@@ -140,7 +140,9 @@ class Panel:
         self.ask("view")
 
     def step(self, turns: float) -> None:
-        """Moves the window on by turns, or by its own length where no prism turns."""
+        """Moves the window by a turn on (1) or back (-1), or by its own length where no prism turns."""
+        if turns not in (-1, 1):
+            return
         turn = self.inspector.turn_us * 1e-3
         self.move(float(self.state.start_ms) + turns * (turn if math.isfinite(turn) else float(self.state.length_ms)))
         self.ask("window")

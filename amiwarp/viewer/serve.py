@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.frames import Frames
 from amiwarp.viewer.gate import MOST_BYTES, Check, Gate
-from amiwarp.viewer.hosts import ANYWHERE, Names, cannot_serve, plain, reachable
+from amiwarp.viewer.hosts import ANYWHERE, Names, address, cannot_serve, plain
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -29,7 +29,7 @@ Closing = Callable[[], object] | None
 Session = Callable[[Any], Closing]
 """Builds the page on a fresh ``trame_server.Server`` (vue3), in the event loop; gives what to run at the end."""
 MOST_TABS = 16
-"""Open at a time: each holds a scene, its window of the recording and threads, some 90 MiB in all."""
+"""Open at a time: each holds a scene, a window of the recording and threads."""
 FULL = f"{MOST_TABS} tabs of this inspector are open, and it takes no more; close one, then reload this page"
 HEARTBEAT_S = 30.0
 """After which a page is asked whether it is there; it has half that time to answer, then it is closed."""
@@ -55,7 +55,6 @@ async def serve(
     Raises AmiwarpError for an empty token, and for a host or a port that cannot be served.
     """
     from aiohttp import web
-    from yarl import URL
 
     if not token:
         raise AmiwarpError("the token is empty: expected a secret, for example secrets.token_urlsafe()")
@@ -70,9 +69,8 @@ async def serve(
         except OSError as error:
             raise cannot_serve(error, host, port) from error
         bound, number = runner.addresses[0][:2]
-        shown = reachable(bound if bound in ANYWHERE else host)
         if ready is not None:
-            ready(str(URL.build(scheme="http", host=shown, port=number, path="/") % {"token": token}))
+            ready(address(bound if bound in ANYWHERE else host, number, token))
         await asyncio.Event().wait()
     finally:
         await runner.cleanup()
@@ -225,6 +223,7 @@ async def _connection(
         for route, source in server.serve.items():
             folders[f"/{route.strip('/')}/"] = Path(source if isinstance(source, str) else source[0]).resolve()
         await server.ready
+        server.controller.on_error.add(_log_report)
         for delivery in server.protocol.getLinkProtocols():
             if hasattr(delivery, "push_render"):
                 stack.callback(Frames(server, delivery).close)
@@ -237,6 +236,10 @@ async def _connection(
         connection.on_message(send)
         stack.push_async_callback(connection.close)
         yield server, connection
+
+
+def _log_report(message: str) -> None:
+    logging.getLogger(__name__).error("the page reports %.1000r", message)  # terminals obey what is not escaped
 
 
 def _build(build: Session) -> tuple[Any, Closing]:
