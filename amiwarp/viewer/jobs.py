@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import traceback
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -71,7 +72,7 @@ class Calibrating:
         try:
             async with panel.warp:
                 found = await panel.in_thread(
-                    calibrate, inspector.recording, settings, device=inspector.device, progress=tell
+                    _calibrate, inspector.recording, settings, device=inspector.device, progress=tell
                 )
             if self._cancelled:
                 raise Cancelled
@@ -91,6 +92,19 @@ class Calibrating:
             return
         with self._panel.state:
             self._panel.state.update({"busy": f"calibrating, {stage}", "progress": round(100 * min(share, 1.0))})
+
+
+def _calibrate(*args: Any, **options: Any) -> Calibration:
+    """As :func:`calibrate`; one that fails or is cancelled keeps nothing.
+
+    What was raised inside NLopt holds NLopt's own object by its frames, and that holds the objective, the panel and
+    what was raised, out of the collector's sight.
+    """
+    try:
+        return calibrate(*args, **options)
+    except BaseException as error:
+        traceback.clear_frames(error.__traceback__)
+        raise
 
 
 def summary(c: Calibration) -> str:

@@ -65,8 +65,7 @@ class Panel:
         self.open_window()
         build(server, self)
         mouse = self.scene.plotter.iren.interactor
-        # the release itself goes to none but the style, which took the mouse when it was pressed
-        style = mouse.GetInteractorStyle()
+        style = mouse.GetInteractorStyle()  # it takes the mouse when that is pressed: the release goes to no other
         self._observed = [(mouse, mouse.AddObserver("LeftButtonPressEvent", self._pressed)),
                           (style, style.AddObserver("EndInteractionEvent", self._released))]  # fmt: skip
         for what, names in {
@@ -270,7 +269,6 @@ class Panel:
         return task
 
     def _ended(self, task: asyncio.Task[None]) -> None:
-        """Says what nobody foresaw."""
         if not task.cancelled() and (error := task.exception()) is not None:
             logging.getLogger(__name__).error("the page's work failed", exc_info=error)
             self.say(f"this failed: {error or type(error).__name__}; its server knows more", "error")

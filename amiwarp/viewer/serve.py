@@ -15,6 +15,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, supp
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from weakref import WeakSet
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.frames import Frames
@@ -35,6 +36,8 @@ HEARTBEAT_S = 30.0
 """After which a page is asked whether it is there; it has half that time to answer, then it is closed."""
 TIDY_S = 0.5
 """From a tab's end to when its memory is given back: of several that are closed together once."""
+LONGEST_S = 30.0
+"""Between two looks whether what a closed tab had begun has ended."""
 HEADERS = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 """The first keeps the token, which is in the page's address, from every other page."""
 
@@ -85,6 +88,7 @@ class Tabs:
         self.folders = {"/": Path(vue3.www).resolve()}
         self._build, self._settable = build, settable
         self._sockets: set[web.WebSocketResponse] = set()
+        self._servers: WeakSet[Any] = WeakSet()  # of the open ones, and of closed ones that something still holds
         self._tidying: asyncio.TimerHandle | None = None
 
     async def open(self, request: web.Request) -> web.WebSocketResponse:
@@ -103,7 +107,7 @@ class Tabs:
             await self._converse(socket, build)
         finally:
             self._sockets.discard(socket)
-            self._tidy_later()
+            self._tidy_later(TIDY_S)
         return socket
 
     async def close(self, _: web.Application) -> None:
@@ -119,21 +123,29 @@ class Tabs:
 
         async with _connection(build, self.folders, socket) as (server, connection):
             gate = Gate(server, self._settable)
+            self._servers.add(server)
             async for message in socket:
                 if message.type is WSMsgType.BINARY and gate.passes(message.data):
                     await connection.send(True, message)
 
-    def _tidy_later(self) -> None:
+    def _tidy_later(self, wait_s: float) -> None:
         if self._tidying is not None:
             self._tidying.cancel()
-        self._tidying = asyncio.get_running_loop().call_later(TIDY_S, _tidy)
+        self._tidying = asyncio.get_running_loop().call_later(wait_s, self._tidy, wait_s)
+
+    def _tidy(self, waited_s: float) -> None:
+        """Give back what closed tabs held; again, ever less often, while work of theirs still runs in a thread."""
+        self._tidying = None
+        _give_back()
+        if len(self._servers) > len(self._sockets):
+            self._tidy_later(min(2.0 * waited_s, LONGEST_S))
 
 
 def _full(_: Any) -> Closing:
     raise AmiwarpError(FULL)
 
 
-def _tidy() -> None:
+def _give_back() -> None:
     """Give back the memory of closed tabs.
 
     A page is a web of references that the collector alone takes apart, and glibc keeps what was freed: it holds free
