@@ -3,9 +3,11 @@
 import asyncio
 import json
 import math
+import socket
 import sys
 import types
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,8 @@ from amiwarp.cli.app import app
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics import Prism
 from amiwarp.simulate import simulate
-from amiwarp.viewer.app import BROWSERS, has_display, open_window
+from amiwarp.viewer import app as viewer_app
+from amiwarp.viewer.app import BROWSERS, export_folder, has_display, open_window
 from amiwarp.viewer.inspector import Inspector
 
 
@@ -118,6 +121,49 @@ def test_a_window_opens_only_where_there_is_a_display(monkeypatch: pytest.Monkey
     assert "chromium" in BROWSERS
 
 
+def test_what_others_can_reach_is_said(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exports go to the recording's folder, or to another."""
+    folders: list[Path] = []
+
+    def serve_panel(make: object, folder: Path, *, host: str, port: int, ready: Callable[[str], None]) -> None:
+        folders.append(folder)
+        ready(f"http://{host}:{port}/")
+
+    monkeypatch.setattr(viewer_app, "serve_panel", serve_panel)
+    code, said, error = view(files / "recording.h5", "--web", "--host", "0.0.0.0", "--out-dir", tmp_path)
+    assert code == 0
+    assert "everybody in the network" in error
+    assert "control the inspector" in error
+    assert said.startswith("recording.h5: http://")
+    assert view(files / "recording.h5", "--web")[2] == ""
+    assert folders == [tmp_path.resolve(), files.resolve()]
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--host", "192.0.2.1"], "is no address of this machine"),
+        (["--port", "{port}"], "is in use"),
+        (["--out-dir", "none"], "is no folder"),
+        (["--out-dir", "{file}"], "is no folder"),
+    ],
+)
+def test_what_cannot_be_served_is_said_in_a_line(files: Path, args: list[str], says: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        given = [a.format(port=other.getsockname()[1], file=files / "c.json") for a in args]
+        code, said, error = view(files / "recording.h5", "--web", *given)
+    assert (code, said) == (1, "")
+    assert says in error.splitlines()[-1]
+    assert error.count("\n") == 1
+
+
+def test_exports_of_a_notebook_s_page_have_a_folder_too(files: Path, tmp_path: Path) -> None:
+    recording = open_recording(files / "recording.h5")
+    assert export_folder(getattr(recording.events, "path", None), None) == files.resolve()
+    assert export_folder(None, None) == Path.cwd()
+    assert export_folder(files / "recording.h5", tmp_path) == tmp_path.resolve()
+
+
 def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The browser is one that writes down how it was called, asks for the page and closes."""
     browser = tmp_path / BROWSERS[0]
@@ -130,7 +176,7 @@ def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkey
     browser.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     said: list[str] = []
-    open_window(lambda: Inspector(open_recording(files / "recording.h5")), said.append)
+    open_window(lambda: Inspector(open_recording(files / "recording.h5")), tmp_path, said.append)
     assert said[0].startswith("http://127.0.0.1:")
     assert b"<html" in (tmp_path / "page").read_bytes().lower()
     with pytest.raises(OSError, match="refused"):

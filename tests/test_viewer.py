@@ -276,6 +276,8 @@ def test_what_cannot_be_shown_is_said(inspector: Inspector, recording: Recording
         inspector.open(recording.events.t_last + 10, 1000)
     with pytest.raises(AmiwarpError, match="none of them selected"):
         inspector.open(*inspector.first_window(), Selection(region=(5, 5, 5, 9)))
+    assert inspector.selection == Selection()
+    assert inspector.show().region == (0, 0, *recording.events.size)  # as before
     other = replace(calibration_of(recording), camera=Camera.from_fov(64, 48, 1.0))
     with pytest.raises(AmiwarpError, match="64x48 pixels, the events are of 160x120"):
         Inspector(recording, other)

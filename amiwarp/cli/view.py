@@ -13,7 +13,7 @@ import typer
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
-from amiwarp.cli.options import OUTPUT, Common
+from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.scene import Axis, Colour, Look, View
@@ -81,6 +81,11 @@ def run(
     web: Annotated[bool, typer.Option("--web", help="Serve the page and print its address; open no window.")] = False,
     host: Annotated[str, typer.Option(help="Interface to serve on; the address carries a secret token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve on; 0: a free one.")] = 0,
+    out_dir: Annotated[
+        Path | None,
+        typer.Option(help="Folder of what the page exports. Default: the recording's, of a stream the current one."),
+        OUTPUT_FOLDER,
+    ] = None,
     window: Annotated[
         str | None,
         typer.Option(help="Only these seconds of the recording. Default: one turn in its middle.", metavar="START:END"),
@@ -94,7 +99,8 @@ def run(
     common: Common,
 ) -> None:
     """Look at events in x, y and prism angle, as recorded and compensated, and turn the prism's knobs."""
-    from amiwarp.viewer.app import has_display, open_window, serve_panel
+    from amiwarp.viewer.app import export_folder, has_display, open_window, serve_panel
+    from amiwarp.viewer.hosts import warning
     from amiwarp.viewer.scene import check_display
 
     device = choose_device(common.device)
@@ -106,25 +112,26 @@ def run(
         def make() -> Inspector:
             return inspector(recording, calibration, window, model, camera, prism, device, latest)
 
-        first = make()  # what is wrong is said here, not in the page
+        waiting = [make()]  # what is wrong is said here, not in the page
         if picture.screenshot is not None:
-            data = {**picture.write(first, picture.screenshot), "device": device}
+            data = {**picture.write(waiting[0], picture.screenshot), "device": device}
             report(common, data, _lines(data))
             return
-        served = [first]
+        folder, in_browser = export_folder(None if live else recording, out_dir), web or not has_display()
 
         def ready(url: str) -> None:
+            if in_browser and (text := warning(host)) is not None:
+                say(text)
             report(common, {"url": url}, [f"{recording.name}: {url}", "Ctrl-C ends it"])
-            if host not in ("127.0.0.1", "localhost"):
-                say(f"served on {host}: whoever has this address can see the recording")
+            sys.stdout.flush()
 
         def tab() -> Inspector:
-            return served.pop() if served else make()
+            return waiting.pop() if waiting else make()
 
-        if web or not has_display():
-            serve_panel(tab, host=host, port=port, ready=ready)
+        if in_browser:
+            serve_panel(tab, folder, host=host, port=port, ready=ready)
         else:
-            open_window(tab, ready)
+            open_window(tab, folder, ready)
 
 
 def inspector(

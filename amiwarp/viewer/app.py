@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.scene import Look, Scene, View
 
@@ -38,31 +39,49 @@ def has_display() -> bool:
 
 
 def serve_panel(
-    make: Callable[[], Inspector], *, host: str = HERE, port: int = 0, ready: Callable[[str], None]
+    make: Callable[[], Inspector], folder: Path, *, host: str = HERE, port: int = 0, ready: Callable[[str], None]
 ) -> None:
-    """Serves the panel until interrupted, each tab with an inspector of its own; ``ready`` is told its address."""
+    """Serve the panel until interrupted, each tab with its own inspector.
+
+    ``folder``: of exports. ``ready`` gets the address. Raises :class:`AmiwarpError` if nothing can be served there.
+    """
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make, host, port, ready))
+        asyncio.run(_serve(make, folder, host, port, ready))
 
 
-async def _serve(make: Callable[[], Inspector], host: str, port: int, ready: Callable[[str], None]) -> None:
+async def _serve(
+    make: Callable[[], Inspector], folder: Path, host: str, port: int, ready: Callable[[str], None]
+) -> None:
     from amiwarp.viewer.serve import serve
+    from amiwarp.viewer.values import SETTABLE
 
-    await serve(partial(_tab, make), host=host, port=port, token=secrets.token_urlsafe(16), ready=ready)
+    token = secrets.token_urlsafe(16)
+    await serve(partial(_tab, make, folder), settable=SETTABLE, host=host, port=port, token=token, ready=ready)
 
 
-def _tab(make: Callable[[], Inspector], server: Any) -> Callable[[], None]:
+def _tab(make: Callable[[], Inspector], folder: Path, server: Any) -> Callable[[], None]:
     from amiwarp.viewer.panel import Panel
 
-    return Panel(server, make(), Path.cwd()).close
+    return Panel(server, make(), folder).close
 
 
-def open_window(make: Callable[[], Inspector], ready: Callable[[str], None]) -> None:
+def export_folder(recording: Path | None, given: Path | None) -> Path:
+    """Return where a page's exports go: to ``given``, else to the recording's folder, else where the command runs.
+
+    Raises :class:`AmiwarpError` if that is no folder.
+    """
+    folder = given or (recording.parent if recording is not None else Path())
+    if not folder.is_dir():
+        raise AmiwarpError(f"{folder}: is no folder; make it first, or give another --out-dir")
+    return folder.resolve()
+
+
+def open_window(make: Callable[[], Inspector], folder: Path, ready: Callable[[str], None]) -> None:
     """Opens the panel in a window and serves it until that is closed; in a tab where no browser has such windows."""
 
     async def both() -> None:
         found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        serving: asyncio.Future[Any] = asyncio.create_task(_serve(make, HERE, 0, found.set_result))
+        serving: asyncio.Future[Any] = asyncio.create_task(_serve(make, folder, HERE, 0, found.set_result))
         await asyncio.wait([serving, found], return_when=asyncio.FIRST_COMPLETED)
         if serving.done():
             serving.result()
@@ -88,18 +107,25 @@ def open_window(make: Callable[[], Inspector], ready: Callable[[str], None]) -> 
 
 
 def view(
-    recording: Recording, calibration: Calibration | None = None, *, device: Any = "cpu", height: int = 700
+    recording: Recording,
+    calibration: Calibration | None = None,
+    *,
+    device: Any = "cpu",
+    height: int = 700,
+    out_dir: str | os.PathLike[str] | None = None,
 ) -> Any:
-    """The panel below a notebook's cell, served by the notebook's own loop until the kernel ends.
+    """Show the panel below a notebook's cell, served by the notebook's own loop until the kernel ends.
 
-    ``height`` [px]. Raises :class:`AmiwarpError` where the recording holds no events, or for another camera's
-    calibration.
+    ``height`` [px]. ``out_dir``: folder of the files that the page exports; without it the recording's, or the current
+    one. Raises :class:`AmiwarpError` for a recording without events, another camera's calibration, or no folder.
     """
     from IPython.display import IFrame, display
 
+    folder = export_folder(getattr(recording.events, "path", None), None if out_dir is None else Path(out_dir))
+
     Inspector(recording, calibration, device=device)  # what is wrong is said here
     make = partial(Inspector, recording, calibration, device=device)
-    show = _serve(make, HERE, 0, lambda url: display(IFrame(url, "100%", height)))
+    show = _serve(make, folder, HERE, 0, lambda url: display(IFrame(url, "100%", height)))
     return asyncio.get_running_loop().create_task(show)
 
 

@@ -247,8 +247,12 @@ class Inspector:
 
     def open(self, start_us: int, length_us: int, selection: Selection | None = None) -> None:
         """Reads a window. Raises :class:`AmiwarpError` where it holds no events of the ``selection``."""
-        self.selection = selection or self.selection
-        self._window = self._prepare(read_span(self.recording.events, start_us, max(1, length_us), MOST_EVENTS))
+        before, self.selection = self.selection, selection or self.selection
+        try:
+            self._window = self._prepare(read_span(self.recording.events, start_us, max(1, length_us), MOST_EVENTS))
+        except BaseException:
+            self.selection = before  # that of what is still shown
+            raise
         self.window = start_us, length_us
 
     def show(self) -> Shown:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import math
+import traceback
+import weakref
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +35,7 @@ class Calibrating:
     """A calibration of the panel's recording, in a thread."""
 
     def __init__(self, panel: Panel) -> None:
-        self._panel, self._cancelled = panel, False
+        self._panel, self.cancelled = panel, False
         self.found: Calibration | None = None
         """What waits to be accepted."""
 
@@ -42,55 +44,75 @@ class Calibrating:
         state = self._panel.state
         if state.busy:
             if state.busy.startswith("calibrating"):
-                self._cancelled = True
+                self.cancelled = True
                 state.busy = "calibrating: about to be cancelled"
             return
-        self._cancelled, self.found = False, None
+        self.cancelled, self.found = False, None
         state.update({"busy": "calibrating", "progress": 0, "found": ""})
         self._panel.begin(self._run())
 
     def cancel(self) -> None:
-        self._cancelled = True
+        self.cancelled = True
 
     async def _run(self) -> None:
-        panel, inspector, loop = self._panel, self._panel.inspector, asyncio.get_running_loop()
-
-        told = -math.inf
-
-        def tell(stage: str, done: int, budget: int) -> None:
-            nonlocal told
-            if self._cancelled:
-                raise Cancelled
-            if (now := loop.time()) < told + PROGRESS_S:
-                return
-            told = now
-            loop.call_soon_threadsafe(self._progress, stage, done / max(budget, 1))
-
+        panel, inspector = self._panel, self._panel.inspector
         rpm = inspector.knobs.rpm
         settings = Settings(start={} if inspector.has_encoder or not rpm else {"rpm": rpm})
         try:
             async with panel.warp:
-                found = await asyncio.to_thread(
-                    calibrate, inspector.recording, settings, device=inspector.device, progress=tell
+                found = await panel.in_thread(
+                    _calibrate, inspector.recording, settings, device=inspector.device, progress=_teller(self)
                 )
-            if self._cancelled:
-                raise Cancelled
-            self.found = found
-            with panel.state:
-                panel.state.found = summary(found)
-        except Cancelled:
-            panel.say("calibration cancelled", "info")
-        except AmiwarpError as error:
-            panel.say(str(error), "error")
+            if self.cancelled:
+                panel.say("calibration cancelled", "info")
+            elif isinstance(found, str):
+                panel.say(found, "error")
+            else:
+                self.found = found
+                with panel.state:
+                    panel.state.found = summary(found)
         finally:
             with panel.state:
                 panel.state.busy = ""
 
-    def _progress(self, stage: str, share: float) -> None:
-        if self._cancelled:
+    def tell(self, stage: str, share: float) -> None:
+        """Shows how far it is."""
+        if self.cancelled:
             return
         with self._panel.state:
             self._panel.state.update({"busy": f"calibrating, {stage}", "progress": round(100 * min(share, 1.0))})
+
+
+def _teller(job: Calibrating) -> Callable[[str, int, int], None]:
+    """What a calibration calls in its thread. NLopt never lets go of what it calls, so this knows the job weakly."""
+    known, loop, told = weakref.ref(job), asyncio.get_running_loop(), -math.inf
+
+    def tell(stage: str, done: int, budget: int) -> None:
+        nonlocal told
+        if not wanted():
+            raise Cancelled
+        if (now := loop.time()) >= told + PROGRESS_S:
+            told = now
+            loop.call_soon_threadsafe(show, stage, done / max(budget, 1))
+
+    def wanted() -> bool:
+        job = known()
+        return job is not None and not job.cancelled
+
+    def show(stage: str, share: float) -> None:
+        if (job := known()) is not None:
+            job.tell(stage, share)
+
+    return tell
+
+
+def _calibrate(*args: Any, **options: Any) -> Calibration | str:
+    """What :func:`calibrate` finds, or why nothing: NLopt also keeps what was raised, and with it every frame."""
+    try:
+        return calibrate(*args, **options)
+    except (AmiwarpError, Cancelled) as error:
+        traceback.clear_frames(error.__traceback__)
+        return str(error)
 
 
 def summary(c: Calibration) -> str:
@@ -109,6 +131,8 @@ class Playing:
 
     def __init__(self, panel: Panel) -> None:
         self._panel, self._ended = panel, False
+        self.runs = False
+        """Until it has noticed that it was stopped, too."""
 
     def end(self) -> None:
         """Also of a film that is being written."""
@@ -118,12 +142,18 @@ class Playing:
         """Runs through the recording from here, or follows a live stream, or stops."""
         state = self._panel.state
         state.playing = not state.playing
-        if state.playing and self._panel.inspector.latest is not None:
-            self._panel.begin(self._follow())
-        elif state.playing:
-            if self._panel.move(float(state.start_ms)):  # at the end: from the beginning
-                self._panel.move(0.0)
-            self._panel.begin(self._run())
+        if not state.playing or self.runs:
+            return
+        if self._panel.inspector.latest is None and self._panel.move(float(state.start_ms)):
+            self._panel.move(0.0)  # at the end: from the beginning
+        self.runs = True
+        self._panel.begin(self._play())
+
+    async def _play(self) -> None:
+        try:
+            await (self._run() if self._panel.inspector.latest is None else self._follow())
+        finally:
+            self.runs = False
 
     async def _run(self) -> None:
         panel, state, loop = self._panel, self._panel.state, asyncio.get_running_loop()
@@ -159,6 +189,8 @@ class Playing:
     async def _film(self, what: str, frames: Callable[[], Iterator[NDArray[np.uint8]]]) -> None:
         """Drawn one by one in this loop, which serves the pages in between, and written in a thread."""
         panel, state, loop, pictures = self._panel, self._panel.state, asyncio.get_running_loop(), frames()
+        if state.busy:
+            return
 
         async def draw() -> NDArray[np.uint8] | None:
             await panel.settled()
@@ -176,8 +208,8 @@ class Playing:
             state.update({"busy": f"writing the {what}", "progress": 0})
         try:
             with panel.reported("export"):
-                path = panel.path(f".{what}.mp4")
-                count = await asyncio.to_thread(save_film, drawn(), path, fps=FPS)
+                path = panel.path(what, ".mp4", ".gif")
+                count = await panel.in_thread(save_film, drawn(), path, fps=FPS)
                 panel.say(f"{path}: {count} frames written", "success")
             panel.server.controller.view_update()
         finally:

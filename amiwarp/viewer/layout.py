@@ -26,6 +26,8 @@ SLIDERS = (
     ("tilt_y", "tilt y", "°", ("-5", "5", 0.05), "model == 'exact' || model == 'ellipse'"),
 )
 """Name, label, unit, (least, most, step) and where it makes sense, of each knob."""
+SPEEDS = (0.01, 0.1, 0.5, 1)
+"""Of a recording that is played."""
 KEYS = (
     ("ArrowRight", ("step", 1.0), "on by one turn"),
     ("ArrowLeft", ("step", -1.0), "back by one turn"),
@@ -153,7 +155,7 @@ def _window(panel: Panel, html: Any, v: Any) -> None:
         _button(v, "◀ turn", (panel.step, "[-1]"), "back", disabled=("!turn_ms",))
         _button(v, "{{ playing ? 'stop' : live ? 'follow' : 'play' }}", panel.play, "play")
         _button(v, "turn ▶", (panel.step, "[1]"), "step", disabled=("!turn_ms",))
-        v.VSelect(v_model=("speed",), items=("[0.01, 0.1, 0.5, 1]",), density="compact", hide_details=True,
+        v.VSelect(v_model=("speed",), items=(str(list(SPEEDS)),), density="compact", hide_details=True,
                   style="max-width: 100px; min-width: 100px", label="speed ×", v_show="!live")  # fmt: skip
     with html.Div(classes="row"):
         with v.VBtnToggle(v_model=("polarity",), density="compact", mandatory=True, variant="outlined", id="polarity"):
@@ -219,8 +221,8 @@ def _look(html: Any, v: Any) -> None:
 
 def _export(panel: Panel, html: Any, v: Any) -> None:
     html.H4("export")
-    v.VTextField(v_model=("out",), label="file; default: the recording's name", density="compact", hide_details=True,
-                 style="margin: 4px 0", id="out")  # fmt: skip
+    v.VTextField(v_model=("out",), label="new file's name; default: the recording's", density="compact",
+                 hide_details=True, maxlength=120, style="margin: 4px 0", id="out")  # fmt: skip
     with html.Div(classes="row"):
         _button(v, "picture", panel.save_picture, "picture")
         _button(v, "turntable", panel.playing.turntable, "turntable", disabled=("!!busy",))

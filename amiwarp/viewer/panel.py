@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import math
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +23,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.figures import Images
 from amiwarp.picture_files import Tone, tones
 from amiwarp.reconstruct import reconstruct
+from amiwarp.viewer.exports import export_path
+from amiwarp.viewer.frames import room
+from amiwarp.viewer.gate import finite
 from amiwarp.viewer.inspector import Selection
 from amiwarp.viewer.jobs import Calibrating, Playing
 from amiwarp.viewer.layout import KEYS, NAMES, UNITS, build
@@ -39,7 +45,7 @@ class Panel:
     """Builds itself on a fresh trame server; :meth:`close` when the tab is gone."""
 
     def __init__(self, server: Any, inspector: Inspector, folder: Path) -> None:
-        """``folder``: where exports go unless they are told a place."""
+        """``folder``: where exports go."""
         self.server, self.state, self.inspector, self.folder = server, server.state, inspector, folder
         self.scene = Scene()
         self.warp: Any = _ONE_AT_A_TIME if "cuda" in str(inspector.device) else contextlib.nullcontext()
@@ -53,30 +59,35 @@ class Panel:
         self._picked: int | None = None
         self._press: tuple[int, int] | None = None
         self._wrong = ""
+        self._threads = ThreadPoolExecutor(2, "amiwarp-tab")  # a calibration or a film, and a curve or a picture
         self.state.update(first_values(inspector))
         self._show_knobs()
         self.open_window()
         build(server, self)
         mouse = self.scene.plotter.iren.interactor
-        mouse.AddObserver("LeftButtonPressEvent", self._pressed)
-        # the release itself goes to none but the style, which took the mouse when it was pressed
-        mouse.GetInteractorStyle().AddObserver("EndInteractionEvent", self._released)
+        style = mouse.GetInteractorStyle()  # it takes the mouse when that is pressed: the release goes to no other
+        self._observed = [(mouse, mouse.AddObserver("LeftButtonPressEvent", self._pressed)),
+                          (style, style.AddObserver("EndInteractionEvent", self._released))]  # fmt: skip
         for what, names in {
             "knobs": NAMES, "view": ("view",), "window": ("start_ms", "length_ms", "polarity", "region_x", "region_y",
             "hide_hot"), "look": ("colour", "axis", "point_size", "opacity", "dark", "overlaid", "orbit_shown"),
         }.items():  # fmt: skip
             self.state.change(*names)(lambda what=what, **_: self.ask(what))
-        self.state.change("model")(self._model_changed)
+        for call in (partial(self.ask, "knobs"), self.released):
+            self.state.change("model")(lambda call=call, **_: call())
         self.later("curve", "picture")
         if inspector.latest is not None:
             self.playing.toggle()
 
     def close(self) -> None:
-        """Ends what is going on."""
+        """Ends what is going on; its threads end with their work."""
         self.calibrating.cancel()
         self.playing.end()
         for task in [*self._tasks, *filter(None, [self._quick, self._slow])]:
             task.cancel()
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for seen, tag in self._observed:  # VTK holds the panel by them, out of the collector's sight
+            seen.RemoveObserver(tag)
         self.scene.close()
 
     # what the page asks for
@@ -87,7 +98,13 @@ class Panel:
 
     def typed(self, name: str, text: str) -> None:
         """A number was entered in a field."""
-        value = float(text or 0.0)
+        if name not in (*NAMES, "start_ms", "length_ms", "turns"):
+            return
+        try:
+            value = finite(text)
+        except ValueError:
+            self.say(f"{text!r} is no number; give one such as 1.5", "error")
+            return
         name, value = ("length_ms", value * float(self.state.turn_ms)) if name == "turns" else (name, value)
         self.state[name] = round(value, 4)
         if name in NAMES:
@@ -99,7 +116,8 @@ class Panel:
 
     def moved(self, name: str) -> None:
         """Of which knob the curve is drawn."""
-        self.state.knob = name
+        if name in NAMES:
+            self.state.knob = name
 
     def key(self, key: str) -> None:
         """A key was pressed outside of a field."""
@@ -121,7 +139,9 @@ class Panel:
         self.ask("view")
 
     def step(self, turns: float) -> None:
-        """Moves the window on by turns, or by its own length where no prism turns."""
+        """Moves the window by a turn on (1) or back (-1), or by its own length where no prism turns."""
+        if turns not in (-1, 1):
+            return
         turn = self.inspector.turn_us * 1e-3
         self.move(float(self.state.start_ms) + turns * (turn if math.isfinite(turn) else float(self.state.length_ms)))
         self.ask("window")
@@ -149,14 +169,14 @@ class Panel:
     def save(self) -> None:
         """Writes the calibration as it is set."""
         with self.reported("export"):
-            path = self.path(".calibration.json")
+            path = self.path("calibration", ".json")
             self.inspector.as_calibration().save(path)
             self.say(f"{path}: written", "success")
 
     def save_picture(self) -> None:
         """Writes what is seen."""
         with self.reported("export"):
-            path = self.path(".png")
+            path = self.path("", ".png")
             self.scene.save(path)
             self.say(f"{path}: written", "success")
 
@@ -166,13 +186,13 @@ class Panel:
         """What is quick, as often as it is asked for."""
         self._pending.update(what)
         if self._quick is None:
-            self._quick = asyncio.get_running_loop().create_task(self._work())
+            self._quick = self._task(self._work())
 
     def later(self, *what: str) -> None:
         """What takes longer, in a thread, when nothing quick is waiting."""
         self._waiting.update(what)
         if self._slow is None:
-            self._slow = asyncio.get_running_loop().create_task(self._work_slowly())
+            self._slow = self._task(self._work_slowly())
 
     async def settled(self) -> None:
         """Waits for what is quick."""
@@ -181,9 +201,12 @@ class Panel:
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
         """Runs a job until it ends or the tab is gone."""
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
+        self._tasks.add(task := self._task(work))
         task.add_done_callback(self._tasks.discard)
+
+    async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        """What ``work`` returns, called in one of this tab's threads."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
 
     def say(self, text: str, severity: str) -> None:
         with self.state:
@@ -215,10 +238,10 @@ class Panel:
         self.move(float(self.state.whole_ms))
         self.ask("window")
 
-    def path(self, ending: str) -> Path:
-        """Where an export goes: what the field says, or the recording's name."""
-        given = str(self.state.out or "").strip() or f"{self.inspector.recording.name}{ending}"
-        return self.folder / given
+    def path(self, what: str, *endings: str) -> Path:
+        """Where an export goes: what the field says, or the recording's name and ``what`` it is."""
+        name = self.inspector.recording.name
+        return export_path(self.folder, str(self.state.out or ""), f"{name}.{what}" if what else name, endings)
 
     def open_window(self) -> None:
         """Reads and draws what the page's window and selection say."""
@@ -240,13 +263,20 @@ class Panel:
 
     # inside
 
-    def _model_changed(self, **_: Any) -> None:
-        self.ask("knobs")
-        self.later("curve", "picture")
+    def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        task.add_done_callback(self._ended)
+        return task
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            logging.getLogger(__name__).error("the page's work failed", exc_info=error)
+            self.say(f"this failed: {error or type(error).__name__}; its server knows more", "error")
 
     async def _work(self) -> None:
         try:
             while self._pending:
+                await room(self.server)
                 todo, self._pending = self._pending, set()
                 async with self.warp:
                     with self.state:
@@ -330,7 +360,7 @@ class Panel:
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
-        values, scores = await asyncio.to_thread(self.inspector.curve, name)
+        values, scores = await self.in_thread(self.inspector.curve, name)
         if not len(values):
             return
         x = values / UNITS[name]
@@ -343,7 +373,7 @@ class Panel:
         if shown is None or not math.isfinite(inspector.turn_us):
             return
         try:
-            picture = await asyncio.to_thread(
+            picture = await self.in_thread(
                 reconstruct, inspector.recording, model=inspector.model, encoder=inspector.set_encoder,
                 start_us=shown.span.start_us, length_us=shown.span.length_us, device=inspector.device,
             )  # fmt: skip

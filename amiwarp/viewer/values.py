@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.optics import MODELS
+from amiwarp.viewer.gate import Check, flag, list_of, number, one_of, text
+from amiwarp.viewer.layout import NAMES, SPEEDS
 from amiwarp.viewer.scene import Axis, Colour, View
 
 if TYPE_CHECKING:
@@ -17,6 +20,16 @@ if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector, Shown
 
 JPEG_QUALITY = 90
+_pixels = number(0, 65536)
+SETTABLE: dict[str, Check] = {
+    **dict.fromkeys(NAMES, number()), "start_ms": number(), "region_x": list_of(_pixels, _pixels),
+    "region_y": list_of(_pixels, _pixels), "point_size": number(0.1, 20.0), "opacity": number(0.0, 1.0),
+    "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
+    "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
+    "view": one_of(*(each.value for each in View)), "out": text(200), "playing": one_of(False), "picked": one_of(""),
+    "message": one_of(""), **dict.fromkeys(("hide_hot", "dark", "overlaid", "orbit_shown", "help_shown"), flag),
+}  # fmt: skip
+"""What of its state the page sets by itself, and to which values; all else it changes by calls."""
 
 
 def first_values(inspector: Inspector) -> dict[str, Any]:

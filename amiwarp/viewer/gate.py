@@ -1,0 +1,156 @@
+"""What a page may send to its server: known calls, each argument of its kind and size. All else is dropped unread."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+MOST_BYTES = 64 * 1024
+"""Of a message. The page's own have up to some hundred; it cuts none into parts."""
+HEADER_BYTES = 12
+"""In front of each part: its message's number, where it begins and how long the message is, 32 bit each."""
+MOST_PX, MOST_SIDE = 16_000_000, 8192
+"""Of the picture of the clouds."""
+LARGEST = 1e12
+"""Numbers are smaller: in ms that is 30 years."""
+
+Check = Callable[[Any], bool]
+
+
+def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
+    def check(value: Any) -> bool:
+        return type(value) in (int, float) and low <= value <= high  # NaN is in no range, True is no number
+
+    return check
+
+
+def text(most: int) -> Check:
+    return lambda value: isinstance(value, str) and len(value) <= most
+
+
+def one_of(*known: Any) -> Check:
+    return lambda value: any(type(value) is type(each) and value == each for each in known)
+
+
+def list_of(*checks: Check) -> Check:
+    return lambda value: (
+        isinstance(value, list)
+        and len(value) == len(checks)
+        and all(check(each) for check, each in zip(checks, value, strict=True))
+    )
+
+
+def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
+    known = {**required, **(optional or {})}
+
+    def check(value: Any) -> bool:
+        return (
+            isinstance(value, dict)
+            and required.keys() <= value.keys() <= known.keys()
+            and all(known[name](each) for name, each in value.items())
+        )
+
+    return check
+
+
+flag = one_of(True, False)
+_switch = one_of(0, 1, True, False)
+_place = number(-16.0, 16.0)
+_side = number(0, MOST_SIDE)
+_mouse = {
+    "action": one_of("down", "up", "move", "dblclick"), "x": _place, "y": _place,
+    **dict.fromkeys(
+        ("buttonLeft", "buttonMiddle", "buttonRight", "shiftKey", "altKey", "ctrlKey", "metaKey"), _switch
+    ),
+}  # fmt: skip
+_wheel = one_of(*(f"{when}{what}" for when in ("Start", "", "End") for what in ("MouseWheel", "Pinch")))
+
+
+class Gate:
+    """Knows the calls of one page; ``settable``: what of its state the page may set, and to which values."""
+
+    def __init__(self, server: Any, settable: Mapping[str, Check]) -> None:
+        self._server, self._warned = server, False
+        view = self._is_view
+        change = self._change(settable)
+        self._calls: dict[str, Check] = {
+            "wslink.hello": list_of(record({"secret": text(64)})),
+            "trame.state.get": list_of(),
+            "trame.lifecycle.update": list_of(one_of("client_connected", "client_exited", "client_unmounted")),
+            "trame.error.client": list_of(text(4000)),
+            "trame.state.update": list_of(lambda changes: isinstance(changes, list) and all(map(change, changes))),
+            "trame.trigger": self._is_trigger,
+            "viewport.image.push": list_of(record({"view": view}, {"size": list_of(_side, _side)})),
+            "viewport.image.push.observer.add": list_of(view),
+            "viewport.image.push.observer.remove": list_of(view),
+            "viewport.image.push.original.size": _is_size(view),
+            "viewport.image.push.quality": list_of(view, number(0, 100), number(0.05, 1)),
+            "viewport.image.push.enabled": list_of(view, flag),
+            "viewport.image.push.invalidate.cache": list_of(view),
+            "viewport.mouse.interaction": list_of(record({**_mouse, "view": view})),
+            "viewport.mouse.zoom.wheel": list_of(
+                record({"type": _wheel, "view": view}, {**_mouse, "spinY": number(-10, 10)})
+            ),
+        }
+
+    def passes(self, message: bytes) -> bool:
+        """Return whether the message is one of the page's; the first that is not is logged."""
+        try:
+            allowed = self._is_call(_unpacked(message))
+        except Exception:  # whatever a decoder makes of junk
+            allowed = False
+        if not allowed and not self._warned:
+            self._warned = True
+            logging.getLogger(__name__).warning("dropped a message of %d bytes that no page sends", len(message))
+        return allowed
+
+    def _is_call(self, call: Any) -> bool:
+        known = {"id": text(120), "method": text(60), "args": lambda args: isinstance(args, list)}
+        more = {"wslink": text(10), "kwargs": one_of({})}
+        return record(known, more)(call) and call["method"] in self._calls and self._calls[call["method"]](call["args"])
+
+    def _is_view(self, value: Any) -> bool:
+        return isinstance(value, str) and value == self._server.state.viewId
+
+    def _is_trigger(self, args: list[Any]) -> bool:
+        """Return whether the page has registered the call with as many plain arguments."""
+        plain = (text(200), number(), flag)
+        if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
+            return False
+        name, given, _ = args
+        called = self._server.controller.trigger_fn(name)
+        if called is None or not all(any(check(each) for check in plain) for each in given):
+            return False
+        inspect.signature(called).bind(*given)
+        return True
+
+    @staticmethod
+    def _change(settable: Mapping[str, Check]) -> Check:
+        shape = record({"key": text(60), "value": lambda _: True})
+        return lambda change: shape(change) and change["key"] in settable and settable[change["key"]](change["value"])
+
+
+def _unpacked(message: bytes) -> Any:
+    """Decode a message that came in one part."""
+    import msgpack  # type: ignore[import-untyped]
+
+    begin, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
+    if (begin, length) != (0, len(message) - HEADER_BYTES):
+        raise ValueError("a part of a message")
+    return msgpack.unpackb(message[HEADER_BYTES:])
+
+
+def _is_size(view: Check) -> Check:
+    shape = list_of(view, _side, _side)
+    return lambda args: shape(args) and args[1] * args[2] <= MOST_PX
+
+
+def finite(given: str) -> float:
+    """Return the number that was typed, within ±:data:`LARGEST`; raises ValueError for what is none."""
+    value = float(given or 0.0)
+    if math.isnan(value):
+        raise ValueError(given)
+    return min(max(value, -LARGEST), LARGEST)

@@ -1,0 +1,565 @@
+"""What hostile, slow and absent clients of the inspector's page cannot do; spoken in the page's own protocol."""
+
+import asyncio
+import base64
+import contextlib
+import gc
+import itertools
+import math
+import os
+import random
+import socket as sockets
+import struct
+import threading
+import weakref
+from collections.abc import AsyncIterator, Awaitable, Callable
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import aiohttp
+import msgpack
+import numpy as np
+import pytest
+from test_serve import COUNT, TOKEN, WAIT_S, Counters, get, served, until
+
+from amiwarp.camera import Camera
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import Recording
+from amiwarp.optics import Prism
+from amiwarp.simulate import simulate
+from amiwarp.viewer import serve as server_module
+from amiwarp.viewer.frames import MOST_IN_FLIGHT
+from amiwarp.viewer.gate import MOST_BYTES, Gate
+from amiwarp.viewer.hosts import Names, address, is_local, reachable, warning
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.serve import serve
+from amiwarp.viewer.values import SETTABLE
+
+pytest.importorskip("trame_vuetify")
+
+
+@pytest.fixture(scope="module")
+def recording(texture: np.ndarray) -> Recording:
+    camera = Camera.from_fov(64, 48, math.radians(50))
+    return simulate(texture, camera, Prism(math.radians(1.0)), duration_s=0.2, seed=1)
+
+
+class Panels:
+    """Builds a panel for each page, remembers all that belongs to it weakly, and the panels while ``keep``."""
+
+    def __init__(self, recording: Recording, folder: Path, *, keep: bool = True) -> None:
+        self.recording, self.folder, self.keep = recording, folder, keep
+        self.panels: list[Any] = []
+        self.parts: list[weakref.ref[Any]] = []
+
+    def __call__(self, server: Any) -> Callable[[], None]:
+        from amiwarp.viewer.panel import Panel
+
+        panel = Panel(server, Inspector(self.recording), self.folder)
+        window = panel.scene.plotter.render_window
+        parts = (server, panel, panel.inspector, panel.scene, panel.scene.plotter, window)
+        self.parts += map(weakref.ref, parts)
+        if self.keep:
+            self.panels.append(panel)
+        return panel.close
+
+
+def packed(call: Any) -> bytes:
+    """A message in one part."""
+    body = msgpack.packb(call)
+    return b"abcd" + struct.pack("<II", 0, len(body)) + body
+
+
+class Client:
+    """One end of a WebSocket that speaks as the page does."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self.socket, self.calls = socket, itertools.count()
+
+    async def send(self, method: Any, *args: Any, **more: Any) -> str:
+        call = {"wslink": "1.0", "id": f"rpc:{next(self.calls)}", "method": method, "args": list(args), "kwargs": {}}
+        await self.socket.send_bytes(packed({**call, **more}))
+        return str(call["id"])
+
+    async def call(self, method: str, *args: Any, **more: Any) -> Any:
+        """Sends it and waits for the answer."""
+        wanted = await self.send(method, *args, **more)
+        async with asyncio.timeout(WAIT_S):
+            async for message in self.socket:
+                answer = msgpack.unpackb(message.data[12:])
+                if answer["id"] in (wanted, more.get("id")):
+                    return answer.get("result", answer.get("error"))
+        raise AssertionError(f"closed with {self.socket.close_code}")
+
+    async def state(self) -> dict[str, Any]:
+        return dict((await self.call("trame.state.get"))["state"])
+
+
+@contextlib.asynccontextmanager
+async def client(url: str) -> AsyncIterator[Client]:
+    """A page's connection, greeted."""
+    origin = url.partition("/?")[0]
+    async with (
+        aiohttp.ClientSession() as session,
+        session.ws_connect(url.replace("/?", "/ws?"), headers={"Origin": origin}, max_msg_size=0) as socket,
+    ):
+        made = Client(socket)
+        await made.call("wslink.hello", {"secret": "wslink-secret"}, id="system:0")
+        yield made
+
+
+def run(work: Callable[[], Awaitable[None]]) -> None:
+    asyncio.run(asyncio.wait_for(work(), 2 * WAIT_S))
+
+
+async def until_async(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(WAIT_S):
+        while not condition():
+            await asyncio.sleep(0.02)
+
+
+# what a page may call
+
+JUNK: tuple[Any, ...] = (
+    None, True, False, 0, -1, 1, 2**63, -(2**63), 1e308, -1e308, math.nan, math.inf, -math.inf, "", "1", "nan", "1e999",
+    "x" * 5000, "../../x", "/etc/passwd", "__class__", "\x00", "\x1b[2J", b"\xff" * 100, [], [[]], [[[1]]], {},
+    {"a": {"b": []}}, {"key": "out"}, [math.nan, 1], [1, 2, 3], ["a", "b"], [-5, 1e300], "trigger__1", "viewport",
+)  # fmt: skip
+METHODS = (
+    "trame.state.update", "trame.trigger", "trame.force.push", "trame.state.get", "trame.lifecycle.update",
+    "trame.error.client", "application.exit", "application.exit.later", "viewport.image.push",
+    "viewport.image.push.original.size", "viewport.image.push.quality", "viewport.image.push.observer.add",
+    "viewport.image.push.observer.remove", "viewport.image.push.invalidate.cache", "viewport.image.animation.start",
+    "viewport.image.animation.stop", "viewport.image.animation.fps.max", "viewport.mouse.interaction",
+    "viewport.mouse.zoom.wheel", "viewport.camera.reset", "viewport.camera.update", "viewport.geometry.array.get",
+    "viewport.geometry.view.get.state", "viewport.geometry.view.get.export", "wslink.hello", "nothing",
+)  # fmt: skip
+
+
+def nested(depth: int) -> Any:
+    value: Any = 1
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def test_junk_changes_nothing_and_the_page_goes_on(
+    recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Each method with junk of each kind, each variable of the state, each trigger, and bytes that are no messages."""
+    (tmp_path / "exports").mkdir()
+    build, rng = Panels(recording, tmp_path / "exports"), random.Random(7)
+
+    async def attack(url: str) -> None:
+        async with client(url) as page:
+            first = await page.state()
+            view = first["viewId"]
+            for method in METHODS:
+                for junk in JUNK:
+                    await page.send(method, junk)
+                    await page.send(method, view, junk, rng.choice(JUNK))
+                    await page.send(method, {"view": view, "action": junk, "x": junk, "type": junk, "spinY": junk})
+                await page.send(method, nested(400))
+                await page.send(method, kwargs={"self": 1})
+            for name in (*first, "trame__scripts", "_x", "__dict__", ""):
+                for junk in JUNK:
+                    if name not in SETTABLE or not SETTABLE[name](junk):
+                        await page.send("trame.state.update", [{"key": name, "value": junk}])
+            for name in ("key", *(f"trigger__{k}" for k in range(40)), "close"):
+                for junk in JUNK:
+                    if not isinstance(junk, str | int | float):
+                        await page.send("trame.trigger", name, [junk], {})
+                        await page.send("trame.trigger", name, junk or None, {})
+                    await page.send("trame.trigger", name, [junk, junk, junk], {})
+                    await page.send("trame.trigger", name, ["apex", junk], {"x": junk})
+            for _ in range(300):
+                await page.socket.send_bytes(rng.randbytes(rng.randrange(200)))
+                await page.socket.send_bytes(packed(rng.choice(JUNK)))
+                await page.socket.send_str("text")
+            for call in ({"id": []}, {"id": "a", "method": []}, {"method": "trame.state.get"}, {"id": 5, "method": 5}):
+                await page.socket.send_bytes(packed(call))
+            await page.socket.send_bytes(b"abcd" + struct.pack("<II", 0, 2**32 - 1) + b"huge")
+            await page.socket.send_bytes(b"abcd" + struct.pack("<II", 2**31, 10) + b"x")
+            after = await page.state()
+            assert after.keys() == first.keys()
+            changed = {name for name in first if first[name] != after[name]}
+            computed = {"curve", "curve_text", "curve_low", "curve_high", "curve_mark", "picture", "picture_note"}
+            assert changed <= computed | {"knob", "message", "severity"}  # "a is no number"
+            await page.send("trame.state.update", [{"key": "apex", "value": 0.5}])
+            sharpness = after["sharpness"]
+            while sharpness == after["sharpness"]:
+                sharpness = (await page.state())["sharpness"]
+
+    with served(build, SETTABLE) as (url, _):
+        run(lambda: attack(url))
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    said = [record.getMessage() for record in caplog.records]
+    assert [text for text in said if not text.startswith("the page reports ")] == [
+        text for text in said if "no page sends" in text
+    ]
+    assert sum("no page sends" in text for text in said) == 1
+    assert all(text.isprintable() for text in said)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_all_that_the_page_may_set_leaves_it_alive(
+    recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The outermost of what passes the gate, in every variable, slider, call, mouse and size."""
+    build = Panels(recording, tmp_path)
+
+    async def attack(url: str) -> None:
+        async with client(url) as page:
+            first = await page.state()
+            view = first["viewId"]
+            await page.call("viewport.image.push.observer.add", view)
+            allowed = [*JUNK, *range(9), *itertools.chain(*(check_values(first, name) for name in SETTABLE))]
+            for name, check in SETTABLE.items():
+                for value in (each for each in allowed if check(each)):
+                    await page.call("trame.state.update", [{"key": name, "value": value}])
+                await page.call("trame.state.update", [{"key": name, "value": first[name]}])
+            for name in ("apex", "start_ms", "length_ms", "turns", "rpm", "message", "trame__title", "__class__"):
+                for text in ("", "nan", "inf", "-inf", "1e308", "-1e308", "1e-308", "x", "0x10", "1_0", "٣"):
+                    await page.call("trame.trigger", "trigger__1", [name, text], {})
+            for name in ("key", *(f"trigger__{k}" for k in range(40))):
+                for plain in ("", "c", "?", "__class__", "apex", 0, -1, 1e12, True):
+                    for args in ([plain], [plain, plain]):
+                        await page.send("trame.trigger", name, args, {})
+            mouse = dict.fromkeys(
+                ("buttonLeft", "buttonMiddle", "buttonRight", "shiftKey", "altKey", "ctrlKey", "metaKey"), 0
+            )
+            for action, at, spin in itertools.product(("down", "move", "up", "dblclick"), (-16, 0.5, 16), (-10, 0, 10)):
+                event = {"view": view, "action": action, "x": at, "y": at, **mouse, "buttonLeft": 1}
+                await page.call("viewport.mouse.interaction", event)
+                for kind in ("StartMouseWheel", "MouseWheel", "StartMouseWheel", "EndMouseWheel"):
+                    await page.call("viewport.mouse.zoom.wheel", {**event, "type": kind, "spinY": spin})
+            for size in ((0, 0), (1, 1), (11, 8192), (8192, 11), (640, 480)):
+                await page.call("viewport.image.push.original.size", view, *size)
+                await page.call("viewport.image.push", {"view": view, "size": list(size)})
+            for _ in range(7):  # plays and stops at once
+                await page.call("trame.trigger", "key", [" "], {})
+            await page.call("trame.trigger", "key", [" "], {})
+            await until_async(lambda: not build.panels[0].playing.runs)
+            for name, value in first.items():
+                if name in SETTABLE and SETTABLE[name](value):
+                    await page.call("trame.state.update", [{"key": name, "value": value}])
+            await page.call("trame.trigger", "trigger__1", ["length_ms", str(first["length_ms"])], {})
+            state = await page.state()
+            while state["sharpness"] != first["sharpness"]:
+                state = await page.state()
+
+    with served(build, SETTABLE) as (url, _):
+        run(lambda: attack(url))
+    assert [text for text in (record.getMessage() for record in caplog.records) if "no page sends" not in text] == []
+
+
+def check_values(state: dict[str, Any], name: str) -> list[Any]:
+    """Values about the first one."""
+    value = state[name]
+    return [value, 1e12, -1e12, [65536, 0], [0, 0], 0.01, "OFF", "circle", "residual", "time", "x-θ", "a" * 200]
+
+
+def test_numbers_that_are_none_do_not_pass() -> None:
+    for name, check in SETTABLE.items():
+        assert not any(check(value) for value in (math.nan, math.inf, None, b"x", {}, "\ud800" * 300)), name
+        assert SETTABLE["apex"](1) and not SETTABLE["apex"](True)  # noqa: PT018
+
+
+# sizes
+
+
+def upgraded(url: str) -> sockets.socket:
+    """A raw WebSocket."""
+    parts = urlsplit(url)
+    raw = sockets.create_connection((parts.hostname, parts.port), timeout=WAIT_S)
+    key = base64.b64encode(os.urandom(16)).decode()
+    raw.sendall(
+        f"GET /ws?{parts.query} HTTP/1.1\r\nHost: {parts.netloc}\r\nOrigin: http://{parts.netloc}\r\n"
+        f"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\n\r\n"
+        .encode()
+    )  # fmt: skip
+    head = b""
+    while not head.endswith(b"\r\n\r\n"):
+        head += raw.recv(1)
+    assert head.startswith(b"HTTP/1.1 101")
+    return raw
+
+
+def closing_code(raw: sockets.socket) -> int:
+    """Reads frames up to the one that closes."""
+    with raw, raw.makefile("rb") as stream:
+        while True:
+            first, second = stream.read(2)
+            length = second & 127
+            if length > 125:
+                length = int.from_bytes(stream.read(2 if length == 126 else 8), "big")
+            body = stream.read(length)
+            if first & 15 == 8:
+                return int.from_bytes(body[:2], "big")
+
+
+def test_a_large_message_is_refused_before_it_has_come() -> None:
+    """Its first bytes say how long it is; no more of it is sent, and no more is waited for."""
+    with served(Counters()) as (url, _):
+        raw = upgraded(url)
+        raw.sendall(bytes([0x82, 0x80 | 127]) + struct.pack(">Q", MOST_BYTES + 1) + b"mask")
+        assert closing_code(raw) == 1009
+
+
+def test_a_large_message_in_pieces_is_refused() -> None:
+    with served(Counters()) as (url, _):
+        raw = upgraded(url)
+        for k in range(5):
+            raw.sendall(bytes([0x02 if k == 0 else 0x00, 0x80 | 126]) + struct.pack(">H", MOST_BYTES // 4) + b"\0" * 4)
+            with contextlib.suppress(ConnectionError):  # closed meanwhile
+                raw.sendall(b"x" * (MOST_BYTES // 4))
+            if k == 3:
+                break
+        raw.sendall(bytes([0x00, 0x80 | 126]) + struct.pack(">H", 100) + b"mask")
+        assert closing_code(raw) == 1009
+
+
+def test_bodies_are_refused_before_they_have_come() -> None:
+    with served(Counters()) as (url, _):
+        parts = urlsplit(url)
+        for method, status in (("GET", 413), ("POST", 413), ("PUT", 413)):
+            connection = HTTPConnection(parts.netloc, timeout=WAIT_S)
+            connection.putrequest(method, f"/?{parts.query}")
+            connection.putheader("Content-Length", str(2**40))
+            connection.endheaders()
+            answer = connection.getresponse()
+            assert (answer.status, answer.getheader("Connection")) == (status, "close")
+            connection.close()
+
+
+# who may speak
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "192.0.2.7", "0.0.0.0", "a b", ""])
+def test_other_names_are_not_served(host: str) -> None:
+    """A page of another site whose name was made to lead here has its own name in Host."""
+    build = Counters()
+    with served(build) as (url, _):
+        parts = urlsplit(url)
+        for path in ("/", "/ws"):
+            for name in (host, f"{host}:{parts.port}"):
+                connection = HTTPConnection(parts.netloc, timeout=WAIT_S)
+                connection.putrequest("GET", f"{path}?{parts.query}", skip_host=True)
+                connection.putheader("Host", name)
+                connection.putheader("Origin", f"http://{name}")
+                connection.endheaders()
+                assert connection.getresponse().status in (400, 403)
+                connection.close()
+    assert build.servers == []
+
+
+@pytest.mark.parametrize("name", ["localhost", "LOCALHOST", "127.0.0.1", "[::1]"])
+def test_its_own_names_are_served(name: str) -> None:
+    """Also with another port, which a tunnel has."""
+    with served(Counters()) as (url, _):
+        parts = urlsplit(url)
+        for port in (parts.port, 4321):
+            connection = HTTPConnection(parts.netloc, timeout=WAIT_S)
+            connection.putrequest("GET", f"/?{parts.query}", skip_host=True)
+            connection.putheader("Host", f"{name}:{port}")
+            connection.endheaders()
+            assert connection.getresponse().status == 200
+            connection.close()
+
+
+@pytest.mark.parametrize(
+    "origin", ["https://127.0.0.1:{port}", "http://127.0.0.1", "http://localhost:{port}", "127.0.0.1:{port}"]
+)
+def test_an_origin_has_scheme_and_port(origin: str) -> None:
+    async def connect(url: str) -> int:
+        headers = {"Origin": origin.format(port=urlsplit(url).port)}
+        async with aiohttp.ClientSession() as session:
+            try:
+                async with session.ws_connect(url.replace("/?", "/ws?"), headers=headers):
+                    return 101
+            except aiohttp.WSServerHandshakeError as error:
+                return error.status
+
+    build = Counters()
+    with served(build) as (url, _):
+        assert asyncio.run(connect(url)) == 403
+    assert build.servers == []
+
+
+def test_the_token_goes_to_no_other_page() -> None:
+    with served(Counters()) as (url, _):
+        parts = urlsplit(url)
+        for path, status in (("/", 403), (f"/?{parts.query}", 200), (f"/none?{parts.query}", 404)):
+            connection = HTTPConnection(parts.netloc, timeout=WAIT_S)
+            connection.request("GET", path)
+            answer = connection.getresponse()
+            assert (answer.status, answer.getheader("Referrer-Policy")) == (status, "no-referrer")
+            assert TOKEN not in answer.read().decode()
+            connection.close()
+
+
+# where it is served
+
+
+def test_an_address_that_can_be_opened_is_given() -> None:
+    assert address("0.0.0.0", 80, TOKEN).startswith(f"http://{reachable('0.0.0.0')}")
+    assert reachable("0.0.0.0") not in ("0.0.0.0", "")
+    assert reachable("::") not in ("::", "")
+    assert address("::1", 8080, "t") == address("[::1]", 8080, "t") == "http://[::1]:8080/?token=t"
+    assert address("localhost", 8080, "t") == "http://localhost:8080/?token=t"
+    with served(Counters(), host="0.0.0.0") as (url, _):
+        assert urlsplit(url).hostname == reachable("0.0.0.0")
+        parts = urlsplit(url)
+        assert get(f"http://127.0.0.1:{parts.port}", f"/?{parts.query}")[0] == 200
+        assert get(url, f"/?{parts.query}")[0] == 200
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "[::]", "0", "192.168.1.5", "example.org", "fe80::1"])
+def test_others_can_reach_it_and_that_is_said(host: str) -> None:
+    text = warning(host)
+    assert text is not None
+    assert host in text
+    assert "everybody in the network" in text
+    assert not is_local(host)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "::1", "[::1]", "127.0.0.2", "LocalHost"])
+def test_this_machine_alone_needs_no_warning(host: str) -> None:
+    assert warning(host) is None
+
+
+@pytest.mark.parametrize(
+    ("host", "says"),
+    [("192.0.2.1", "no address of this machine"), ("no.such.host.invalid", "no known name"), ("  ", "host is empty")],
+)
+def test_a_host_that_is_not_here_is_one_error(host: str, says: str) -> None:
+    with pytest.raises(AmiwarpError, match=says) as error:
+        asyncio.run(serve(Counters(), settable=COUNT, token=TOKEN, host=host))
+    assert "\n" not in str(error.value)
+
+
+def test_an_occupied_port_is_one_error() -> None:
+    with sockets.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(AmiwarpError, match=f"--port {port}: is in use") as error:
+            asyncio.run(serve(Counters(), settable=COUNT, token=TOKEN, port=port))
+    assert "\n" not in str(error.value)
+
+
+def test_names_of_a_host_that_others_reach() -> None:
+    names = Names("0.0.0.0")
+    assert sockets.gethostname().lower() in names.known
+    assert "0.0.0.0" not in names.known
+    assert sockets.gethostname().lower() not in Names("127.0.0.1").known - {"localhost"}
+
+
+# slow and absent pages, many of them
+
+
+class Unread:
+    """A WebSocket whose other end takes three messages and no more, until it is gone."""
+
+    def __init__(self) -> None:
+        self.taken, self.gone = 0, asyncio.Event()
+
+    async def send_bytes(self, content: bytes) -> None:
+        self.taken += 1
+        if self.taken > 3:
+            await self.gone.wait()
+            raise ConnectionResetError
+
+
+def test_for_a_page_that_takes_nothing_nothing_more_is_drawn(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Everything that makes pictures goes on: knobs, the mouse that turns, a recording that is played."""
+    build = Panels(recording, tmp_path)
+
+    async def work() -> None:
+        unread = Unread()
+        async with server_module._connection(build, {}, unread) as (server, connection):  # type: ignore[arg-type]
+            panel, monitor, waiting, drawn = build.panels[0], server.protocol.network_monitor, [0], [0]
+            application, show = server.protocol.getSharedObject("app"), panel.scene.show
+            monkeypatch.setattr(panel.scene, "show", lambda *args: (drawn.append(1), show(*args)))
+            view = server.state.viewId
+            for number, (method, *args) in enumerate(
+                (("wslink.hello", {"secret": "wslink-secret"}), ("viewport.image.push.observer.add", view))
+            ):
+                message = packed({"id": "rpc:1" if number else "system:0", "method": method, "args": args})
+                assert Gate(server, SETTABLE).passes(message)
+                await connection.send(True, aiohttp.WSMessage(aiohttp.WSMsgType.BINARY, message, None))
+            panel.play()
+            application.InvokeEvent("StartInteractionEvent")
+            await until_async(lambda: monitor.pending > MOST_IN_FLIGHT)
+            drawn.clear()
+            for number in range(200):
+                panel.state.dark = bool(number % 2)
+                panel.ask("look")
+                application.InvokeEvent("UpdateEvent")
+                await asyncio.sleep(0.01)
+                waiting.append(monitor.pending)
+            assert len(drawn) <= 1  # what had begun
+            assert max(waiting) < 3 * MOST_IN_FLIGHT
+            unread.gone.set()
+
+    run(work)
+
+
+def test_tabs_are_bounded_and_the_next_one_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "MOST_TABS", 2)
+    build = Counters()
+
+    async def attack(url: str) -> None:
+        async with client(url) as one, client(url) as two:
+            assert [(await each.state())["count"] for each in (one, two)] == [0, 0]
+            async with client(url) as three, client(url):
+                assert "tabs of this inspector are open" in (await three.state())["failure"]
+                with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
+                    async with client(url):
+                        pass
+            await two.socket.close()
+            await until_async(lambda: build.closed == 1)
+            async with client(url) as four:
+                assert (await four.state())["count"] == 0
+
+    with served(build) as (url, _):
+        run(lambda: attack(url))
+    assert len(build.servers) == build.closed == 3
+
+
+def native_threads() -> int:
+    """Threads that Python knows nothing of: VTK's and the renderer's."""
+    tasks = Path("/proc/self/task")
+    return len(list(tasks.iterdir())) - threading.active_count() if tasks.is_dir() else 0
+
+
+def test_closed_tabs_give_back_threads_and_memory(recording: Recording, tmp_path: Path) -> None:
+    build = Panels(recording, tmp_path, keep=False)
+    gc.collect()
+
+    async def visit(url: str, count: int) -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            pages = [await stack.enter_async_context(client(url)) for _ in range(count)]
+            for page in pages:
+                state = await page.state()
+                await page.call("viewport.image.push.observer.add", state["viewId"])
+                await page.call("trame.trigger", "key", ["c"], {})
+                while not ((state := await page.state())["curve_text"] and state["picture"]):
+                    await asyncio.sleep(0.02)
+                await page.call("trame.trigger", "key", ["c"], {})
+
+    def ours() -> list[str]:
+        return [thread.name for thread in threading.enumerate() if thread.name.startswith("amiwarp-tab")]
+
+    with served(build, SETTABLE) as (url, _):
+        run(lambda: visit(url, 1))
+        until(lambda: all(part() is None for part in build.parts) and not ours())
+        before = native_threads()
+        for _ in range(2):
+            run(lambda: visit(url, 4))
+            until(lambda: all(part() is None for part in build.parts) and not ours())
+            until(lambda: native_threads() <= before)
+    assert len(build.parts) == 9 * 6
+    assert ours() == []
