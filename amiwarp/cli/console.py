@@ -76,14 +76,14 @@ def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -
     In JSON a number that is not finite becomes null.
     """
     if common.json:
-        print(json.dumps(plain(data), allow_nan=False))
+        print(json.dumps(plain(data), allow_nan=False), flush=True)
         return
     # Into a file or a pipe nothing is wrapped.
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 1000)
     with console.capture() as text:
         for line in lines:
             console.print(printable(line) if isinstance(line, str) else line, markup=False)
-    print("\n".join(row.rstrip() for row in text.get().splitlines()))
+    print("\n".join(row.rstrip() for row in text.get().splitlines()), flush=True)
 
 
 def plain(value: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 import threading
 import time
 from pathlib import Path
@@ -102,7 +101,6 @@ def run(
                 [terminal.name, served.address, f"try: {hint}"],
             )
         report(common, data, lines)
-        sys.stdout.flush()
         end = math.inf if seconds is None else time.monotonic() + seconds
         while not stop.wait(STEP_S) and time.monotonic() < end:
             if served is not None and served.done.is_set():

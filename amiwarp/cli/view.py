@@ -123,7 +123,6 @@ def run(
             if in_browser and (text := warning(host)) is not None:
                 say(text)
             report(common, {"url": url}, [f"{recording.name}: {url}", "Ctrl-C ends it"])
-            sys.stdout.flush()
 
         def tab() -> Inspector:
             return waiting.pop() if waiting else make()
