@@ -1,5 +1,8 @@
 """Every NLopt algorithm by its own name, its budget, its failures."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -76,3 +79,19 @@ def test_one_dimension_is_refused_where_nlopt_has_no_way() -> None:
             lambda x: -float(x[0] ** 2), "LN_BOBYQA",
             low=LOW[:1], high=HIGH[:1], start=np.ones(1), evaluations=50, tolerance=0.1,
         )  # fmt: skip
+
+
+def test_what_the_score_holds_is_let_go() -> None:
+    """NLopt keeps what it has called; buffers of a search, or a whole page, must not stay with it."""
+
+    class Held:
+        def __call__(self, x: np.ndarray) -> float:
+            return -float(x @ x)
+
+    held = Held()
+    gone = weakref.ref(held)
+    for algorithm in ("GN_DIRECT_L", "LN_SBPLX", "GN_MLSL"):
+        maximise(held, algorithm, low=LOW, high=HIGH, start=np.ones(2), evaluations=50, tolerance=0.01)
+    del held
+    gc.collect()
+    assert gone() is None

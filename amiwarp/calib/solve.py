@@ -108,6 +108,8 @@ def maximise(
         ended = "budget"
     except (RuntimeError, ValueError) as error:
         raise AmiwarpError(f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm") from error
+    finally:
+        samples.release()
     if samples.failure is not None:
         raise samples.failure
     points, scores = np.array(samples.points), np.array(samples.scores)
@@ -123,9 +125,17 @@ class _Samples:
         self.points: list[NDArray[np.float64]] = []
         self.scores: list[float] = []
         self.failure: BaseException | None = None
-        self._score, self._most, self._stop = score, most, stop
+        self._score: Callable[[NDArray[np.float64]], float] | None = score
+        self._stop: Callable[[], None] | None = stop
+        self._most = most
+
+    def release(self) -> None:
+        """Let go of the score and of what it holds: NLopt keeps what it has called for ever."""
+        self._score = self._stop = None
 
     def cost(self, x: NDArray[np.float64], _gradient: Any) -> float:
+        assert self._score is not None
+        assert self._stop is not None
         # NLopt's C code may go on calling after an exception, so none is let through: it is kept, and NLopt stopped.
         if self.failure is not None or len(self.scores) >= self._most:  # some algorithms overrun their budget
             self._stop()
