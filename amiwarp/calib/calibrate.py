@@ -134,11 +134,13 @@ def _why_doubtful(
 ) -> Calibration | AmiwarpError:
     """The answer with the camera's motion free, or ``found``; or the error that the encoder's scale is wrong.
 
-    A slow camera motion explains some of what a wrong scale does to the events, and the reverse, so the cause that
-    leaves less of the cost is named.
+    A slow camera motion explains some of what a wrong scale does to the events, and the reverse: where it leaves more
+    than a still scene does, the cause that leaves less is named.
     """
-    scaled = _scaled(recording, settings, found, device, progress)
     turning = found if settings.free is not None else _turning(recording, settings, found, device, progress)
+    if turning is not found and _cost(turning) <= STILL_COST:
+        return turning
+    scaled = _scaled(recording, settings, found, device, progress)
     if scaled is None or (turning is not found and _cost(turning) <= scaled[1]):
         return turning
     turns, cost = scaled
