@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import io
 import itertools
 import os
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import NewFile, check_output
+from amiwarp.io.output import NewFile, allocate, check_output
 from amiwarp.iwe import PIECE, CanvasShape, Votes
 from amiwarp.values import choice
 
@@ -77,7 +78,14 @@ def encode_png(path: Path, picture: Any) -> None:
     from PIL import Image
 
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
-    image.save(path, format="PNG", optimize=True)
+    encode_image(path, image, "PNG", optimize=True)
+
+
+def encode_image(path: Path, image: Any, kind: str, **options: Any) -> None:
+    """Write Pillow's image to an unfinished file. Raises OSError on a full disk, where Pillow itself may not notice."""
+    buffer = io.BytesIO()
+    image.save(buffer, format=kind, **options)
+    path.write_bytes(buffer.getbuffer())
 
 
 class IweFiles:
@@ -157,6 +165,8 @@ class IweFiles:
             flat = np.lib.format.open_memmap(
                 part, mode="w+", dtype=np.float32, shape=shape if self._window_us is None else full
             )
+            with open(part, "r+b") as file:  # a full disk would end the process when its pages are written
+                allocate(file.fileno(), 0, os.path.getsize(part))
             self._stacks[path] = flat.reshape(full)
         return self._stacks[path]
 

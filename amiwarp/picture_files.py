@@ -11,6 +11,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.output import NewFile, check_output
+from amiwarp.iwe_files import encode_image
 from amiwarp.values import choice
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def save_grey(value: NDArray[np.float32], path: Path, *, bits: int) -> None:
     kind = np.uint8 if bits == 8 else np.uint16
     image = Image.fromarray(np.rint(value * np.iinfo(kind).max).astype(kind))
     with NewFile(path) as new:
-        image.save(new.part, format="PNG" if path.suffix.lower() == ".png" else "TIFF")
+        encode_image(new.part, image, "PNG" if path.suffix.lower() == ".png" else "TIFF")
 
 
 def save_video(

@@ -27,6 +27,7 @@ from amiwarp.events import Events, MemoryEvents, Recording
 from amiwarp.io import RecordingWriter, convert, open_recording, output, save_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.io.output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
+from amiwarp.iwe_files import IweFiles, Layers
 from amiwarp.optics import Prism
 
 SIZE = (64, 48)
@@ -464,3 +465,43 @@ def test_a_recording_that_appears_while_one_is_written_is_kept(tmp_path: Path) -
         # what was recorded live is not lost either
         assert os.listdir(tmp_path) == ([] if k == 0 else ["a.part.h5"])
     assert len(open_recording(tmp_path / "a.part.h5").events) == 2000
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from amiwarp.errors import AmiwarpError
+from amiwarp.picture_files import save_grey
+from amiwarp.iwe_files import save_png
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+noise = np.random.default_rng(0).random((60, 80), np.float32)
+for write in (lambda p: save_grey(noise, p, bits=16), lambda p: save_png(p, np.uint8(255 * noise))):
+    try:
+        write(Path(sys.argv[1]))
+    except AmiwarpError as error:
+        print(error)
+"""
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.png"])
+def test_pictures_on_a_full_disk(tmp_path: Path, name: str) -> None:
+    """Pillow itself takes a part of a TIFF for the whole."""
+    words = [sys.executable, "-c", FULL, tmp_path / name]
+    done = subprocess.run(words, env=environment(), capture_output=True, text=True, check=True)
+    assert [f"{name}: cannot be written: File too large" in line for line in done.stdout.splitlines()] == [True, True]
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_stack_of_images_takes_its_room_on_the_disk_first(tmp_path: Path) -> None:
+    """A page of a mapped file that finds no room ends the process."""
+    source = MemoryEvents(events(), *SIZE)
+    with IweFiles([tmp_path / "a.npy"], source, window_us=10_000, layers=Layers.MERGED, device="cpu") as files:
+        files.add(compensated(events()))
+        (part,) = tmp_path.iterdir()
+        found = part.stat()
+        assert found.st_blocks * 512 >= found.st_size > 20 * 4 * SIZE[0] * SIZE[1]
+
+
+def compensated(given: Events) -> Events:
+    return Events(given.x.astype(np.float32), given.y.astype(np.float32), given.t, given.p)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import errno
 import os
 import time
 from collections.abc import Mapping
@@ -37,7 +36,7 @@ from amiwarp.io.native_writer import (
     save_recording,
     write_header,
 )
-from amiwarp.io.output import check_output, put_in_place
+from amiwarp.io.output import allocate, check_output, put_in_place
 
 if TYPE_CHECKING:
     from amiwarp.prism import NominalPrism
@@ -117,7 +116,7 @@ class LiveWriter:
         check_output(self.path, overwrite=self._overwrite)
         try:
             with open(self.part, "xb") as file:
-                _allocate(file.fileno(), 0, self._to_finish())
+                allocate(file.fileno(), 0, self._to_finish())
         except FileExistsError as error:
             what = "is being written, or was left by a recording that was cut off; it opens like any other"
             raise AmiwarpError(f"{self.part}: {what}: rename or delete it") from error
@@ -262,7 +261,7 @@ class LiveWriter:
         if end <= self._reserved:
             return
         try:
-            _allocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
+            allocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
         except OSError as error:
             self._finish(tidy=False)
             what = f"{error.strerror} after {len(self)} events; it holds these"
@@ -323,16 +322,6 @@ class LiveWriter:
         self._columns, self._small = {}, {}
         if file is not None:
             file.close()
-
-
-def _allocate(handle: int, start: int, count: int) -> None:
-    """Take room on the disk for bytes of a file; OSError without it. Where a system cannot, it is not done."""
-    if hasattr(os, "posix_fallocate"):
-        try:
-            os.posix_fallocate(handle, start, count)
-        except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
-                raise
 
 
 class _Growing:

@@ -174,6 +174,16 @@ def _link(part: Path, target: Path) -> None:
         part.unlink()
 
 
+def allocate(handle: int, start: int, count: int) -> None:
+    """Take room on the disk for bytes of a file; OSError if there is none. Systems that cannot do so are left out."""
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(handle, start, count)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise
+
+
 @contextlib.contextmanager
 def scratch_folder(folder: Path) -> Iterator[Path]:
     """Make a folder for temporary files; it is removed at the end, or by the next run if this one is killed."""
