@@ -431,10 +431,10 @@ def test_a_status_tells_rate_latency_coverage_and_sharpness(monkeypatch: pytest.
         def packets(self) -> Iterator[Packet]:
             nonlocal now_us
             events, until = 0, time.monotonic() + LONG_S
-            for packet in given:
-                events += len(packet.events)
-                now_us = int(packet.events.t[-1])
-                yield replace(packet, arrived_us=now_us - 3000)
+            for part in given:
+                events += len(part.events)
+                now_us = int(part.events.t[-1])
+                yield replace(part, arrived_us=now_us - 3000)
                 while session.status.done < events and time.monotonic() < until:
                     time.sleep(1e-4)
 
