@@ -356,15 +356,16 @@ def test_empty_packets_come_each_50_ms_of_silence(monkeypatch):
         source, host = StreamSource("the silent", ours.makefile("rb", buffering=0)), Host()
 
         def silent(_file, seconds):
-            host.sleep(seconds)
+            host.sleep(seconds + 1e-4)
             return False
 
         monkeypatch.setattr(sources, "ready", silent)
         monkeypatch.setattr(sources, "time", SimpleNamespace(monotonic=host.monotonic))
         monkeypatch.setattr(sources, "monotonic_us", lambda: host.now)
-        arrived = [next_.arrived_us for next_ in itertools.islice(source.packets(), 5)]
-        assert arrived == [70_050_000, 70_100_000, 70_150_000, 70_200_000, 70_250_000]
+        packets = list(itertools.islice(source.packets(), 5))
         source.close()
+    assert [packet.arrived_us for packet in packets] == [70_050_100, 70_100_200, 70_150_300, 70_200_400, 70_250_500]
+    assert all(packet.bare for packet in packets)
 
 
 def test_addresses_that_are_none(tmp_path):
