@@ -482,7 +482,8 @@ class Dropping:
 def slow(*args, **extra):
     thing = Dropping()
     del thing
-    time.sleep(3000)
+    while True:
+        time.sleep(0.01)
 
 amiwarp.io.open_recording = slow
 main()
