@@ -7,18 +7,20 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rig_world import LONG_S, Wire, World
 from typer.testing import CliRunner
 
 from amiwarp.cli import motor as command
 from amiwarp.errors import AmiwarpError
 from amiwarp.link import following
-from amiwarp.link.clocks import WRAP, monotonic_us
+from amiwarp.link import link as link_module
+from amiwarp.link.clocks import WRAP
 from amiwarp.link.emulator import LASTING, Controller, Fault
 from amiwarp.link.following import Follower, News
 from amiwarp.link.link import Link
@@ -81,7 +83,7 @@ def said(news: Iterable[News]) -> str:
     return "\n".join(m for n in news for m in n.messages)
 
 
-def wait(true: Callable[[], object], seconds: float = 10.0) -> None:
+def wait(true: Callable[[], object], seconds: float = LONG_S) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "waited in vain"
@@ -352,13 +354,17 @@ def path(tmp_path: Path) -> Path:
 
 
 class Live:
-    """An emulator in real time whose world's clock is the host's, less its start."""
+    """An emulator in real time."""
 
-    def __init__(self, path: Path, *faults: str, rpm: float = RPM, drift_ppm: float = 0.0) -> None:
-        self.origin = monotonic_us()
+    def __init__(
+        self, path: Path, *faults: str, rpm: float = RPM, drift_ppm: float = 0.0, sample_hz: float = 1000.0,
+        now_us: Callable[[], int] | None = None,
+    ) -> None:  # fmt: skip
         self.motor = Motor(rpm)
-        self.controller = Controller(self.motor, faults=[Fault.parse(f) for f in faults], drift_ppm=drift_ppm)
-        self.terminal = PseudoTerminal(self.controller, path, now_us=lambda: monotonic_us() - self.origin)
+        self.controller = Controller(
+            self.motor, faults=[Fault.parse(f) for f in faults], drift_ppm=drift_ppm, sample_hz=sample_hz
+        )
+        self.terminal = PseudoTerminal(self.controller, path, now_us=now_us)
 
     def __enter__(self) -> "Live":
         return self
@@ -371,8 +377,24 @@ class Live:
         return np.asarray((error + math.pi) % math.tau - math.pi)
 
 
+class Paced(Live):
+    """An emulator in a world that begins with its link, waits for it, and stands still while ``running`` is clear."""
+
+    def __init__(self, path: Path, *faults: str, rpm: float = RPM, drift_ppm: float = 0.0) -> None:
+        self.running = threading.Event()
+        self.world = World(self.running.is_set)
+        super().__init__(path, *faults, rpm=rpm, drift_ppm=drift_ppm, now_us=self.world.step)
+
+    @contextlib.contextmanager
+    def link(self) -> Iterator[Link]:
+        with Link(self.terminal.name, host_us=self.world.now) as link:
+            self.world.conditions.append(Wire(link, self.terminal))
+            self.running.set()
+            yield link
+
+
 def test_live_angles_and_clock(path: Path) -> None:
-    with Live(path, drift_ppm=3000.0) as live, Link(str(path)) as link:
+    with Paced(path, drift_ppm=3000.0) as live, live.link() as link:
         assert link.connected
         wait(lambda: len(link._follower.trips) >= 11 and link.status is not None)
         news = link.poll()
@@ -382,17 +404,20 @@ def test_live_angles_and_clock(path: Path) -> None:
         clock = link.clock()
         assert clock is not None
         assert clock.drift == pytest.approx(3e-3, abs=5 * clock.drift_std)
-        true = live.controller.clock(clock.at_us - live.origin) - clock.at_us
+        true = live.controller.clock(clock.at_us) - clock.at_us
         assert clock.offset_us == pytest.approx(true, abs=5 * clock.offset_std_us)
     assert not link.connected
     assert [t.name for t in threading.enumerate() if t.name in ("amiwarp-link", "amiwarp-emulator")] == []
 
 
 def test_a_port_that_was_unplugged_comes_back(path: Path) -> None:
-    with Live(path, "unplug@1.6+0.5") as live, Link(str(path)) as link:
+    with Paced(path, "unplug@1.6+0.5") as live, live.link() as link:
+        seen = threading.Event()
+        live.world.conditions.append(lambda: link.connected or seen.is_set())
         wait(lambda: not link.connected)
         with pytest.raises(AmiwarpError, match="not sent, the port is gone"):
             link.stop()
+        seen.set()
         wait(lambda: link.connected)
         news = [link.poll()]
         wait(lambda: news.append(link.poll()) or sum(len(n.t_us) for n in news[1:]) > 200)
@@ -410,12 +435,14 @@ def test_a_port_that_was_unplugged_comes_back(path: Path) -> None:
 
 
 def test_a_link_is_closed_while_its_port_is_gone(path: Path) -> None:
-    with Live(path, "unplug@0.3+60"), Link(str(path)) as link:
+    with Paced(path, "unplug@0.3+60") as live, live.link() as link:
         wait(lambda: not link.connected)
 
 
-def test_commands_over_the_line(path: Path) -> None:
-    with Live(path, rpm=0.0) as live, Link(str(path)) as link:
+def test_commands_over_the_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr(link_module, "ANSWER_S", LONG_S)
+    with Paced(path, rpm=0.0) as live, live.link() as link:
         link.set_speed(900.0, 10_000.0)
         wait(lambda: link.status is not None and (link.status.state, link.status.target_rpm) == (1, 900.0))
         with pytest.raises(AmiwarpError, match=r"set speed 1e\+06 rpm: refused by the controller, out of its range"):
@@ -427,10 +454,12 @@ def test_commands_over_the_line(path: Path) -> None:
         link.stop()
         wait(lambda: link.status is not None and link.status.state == 0)
         live.controller.feed = lambda data, now_us: None  # type: ignore[method-assign]
-        began = time.monotonic()
+        monkeypatch.undo()
+        wait_for = link._changed.wait_for
+        monkeypatch.setattr(link._changed, "wait_for", lambda true, s: waits.append(s) or wait_for(true, s))
         with pytest.raises(AmiwarpError, match="stop: no answer in 1 s"):
             link.stop()
-        assert time.monotonic() - began < 1.5
+        assert waits == [1.0]  # the only wait
 
 
 def test_a_port_that_is_open_elsewhere_is_not_shared(path: Path) -> None:
@@ -451,7 +480,15 @@ def test_ports_by_usb_id_and_by_what_they_send(path: Path, tmp_path: Path, monke
         other.controller.plugged = False
         other.controller.advance = lambda now_us: b""  # type: ignore[method-assign]
         listed(monkeypatch, (str(dumb), None, None), (str(tmp_path / "absent"), None, None), (str(path), 0x16C0, 0x483))
-        monkeypatch.setattr("amiwarp.link.port.LISTEN_S", 0.2)
+        listened = itertools.count()  # a second goes by with 20 looks at the port that sends nothing
+
+        def clock() -> float:
+            assert other.terminal._master is not None
+            if other.terminal._alone(other.terminal._master):
+                return 0.0
+            return 0.05 * next(listened)
+
+        monkeypatch.setattr("amiwarp.link.port.time", SimpleNamespace(monotonic=clock))
         for where in ("16C0:0483", None):
             with Link(where) as link:
                 assert link.name == str(path)
@@ -515,12 +552,14 @@ def motor(*args: object) -> tuple[int, str, BaseException | None]:
     return done.exit_code, done.stdout, done.exception
 
 
-def test_the_command_sets_shows_and_stops(path: Path) -> None:
-    with Live(path, rpm=0.0):
+def test_the_command_sets_shows_and_stops(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_module, "ANSWER_S", LONG_S)
+    monkeypatch.setattr(command, "WAIT_S", LONG_S)
+    with Live(path, rpm=0.0, sample_hz=50.0):  # so few that none is lost while the machine is busy
         code, out, _ = motor("set", "--rpm", -300, "--ramp-rpm-s", 10_000, "--port", path)
         assert code == 0
         assert "set to -300 rpm" in out
-        wait(lambda: "at speed" in motor("status", "--port", path)[1], 20.0)
+        wait(lambda: "at speed" in motor("status", "--port", path)[1])
         code, out, _ = motor("stop", "--port", path, "--json")
         assert '"target_rpm": 0.0' in out
         assert '"answers": true' in out

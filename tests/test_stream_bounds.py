@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rig_world import World
 from test_session import KNOWN, MODEL, Made, points, world
 
 from amiwarp.compensator import Compensated, Compensator, held_bytes
@@ -42,7 +43,7 @@ from amiwarp.stream.watch import PhaseWatch
 MOST = 1 << 20
 """Bound of the queues here [bytes]."""
 HELLO = encode_hello(64, 48)
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def samples(k: int, n: int = 500) -> Packet:
@@ -339,7 +340,7 @@ def test_an_emulated_port_comes_back_after_a_lack_of_descriptors(
         return openpty()
 
     controller = Controller(Motor(720.0), faults=[Fault.parse("unplug@0.1+0.1")])
-    with PseudoTerminal(controller, tmp_path / "prism"):
+    with PseudoTerminal(controller, tmp_path / "prism", now_us=World().step):
         monkeypatch.setattr(os, "openpty", exhausted)
         reached(lambda: len(failed) == 3)
         reached(lambda: (tmp_path / "prism").exists())

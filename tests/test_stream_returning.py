@@ -35,7 +35,7 @@ CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.
 HELLO = encode_hello(64, 48, CAMERA, PRISM)
 END = encode_end()
 N = 3000
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def part(start_us: int, n: int = N) -> bytes:

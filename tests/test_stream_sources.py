@@ -20,7 +20,7 @@ from amiwarp.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.link.clocks import monotonic_us
 from amiwarp.optics import Prism
-from amiwarp.stream import sockets, sources
+from amiwarp.stream import cameras, sockets, sources
 from amiwarp.stream.packets import (
     HEADER,
     Decoder,
@@ -40,6 +40,8 @@ from amiwarp.stream.sources import FileSource, StreamSource, open_source
 SIZE = (320, 240)
 CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5)
 HELLO = encode_hello(*SIZE, CAMERA, Prism(0.04))
+LONG_S = 120.0
+"""Limit of waits: only what hangs takes as long [s]."""
 
 
 def make(count: int, *, start: int = 5_000_000, seed: int = 0, mean_us: float = 3.0) -> Events:
@@ -69,6 +71,9 @@ class Host:
     def __init__(self) -> None:
         self.now = 70_000_000
         self.slept: list[float] = []
+
+    def monotonic(self) -> float:
+        return self.now / 1e6
 
     def sleep(self, seconds: float) -> None:
         self.slept.append(seconds)
@@ -240,7 +245,8 @@ def address(request, tmp_path):
     return {"tcp": "tcp::0", "tcp6": "tcp:[::1]:0", "unix": f"unix:{tmp_path}/socket"}[request.param]
 
 
-def test_any_number_of_clients_get_hello_packets_and_end(address, tmp_path):
+def test_any_number_of_clients_get_hello_packets_and_end(address, tmp_path, monkeypatch):
+    monkeypatch.setattr(sockets, "PARTING_S", LONG_S)
     events = make(60_000)
     with SocketSink(address, HELLO) as sink:
         assert sink.address.startswith("tcp:127.0.0.1:" if address == "tcp::0" else address[: address.rfind(":") + 1])
@@ -262,7 +268,7 @@ def test_any_number_of_clients_get_hello_packets_and_end(address, tmp_path):
         for start in range(20, len(events), 5000):
             sink.send(encode_events(events[start : start + 5000]))
     for thread in threads:
-        thread.join(10.0)
+        thread.join(LONG_S)
     for source, packets, connection in zip(parts, got, (*early, late), strict=True):
         assert_equal(joined(packets), events[10:])
         assert (source.problem, source.size, sink.lost) == (None, SIZE, 0)
@@ -271,7 +277,8 @@ def test_any_number_of_clients_get_hello_packets_and_end(address, tmp_path):
     assert not (tmp_path / "socket").exists()
 
 
-def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path):
+def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path, monkeypatch):
+    monkeypatch.setattr(sockets, "PARTING_S", LONG_S)
     with SocketSink(f"unix:{tmp_path}/s", HELLO, most_bytes=1 << 18) as sink:
         slow, quick, gone = (sockets.connect(sink.address) for _ in range(3))
         sink.tick()
@@ -291,7 +298,7 @@ def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path):
         assert 0 < held <= (1 << 18) + 20_000
         thread = threading.Thread(target=sink.close)
         thread.start()
-        slow.settimeout(5.0)
+        slow.settimeout(LONG_S)
         data = b"".join(iter(lambda: slow.recv(1 << 20), b""))
         quick.setblocking(True)
         seen += decoder.feed(b"".join(iter(lambda: quick.recv(1 << 20), b"")))
@@ -331,17 +338,34 @@ def test_a_silent_sender_brings_empty_packets():
     with ours, theirs:
         theirs.sendall(HELLO)
         source = StreamSource("the silent", ours.makefile("rb", buffering=0))
-        began = time.monotonic()
         packets = source.packets()
         for _ in range(2):
             assert not len(next(packets).events)
-        assert 0.1 <= time.monotonic() - began < 1.0
         half = encode_events(make(10))
         theirs.sendall(half[:50])
         assert not len(next(packets).events)
         theirs.sendall(half[50:])
         assert next(len(packet.events) for packet in packets if len(packet.events)) == 10
         source.close()
+
+
+def test_empty_packets_come_each_50_ms_of_silence(monkeypatch):
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        theirs.sendall(HELLO)
+        source, host = StreamSource("the silent", ours.makefile("rb", buffering=0)), Host()
+
+        def silent(_file, seconds):
+            host.sleep(seconds + 1e-4)
+            return False
+
+        monkeypatch.setattr(sources, "ready", silent)
+        monkeypatch.setattr(sources, "time", SimpleNamespace(monotonic=host.monotonic))
+        monkeypatch.setattr(sources, "monotonic_us", lambda: host.now)
+        packets = list(itertools.islice(source.packets(), 5))
+        source.close()
+    assert [packet.arrived_us for packet in packets] == [70_050_100, 70_100_200, 70_150_300, 70_200_400, 70_250_500]
+    assert all(packet.bare for packet in packets)
 
 
 def test_addresses_that_are_none(tmp_path):
@@ -437,9 +461,12 @@ def test_a_quiet_camera_brings_empty_packets_and_its_errors_are_one_line(monkeyp
     fake = FakeDv([None] * 2000 + [RuntimeError("lost\nStacktrace:\n 0# 0x0")], [])
     monkeypatch.setitem(sys.modules, "dv_processing", fake.module)
     packets = open_source("dv:DX0").packets()
-    began = time.monotonic()
-    assert not len(next(packets).events)
-    assert 0.05 <= time.monotonic() - began < 1.0
+    host = Host()
+    monkeypatch.setattr(cameras, "time", SimpleNamespace(monotonic=host.monotonic, sleep=host.sleep))
+    for _ in range(2):
+        began = host.now
+        assert not len(next(packets).events)
+        assert 50_000 <= host.now - began < 51_000
     del fake.batches[:-1]
     with pytest.raises(AmiwarpError, match="dv:DX0: stopped: lost; check cable"):
         list(packets)

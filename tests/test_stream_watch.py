@@ -6,6 +6,7 @@ import math
 import re
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,11 +24,12 @@ from amiwarp.events import Events, Recording
 from amiwarp.io import save_recording
 from amiwarp.optics import Prism
 from amiwarp.simulate import SensorModel, simulate
+from amiwarp.stream import ring as ring_module
 from amiwarp.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.stream.forward import Forward
-from amiwarp.stream.packets import Angles, Decoder
+from amiwarp.stream.packets import Angles, Decoder, Packet
 from amiwarp.stream.ring import SECONDS, Ring, followed
-from amiwarp.stream.sources import open_source
+from amiwarp.stream.sources import FileSource, open_source
 from amiwarp.stream.speed import WINDOW_US, SpeedKeeper
 from amiwarp.stream.watch import PhaseWatch
 
@@ -54,7 +56,7 @@ def streamed(recording: Recording) -> EncoderStream:
     return stream
 
 
-def looked(watch: PhaseWatch, encoder: EncoderStream, until_s: float = 60.0) -> float:
+def looked(watch: PhaseWatch, encoder: EncoderStream, until_s: float = 120.0) -> float:
     """What the watch finds, which it is asked again and again as by a session."""
     end = time.monotonic() + until_s
     while (found := watch.look(encoder)) is None:
@@ -74,7 +76,9 @@ def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
     slipped = EncoderStream()
     assert recording.encoder is not None
     slipped.append(recording.encoder.t, recording.encoder.angle - math.radians(4.0))
+    end = time.monotonic() + 120.0
     while abs(looked(watch, slipped) - first) < 1.0:
+        assert time.monotonic() < end
         time.sleep(0.01)
     assert looked(watch, slipped) - first == pytest.approx(4.0, abs=0.5)
     assert len(said) == 1
@@ -197,15 +201,30 @@ def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:
     assert (found.camera, found.prism) == (CAMERA, PRISM)
 
 
-def test_a_stream_is_followed_while_one_looks(recording: Recording, tmp_path: Path) -> None:
+def test_a_stream_is_followed_while_one_looks(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     save_recording(tmp_path / "r.h5", replace(recording, truth=None))
     said: list[str] = []
-    source = open_source(str(tmp_path / "r.h5"))
+    monkeypatch.setattr(ring_module, "FIRST_S", 120.0)
+    looked_at = threading.Event()
+
+    class Held(FileSource):
+        """Gives a turn, and the rest once somebody has looked."""
+
+        def packets(self) -> Iterator[Packet]:
+            for packet in super().packets():
+                if len(packet.events) and packet.events.t[-1] > recording.events.t_first + 200_000:
+                    assert looked_at.wait(120.0)
+                yield packet
+
+    source = Held(tmp_path / "r.h5")
     ring = Ring(source)
     with followed(source, None, ring, said.append):
         first = ring.recording()
         assert first is not None
-        end = time.monotonic() + 20.0
+        looked_at.set()
+        end = time.monotonic() + 120.0
         while not said:
             assert time.monotonic() < end
             time.sleep(0.01)

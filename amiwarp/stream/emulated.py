@@ -44,7 +44,7 @@ class EmulatedCamera:
         self._origin = round(int(encoder.t[0]) - encoder.clock_offset_us)
         """On the events' clock when the rotor begins."""
         rotor.begin(NEVER)
-        self._start, self._told = NEVER, -1
+        self._start, self._told_us = NEVER, -1
         self.late_us = 0
         """By how much events were sent late at most."""
         self._sink = SocketSink(address, encode_hello(*events.size, recording.camera, recording.prism))
@@ -102,10 +102,11 @@ class EmulatedCamera:
         """Waits, then sends what pulses there were and what waits; whether it is to end."""
         if self._ended.wait(seconds):
             return True
-        pulses = [(n, self._time(world)) for n, world in list(self._controller.pulses) if n > self._told]
+        # by their time: a controller that was reset counts its pulses from 0 again
+        pulses = [world for _, world in list(self._controller.pulses) if world > self._told_us]
         if pulses:
-            self._told = pulses[-1][0]
-        self._sink.send(encode_triggers(np.array([t for _, t in pulses], np.int64)))
+            self._told_us = pulses[-1]
+        self._sink.send(encode_triggers(np.array([self._time(world) for world in pulses], np.int64)))
         return False
 
     def _time(self, world_us: int) -> int:

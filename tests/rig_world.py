@@ -1,0 +1,98 @@
+"""An emulated rig in a world of its own time, which stands still until the programs under test have caught up.
+
+Nothing that is late on a busy machine is late by this clock: what a test finds does not depend on the machine's speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from amiwarp.link.link import Link
+from amiwarp.link.protocol import Answer
+from amiwarp.link.terminal import PseudoTerminal
+from amiwarp.stream.emulated import EmulatedCamera
+from amiwarp.stream.packets import Packet, Source
+from amiwarp.stream.session import Session
+
+LONG_S = 120.0
+"""Limit of every wait: only what hangs takes as long [s]."""
+LAG_US = 20_000
+"""By how much a session may be behind the camera before the world waits for it [us]."""
+
+
+class World:
+    """A clock [us] that begins at 0; :meth:`step` moves it on if all ``conditions`` hold."""
+
+    def __init__(self, *conditions: Callable[[], bool], step_us: int = 4000) -> None:
+        self.conditions = list(conditions)
+        self._now, self._step_us = 0, step_us
+
+    def now(self) -> int:
+        return self._now
+
+    def step(self) -> int:
+        """For one thread, the emulated controller's."""
+        if all(condition() for condition in self.conditions):
+            self._now += self._step_us
+        return self._now
+
+
+class Wire:
+    """The bytes between a terminal and a link. A kernel under load hands them over later than it takes them.
+
+    Called, it tells whether the link has read all, and knows whether the cable is in.
+    """
+
+    def __init__(self, link: Link, terminal: PseudoTerminal) -> None:
+        self._link, self._terminal = link, terminal
+        self._under_way = 0
+        advance, feed = terminal._controller.advance, link._follower.feed
+
+        def sent(now_us: int) -> bytes:
+            out = advance(now_us)
+            self._under_way += len(out)
+            return out
+
+        def read(data: bytes, host_us: int) -> list[Answer]:
+            answers = feed(data, host_us)
+            self._under_way -= len(data)
+            return answers
+
+        terminal._controller.advance = sent  # type: ignore[method-assign]
+        link._follower.feed = read  # type: ignore[method-assign]
+
+    def __call__(self) -> bool:
+        plugged = self._terminal._master is not None
+        if not plugged:
+            self._under_way = 0
+        return self._link.connected == plugged and self._under_way <= 0
+
+
+class Counted:
+    """A source that counts the triggers that came."""
+
+    def __init__(self, source: Source) -> None:
+        self._source, self.triggers = source, 0
+        self.size, self.camera, self.prism = source.size, source.camera, source.prism
+        self.name, self.has_encoder = source.name, source.has_encoder
+
+    def packets(self) -> Iterator[Packet]:
+        for packet in self._source.packets():
+            self.triggers += len(packet.triggers)
+            yield packet
+
+    def close(self) -> None:
+        self._source.close()
+
+
+def has_taken_in(session: Session, source: Counted, camera: EmulatedCamera, link: Link) -> Callable[[], bool]:
+    """Whether the session has what the link gives, all pulses that the camera saw, and its events but the last few."""
+    first, last = camera._events.t_first, camera._events.t_last
+
+    def ready() -> bool:
+        if link._follower._kept or (source.triggers < len(camera._controller.pulses) and not camera.done.is_set()):
+            return False
+        due = camera._time(camera._now_us()) - LAG_US
+        return due < first or session._last_us >= min(due, last)
+
+    return ready
