@@ -362,5 +362,5 @@ class Recording:
     """What made the recording, where it is synthetic."""
     metadata: dict[str, MetadataValue] = field(default_factory=dict)
     """Whatever else is known: format, repairs made while reading, the simulator's seed."""
-    name: str = ""
+    name: str = "recording"
     """Short name for messages and titles: the file's name without its ending."""

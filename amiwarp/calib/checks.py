@@ -50,7 +50,7 @@ def check_left(count: int, left_out: NDArray[np.bool_], name: str) -> None:
     if count < FEWEST_EVENTS:
         pixels = int(np.count_nonzero(left_out))
         raise AmiwarpError(
-            f"{name}: {pixels:,} pixels flicker or fire at random, and without them {count} events are left; "
+            f"{name}: without the pixels that flicker or fire at random, {pixels:,} in all, {count} events are left; "
             f"calibration needs at least {FEWEST_EVENTS}, of edges all over the image that the prism moves"
         )
 
