@@ -505,3 +505,20 @@ def test_a_stack_of_images_takes_its_room_on_the_disk_first(tmp_path: Path) -> N
 
 def compensated(given: Events) -> Events:
     return Events(given.x.astype(np.float32), given.y.astype(np.float32), given.t, given.p)
+
+
+def test_a_scratch_folder_whose_removal_is_interrupted_goes_with_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def use() -> None:
+        with output.run((), (), overwrite=False), output.scratch_folder(tmp_path) as scratch:
+            (scratch / "big").write_bytes(b"x")
+            monkeypatch.setattr(output.shutil, "rmtree", interrupted)
+
+    def interrupted(path: Path) -> None:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        use()
+    assert os.listdir(tmp_path) == []

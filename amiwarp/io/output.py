@@ -141,9 +141,7 @@ class NewFile:
 
     def discard(self) -> None:
         """Remove what was written, if it has not got its name."""
-        with contextlib.suppress(OSError):
-            self.part.unlink(missing_ok=True)
-        _unfinished.discard(self.part)
+        _remove(self.part)
 
 
 def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
@@ -189,11 +187,12 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
     """Make a folder for temporary files; it is removed at the end, or by the next run if this one is killed."""
     remove_abandoned(folder.resolve())
     made = _unfinished_name(folder.resolve() / "scratch")
-    made.mkdir()
+    _unfinished.add(made)
     try:
+        made.mkdir()
         yield made
     finally:
-        shutil.rmtree(made, ignore_errors=True)
+        _remove(made)
 
 
 def _unfinished_name(target: Path) -> Path:
@@ -221,8 +220,7 @@ def remove_abandoned(folder: Path) -> None:
         for entry in entries:
             found = UNFINISHED.fullmatch(entry.name)
             if found and found["host"] == HOST and not _is_alive(int(found["pid"])):
-                with contextlib.suppress(OSError):
-                    shutil.rmtree(entry.path) if entry.is_dir(follow_symlinks=False) else os.unlink(entry.path)
+                _remove(folder / entry.name)
 
 
 def _is_alive(pid: int) -> bool:
@@ -240,9 +238,18 @@ def _discard_unfinished() -> None:
     """Remove what this process, not one that it was forked from, has begun and not finished."""
     for part in list(_unfinished):
         if f"-{os.getpid()}-" in part.name:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+            _remove(part)
     _unfinished.clear()
+
+
+def _remove(unfinished: Path) -> None:
+    """Remove an unfinished file, or a folder of them, if it is there."""
+    with contextlib.suppress(OSError):
+        if unfinished.is_dir() and not unfinished.is_symlink():
+            shutil.rmtree(unfinished)
+        else:
+            unfinished.unlink(missing_ok=True)
+    _unfinished.discard(unfinished)
 
 
 def _reason(error: BaseException) -> str:
