@@ -482,8 +482,7 @@ class Dropping:
 def slow(*args, **extra):
     thing = Dropping()
     del thing
-    while True:
-        time.sleep(0.01)
+    time.sleep(3000)
 
 amiwarp.io.open_recording = slow
 main()
