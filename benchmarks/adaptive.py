@@ -31,7 +31,7 @@ from amiwarp.demo import earth
 from amiwarp.encoder import Encoder
 from amiwarp.events import Events
 from amiwarp.figures import save
-from amiwarp.io.files import write_text
+from amiwarp.io.output import write_text
 from amiwarp.kernels import sight
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.structs import camera_params
@@ -404,7 +404,7 @@ def main() -> int:
     print(f"{'ok' if results['ok'] else 'NOT ok'}, {time.perf_counter() - began:.0f} s; coverage of 300,000 events in "
           f"{results['measure_ms'][0]:.2f} ms, speeds in {results['measure_ms'][1]:.2f} ms", flush=True)  # fmt: skip
     if args.out:
-        write_text(args.out, json.dumps(results, indent=1) + "\n")
+        write_text(args.out, json.dumps(results, indent=1) + "\n", overwrite=True)
     if args.figure:
         draw(args.figure, results)
     return int(not results["ok"])
