@@ -39,6 +39,9 @@ LIMIT_S = 180.0
 START_S = 0.3
 """Until then Python starts and reads its own modules; what interrupts it there is answered by Python itself."""
 
+CELLS = "cells"
+"""A folder of whole results, which the next run goes on from."""
+
 COMMANDS = {
     "simulate": ("simulate OUT/o.h5 --picture IN/pic.png --size 160x120 --duration 0.4", ("o.h5",)),
     "translate": ("translate IN/v.npy OUT/o.h5 --fps 100", ("o.h5",)),
@@ -73,6 +76,10 @@ COMMANDS = {
     "demo": (
         "demo --out OUT --picture IN/pic.png --size 160x120 --duration 0.2",
         ("recording.h5", "calibration.json", "compensated.h5", "picture.png", "demo.png"),
+    ),
+    "stability": (
+        "stability --quick --axes apex --minutes 0.01 --out OUT",
+        ("atlas.csv", "atlas.json", "atlas.pdf", "axis_apex.png", "overview.png", "summary.md", CELLS),
     ),
 }
 """Each command, and the files it writes. IN is read, OUT is empty before."""
@@ -140,6 +147,10 @@ def digest(folder: Path) -> dict[str, str]:
 
 def size_of(path: Path) -> Any:
     """What tells a whole file of its kind, found by reading all of it."""
+    if path.is_dir():
+        return all(json.loads(f.read_text())["results"] for f in path.glob("[!.]*"))
+    if path.suffix == ".pdf":
+        return path.read_bytes()[:5] + path.read_bytes()[-6:]
     if path.suffix == ".h5":
         events = open_recording(path).events
         return sum(len(block) for block in events.blocks())
@@ -207,7 +218,8 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
     """How a run ended, and all that is wrong with what it left."""
     wrong = []
     there = {f.name for f in out.iterdir()}
-    unfinished = {f for f in there if f.startswith(".") and f.endswith(".part")}
+    left = set(out.rglob(".*.part"))
+    unfinished = {f.name for f in left}
     kept = {f for f in there if f.endswith(".part.h5")}
     for file in sorted(there - unfinished):
         try:
@@ -222,8 +234,10 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
     if number is not signal.SIGKILL:
         wrong += [f"{file} was left" for file in unfinished | kept]
     remove_abandoned.cache_clear()
-    NewFile(out / "next").discard()
-    wrong += [f"{f.name} outlived the next run" for f in out.iterdir() if f.name in unfinished]
+    for place in (out, out / CELLS):
+        if place.is_dir():
+            NewFile(place / "next").discard()
+    wrong += [f"{f.name} outlived the next run" for f in left if f.exists()]
     # -number: Python was starting, or all was done and it was ending
     if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number, -signal.SIGINT}):
         wrong.append(f"exit status {code}")
@@ -253,7 +267,7 @@ def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random)
                 continue
             longest = max(longest, time.perf_counter() - told)
             alive = left_alive(process.pid)
-        unfinished += any(f.name.endswith(".part") for f in out.iterdir())
+        unfinished += any(out.rglob(".*.part"))
         starting = after < START_S and process.returncode in (1, -signal.SIGINT)  # in Python's own start
         how, wrong = judge(name, out, expected, number, 0 if starting else process.returncode)
         wrong += [f"{line} lives on" for line in alive]
