@@ -11,21 +11,21 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration, Settings, calibrate
-    from amiwarp.camera import Camera, Fisheye, RadialTangential
-    from amiwarp.compensate import compensate, compensate_events
-    from amiwarp.compensator import Compensated, Compensator
-    from amiwarp.encoder import Encoder, EncoderStream
+    from amiwarp.compensation.recordings import compensate, compensate_events
+    from amiwarp.compensation.streams import Compensated, Compensator
     from amiwarp.errors import AmiwarpError
-    from amiwarp.events import Events, MemoryEvents, Recording, Truth
+    from amiwarp.events.encoder import Encoder, EncoderStream
+    from amiwarp.events.events import Events, MemoryEvents, Recording, Truth
+    from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
+    from amiwarp.imaging.sharpness_costs import Sharpness, sharpness
+    from amiwarp.imaging.warped_image import iwe
     from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
-    from amiwarp.iwe import iwe
-    from amiwarp.metrics import edge_blur, model_error, truth_model
-    from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
-    from amiwarp.optics import CircleModel, EllipseModel, ExactModel, FlatSide, Prism, RadialCircleModel
-    from amiwarp.reconstruct import Fill, Picture, Reconstruction, reconstruct
-    from amiwarp.sharpness import Sharpness, sharpness
-    from amiwarp.simulate import Scene, SensorModel, Simulation, simulate
-    from amiwarp.translate import translate
+    from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+    from amiwarp.optics.models import CircleModel, EllipseModel, ExactModel, FlatSide, Prism, RadialCircleModel
+    from amiwarp.reconstruction.picture import Fill, Picture, Reconstruction, reconstruct
+    from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
+    from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
+    from amiwarp.simulation.translator import translate
     from amiwarp.viewer.app import view
 
 _PUBLIC = {

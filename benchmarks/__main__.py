@@ -27,8 +27,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp.kernels.cores import cpu_threads
-from amiwarp.machine import processor
-from amiwarp.peers import Missing
+from benchmarks.libraries import Missing
+from amiwarp.studies.machine import processor
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case
 from benchmarks.job import Job

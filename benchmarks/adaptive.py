@@ -25,22 +25,22 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate_events
-from amiwarp.demo import earth
-from amiwarp.encoder import Encoder
-from amiwarp.events import Events
-from amiwarp.figures import save
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.io.output import write_text
 from amiwarp.kernels import sight
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.structs import camera_params
-from amiwarp.machine import machine, versions
-from amiwarp.motion import CameraMotion, PrismMotion
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.scenery import MapRing, place_scene, step_us
-from amiwarp.simulate import Scene, Simulation
-from amiwarp.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
+from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.plotting.figures import save
+from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.scenery import MapRing, place_scene, step_us
+from amiwarp.simulation.simulator import Scene, Simulation
+from amiwarp.studies.demo import earth
+from amiwarp.studies.machine import machine, versions
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 PRISM, SMALL, PHASE = Prism(math.radians(1.8)), Prism(math.radians(0.9)), 1.0
@@ -69,7 +69,7 @@ MARGIN = 24
 
 @dataclass(eq=False)
 class Driven:
-    """A prism whose speed is told as it turns, for :class:`amiwarp.simulate.Simulation` in place of a PrismMotion."""
+    """A prism whose speed is told as it turns, for :class:`amiwarp.simulation.simulator.Simulation` in place of a PrismMotion."""
 
     rpm: float
     largest_rpm: float

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import warp as wp
 
-from amiwarp.stability.cells import Cell, run_cell
-from amiwarp.stability.conditions import AXES
-from amiwarp.stability.run import QUICK_METHODS, chosen, quick_axes, run
+from amiwarp.studies.stability.cells import Cell, run_cell
+from amiwarp.studies.stability.conditions import AXES
+from amiwarp.studies.stability.run import QUICK_METHODS, chosen, quick_axes, run
 
 _started = multiprocessing.get_context("spawn").Value("i", 0)
 

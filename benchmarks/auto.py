@@ -25,16 +25,16 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.auto import calibrate_auto
-from amiwarp.calib.rungs import Places, fit, rung_space
-from amiwarp.camera import Camera
+from amiwarp.calib.selection.model_choice import calibrate_auto
+from amiwarp.calib.selection.smaller_models import Places, fit, rung_space
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
-from amiwarp.machine import machine
-from amiwarp.metrics import model_error, truth_model
-from amiwarp.motion import EncoderModel, PrismMotion
-from amiwarp.optics import MODELS, EllipseModel, FlatSide, Prism
-from amiwarp.simulate import simulate
+from amiwarp.events.events import Recording
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, EllipseModel, FlatSide, Prism
+from amiwarp.simulation.motion import EncoderModel, PrismMotion
+from amiwarp.simulation.simulator import simulate
+from amiwarp.studies.machine import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1  # nominal over true apex: no box is centred on the truth

@@ -31,23 +31,23 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from amiwarp.brightness.event_pairs import Sensor
 from amiwarp.calib import Calibration, Settings, calibrate
-from amiwarp.calib.calibrate import prepare
-from amiwarp.calib.gauss_newton import GAUSS_NEWTON
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.photometric import PhotometricSettings
-from amiwarp.calib.search import STAGES
+from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON
+from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.sharpness.search import STAGES
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate_events
+from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording, Truth
-from amiwarp.metrics import edge_blur, model_error, truth_model
-from amiwarp.motion import CameraMotion, PrismMotion
-from amiwarp.optics import FlatSide, Prism
-from amiwarp.pairs import Sensor
-from amiwarp.sharpness import Sharpness
-from amiwarp.simulate import Scene, SensorModel, Simulation
+from amiwarp.events.events import Events, MemoryEvents, Recording, Truth
+from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
+from amiwarp.imaging.sharpness_costs import Sharpness
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.3  # nominal over true apex: no box is centred on the truth
@@ -267,7 +267,7 @@ def run_shares(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    from amiwarp.translate import open_pictures
+    from amiwarp.simulation.translator import open_pictures
 
     for clip in sorted(p for p in args.folder.iterdir() if p.suffix in (".npy", ".mp4")):
         frames = open_pictures(clip, fps=240.0 if "240fps" in clip.name else 25.0 if clip.suffix == ".npy" else None)

@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from amiwarp import peers
-from amiwarp.calib.search import STAGES
-from amiwarp.iwe import Vote
+from benchmarks import libraries
+from amiwarp.calib.sharpness.search import STAGES
+from amiwarp.imaging.warped_image import Vote
 from benchmarks import ours
 from benchmarks.job import Job
 from benchmarks.peers import image
@@ -77,7 +77,7 @@ def image_bars(model: str, vote: Vote) -> dict[str, float]:
     return {"misplaced": 4e-3, "local": 6e-3 if vote is Vote.BILINEAR else 0.3, "exact_px": EXACT_PX[model]}
 
 
-def _peer(name: str, way: Callable[..., peers.Peer], *devices: str, most_repeats: int = 1_000) -> Case:
+def _peer(name: str, way: Callable[..., libraries.Peer], *devices: str, most_repeats: int = 1_000) -> Case:
     bars = image_bars("plane circle", Vote.BILINEAR)
     return Case(IMAGE, name, partial(image, way), devices=devices, bars=bars, most_repeats=most_repeats)
 
@@ -88,14 +88,14 @@ LADDER = tuple(
     for vote in (Vote.BILINEAR, Vote.NEAREST)
 )
 PEERS = (
-    _peer("NumPy", peers.with_numpy, "cpu"),
-    _peer("NumPy, blocks of 65,536", partial(peers.with_numpy, block=peers.BLOCK), "cpu"),
-    _peer("Numba", peers.with_numba, "cpu"),
-    _peer("Numba, angle table", peers.with_numba_table, "cpu"),
-    _peer("PyTorch", peers.with_torch, "cpu", "cuda"),
-    _peer("PyTorch, blocks of 65,536", partial(peers.with_torch, block=peers.BLOCK), "cpu", most_repeats=5),
-    _peer("CuPy add.at", peers.with_cupy, "cuda"),
-    _peer("CuPy, four float atomics", peers.with_cupy_kernel, "cuda"),
+    _peer("NumPy", libraries.with_numpy, "cpu"),
+    _peer("NumPy, blocks of 65,536", partial(libraries.with_numpy, block=libraries.BLOCK), "cpu"),
+    _peer("Numba", libraries.with_numba, "cpu"),
+    _peer("Numba, angle table", libraries.with_numba_table, "cpu"),
+    _peer("PyTorch", libraries.with_torch, "cpu", "cuda"),
+    _peer("PyTorch, blocks of 65,536", partial(libraries.with_torch, block=libraries.BLOCK), "cpu", most_repeats=5),
+    _peer("CuPy add.at", libraries.with_cupy, "cuda"),
+    _peer("CuPy, four float atomics", libraries.with_cupy_kernel, "cuda"),
     Case(IMAGE, "Warp, four float atomics", ours.warp_atomics, devices=("cuda",),
          bars=image_bars("plane circle", Vote.BILINEAR)),
 )  # fmt: skip

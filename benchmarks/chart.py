@@ -13,10 +13,11 @@ from pathlib import Path
 
 import warp as wp
 
-from amiwarp.chart import Charts, make, simulated
-from amiwarp.chart.rows import beaten_by, fronts
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.output import own_folder
+from amiwarp.studies.chart import Charts, make, simulated
+from amiwarp.studies.chart.rows import beaten_by, fronts
+from benchmarks.chart_libraries import library_tasks
 
 
 def main() -> int:
@@ -65,7 +66,8 @@ def _measured(args: argparse.Namespace) -> Charts:
     recording = simulated(args.picture, seed=args.seed, device=args.device, quick=args.quick)
     args.out.mkdir(parents=True, exist_ok=True)
     with own_folder(args.out):
-        charts = make(recording, args.out, device=args.device, seed=args.seed, quick=args.quick, progress=tell)
+        charts = make(recording, args.out, device=args.device, seed=args.seed, quick=args.quick,
+                      libraries=library_tasks, progress=tell)
     tell("done", 1.0)
     return charts
 

@@ -32,14 +32,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.camera import Camera
-from amiwarp.compensate import PIECE, Mover, compensate, inside_image
-from amiwarp.encoder import Encoder
-from amiwarp.events import Events
+from amiwarp.compensation.recordings import PIECE, Mover, compensate, inside_image
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import in_order
 from amiwarp.kernels.cores import cpu_threads
-from amiwarp.optics import MODELS, Model, Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, Model, Prism
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -54,8 +54,8 @@ MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside
 
 
 def half_a_second() -> Events:
-    from amiwarp.motion import EncoderModel
-    from amiwarp.simulate import Scene, Simulation
+    from amiwarp.simulation.motion import EncoderModel
+    from amiwarp.simulation.simulator import Scene, Simulation
 
     scene = Scene.from_picture(blocks_picture())
     simulation = Simulation(scene, CAMERA, PRISM, REPEATED_US * 1e-6, encoder_model=EncoderModel.ideal())
@@ -275,7 +275,7 @@ def errors(
 
 
 def about(device: str) -> dict[str, Any]:
-    from amiwarp.machine import processor  # here: what a row's process loads counts to its memory
+    from amiwarp.studies.machine import processor  # here: what a row's process loads counts to its memory
 
     wp.init()
     found = {"python": platform.python_version()}

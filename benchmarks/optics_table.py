@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
-from amiwarp.optics import (
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics.models import (
     CircleModel,
     EllipseModel,
     ExactModel,

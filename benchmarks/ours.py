@@ -12,13 +12,13 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.iwe import CanvasShape, Image, Vote, Votes
-from amiwarp.metrics import PictureQuality, model_error, picture_quality
-from amiwarp.optics import MODELS, Model
-from amiwarp.peers import Peer
-from amiwarp.reconstruct import Picture, Reconstruction
-from amiwarp.tiles import TileVotes
-from amiwarp.uploads import TURNS, upload_events
+from amiwarp.imaging.device_events import TURNS, upload_events
+from amiwarp.imaging.metrics import PictureQuality, model_error, picture_quality
+from amiwarp.imaging.tile_votes import TileVotes
+from amiwarp.imaging.warped_image import CanvasShape, Image, Vote, Votes
+from amiwarp.optics.models import MODELS, Model
+from benchmarks.libraries import Peer
+from amiwarp.reconstruction.picture import Picture, Reconstruction
 from benchmarks import peers, truth
 from benchmarks.job import Job
 from benchmarks.scenes import PHASE, EventScene, FileScene, RecordingScene

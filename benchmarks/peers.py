@@ -1,4 +1,4 @@
-"""Other libraries at the same job, :mod:`amiwarp.peers`, as rows here."""
+"""Other libraries at the same job, :mod:`benchmarks.libraries`, as rows here."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from amiwarp.iwe import Vote
-from amiwarp.peers import Peer, PeerEvents
+from amiwarp.imaging.warped_image import Vote
+from benchmarks.libraries import Peer, PeerEvents
 from benchmarks import truth
 from benchmarks.job import Job
 from benchmarks.scenes import MARGIN, EventScene
@@ -34,5 +34,5 @@ def job(scene: EventScene, vote: Vote, peer: Peer, model: str = "plane circle") 
 
 
 def image(way: Callable[[PeerEvents, str], Peer], scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """By one of the functions of :mod:`amiwarp.peers`."""
+    """By one of the functions of :mod:`benchmarks.libraries`."""
     return job(scene, vote, way(peer_events(scene), device), model)

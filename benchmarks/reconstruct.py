@@ -31,20 +31,20 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate_events
-from amiwarp.encoder import Encoder
-from amiwarp.events import Recording
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Recording
+from amiwarp.imaging.export import save_png
+from amiwarp.imaging.metrics import RANGE, picture_quality
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
-from amiwarp.iwe_files import save_png
-from amiwarp.metrics import RANGE, picture_quality
-from amiwarp.motion import CameraMotion, PrismMotion
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.reconstruct import Reconstruction, reconstruct
-from amiwarp.scenery import place_scene
-from amiwarp.simulate import Scene, SensorModel, Simulation
-from amiwarp.turning import Turning
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.reconstruction.picture import Reconstruction, reconstruct
+from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.scenery import place_scene
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
 CAMERA = Camera.from_fov(346, 260, math.radians(60.0))
 PRISM, PHASE = Prism(math.radians(1.0)), 1.0

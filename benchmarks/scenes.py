@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.camera import Camera
-from amiwarp.demo import Demo, simulation
-from amiwarp.events import Events, Recording
+from amiwarp.events.events import Events, Recording
+from amiwarp.imaging.metrics import truth_model
 from amiwarp.kernels.cores import cpu_threads
-from amiwarp.metrics import truth_model
-from amiwarp.optics import ExactModel, Prism, apex_from_deflection
-from amiwarp.peers import Missing
-from amiwarp.simulate import SensorModel, Simulation
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism, apex_from_deflection
+from benchmarks.libraries import Missing
+from amiwarp.simulation.simulator import SensorModel, Simulation
+from amiwarp.studies.demo import Demo, simulation
 from benchmarks import compensate
 
 Array = NDArray[np.float64]

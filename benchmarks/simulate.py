@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.camera import Camera
-from amiwarp.engine import Engine
-from amiwarp.motion import EncoderModel
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.scenery import step_us
-from amiwarp.simulate import Scene, Simulation
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.simulation.engine import Engine
+from amiwarp.simulation.motion import EncoderModel
+from amiwarp.simulation.scenery import step_us
+from amiwarp.simulation.simulator import Scene, Simulation
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55
 

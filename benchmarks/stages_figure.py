@@ -17,15 +17,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from amiwarp.brightness import BrightnessMap
+from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib import Settings
-from amiwarp.calib.calibrate import prepare
-from amiwarp.calib.photometric import Cost, gather_pairs, off_excess
-from amiwarp.camera import Camera
-from amiwarp.demo import earth
-from amiwarp.iwe_files import save_png
-from amiwarp.optics import Prism
-from amiwarp.simulate import simulate
+from amiwarp.calib.calibration import prepare
+from amiwarp.calib.photometric.stage import Cost, gather_pairs, off_excess
+from amiwarp.imaging.export import save_png
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
+from amiwarp.simulation.simulator import simulate
+from amiwarp.studies.demo import earth
 
 APEX = math.radians(0.5)
 BLUE, ORANGE = "#0072b2", "#d55e00"

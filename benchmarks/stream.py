@@ -28,17 +28,17 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib.result import Calibration
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate_events
-from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, Compensator
-from amiwarp.encoder import Encoder, EncoderStream
-from amiwarp.events import Events
-from amiwarp.link.clocks import monotonic_us
-from amiwarp.machine import machine
-from amiwarp.optics import CircleModel, ExactModel, Model, Prism
-from amiwarp.simulate import simulate
-from amiwarp.stream.packets import Packet
-from amiwarp.stream.session import IMAGE_US, Session, Status
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, Compensator
+from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.events import Events
+from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.stream.packets import Packet
+from amiwarp.live.stream.session import IMAGE_US, Session, Status
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import CircleModel, ExactModel, Model, Prism
+from amiwarp.simulation.simulator import simulate
+from amiwarp.studies.machine import machine
 
 PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))
 MODELS: dict[str, Model] = {

@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate_events
-from amiwarp.encoder import Encoder
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
 from amiwarp.io import RecordingWriter
-from amiwarp.machine import machine
-from amiwarp.optics import Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
+from amiwarp.studies.machine import machine
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.scene import Look, Scene, View
 from amiwarp.viewer.values import jpeg

@@ -3,7 +3,7 @@
 import math
 
 from amiwarp import Camera, ExactModel, Prism
-from amiwarp.optics import MODELS, predicted_error
+from amiwarp.optics.models import MODELS, predicted_error
 
 camera = Camera.from_fov(640, 480, math.radians(60))
 for apex_deg in (0.5, 1.0, 2.0, 4.0):

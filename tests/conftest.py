@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.camera import Camera
-from amiwarp.events import Recording
-from amiwarp.motion import PrismMotion
-from amiwarp.optics import Prism
-from amiwarp.simulate import simulate
+from amiwarp.events.events import Recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
+from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.simulator import simulate
 
 # for the benchmarks; last, so that the package that is tested is the one that was installed
 sys.path.append(str(Path(__file__).parents[1]))

@@ -28,15 +28,15 @@ from io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
 from PIL import Image
 
 from amiwarp.calib import Calibration
-from amiwarp.camera import Camera, Fisheye
 from amiwarp.cli.info import describe
 from amiwarp.cli.inputs import read_camera
-from amiwarp.events import check_events
+from amiwarp.events.events import check_events
 from amiwarp.io import open_recording, read_encoder_csv
 from amiwarp.io.text import read_calib
-from amiwarp.optics import Prism
-from amiwarp.pictures import read_picture
-from amiwarp.translate import open_pictures
+from amiwarp.optics.camera import Camera, Fisheye
+from amiwarp.optics.models import Prism
+from amiwarp.simulation.pictures import read_picture
+from amiwarp.simulation.translator import open_pictures
 
 MEMORY_KIB = 3 << 19
 """Most memory that a check may take, 1.5 GiB [KiB]."""

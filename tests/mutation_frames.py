@@ -16,8 +16,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from amiwarp.link.following import Follower
-from amiwarp.link.protocol import (
+from amiwarp.live.link.following import Follower
+from amiwarp.live.link.protocol import (
     LONGEST,
     Answer,
     Index,
@@ -30,9 +30,9 @@ from amiwarp.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.link.protocol import Decoder as SerialDecoder
-from amiwarp.stream.packets import COLUMNS, END, EVENTS, HEADER, HELLO, MAGIC, Decoder
-from amiwarp.stream.sources import StreamSource
+from amiwarp.live.link.protocol import Decoder as SerialDecoder
+from amiwarp.live.stream.packets import COLUMNS, END, EVENTS, HEADER, HELLO, MAGIC, Decoder
+from amiwarp.live.stream.sources import StreamSource
 
 WIDTH, HEIGHT = 64, 48
 WHOLE = [0, 1, 2, 255, 256, 65535, 65536, (1 << 31) - 1, 1 << 31, (1 << 32) - 1]

@@ -12,8 +12,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics import FlatSide, Prism
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics.models import FlatSide, Prism
 
 Array = NDArray[np.float64]
 

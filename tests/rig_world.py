@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from amiwarp.link.link import Link
-from amiwarp.link.protocol import Answer
-from amiwarp.link.terminal import PseudoTerminal
-from amiwarp.stream.emulated import EmulatedCamera
-from amiwarp.stream.packets import Packet, Source
-from amiwarp.stream.session import Session
+from amiwarp.live.link.link import Link
+from amiwarp.live.link.protocol import Answer
+from amiwarp.live.link.terminal import PseudoTerminal
+from amiwarp.live.stream.emulated import EmulatedCamera
+from amiwarp.live.stream.packets import Packet, Source
+from amiwarp.live.stream.session import Session
 
 LONG_S = 120.0
 """Limit of every wait: only what hangs takes as long [s]."""

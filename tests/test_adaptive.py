@@ -5,16 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate_events
-from amiwarp.encoder import Encoder
+from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
-from amiwarp.motion import CameraMotion, PrismMotion
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.simulate import Scene, Simulation
-from amiwarp.stability.scenes import SceneKind, draw
-from amiwarp.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, SpeedController, prism_path
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
+from amiwarp.live.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, SpeedController, prism_path
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.simulator import Scene, Simulation
+from amiwarp.studies.stability.scenes import SceneKind, draw
 
 WINDOW_US = 33_000
 CAMERA, PRISM, PHASE = Camera.from_fov(200, 150, math.radians(40.0)), Prism(math.radians(1.8)), 0.7

@@ -9,21 +9,22 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from amiwarp.calib import Calibration, Settings, auto
-from amiwarp.calib.auto import calibrate_auto
-from amiwarp.calib.held_out import halves
-from amiwarp.calib.rungs import Places, encoder_noise, fit, rung_space
-from amiwarp.calib.search import Material
+from amiwarp.calib import Calibration, Settings
+from amiwarp.calib.selection import model_choice as auto
+from amiwarp.calib.selection.model_choice import calibrate_auto
+from amiwarp.calib.selection.smaller_models import Places, encoder_noise, fit, rung_space
+from amiwarp.calib.selection.trial import FACTOR, make_trial
+from amiwarp.calib.sharpness.held_out import halves
+from amiwarp.calib.sharpness.search import Material
 from amiwarp.calib.thinning import thin
-from amiwarp.calib.trial import FACTOR, make_trial
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, Recording
-from amiwarp.metrics import truth_model
-from amiwarp.motion import EncoderModel, PrismMotion
-from amiwarp.optics import MODELS, CircleModel, ExactModel, FlatSide, Prism
-from amiwarp.simulate import simulate
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, Recording
+from amiwarp.imaging.metrics import truth_model
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, CircleModel, ExactModel, FlatSide, Prism
+from amiwarp.simulation.motion import EncoderModel, PrismMotion
+from amiwarp.simulation.simulator import simulate
 
 SHARPNESS = Settings(events=120_000, stages=("sharpness",))
 CONSTANT, DOUBLING = 720.0, np.array([[0.0, 500.0], [0.34, 1000.0]])

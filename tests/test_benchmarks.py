@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amiwarp.compensate import PIECE
-from amiwarp.events import Events
-from amiwarp.iwe import Vote
-from amiwarp.peers import Missing
+from amiwarp.compensation.recordings import PIECE
+from amiwarp.events.events import Events
+from amiwarp.imaging.warped_image import Vote
+from benchmarks.libraries import Missing
 from benchmarks import __main__ as runner
 from benchmarks import cases, compensate, ours, report, scenes, truth
 from benchmarks.job import Job

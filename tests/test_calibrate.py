@@ -11,22 +11,22 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.calibrate import prepare
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import edge_coherence
 from amiwarp.calib.parameters import make_space
-from amiwarp.calib.search import PARTS
-from amiwarp.calib.speed import estimate_rpm
+from amiwarp.calib.prism_speed import estimate_rpm
+from amiwarp.calib.sharpness.search import PARTS
 from amiwarp.calib.thinning import RUN, thin
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.imaging.sharpness_costs import Sharpness
 from amiwarp.io import open_recording
-from amiwarp.metrics import model_error, truth_model
-from amiwarp.motion import EncoderModel, PrismMotion
-from amiwarp.optics import MODELS, FlatSide, Prism, predicted_error, wrap_angle
-from amiwarp.sharpness import Sharpness
-from amiwarp.simulate import SensorModel, simulate
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, FlatSide, Prism, predicted_error, wrap_angle
+from amiwarp.simulation.motion import EncoderModel, PrismMotion
+from amiwarp.simulation.simulator import SensorModel, simulate
 
 calibrate = functools.partial(calib.calibrate, stages=("sharpness",))
 

@@ -9,10 +9,10 @@ import pytest
 import reference
 import warp as wp
 
-from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.camera import CameraParams, solve_ray
 from amiwarp.kernels.structs import camera_params, fold
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
 
 # as the package's kernels: a GPU would else fuse multiplications and additions here alone
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -17,11 +17,19 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 import benchmarks.chart
-from amiwarp import figures, peers
+from benchmarks import libraries as peers
 from amiwarp.calib import Calibration, Settings
-from amiwarp.camera import Camera, RadialTangential
-from amiwarp.chart import Charts, calibration, compensation
-from amiwarp.chart.rows import (
+from amiwarp.calib.presets import Preset, check, settings_from, settings_to, simplified
+from amiwarp.cli.app import app
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import MemoryEvents, Recording
+from amiwarp.imaging.warped_image import Vote, iwe
+from amiwarp.io import open_recording, save_recording
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.models import MODELS, ExactModel, FlatSide, Prism, predicted_error
+from amiwarp.plotting import figures
+from amiwarp.studies.chart import Charts, calibration, compensation
+from amiwarp.studies.chart.rows import (
     Row,
     Task,
     beaten_by,
@@ -32,14 +40,7 @@ from amiwarp.chart.rows import (
     near_front,
     told_apart,
 )
-from amiwarp.chart.truth import Known, exact_image, exact_places, rms
-from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events import MemoryEvents, Recording
-from amiwarp.io import open_recording, save_recording
-from amiwarp.iwe import Vote, iwe
-from amiwarp.optics import MODELS, ExactModel, FlatSide, Prism, predicted_error
-from amiwarp.presets import Preset, check, settings_from, settings_to, simplified
+from amiwarp.studies.chart.truth import Known, exact_image, exact_places, rms
 
 
 def run(*args: str | Path) -> Result:
@@ -287,7 +288,7 @@ def test_charts_are_drawn_later(
         raise ModuleNotFoundError("No module named 'matplotlib'")
 
     with monkeypatch.context() as patch:
-        patch.setattr(sys.modules["amiwarp.chart.make"], "draw", missing)
+        patch.setattr(sys.modules["amiwarp.studies.chart.charts"], "draw", missing)
         note = loaded.draw(tmp_path).notes[-1]
     assert "No module named 'matplotlib'" in note
     assert "benchmarks.chart --from chart.json" in note
@@ -477,7 +478,7 @@ DRAWN = {
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_letters_do_not_overlap(name: str, known: Known, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from amiwarp.chart.drawing import draw
+    from amiwarp.studies.chart.drawing import draw
 
     drawn: list[Any] = []
     monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure))

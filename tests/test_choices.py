@@ -15,22 +15,22 @@ import pytest
 
 import amiwarp
 from amiwarp.calib.parameters import build_model
-from amiwarp.calib.photometric import PhotometricSettings
-from amiwarp.calib.search import STAGES, Settings
+from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.presets import simplified
+from amiwarp.calib.sharpness.search import STAGES, Settings
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
-from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.imaging.export import IweFiles, Layers, to_picture
+from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter, sharpness
+from amiwarp.imaging.warped_image import CanvasShape, Vote, iwe
 from amiwarp.io.formats import Format, open_recording
-from amiwarp.iwe import CanvasShape, Vote, iwe
-from amiwarp.iwe_files import IweFiles, Layers, to_picture
-from amiwarp.optics import MODELS, CircleModel, ExactModel, Prism, RadialCircleModel
-from amiwarp.picture_files import Tone, save_picture, tones
-from amiwarp.presets import simplified
-from amiwarp.prism import FlatSide, UnsizedPrism, apex_from_deflection, deflection_from_apex
-from amiwarp.reconstruct import Fill, Picture, Reconstruction
-from amiwarp.sharpness import Sharpness, SharpnessMeter, sharpness
-from amiwarp.stream.queues import PacketQueue, Policy
+from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, CircleModel, ExactModel, Prism, RadialCircleModel
+from amiwarp.optics.prism import FlatSide, UnsizedPrism, apex_from_deflection, deflection_from_apex
+from amiwarp.reconstruction.export import Tone, save_picture, tones
+from amiwarp.reconstruction.picture import Fill, Picture, Reconstruction
 from amiwarp.viewer.scene import Axis, Colour, Look, View
 
 CAMERA = Camera.from_fov(8, 6, 1.0)

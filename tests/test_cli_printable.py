@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from amiwarp.cli.console import report, table
 from amiwarp.cli.options import Common
 from amiwarp.errors import printable
-from amiwarp.events import Events
+from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 
 NASTY = "a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"

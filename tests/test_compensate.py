@@ -13,20 +13,20 @@ import warp as wp
 from conftest import TRUE_PRISM
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.camera import Camera, Fisheye, RadialTangential
-from amiwarp.compensate import compensate, compensate_events, compensated_blocks, inside_image
-from amiwarp.encoder import TURN, Encoder
+from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks, inside_image
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.imaging.metrics import edge_blur, truth_model
+from amiwarp.imaging.sharpness_costs import sharpness
+from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.chunks import CHUNK
-from amiwarp.iwe import iwe
 from amiwarp.kernels.encoder import EncoderParams, angle_at
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.structs import encoder_params
-from amiwarp.metrics import edge_blur, truth_model
-from amiwarp.optics import MODELS, CircleModel, ExactModel, FlatSide
-from amiwarp.sharpness import sharpness
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics.models import MODELS, CircleModel, ExactModel, FlatSide
 
 
 @wp.kernel
@@ -182,7 +182,7 @@ def test_files_and_memory_give_the_same(
     recording: Recording, calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:
     """A file whose chunks threads read past HDF5, one that HDF5 reads, and events in memory, in several pieces."""
-    monkeypatch.setattr(sys.modules["amiwarp.compensate"], "PIECE", CHUNK)
+    monkeypatch.setattr(sys.modules["amiwarp.compensation.recordings"], "PIECE", CHUNK)
     count = len(recording.events)
     raw = recording.events.slice(0, count)
     repeats = 2 * CHUNK // count + 1

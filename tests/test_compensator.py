@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amiwarp.camera import Camera, RadialTangential
-from amiwarp.compensate import compensate_events
-from amiwarp.compensator import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
-from amiwarp.encoder import Encoder, EncoderStream
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
-from amiwarp.iwe import iwe
-from amiwarp.optics import MODELS, ExactModel, Prism
+from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.events import Events
+from amiwarp.imaging.warped_image import iwe
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.models import MODELS, ExactModel, Prism
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(60))

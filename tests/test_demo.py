@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 from typer.testing import CliRunner
 
-from amiwarp import clouds
 from amiwarp.calib import Calibration
 from amiwarp.cli.app import app
 from amiwarp.io import open_recording
+from amiwarp.plotting import clouds
 
 FILES = {"recording.h5", "calibration.json", "compensated.h5", "picture.png", "demo.png"}
 

@@ -15,20 +15,20 @@ from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner
 
-from amiwarp.camera import Camera, RadialTangential
 from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
-from amiwarp.design import Design, Limits, Timing, design
-from amiwarp.design.choose import ACROSS, LEAST_SWING, QUANTISATION_PX
-from amiwarp.design.drawing import chart
-from amiwarp.design.orbit import QUARTER_SWING, orbit_of
-from amiwarp.design.volume import TILE, filled, measure, tiles
-from amiwarp.design.words import headline, reasons
 from amiwarp.errors import AmiwarpError
-from amiwarp.motion import PrismMotion
-from amiwarp.optics import ExactModel, FlatSide, Prism, apex_from_deflection
-from amiwarp.simulate import Scene, SensorModel, Simulation
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.models import ExactModel, FlatSide, Prism, apex_from_deflection
+from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.studies.design import Design, Limits, Timing, design
+from amiwarp.studies.design.choice import ACROSS, LEAST_SWING, QUANTISATION_PX
+from amiwarp.studies.design.drawing import chart
+from amiwarp.studies.design.orbit import QUARTER_SWING, orbit_of
+from amiwarp.studies.design.recommendation import headline, reasons
+from amiwarp.studies.design.volume import TILE, filled, measure, tiles
 
 GLASS = Prism(0.0)
 SMALL = Camera.from_fov(64, 48, math.radians(10.0))

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.link.clocks import WRAP
-from amiwarp.link.emulator import MOST_RPM, Controller, Fault
-from amiwarp.link.protocol import (
+from amiwarp.events.encoder import Encoder
+from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.emulator import MOST_RPM, Controller, Fault
+from amiwarp.live.link.protocol import (
     Answer,
     Decoder,
     Index,
@@ -32,8 +32,8 @@ from amiwarp.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.link.rotors import Motor, Played
-from amiwarp.link.terminal import PseudoTerminal
+from amiwarp.live.link.rotors import Motor, Played
+from amiwarp.live.link.terminal import PseudoTerminal
 
 S = 1_000_000
 LONG_S = 120.0

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amiwarp.encoder import TURN, Encoder, EncoderStream
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TURN, Encoder, EncoderStream
 from amiwarp.io import read_encoder_csv
 
 SPEED = TURN * 50e-6

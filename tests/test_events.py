@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, EventSource, MemoryEvents, Truth, check_events, regroup
+from amiwarp.events.events import Events, EventSource, MemoryEvents, Truth, check_events, regroup
 
 
 def make(t: list[int]) -> Events:

@@ -15,13 +15,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amiwarp.camera import Camera, Fisheye, RadialTangential
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, EventSource, MemoryEvents, Recording, Truth
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, EventSource, MemoryEvents, Recording, Truth
 from amiwarp.io import RecordingWriter, open_recording, save_recording
 from amiwarp.io.chunks import CHUNK, StoredColumn, checksum, decode, encode, in_order
-from amiwarp.optics import FlatSide, Prism
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics.models import FlatSide, Prism
 
 SIZE = (320, 240)
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sample
 
-from amiwarp.camera import Camera, RadialTangential
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, EventSource, MemoryEvents
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.io import Format, Summary, convert, detect_format, open_recording, scan
-from amiwarp.optics import Prism
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.models import Prism
 
 EVENTS = make_events()
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
-from amiwarp.iwe import PROBE, CanvasShape, Image, Vote, Votes, iwe
-from amiwarp.optics import MODELS, ExactModel, Prism
-from amiwarp.uploads import upload_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
+from amiwarp.imaging.device_events import upload_events
+from amiwarp.imaging.warped_image import PROBE, CanvasShape, Image, Vote, Votes, iwe
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, ExactModel, Prism
 
 
 def random_events(n: int, width: int, height: int, seed: int = 0) -> Events:

@@ -11,13 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.camera import Camera
+from amiwarp.calib.presets import Preset
 from amiwarp.cli.inputs import read_camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events.events import Recording
 from amiwarp.io.json_files import MOST_BYTES, read_json
-from amiwarp.presets import Preset
-from amiwarp.translate import open_pictures
+from amiwarp.optics.camera import Camera
+from amiwarp.simulation.translator import open_pictures
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "calibration": Calibration.load,

@@ -18,16 +18,16 @@ from typer.testing import CliRunner
 
 from amiwarp.cli import motor as command
 from amiwarp.errors import AmiwarpError
-from amiwarp.link import following
-from amiwarp.link import link as link_module
-from amiwarp.link.clocks import WRAP
-from amiwarp.link.emulator import LASTING, Controller, Fault
-from amiwarp.link.following import Follower, News
-from amiwarp.link.link import Link
-from amiwarp.link.port import open_port, usb_id
-from amiwarp.link.protocol import Answer, Decoder, Index, Message, Ping, Samples, Status, encode
-from amiwarp.link.rotors import Motor
-from amiwarp.link.terminal import PseudoTerminal
+from amiwarp.live.link import following
+from amiwarp.live.link import link as link_module
+from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.emulator import LASTING, Controller, Fault
+from amiwarp.live.link.following import Follower, News
+from amiwarp.live.link.link import Link
+from amiwarp.live.link.port import open_port, usb_id
+from amiwarp.live.link.protocol import Answer, Decoder, Index, Message, Ping, Samples, Status, encode
+from amiwarp.live.link.rotors import Motor
+from amiwarp.live.link.terminal import PseudoTerminal
 
 S = 1_000_000
 RPM = 720.0
@@ -488,7 +488,7 @@ def test_ports_by_usb_id_and_by_what_they_send(path: Path, tmp_path: Path, monke
                 return 0.0
             return 0.05 * next(listened)
 
-        monkeypatch.setattr("amiwarp.link.port.time", SimpleNamespace(monotonic=clock))
+        monkeypatch.setattr("amiwarp.live.link.port.time", SimpleNamespace(monotonic=clock))
         for where in ("16C0:0483", None):
             with Link(where) as link:
                 assert link.name == str(path)

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.link.angles import Angles, Fault, Report
+from amiwarp.live.link.angles import Angles, Fault, Report
 
 PER_TURN = 1000
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.link.clocks import WRAP, Unwrapped, from_pulses, from_round_trips
+from amiwarp.live.link.clocks import WRAP, Unwrapped, from_pulses, from_round_trips
 
 DRIFT, OFFSET = 35e-6, 123_456_789_000
 

@@ -9,7 +9,7 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from amiwarp.link.protocol import (
+from amiwarp.live.link.protocol import (
     LONGEST,
     MOST_SAMPLES,
     Answer,

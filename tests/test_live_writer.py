@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 from io_samples import refusal
 
-from amiwarp.camera import Camera, RadialTangential
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.live_writer import WASTE, LiveWriter
-from amiwarp.optics import FlatSide, Prism
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.models import FlatSide, Prism
 
 SIZE = (320, 240)
 CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))
@@ -144,7 +144,7 @@ def test_a_copy_at_any_moment_is_a_recording(tmp_path, seed):
 KILLED = """
 import sys, time
 import numpy as np
-from amiwarp.events import Events
+from amiwarp.events.events import Events
 from amiwarp.io.live_writer import LiveWriter
 n, zeros = int(sys.argv[2]), np.zeros(int(sys.argv[2]), np.uint16)
 with LiveWriter(sys.argv[1], width=320, height=240, flush_s=0.05) as writer:
@@ -195,7 +195,7 @@ FULL = """
 import resource, sys
 import numpy as np
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
+from amiwarp.events.events import Events
 from amiwarp.io.live_writer import LiveWriter
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
 rng, n = np.random.default_rng(0), 10_000

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.metrics import contrast, edge_blur, entropy, find_edges, model_error, picture_quality
-from amiwarp.optics import ExactModel, Prism
+from amiwarp.imaging.metrics import contrast, edge_blur, entropy, find_edges, model_error, picture_quality
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism
 
 
 def circle_events(sigma: float, noise: int = 0, seed: int = 0) -> np.ndarray:

@@ -11,26 +11,26 @@ import pytest
 from conftest import TRUE_PRISM
 from numpy.typing import NDArray
 
+from amiwarp.brightness.event_pairs import Sensor
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.panning import estimate_rates
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.photometric import PhotometricSettings
+from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.rotation_estimate import estimate_rates
 from amiwarp.calib.thinning import thin
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Recording
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
-from amiwarp.iwe import iwe
-from amiwarp.metrics import model_error, truth_model
-from amiwarp.motion import CameraMotion
-from amiwarp.optics import FlatSide
-from amiwarp.pairs import Sensor
-from amiwarp.pictures import linear_luminance
-from amiwarp.reconstruct import reconstruct
-from amiwarp.simulate import Scene, SensorModel, Simulation, simulate
-from amiwarp.turning import Turning
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.models import FlatSide
+from amiwarp.reconstruction.picture import reconstruct
+from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.pictures import linear_luminance
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 KNOWN = PhotometricSettings(sensor=Sensor(latency_us=100.0, refractory_us=100.0))

@@ -9,9 +9,9 @@ import pytest
 import reference
 import warp as wp
 
-from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics import (
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics.models import (
     MODELS,
     CircleModel,
     EllipseModel,

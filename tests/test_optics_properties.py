@@ -8,8 +8,8 @@ import numpy as np
 import reference
 from hypothesis import HealthCheck, assume, given, settings
 
-from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
-from amiwarp.optics import (
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics.models import (
     MODELS,
     CircleModel,
     ExactModel,

@@ -19,16 +19,16 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from amiwarp.calib import Calibration
-from amiwarp.camera import Camera
 from amiwarp.cli.app import app
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.imaging.export import IweFiles, Layers
 from amiwarp.io import RecordingWriter, convert, open_recording, output, save_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.io.output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
-from amiwarp.iwe_files import IweFiles, Layers
-from amiwarp.optics import Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
 
 SIZE = (64, 48)
 CAMERA = Camera.from_fov(*SIZE, math.radians(40.0))
@@ -424,7 +424,7 @@ def test_api_calls_guard_what_they_read(place: Path) -> None:
     recording = open_recording("a.h5")
     before = snapshot(place)
     calibration = Calibration.load("cal.json")
-    from amiwarp.compensate import compensate
+    from amiwarp.compensation.recordings import compensate
 
     for write in (
         lambda: compensate(recording, calibration, "a.h5", overwrite=True),
@@ -472,8 +472,8 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from amiwarp.errors import AmiwarpError
-from amiwarp.picture_files import save_grey
-from amiwarp.iwe_files import save_png
+from amiwarp.reconstruction.export import save_grey
+from amiwarp.imaging.export import save_png
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 noise = np.random.default_rng(0).random((60, 80), np.float32)
 for write in (lambda p: save_grey(noise, p, bits=16), lambda p: save_png(p, np.uint8(255 * noise))):

@@ -10,18 +10,18 @@ from conftest import TRUE_PHASE, TRUE_PRISM
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from amiwarp.brightness import BrightnessMap, Tiles
+from amiwarp.brightness.event_pairs import EventTable, PairSet, Sensor
+from amiwarp.brightness.solver import BrightnessMap, Tiles
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric import PhotometricSettings, _spread
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
+from amiwarp.calib.photometric.stage import PhotometricSettings, _spread
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
-from amiwarp.metrics import model_error, truth_model
-from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.optics import ExactModel, FlatSide, Prism
-from amiwarp.pairs import EventTable, PairSet, Sensor
-from amiwarp.simulate import SensorModel, simulate
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, FlatSide, Prism
+from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
+from amiwarp.simulation.simulator import SensorModel, simulate
 
 KNOWN = PhotometricSettings(sensor=Sensor(latency_us=100.0, refractory_us=100.0))
 

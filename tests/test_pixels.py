@@ -10,15 +10,23 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from amiwarp.calib import calibrate
-from amiwarp.calib.pixels import StrangeSummary, bin_times, keep, stands_out, strange_pixels, stretch, unlocked_counts
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
-from amiwarp.events import Events, MemoryEvents, Recording
-from amiwarp.metrics import model_error, truth_model
-from amiwarp.motion import CameraMotion
-from amiwarp.optics import FlatSide, Prism
-from amiwarp.pictures import linear_luminance
-from amiwarp.simulate import Scene, SensorModel, simulate
+from amiwarp.calib.bad_pixels import (
+    StrangeSummary,
+    bin_times,
+    keep,
+    stands_out,
+    strange_pixels,
+    stretch,
+    unlocked_counts,
+)
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.pictures import linear_luminance
+from amiwarp.simulation.simulator import Scene, SensorModel, simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 SIZE = (200, 150)
@@ -204,7 +212,7 @@ def test_a_stretch_of_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     source = MemoryEvents(Events(none, none, t, none.astype(np.uint8)), 4, 3)
     encoder = Encoder.constant_speed(-600.0, 0, 2_400_000)  # 1000 events a turn
     for most, turns in ((10**6, 8), (5_200, 5), (600, 2)):
-        monkeypatch.setattr("amiwarp.calib.pixels.MOST_EVENTS", most)
+        monkeypatch.setattr("amiwarp.calib.bad_pixels.MOST_EVENTS", most)
         found = stretch(source, encoder)
         assert len(found) == pytest.approx(1000 * turns + 50, abs=1)
         assert found.t[0] + found.t[-1] == pytest.approx(2_400_000, abs=200)

@@ -13,16 +13,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from amiwarp.calib import Settings
-from amiwarp.camera import LARGEST_FOCAL, Camera, Fisheye, RadialTangential
-from amiwarp.encoder import LARGEST_ANGLE, Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import TIME_LIMIT, Events, MemoryEvents, check_events
+from amiwarp.events.encoder import LARGEST_ANGLE, Encoder
+from amiwarp.events.events import TIME_LIMIT, Events, MemoryEvents, check_events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.optics import CircleModel, EllipseModel, ExactModel, Prism, RadialCircleModel
-from amiwarp.prism import UnsizedPrism
-from amiwarp.simulate import Scene, SensorModel, Simulation
+from amiwarp.optics.camera import LARGEST_FOCAL, Camera, Fisheye, RadialTangential
+from amiwarp.optics.models import CircleModel, EllipseModel, ExactModel, Prism, RadialCircleModel
+from amiwarp.optics.prism import UnsizedPrism
+from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
 CAMERA = Camera.from_fov(4, 3, 1.0)
 TABLE = np.zeros((3, 4, 2), np.float32)

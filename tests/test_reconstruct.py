@@ -13,21 +13,21 @@ from PIL import Image
 from scipy import ndimage
 from typer.testing import CliRunner
 
+from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.calib.result import Calibration
-from amiwarp.camera import Camera
 from amiwarp.cli.app import app
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.text import read_calib
-from amiwarp.motion import CameraMotion, PrismMotion
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.pairs import EventTable
-from amiwarp.picture_files import Tone, save_picture, save_video, tones
-from amiwarp.reconstruct import Fill, Picture, Reconstruction, grown, reconstruct, without_pinholes
-from amiwarp.simulate import Scene, SensorModel, Simulation
-from amiwarp.turning import Turning
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.reconstruction.export import Tone, save_picture, save_video, tones
+from amiwarp.reconstruction.picture import Fill, Picture, Reconstruction, grown, reconstruct, without_pinholes
+from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 PRISM, PHASE = Prism(math.radians(1.2)), 2.0

@@ -9,20 +9,20 @@ import pytest
 from conftest import TRUE_PRISM
 
 from amiwarp.calib import calibrate
-from amiwarp.calib.calibrate import prepare
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import check_pulses, check_texture
-from amiwarp.calib.search import Settings
-from amiwarp.calib.speed import turns_per_turn
-from amiwarp.calib.trial import FARTHEST_PX, in_pixels
-from amiwarp.calib.verdict import verdict
-from amiwarp.camera import Camera
+from amiwarp.calib.photometric.acceptance import verdict
+from amiwarp.calib.prism_speed import turns_per_turn
+from amiwarp.calib.selection.trial import FARTHEST_PX, in_pixels
+from amiwarp.calib.sharpness.search import Settings
 from amiwarp.cli.inputs import interval, number
-from amiwarp.encoder import TURN, Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
-from amiwarp.motion import CameraMotion
-from amiwarp.optics import Prism
-from amiwarp.simulate import simulate
+from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
+from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.simulator import simulate
 
 WIDTH, HEIGHT, LENGTH_US = 96, 72, 500_000
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(50.0))

@@ -16,9 +16,9 @@ from io_samples import SIZE, make_events, write_text
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import Format, open_recording, read_encoder_csv
 from amiwarp.io.text import read_calib
-from amiwarp.pictures import read_picture
-from amiwarp.regular import check_regular
-from amiwarp.translate import open_pictures
+from amiwarp.regular_file import check_regular
+from amiwarp.simulation.pictures import read_picture
+from amiwarp.simulation.translator import open_pictures
 
 
 def fifo(path: Path) -> Path:

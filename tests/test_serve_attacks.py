@@ -24,11 +24,11 @@ import numpy as np
 import pytest
 from test_serve import COUNT, TOKEN, WAIT_S, Counters, get, served, until
 
-from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
-from amiwarp.optics import Prism
-from amiwarp.simulate import simulate
+from amiwarp.events.events import Recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
+from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.frames import MOST_IN_FLIGHT
 from amiwarp.viewer.gate import MOST_BYTES, Gate

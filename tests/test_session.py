@@ -16,24 +16,24 @@ import pytest
 from rig_world import LONG_S, Counted, Wire, World, has_taken_in
 
 from amiwarp.calib.result import Calibration
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate, compensate_events
-from amiwarp.compensator import OUTSIDE, Compensated
-from amiwarp.encoder import Encoder
+from amiwarp.compensation.recordings import compensate, compensate_events
+from amiwarp.compensation.streams import OUTSIDE, Compensated
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.link.clocks import monotonic_us
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.stream import session as session_module
-from amiwarp.stream import sources
-from amiwarp.stream.beside import Beside
-from amiwarp.stream.emulated import LEAD_US, EmulatedCamera
-from amiwarp.stream.packets import Packet, packet
-from amiwarp.stream.queues import Policy
-from amiwarp.stream.session import Session, Status
-from amiwarp.stream.sources import open_source
+from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.stream import session as session_module
+from amiwarp.live.stream import sources
+from amiwarp.live.stream.background_worker import Beside
+from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
+from amiwarp.live.stream.packets import Packet, packet
+from amiwarp.live.stream.queues import Policy
+from amiwarp.live.stream.session import Session, Status
+from amiwarp.live.stream.sources import open_source
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.4)
@@ -77,10 +77,10 @@ def world() -> Callable[[], int]:
 
 def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran:
     """The recording played by an emulated rig through a session, which writes both files."""
-    from amiwarp.link.emulator import Controller, Fault
-    from amiwarp.link.link import Link
-    from amiwarp.link.rotors import Played
-    from amiwarp.link.terminal import PseudoTerminal
+    from amiwarp.live.link.emulator import Controller, Fault
+    from amiwarp.live.link.link import Link
+    from amiwarp.live.link.rotors import Played
+    from amiwarp.live.link.terminal import PseudoTerminal
 
     assert recording.encoder is not None
     rotor = Played(recording.encoder)
@@ -183,8 +183,8 @@ def test_a_fault_loses_nothing_and_is_told(tmp_path: Path, fault: str, said: str
 
 def test_an_emulated_camera_sees_the_pulses_of_a_controller_that_was_reset(tmp_path: Path) -> None:
     """Which counts them from 0 again."""
-    from amiwarp.link.emulator import Controller, Fault
-    from amiwarp.link.rotors import Played
+    from amiwarp.live.link.emulator import Controller, Fault
+    from amiwarp.live.link.rotors import Played
 
     recording, clock = points(1000, 0.1), World()
     assert recording.encoder is not None
@@ -205,8 +205,8 @@ def test_an_emulated_camera_sees_the_pulses_of_a_controller_that_was_reset(tmp_p
 
 @TURNING
 def test_an_emulated_camera_loses_nothing_where_its_client_is_slow(tmp_path: Path) -> None:
-    from amiwarp.link.emulator import Controller
-    from amiwarp.link.rotors import Played
+    from amiwarp.live.link.emulator import Controller
+    from amiwarp.live.link.rotors import Played
 
     recording, now_us = points(3_000_000, 0.3), world()
     assert recording.encoder is not None

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.sharpness import PAPER_ETA, Sharpness, gaussian, sharpness
+from amiwarp.imaging.sharpness_costs import PAPER_ETA, Sharpness, gaussian, sharpness
 
 
 @pytest.fixture

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from amiwarp.camera import Camera, RadialTangential
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, Recording
+from amiwarp.events.events import Events, Recording
 from amiwarp.kernels import launch as launching
-from amiwarp.kernels import simulate as kernels
-from amiwarp.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.optics import ExactModel, FlatSide, Prism
-from amiwarp.pictures import DARK, Placement, linear_luminance, log_map, place, read_picture
-from amiwarp.scenery import step_us
-from amiwarp.simulate import Scene, SensorModel, Simulation, simulate
+from amiwarp.kernels import event_generation as kernels
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.models import ExactModel, FlatSide, Prism
+from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
+from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place, read_picture
+from amiwarp.simulation.scenery import step_us
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)
@@ -166,8 +166,8 @@ def test_chunks_do_not_matter(device: str, chunk_us: int) -> None:
 
 def test_threads_and_room_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     many = base().run()
-    monkeypatch.setattr("amiwarp.engine.CPU_RUN", 100)
-    monkeypatch.setattr("amiwarp.engine.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
+    monkeypatch.setattr("amiwarp.simulation.engine.CPU_RUN", 100)
+    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
     monkeypatch.setattr(launching, "cpu_threads", lambda: 1)
     assert same(many, base().run())
 

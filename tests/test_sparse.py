@@ -8,13 +8,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from amiwarp.calib import calibrate
-from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
-from amiwarp.metrics import model_error, truth_model
-from amiwarp.motion import PrismMotion
-from amiwarp.optics import FlatSide, Prism
-from amiwarp.simulate import Scene, SensorModel, Simulation
+from amiwarp.events.events import Recording
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from amiwarp.calib import calibrate
-from amiwarp.calib.paper import calibrate_as_paper
+from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.errors import AmiwarpError
-from amiwarp.metrics import model_error
-from amiwarp.optics import ExactModel
-from amiwarp.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
-from amiwarp.stability.cells import Cell, Store, best_fit
-from amiwarp.stability.run import conditions
-from amiwarp.stability.scenes import SceneKind, draw
+from amiwarp.imaging.metrics import model_error
+from amiwarp.optics.models import ExactModel
+from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
+from amiwarp.studies.stability.cells import Cell, Store, best_fit
+from amiwarp.studies.stability.run import conditions
+from amiwarp.studies.stability.scenes import SceneKind, draw
 
 SMALL = Condition(width=160, height=120, turns=3.0)
 

@@ -15,13 +15,25 @@ from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner, Result
 
-import amiwarp.stability
+import amiwarp.studies.stability
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
-from amiwarp.stability import METHODS, Atlas, Axis, Cell, Condition, Outcome, Store, Stored, aggregate, identity, load
-from amiwarp.stability import Result as Found
-from amiwarp.stability.figures import OVERVIEW, _overview, _page, draw
-from amiwarp.stability.report import Rate, most_said, words_of
+from amiwarp.studies.stability import (
+    METHODS,
+    Atlas,
+    Axis,
+    Cell,
+    Condition,
+    Outcome,
+    Store,
+    Stored,
+    aggregate,
+    identity,
+    load,
+)
+from amiwarp.studies.stability import Result as Found
+from amiwarp.studies.stability.figures import OVERVIEW, _overview, _page, draw
+from amiwarp.studies.stability.report import Rate, most_said, words_of
 
 METHOD = {m.name: m for m in METHODS}
 NOISE = Axis("background noise", "noise", (0.0, 0.25, 0.5, 0.8), "of all events")

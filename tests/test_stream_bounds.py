@@ -18,27 +18,27 @@ import pytest
 from rig_world import World
 from test_session import KNOWN, MODEL, Made, points, world
 
-from amiwarp.compensator import Compensated, Compensator, held_bytes
-from amiwarp.encoder import Encoder, EncoderStream
+from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
-from amiwarp.link.emulator import MOST_OUT, Controller, Fault
-from amiwarp.link.news import News
-from amiwarp.link.rotors import MOST_PIECES, Motor, Played
-from amiwarp.link.terminal import RETRY_S, PseudoTerminal
-from amiwarp.stream import ring as ring_module
-from amiwarp.stream import speed as speed_module
-from amiwarp.stream import watch as watch_module
-from amiwarp.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.stream.beside import Beside
-from amiwarp.stream.emulated import EmulatedCamera
-from amiwarp.stream.packets import Packet, encode_hello, packet
-from amiwarp.stream.queues import PacketQueue, Policy
-from amiwarp.stream.ring import Ring
-from amiwarp.stream.session import Session
-from amiwarp.stream.sockets import MOST_CLIENTS, PIECE, REST_S, PipeSink, SocketSink
-from amiwarp.stream.speed import SpeedKeeper
-from amiwarp.stream.watch import PhaseWatch
+from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.events import Events
+from amiwarp.live.link.emulator import MOST_OUT, Controller, Fault
+from amiwarp.live.link.news import News
+from amiwarp.live.link.rotors import MOST_PIECES, Motor, Played
+from amiwarp.live.link.terminal import RETRY_S, PseudoTerminal
+from amiwarp.live.stream import recent_events as ring_module
+from amiwarp.live.stream import speed_control as speed_module
+from amiwarp.live.stream import phase_check as watch_module
+from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
+from amiwarp.live.stream.background_worker import Beside
+from amiwarp.live.stream.emulated import EmulatedCamera
+from amiwarp.live.stream.packets import Packet, encode_hello, packet
+from amiwarp.live.stream.phase_check import PhaseWatch
+from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.live.stream.recent_events import Ring
+from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.sockets import MOST_CLIENTS, PIECE, REST_S, PipeSink, SocketSink
+from amiwarp.live.stream.speed_control import SpeedKeeper
 
 MOST = 1 << 20
 """Bound of the queues here [bytes]."""
@@ -165,8 +165,8 @@ class Flood(Made):
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions whose queues are small."""
-    monkeypatch.setattr("amiwarp.stream.session.Beside", partial(Beside, MOST))
-    monkeypatch.setattr("amiwarp.stream.session.PacketQueue", partial(PacketQueue, most_bytes=MOST))
+    monkeypatch.setattr("amiwarp.live.stream.session.Beside", partial(Beside, MOST))
+    monkeypatch.setattr("amiwarp.live.stream.session.PacketQueue", partial(PacketQueue, most_bytes=MOST))
 
 
 @pytest.mark.usefixtures("small")
@@ -284,7 +284,7 @@ def test_a_window_that_never_ends_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A controller that sends without end while the camera sends nothing."""
-    monkeypatch.setattr("amiwarp.stream.session.MOST_HELD", 1000)
+    monkeypatch.setattr("amiwarp.live.stream.session.MOST_HELD", 1000)
     said: list[str] = []
 
     class Sending:
@@ -471,7 +471,7 @@ def test_a_pipe_whose_reader_takes_nothing_can_be_ended() -> None:
 
 
 def test_descriptors_above_a_thousand_can_be_waited_for() -> None:
-    from amiwarp.stream.sockets import ready
+    from amiwarp.live.stream.sockets import ready
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     ours, theirs = socket.socketpair()

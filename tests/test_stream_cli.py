@@ -24,16 +24,16 @@ from rig_world import LONG_S
 from typer.testing import CliRunner
 
 from amiwarp.calib.result import Calibration
-from amiwarp.camera import Camera
 from amiwarp.cli.app import app
-from amiwarp.compensate import compensate
-from amiwarp.encoder import Encoder
+from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
 from amiwarp.io import open_recording, save_recording
-from amiwarp.optics import Prism
-from amiwarp.stream.packets import encode_encoder, encode_events, encode_hello
-from amiwarp.stream.sockets import listen, shut
+from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
+from amiwarp.live.stream.sockets import listen, shut
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 SCRIPT = (
@@ -61,7 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-PATIENT = "import amiwarp.stream.sockets as sockets; sockets.PARTING_S = 120.0; "
+PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.PARTING_S = 120.0; "
 """Before a command that serves: it waits for whoever is slow at the end."""
 
 
@@ -253,12 +253,12 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
 
 def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From rest; events at random are more than the limit allows, so that it is slowed down."""
-    from amiwarp.link.emulator import Controller
-    from amiwarp.link.rotors import Motor
-    from amiwarp.link.terminal import PseudoTerminal
+    from amiwarp.live.link.emulator import Controller
+    from amiwarp.live.link.rotors import Motor
+    from amiwarp.live.link.terminal import PseudoTerminal
 
     motor = Motor()
-    monkeypatch.setattr("amiwarp.link.link.ANSWER_S", LONG_S)
+    monkeypatch.setattr("amiwarp.live.link.link.ANSWER_S", LONG_S)
     with PseudoTerminal(Controller(motor), tmp_path / "prism") as port:
         args = ["live", str(folder / "recording.h5"), "--port", port.name, "--calibration", str(folder / "c.json")]
         options = ["--adaptive", "--most-mev-s", "0.05", "--device", "cpu", "--json"]

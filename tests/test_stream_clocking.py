@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from amiwarp.link.clocks import from_round_trips
-from amiwarp.stream.clocking import CameraClock
+from amiwarp.live.link.clocks import from_round_trips
+from amiwarp.live.stream.clocking import CameraClock
 
 OFFSET, DRIFT = 1_700_000_000_000_000, 40e-6
 

@@ -9,10 +9,10 @@ import pytest
 from mutation_frames import CAMERA, mutated_serial, mutated_stream, packed, read_serial, read_stream
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.link.following import MOST_PARTS, Follower
-from amiwarp.link.protocol import LONGEST, Samples, Status, Sync, encode
-from amiwarp.link.protocol import Decoder as SerialDecoder
-from amiwarp.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Decoder, Hello
+from amiwarp.live.link.following import MOST_PARTS, Follower
+from amiwarp.live.link.protocol import LONGEST, Samples, Status, Sync, encode
+from amiwarp.live.link.protocol import Decoder as SerialDecoder
+from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Decoder, Hello
 
 SEEDS = 300
 

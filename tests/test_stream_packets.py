@@ -11,11 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
-from amiwarp.optics import FlatSide, Prism
-from amiwarp.stream.packets import (
+from amiwarp.events.events import Events
+from amiwarp.live.stream.packets import (
     ENCODER,
     HEADER,
     HELLO,
@@ -35,6 +33,8 @@ from amiwarp.stream.packets import (
     encode_hello,
     encode_triggers,
 )
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics.models import FlatSide, Prism
 
 CAMERAS = (
     None,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
-from amiwarp.stream.packets import Packet
-from amiwarp.stream.queues import PacketQueue, Policy
+from amiwarp.events.events import Events
+from amiwarp.live.stream.packets import Packet
+from amiwarp.live.stream.queues import PacketQueue, Policy
 
 
 def packet(first: int, n: int) -> Packet:

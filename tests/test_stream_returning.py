@@ -19,17 +19,17 @@ from test_stream_cli import start
 from typer.testing import CliRunner
 
 from amiwarp.calib.result import Calibration
-from amiwarp.camera import Camera
 from amiwarp.cli.app import app
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.io import open_recording
-from amiwarp.optics import Prism
-from amiwarp.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
-from amiwarp.stream.ring import Ring, followed
-from amiwarp.stream.sockets import listen, shut
-from amiwarp.stream.sources import open_source
+from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
+from amiwarp.live.stream.recent_events import Ring, followed
+from amiwarp.live.stream.sockets import listen, shut
+from amiwarp.live.stream.sources import open_source
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 HELLO = encode_hello(64, 48, CAMERA, PRISM)

@@ -13,15 +13,13 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
-from amiwarp.link.clocks import monotonic_us
-from amiwarp.optics import Prism
-from amiwarp.stream import cameras, sockets, sources
-from amiwarp.stream.packets import (
+from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.stream import cameras, sockets, sources
+from amiwarp.live.stream.packets import (
     HEADER,
     Decoder,
     End,
@@ -34,8 +32,10 @@ from amiwarp.stream.packets import (
     encode_hello,
     encode_triggers,
 )
-from amiwarp.stream.sockets import PipeSink, SocketSink, open_sink
-from amiwarp.stream.sources import FileSource, StreamSource, open_source
+from amiwarp.live.stream.sockets import PipeSink, SocketSink, open_sink
+from amiwarp.live.stream.sources import FileSource, StreamSource, open_source
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
 
 SIZE = (320, 240)
 CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5)
@@ -219,9 +219,9 @@ def test_standard_input_and_output(tmp_path):
     with open(tmp_path / "stream", "wb") as file, PipeSink(HELLO, file) as sink:
         sink.send(encode_events(events))
     script = (
-        "from amiwarp.stream.packets import encode_events, encode_hello\n"
-        "from amiwarp.stream.sockets import open_sink\n"
-        "from amiwarp.stream.sources import open_source\n"
+        "from amiwarp.live.stream.packets import encode_events, encode_hello\n"
+        "from amiwarp.live.stream.sockets import open_sink\n"
+        "from amiwarp.live.stream.sources import open_source\n"
         "source = open_source('-')\n"
         "with open_sink('-', encode_hello(*source.size, source.camera, source.prism)) as sink:\n"
         "    for packet in source.packets():\n"

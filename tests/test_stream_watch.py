@@ -16,22 +16,22 @@ import numpy as np
 import pytest
 
 from amiwarp.calib.result import Calibration
-from amiwarp.camera import Camera
-from amiwarp.compensator import Compensated, Compensator
-from amiwarp.encoder import EncoderStream
+from amiwarp.compensation.streams import Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, Recording
+from amiwarp.events.encoder import EncoderStream
+from amiwarp.events.events import Events, Recording
 from amiwarp.io import save_recording
-from amiwarp.optics import Prism
-from amiwarp.simulate import SensorModel, simulate
-from amiwarp.stream import ring as ring_module
-from amiwarp.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.stream.forward import Forward
-from amiwarp.stream.packets import Angles, Decoder, Packet
-from amiwarp.stream.ring import SECONDS, Ring, followed
-from amiwarp.stream.sources import FileSource, open_source
-from amiwarp.stream.speed import WINDOW_US, SpeedKeeper
-from amiwarp.stream.watch import PhaseWatch
+from amiwarp.live.stream import recent_events as ring_module
+from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
+from amiwarp.live.stream.forward import Forward
+from amiwarp.live.stream.packets import Angles, Decoder, Packet
+from amiwarp.live.stream.phase_check import PhaseWatch
+from amiwarp.live.stream.recent_events import SECONDS, Ring, followed
+from amiwarp.live.stream.sources import FileSource, open_source
+from amiwarp.live.stream.speed_control import WINDOW_US, SpeedKeeper
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
+from amiwarp.simulation.simulator import SensorModel, simulate
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
 BIAS_DEG = 3.5

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.camera import Camera, RadialTangential
-from amiwarp.encoder import Encoder
-from amiwarp.events import Events
-from amiwarp.iwe import CanvasShape, Image, Vote, Votes
-from amiwarp.optics import CircleModel, ExactModel, Model, Prism
-from amiwarp.tiles import TileVotes
-from amiwarp.turning import Turning
-from amiwarp.uploads import upload_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
+from amiwarp.imaging.device_events import upload_events
+from amiwarp.imaging.tile_votes import TileVotes
+from amiwarp.imaging.warped_image import CanvasShape, Image, Vote, Votes
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.models import CircleModel, ExactModel, Model, Prism
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 

@@ -8,13 +8,13 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, Recording
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.pictures import DARK
-from amiwarp.simulate import SensorModel
-from amiwarp.translate import open_pictures, translate, translation
+from amiwarp.events.events import Events, Recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.simulation.pictures import DARK
+from amiwarp.simulation.simulator import SensorModel
+from amiwarp.simulation.translator import open_pictures, translate, translation
 
 CLEAR = Prism(0.0, 1.5)  # bends nothing
 WEDGE = Prism(math.radians(2.0), 1.55)

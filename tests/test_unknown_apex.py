@@ -12,15 +12,15 @@ import pytest
 from typer.testing import CliRunner
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.camera import Camera
 from amiwarp.cli.app import app
 from amiwarp.cli.inputs import NominalPrismOptions
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events.events import Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.attributes import prism_attributes, read_prism
-from amiwarp.prism import FlatSide, Prism, UnsizedPrism
-from amiwarp.simulate import simulate
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
+from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer.inspector import Inspector
 
 APEX, INDEX = math.radians(1.0), 1.55

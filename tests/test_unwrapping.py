@@ -8,10 +8,10 @@ import pytest
 from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
-from amiwarp.encoder import TURN, Encoder
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.unwrapping import UnwrapError
 from amiwarp.io import read_encoder_csv
-from amiwarp.unwrapping import UnwrapError
 
 
 def wrapped(count, bits, *, signed=False):

@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events
-from amiwarp.iwe import CanvasShape, Votes
-from amiwarp.optics import ExactModel, Prism
-from amiwarp.uploads import LARGEST_WEIGHT, TURNS, upload_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
+from amiwarp.imaging.device_events import LARGEST_WEIGHT, TURNS, upload_events
+from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Prism
 
 
 def still_scene(n: int, points: int = 200, seed: int = 0) -> Events:

@@ -17,13 +17,13 @@ from PIL import Image
 from test_serve import WAIT_S, served, until
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.camera import Camera
-from amiwarp.events import MemoryEvents, Recording
+from amiwarp.events.events import MemoryEvents, Recording
 from amiwarp.io import open_recording, save_recording
-from amiwarp.motion import PrismMotion
-from amiwarp.optics import Prism
-from amiwarp.picture_files import save_film
-from amiwarp.simulate import simulate
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import Prism
+from amiwarp.reconstruction.export import save_film
+from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import jobs
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.layout import KEYS

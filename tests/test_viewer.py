@@ -11,17 +11,17 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from amiwarp.calib import Calibration
+from amiwarp.calib.bad_pixels import Masked
 from amiwarp.calib.parameters import build_model
-from amiwarp.calib.pixels import Masked
-from amiwarp.camera import Camera
-from amiwarp.compensate import compensate_events
-from amiwarp.encoder import Encoder
+from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MemoryEvents, Recording
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
-from amiwarp.iwe import iwe
-from amiwarp.optics import MODELS, Prism
-from amiwarp.simulate import simulate
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, Prism
+from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection
 from amiwarp.viewer.scene import Axis, Colour, Look, Scene, View, colours_of, residual

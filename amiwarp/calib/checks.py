@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from amiwarp.calib.pixels import StrangeSummary
-    from amiwarp.encoder import Encoder
-    from amiwarp.optics import Prism
+    from amiwarp.calib.bad_pixels import StrangeSummary
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.optics.models import Prism
 
 FEWEST_EVENTS = 2000
 SMALLEST_TURN = math.pi / 2

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics import (
+from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.models import (
     MODELS,
     CircleModel,
     EllipseModel,
@@ -24,16 +25,15 @@ from amiwarp.optics import (
     RadialCircleModel,
     deflection_from_apex,
 )
-from amiwarp.prism import UnsizedPrism
-from amiwarp.turning import Turning
-from amiwarp.values import instance, one_of, real, shown, vector
+from amiwarp.optics.prism import UnsizedPrism
+from amiwarp.validation import instance, one_of, real, shown, vector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.camera import Camera
-    from amiwarp.optics import Model
-    from amiwarp.prism import NominalPrism
+    from amiwarp.optics.camera import Camera
+    from amiwarp.optics.models import Model
+    from amiwarp.optics.prism import NominalPrism
 
 NOMINAL_APEX = math.radians(2.0)
 """What is assumed where a recording does not say its prism's apex: the apex is sought up to twice this."""

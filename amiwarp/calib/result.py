@@ -13,23 +13,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib.parameters import MOTION, UNITS, build_model, size_name, turning_of
-from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.imaging.sharpness_costs import Sharpness
 from amiwarp.io.files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
 from amiwarp.io.output import write_text
-from amiwarp.optics import MODELS, Prism
-from amiwarp.sharpness import Sharpness
-from amiwarp.turning import Turning
-from amiwarp.values import one_of, real, shown
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.models import MODELS, Prism
+from amiwarp.validation import one_of, real, shown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import Space
     from amiwarp.calib.solve import Stage
-    from amiwarp.optics import Model
+    from amiwarp.optics.models import Model
 
 FORMAT = "amiwarp-calibration"
 VERSION = 1
@@ -94,7 +94,7 @@ class Photometric:
 
 @dataclass(frozen=True)
 class Rung:
-    """One model of the ladder and what was found of it; see :mod:`amiwarp.calib.auto`."""
+    """One model of the ladder and what was found of it; see :mod:`amiwarp.calib.selection.model_choice`."""
 
     model: str
     numbers: str

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.values import one_of
+from amiwarp.validation import one_of
 
 GLOBAL_ALGORITHMS = (
     "GN_DIRECT",

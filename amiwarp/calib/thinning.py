@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.events import Events, MemoryEvents
+from amiwarp.events.events import Events, MemoryEvents
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events import Recording
+    from amiwarp.events.events import Recording
 
 RUN = 8
 """Events that stay together where a recording is thinned: a cache line of times."""

@@ -14,13 +14,13 @@ from amiwarp.cli.console import Advance, choose_device, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, interval, number, span
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.sharpness import Sharpness
+from amiwarp.imaging.sharpness_costs import Sharpness
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration, Settings
-    from amiwarp.calib.photometric import PhotometricSettings
+    from amiwarp.calib.photometric.stage import PhotometricSettings
     from amiwarp.calib.result import Ladder
-    from amiwarp.events import Recording
+    from amiwarp.events.events import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
 
@@ -106,7 +106,7 @@ class SearchOptions:
 
     def changes(self, base: PhotometricSettings) -> dict[str, Any]:
         """Fields of the settings that were given; ``base``: those of the photometric stage that were not."""
-        from amiwarp.pairs import Sensor
+        from amiwarp.brightness.event_pairs import Sensor
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
         if (given.get("global_algorithm") or "").lower() == "none":
@@ -208,10 +208,10 @@ def run(
 ) -> None:
     """Find the prism's parameters: those that make the image of the events sharpest. No guess is needed."""
     from amiwarp.calib import Settings, calibrate
-    from amiwarp.calib.paper import calibrate_as_paper
+    from amiwarp.calib.paper_method import calibrate_as_paper
+    from amiwarp.calib.presets import Preset
     from amiwarp.io import open_recording
     from amiwarp.io.output import check_output
-    from amiwarp.presets import Preset
 
     device = choose_device(common.device)
     base = Settings() if preset is None else Preset.load(preset, "calibration").calibration_settings()
@@ -232,7 +232,7 @@ def run(
             found = calibrate(opened, settings, device=device, progress=staged(advance, settings))
     found.save(out)
     if figure is not None:
-        from amiwarp.figures import draw_calibration
+        from amiwarp.plotting.figures import draw_calibration
 
         draw_calibration(figure, opened, found, device=device)
     data = summary(found) | {"file": str(out), "figure": None if figure is None else str(figure), "device": device}
@@ -250,7 +250,7 @@ def cut(recording: Recording, window: str) -> Recording:
 
     Raises :class:`AmiwarpError` for a window that is none or holds no event.
     """
-    from amiwarp.events import MemoryEvents
+    from amiwarp.events.events import MemoryEvents
 
     first, last = recording.events.t_first, recording.events.t_last
     low, high = span(window, first, last)
@@ -329,7 +329,7 @@ def _exact(ladder: Ladder) -> list[str]:
 
 
 def _range(px: tuple[float, float]) -> str:
-    from amiwarp.calib.trial import in_pixels
+    from amiwarp.calib.selection.trial import in_pixels
 
     low, high = (max(x, 0.0) for x in px)
     return f"{low:.3f} to {in_pixels(high)}"

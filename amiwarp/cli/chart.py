@@ -12,8 +12,8 @@ from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
-    from amiwarp.chart import Charts
-    from amiwarp.chart.rows import Row
+    from amiwarp.studies.chart import Charts
+    from amiwarp.studies.chart.rows import Row
 
 EXAMPLE = "amiwarp chart --out amiwarp-chart --budget-px 0.3"
 
@@ -46,9 +46,9 @@ def run(
     if recording is not None and picture is not None:
         raise AmiwarpError("a recording and --picture both say what to measure on; give one of them")
     device = choose_device(common.device)
-    from amiwarp.chart import make, simulated
     from amiwarp.io import open_recording
     from amiwarp.io.output import check_output
+    from amiwarp.studies.chart import make, simulated
 
     if budget_px is not None or budget_ms is not None:
         for kind in ("calibration", "compensation"):
@@ -69,7 +69,7 @@ def run(
 
 def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
     """Fronts, defaults and answers; the whole table is in the files."""
-    from amiwarp.chart.rows import fronts
+    from amiwarp.studies.chart.rows import fronts
 
     def fields(row: Row) -> dict[str, Any]:
         return {"label": row.label, "job": row.job, "mev_per_s": row.mev_per_s, "ms": row.seconds * 1e3,
@@ -89,7 +89,7 @@ def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[s
 
 def lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> list[Any]:
     """The same for people."""
-    from amiwarp.chart.rows import beaten_by, fronts, told_apart
+    from amiwarp.studies.chart.rows import beaten_by, fronts, told_apart
 
     shown: list[Any] = []
     for rows in (charts.compensation, charts.calibration):

@@ -11,10 +11,10 @@ import typer
 from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.iwe_files import IweFiles, Layers
+from amiwarp.imaging.export import IweFiles, Layers
 
 if TYPE_CHECKING:
-    from amiwarp.events import Recording
+    from amiwarp.events.events import Recording
 
 EXAMPLE = "amiwarp compensate recording.h5 compensated.h5 --calibration calibration.json --iwe iwe.png"
 
@@ -72,9 +72,9 @@ def run(
     A PNG shows counts from 0 (black) to their 99.5th percentile over pixels with events (white), with gamma 0.5.
     """
     from amiwarp.calib import Calibration
-    from amiwarp.compensate import compensate
+    from amiwarp.calib.presets import Preset, simplified
+    from amiwarp.compensation.recordings import compensate
     from amiwarp.io import open_recording
-    from amiwarp.presets import Preset, simplified
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)

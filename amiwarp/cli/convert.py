@@ -16,7 +16,7 @@ from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
-    from amiwarp.encoder import Encoder
+    from amiwarp.events.encoder import Encoder
 
 EXAMPLE = "amiwarp convert events.raw recording.h5 --encoder encoder.csv --counts-per-turn 4096 --fov-deg 60"
 

@@ -34,8 +34,8 @@ def run(
     device = choose_device(common.device)
     with progress("starting") as advance:
         from amiwarp.cli.rig import parse_size
-        from amiwarp.demo import Demo, run_demo
         from amiwarp.io.output import own_folder
+        from amiwarp.studies.demo import Demo, run_demo
 
         width, height = parse_size(size)
         demo = Demo(out, picture, width, height, duration, common.seed, device)

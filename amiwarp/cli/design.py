@@ -16,11 +16,11 @@ from amiwarp.cli.console import choose_device, plain, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, numbers
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
-from amiwarp.optics import FlatSide, Prism
+from amiwarp.optics.models import FlatSide, Prism
 
 if TYPE_CHECKING:
-    from amiwarp.camera import Camera
-    from amiwarp.design import Choice, Design, Limits, Timing
+    from amiwarp.optics.camera import Camera
+    from amiwarp.studies.design import Choice, Design, Limits, Timing
 
 EXAMPLE = "amiwarp design --size 640x480 --fov-deg 60 --tolerance-px 0.5 --out amiwarp-design"
 FOV_DEG = 60.0
@@ -75,7 +75,7 @@ class LimitOptions:
     ] = None  # fmt: skip
 
     def build(self) -> Limits:
-        from amiwarp.design import Limits
+        from amiwarp.studies.design import Limits
 
         most = None if self.bandwidth_mev_s is None else self.bandwidth_mev_s * 1e6
         return Limits(self.tolerance_px, self.window_ms, most, self.budget_px)
@@ -97,7 +97,7 @@ class FaultOptions:
     ] = 0.25
 
     def timing(self) -> Timing:
-        from amiwarp.design import Timing
+        from amiwarp.studies.design import Timing
 
         return Timing(self.clock_us, math.radians(self.encoder_deg))
 
@@ -128,11 +128,11 @@ def run(
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.demo import earth
-    from amiwarp.design import design
-    from amiwarp.design.drawing import draw
     from amiwarp.io.output import check_output, make_folder, write_text
-    from amiwarp.simulate import Scene, SensorModel
+    from amiwarp.simulation.simulator import Scene, SensorModel
+    from amiwarp.studies.demo import earth
+    from amiwarp.studies.design import design
+    from amiwarp.studies.design.drawing import draw
 
     make_folder(out)
     files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
@@ -153,7 +153,7 @@ def run(
 
 
 def _camera(options: CameraOptions, size: str | None) -> Camera:
-    from amiwarp.camera import Camera
+    from amiwarp.optics.camera import Camera
 
     width, height = parse_size(size or "640x480")
     found = options.build(width, height, fixed=size is not None)
@@ -166,7 +166,7 @@ def _list(text: str, name: str) -> tuple[float, ...]:
 
 def summary(design: Design) -> dict[str, Any]:
     """Everything that was computed; angles in degrees."""
-    from amiwarp.design.words import headline, reasons
+    from amiwarp.studies.design.recommendation import headline, reasons
 
     camera, volume = design.camera, design.volume
     return {
@@ -229,7 +229,7 @@ def _csv(rows: list[dict[str, Any]]) -> str:
 
 def lines(design: Design, files: dict[str, str]) -> list[Any]:
     """The same for people."""
-    from amiwarp.design.words import degrees, headline, rate, reasons
+    from amiwarp.studies.design.recommendation import degrees, headline, rate, reasons
 
     rows = [
         (degrees(c.orbit.apex), f"{c.rpm:g}", rate(c.events_per_s), f"{c.orbit.radius:.1f} px", f"{c.error_px:.3f} px",

@@ -18,8 +18,8 @@ from amiwarp.cli.streams import stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
-    from amiwarp.encoder import Encoder
-    from amiwarp.events import Recording
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import Recording
 
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"
 
@@ -62,11 +62,11 @@ def run(
     common: Common,
 ) -> None:
     """Be a controller with motor, encoder and index, for trying out without one, and with what goes wrong on demand."""
-    from amiwarp.link.clocks import monotonic_us
-    from amiwarp.link.emulator import Controller, Fault
-    from amiwarp.link.rotors import Motor, Played
-    from amiwarp.link.terminal import PseudoTerminal
-    from amiwarp.stream.emulated import EmulatedCamera
+    from amiwarp.live.link.clocks import monotonic_us
+    from amiwarp.live.link.emulator import Controller, Fault
+    from amiwarp.live.link.rotors import Motor, Played
+    from amiwarp.live.link.terminal import PseudoTerminal
+    from amiwarp.live.stream.emulated import EmulatedCamera
 
     if (recording is None) != (camera is None):
         raise AmiwarpError("--recording and --camera go together: what is played, and where its events are served")

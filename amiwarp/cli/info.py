@@ -11,11 +11,11 @@ import typer
 
 from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import Common
-from amiwarp.prism import Prism
+from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
-    from amiwarp.encoder import Encoder
-    from amiwarp.events import EventSource, Recording
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import EventSource, Recording
 
 EXAMPLE = "amiwarp info recording.h5"
 
@@ -85,7 +85,7 @@ def _events(source: EventSource) -> dict[str, Any]:
 
 
 def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
-    from amiwarp.io.convert import GAP_INTERVALS
+    from amiwarp.io.conversion import GAP_INTERVALS
 
     slip = encoder.slip()
     first, last = encoder.coverage

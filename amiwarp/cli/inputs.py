@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.prism import FlatSide, NominalPrism, UnsizedPrism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
 
 if TYPE_CHECKING:
-    from amiwarp.events import Recording
+    from amiwarp.events.events import Recording
 
 _CAMERA = "Camera"
 _PRISM = "Prism"

@@ -15,20 +15,20 @@ from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 from amiwarp.errors import AmiwarpError
-from amiwarp.stream.queues import Policy
+from amiwarp.live.stream.queues import Policy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from amiwarp.calib import Calibration
-    from amiwarp.compensator import Compensated
+    from amiwarp.compensation.streams import Compensated
     from amiwarp.io.live_writer import LiveWriter
-    from amiwarp.link.link import Link
-    from amiwarp.optics import Model
-    from amiwarp.stream.packets import Source
-    from amiwarp.stream.session import Raw, Status
-    from amiwarp.stream.sockets import PipeSink, SocketSink
-    from amiwarp.stream.speed import SpeedKeeper
+    from amiwarp.live.link.link import Link
+    from amiwarp.live.stream.packets import Source
+    from amiwarp.live.stream.session import Raw, Status
+    from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.speed_control import SpeedKeeper
+    from amiwarp.optics.models import Model
 
 EXAMPLE = "amiwarp live dv --port find --calibration calibration.json --out compensated.h5"
 
@@ -54,8 +54,8 @@ class AdaptiveOptions:
     ] = None
 
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
-        from amiwarp.stream.adaptive import SpeedController, prism_orbit
-        from amiwarp.stream.speed import SpeedKeeper
+        from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
+        from amiwarp.live.stream.speed_control import SpeedKeeper
 
         if not self.adaptive:
             return None
@@ -105,10 +105,10 @@ def run(
     Every event comes out once, in order, marked where it left the image or its angle had to be extrapolated.
     """
     from amiwarp.calib import Calibration
-    from amiwarp.compensate import check_size
-    from amiwarp.stream.clocking import clock_offset
-    from amiwarp.stream.forward import Forward
-    from amiwarp.stream.session import Session
+    from amiwarp.compensation.recordings import check_size
+    from amiwarp.live.stream.clocking import clock_offset
+    from amiwarp.live.stream.forward import Forward
+    from amiwarp.live.stream.session import Session
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)
@@ -165,8 +165,8 @@ def run(
 def _sink(
     to: str, found: Calibration, held: contextlib.ExitStack, stop: threading.Event, say: Callable[[str], None]
 ) -> SocketSink | PipeSink:
-    from amiwarp.stream.packets import encode_hello
-    from amiwarp.stream.sockets import open_sink
+    from amiwarp.live.stream.packets import encode_hello
+    from amiwarp.live.stream.sockets import open_sink
 
     hello = encode_hello(found.camera.width, found.camera.height, found.camera, found.prism)
     sink = open_sink(to, hello, stop=stop, say=say)
@@ -175,7 +175,7 @@ def _sink(
 
 
 def _sent(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
-    from amiwarp.stream.packets import encode_compensated
+    from amiwarp.live.stream.packets import encode_compensated
 
     return lambda packet: sink.send(encode_compensated(packet.events, packet.flags))
 

@@ -14,7 +14,7 @@ from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
-    from amiwarp.link.link import Link
+    from amiwarp.live.link.link import Link
 
 EXAMPLE = "amiwarp motor set --port /dev/ttyACM0 --rpm 720"
 LIMIT_RPM = 3000.0
@@ -48,7 +48,7 @@ def run(
     common: Common,
 ) -> None:
     """Drive the prism's motor, and see what its controller says. The motor goes on as told when this ends."""
-    from amiwarp.link.link import Link
+    from amiwarp.live.link.link import Link
 
     if (rpm is None) == (action is Action.SET):
         raise AmiwarpError("--rpm is the speed to set; 'amiwarp motor set' needs it and nothing else takes it")
@@ -82,7 +82,7 @@ def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
 
 
 def _described(link: Link, messages: list[str]) -> dict[str, Any]:
-    from amiwarp.link.protocol import FAULTS, STATES
+    from amiwarp.live.link.protocol import FAULTS, STATES
 
     status = link.status
     if status is None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from amiwarp.io import output
-from amiwarp.regular import check_regular
+from amiwarp.regular_file import check_regular
 
 OUTPUT = "output"
 """Marks, in ``Annotated``, an option that names a file to write; every other path is read."""

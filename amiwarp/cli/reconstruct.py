@@ -14,12 +14,12 @@ from amiwarp.cli.console import Advance, choose_device, progress, report
 from amiwarp.cli.inputs import numbers
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.picture_files import CONTRAST, VIDEO, Tone, check_path, save_mask, save_picture, save_video
-from amiwarp.reconstruct import Fill
-from amiwarp.turning import Turning
+from amiwarp.optics.camera_rotation import Turning
+from amiwarp.reconstruction.export import CONTRAST, VIDEO, Tone, check_path, save_mask, save_picture, save_video
+from amiwarp.reconstruction.picture import Fill
 
 if TYPE_CHECKING:
-    from amiwarp.reconstruct import Picture, Reconstruction
+    from amiwarp.reconstruction.picture import Picture, Reconstruction
 
 EXAMPLE = "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1"
 
@@ -110,7 +110,7 @@ def run(
     """
     from amiwarp.calib import Calibration
     from amiwarp.io import open_recording
-    from amiwarp.reconstruct import Reconstruction
+    from amiwarp.reconstruction.picture import Reconstruction
 
     check_path(out)
     video = out.suffix.lower() == VIDEO

@@ -32,8 +32,8 @@ def run(
     The file can be opened at any moment, also after a crash: NAME.part.h5 then, without at most its last second.
     """
     from amiwarp.io.live_writer import LiveWriter
-    from amiwarp.stream.clocking import clock_offset
-    from amiwarp.stream.session import Session
+    from amiwarp.live.stream.clocking import clock_offset
+    from amiwarp.live.stream.session import Session
 
     stop = threading.Event()
     with StatusLine(stop, stream.seconds) as line, stream.link() as link:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.camera import Camera
 from amiwarp.cli.inputs import numbers, read_camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics import FlatSide, Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import FlatSide, Prism
 
 if TYPE_CHECKING:
-    from amiwarp.motion import EncoderModel, PrismMotion
-    from amiwarp.simulate import SensorModel
+    from amiwarp.simulation.motion import EncoderModel, PrismMotion
+    from amiwarp.simulation.simulator import SensorModel
 
 _CAMERA, _PRISM, _SENSOR, _ENCODER = "Camera", "Prism", "Sensor", "Encoder"
 
@@ -81,7 +81,7 @@ class RigOptions:
         return replace(self.build_prism(), apex=math.radians(nominal))
 
     def build_motion(self) -> PrismMotion:
-        from amiwarp.motion import PrismMotion
+        from amiwarp.simulation.motion import PrismMotion
 
         x, y = (math.radians(v) for v in numbers(self.tilt_deg, 2, "--tilt-deg"))
         rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
@@ -110,7 +110,7 @@ def _sensor(text: str) -> Any:
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """The sensor's faults; what is left out takes the default of ``amiwarp.simulate.SensorModel``."""
+    """The sensor's faults; what is left out takes the default of ``amiwarp.simulation.simulator.SensorModel``."""
 
     ideal: Annotated[
         bool, typer.Option("--ideal", help="No noise, no mismatch, no latency.", rich_help_panel=_SENSOR)
@@ -127,7 +127,7 @@ class SensorOptions:
     hot_hz: Annotated[float | None, _sensor("Additional events per hot pixel and second.")] = None
 
     def build(self) -> SensorModel:
-        from amiwarp.simulate import SensorModel
+        from amiwarp.simulation.simulator import SensorModel
 
         given = {name: value for name, value in vars(self).items() if name != "ideal" and value is not None}
         return replace(SensorModel.ideal() if self.ideal else SensorModel(), **given)
@@ -139,7 +139,7 @@ def _encoder(text: str) -> Any:
 
 @dataclass(frozen=True)
 class EncoderModelOptions:
-    """The encoder's faults; what is left out takes the default of ``amiwarp.motion.EncoderModel``."""
+    """The encoder's faults; what is left out takes the default of ``amiwarp.simulation.motion.EncoderModel``."""
 
     counts_per_turn: Annotated[int | None, _encoder("Resolution; 0 for none.")] = None
     rate_hz: Annotated[float | None, _encoder("Samples per second.")] = None
@@ -149,7 +149,7 @@ class EncoderModelOptions:
     dropout_us: Annotated[float | None, _encoder("How long each loses all samples.")] = None
 
     def build(self) -> EncoderModel:
-        from amiwarp.motion import EncoderModel
+        from amiwarp.simulation.motion import EncoderModel
 
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
         if self.counts_per_turn == 0:

@@ -16,7 +16,7 @@ from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
 
 if TYPE_CHECKING:
-    from amiwarp.simulate import Simulation
+    from amiwarp.simulation.simulator import Simulation
 
 EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
 
@@ -64,8 +64,8 @@ def run(
     common: Common,
 ) -> None:
     """Make a recording of a picture as an event camera behind the prism would see it; the truth is stored beside it."""
-    from amiwarp.motion import CameraMotion
-    from amiwarp.simulate import Scene, Simulation
+    from amiwarp.simulation.motion import CameraMotion
+    from amiwarp.simulation.simulator import Scene, Simulation
 
     device = choose_device(common.device)
     simulation = Simulation(

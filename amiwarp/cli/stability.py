@@ -22,7 +22,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.cores import cpu_threads
 
 if TYPE_CHECKING:
-    from amiwarp.stability import Atlas, Axis, Method, Stored
+    from amiwarp.studies.stability import Atlas, Axis, Method, Stored
 
 EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
 SEEDS, QUICK_SEEDS, QUICK_MINUTES = 20, 1, 9.0
@@ -65,7 +65,7 @@ def run(
     """
     device = choose_device(common.device)
     from amiwarp.io.output import make_folder, own_folder
-    from amiwarp.stability import aggregate, draw, identity, load
+    from amiwarp.studies.stability import aggregate, draw, identity, load
 
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
@@ -90,7 +90,7 @@ def run(
 
 
 def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
-    from amiwarp.stability import AXES, quick_axes
+    from amiwarp.studies.stability import AXES, quick_axes
 
     known = quick_axes() if quick else AXES
     _check("axis", names, [a.name for a in known])
@@ -98,7 +98,7 @@ def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
 
 
 def _methods(names: Sequence[str], quick: bool) -> tuple[Method, ...]:
-    from amiwarp.stability import METHODS, QUICK_METHODS, chosen
+    from amiwarp.studies.stability import METHODS, QUICK_METHODS, chosen
 
     _check("method", names, [m.name for m in METHODS])
     return chosen(QUICK_METHODS if quick and not names else names)
@@ -115,7 +115,7 @@ def _run(
     minutes: float | None, first: int,
 ) -> tuple[list[Stored], int]:  # fmt: skip
     """All cells, and how many of them were not there before."""
-    from amiwarp.stability import run
+    from amiwarp.studies.stability import run
 
     end = None if minutes is None else time.monotonic() + 60.0 * minutes
     new = 0
@@ -167,7 +167,7 @@ def _prepare(device: str, here: bool) -> None:
 
 
 def _about(cells: Sequence[Stored]) -> dict[str, Any]:
-    from amiwarp.machine import versions
+    from amiwarp.studies.machine import versions
 
     machines = sorted({r.machine for c in cells for r in c.results.values() if r.machine})
     return {"date": time.strftime("%Y-%m-%d"), "machine": ", ".join(machines), "versions": versions(())}
@@ -175,7 +175,7 @@ def _about(cells: Sequence[Stored]) -> dict[str, Any]:
 
 def lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, took: float) -> list[Any]:
     """For people: where each method works, the aims, the files and the speed."""
-    from amiwarp.stability import summary
+    from amiwarp.studies.stability import summary
 
     shown: list[Any] = [table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
     named = ("overview", "pages", "summary", "data", "table")

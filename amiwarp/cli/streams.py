@@ -19,10 +19,10 @@ from amiwarp.cli import say
 from amiwarp.errors import AmiwarpError, printable
 
 if TYPE_CHECKING:
-    from amiwarp.link.link import Link
-    from amiwarp.stream.packets import Source
-    from amiwarp.stream.session import Status
-    from amiwarp.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.link.link import Link
+    from amiwarp.live.stream.packets import Source
+    from amiwarp.live.stream.session import Status
+    from amiwarp.live.stream.sockets import PipeSink, SocketSink
 
 _SOURCE = "Source"
 
@@ -60,14 +60,14 @@ class SourceOptions:
     ] = 0.0
 
     def open(self, spec: str, say: Callable[[str], None]) -> Source:
-        from amiwarp.stream.sources import open_source
+        from amiwarp.live.stream.sources import open_source
 
         return open_source(spec, pace=None if self.fast else 1.0, wait_s=self.wait_for_source, say=say)
 
     @contextlib.contextmanager
     def link(self) -> Iterator[Link | None]:
         """The controller, or None where no port was given."""
-        from amiwarp.link.link import Link
+        from amiwarp.live.link.link import Link
 
         if self.port is None:
             yield None

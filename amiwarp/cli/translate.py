@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from amiwarp.camera import Camera
 from amiwarp.cli.console import choose_device
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
 from amiwarp.cli.simulate import write
+from amiwarp.optics.camera import Camera
 
 EXAMPLE = "amiwarp translate video.mp4 recording.h5 --apex-deg 1 --rpm 720"
 
@@ -33,7 +33,7 @@ def run(
 
     The camera has the pictures' size unless --size or --camera say otherwise.
     """
-    from amiwarp.translate import open_pictures, translation
+    from amiwarp.simulation.translator import open_pictures, translation
 
     device = choose_device(common.device)
     pictures = open_pictures(source, fps=fps)

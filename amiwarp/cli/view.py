@@ -19,7 +19,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.scene import Axis, Colour, Look, View
 
 if TYPE_CHECKING:
-    from amiwarp.events import Recording
+    from amiwarp.events.events import Recording
     from amiwarp.viewer.inspector import Inspector
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
@@ -146,7 +146,7 @@ def inspector(
     """The recording with what the options add, at its first window."""
     from amiwarp.calib import Calibration
     from amiwarp.io import open_recording
-    from amiwarp.optics import MODELS
+    from amiwarp.optics.models import MODELS
     from amiwarp.viewer.inspector import Inspector
 
     found = None if calibration is None else Calibration.load(calibration)
@@ -167,8 +167,8 @@ def inspector(
 def _following(spec: str, controller: str | None) -> Iterator[Callable[[], Recording]]:
     """What a stream's last seconds are by now; waits for the first turn."""
     from amiwarp.cli.streams import SourceOptions, check_angles
-    from amiwarp.stream.ring import Ring, followed
-    from amiwarp.stream.sources import open_source
+    from amiwarp.live.stream.recent_events import Ring, followed
+    from amiwarp.live.stream.sources import open_source
 
     with SourceOptions(port=controller).link() as link:
         source = open_source(spec)

@@ -1,6 +1,6 @@
 """Recordings in and out: :func:`open_recording` reads every format, :class:`RecordingWriter` writes the native one."""
 
-from amiwarp.io.convert import Summary, convert
+from amiwarp.io.conversion import Summary, convert
 from amiwarp.io.encoder_csv import read_encoder_csv
 from amiwarp.io.formats import Format, detect_format, open_recording
 from amiwarp.io.native_writer import RecordingWriter, save_recording

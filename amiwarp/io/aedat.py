@@ -15,12 +15,12 @@ from typing import BinaryIO
 from xml.etree import ElementTree
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events.events import Recording
 from amiwarp.io.files import errors_name
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply
 from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular import check_regular
+from amiwarp.regular_file import check_regular
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 

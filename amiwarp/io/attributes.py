@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import LARGEST_INTEGER
-from amiwarp.values import array, instance, one_of, real, shown, whole
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.validation import array, instance, one_of, real, shown, whole
 
 if TYPE_CHECKING:
-    from amiwarp.prism import NominalPrism
+    from amiwarp.optics.prism import NominalPrism
 
 
 LENSES: dict[str, tuple[type[RadialTangential] | type[Fisheye], int]] = {
@@ -77,7 +77,7 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
 
 def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
     """A nominal prism's attributes; no apex where it is unknown."""
-    from amiwarp.prism import Prism
+    from amiwarp.optics.prism import Prism
 
     known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
     return {**known, "index": prism.index, "flat_side": prism.flat_side.value}
@@ -85,7 +85,7 @@ def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
 
 def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
     """A nominal prism from its attributes; one of unknown apex where that is missing."""
-    from amiwarp.prism import FlatSide, UnsizedPrism
+    from amiwarp.optics.prism import FlatSide, UnsizedPrism
 
     side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
     prism = UnsizedPrism(attribute(attributes, where, "index", float), side)

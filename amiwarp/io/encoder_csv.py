@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.unwrapping import UnwrapError
 from amiwarp.io.files import errors_name
-from amiwarp.regular import check_regular
-from amiwarp.unwrapping import UnwrapError
+from amiwarp.regular_file import check_regular
 
 
 def read_encoder_csv(

@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events.events import Recording
 from amiwarp.io.files import errors_name
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply
 from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular import check_regular
+from amiwarp.regular_file import check_regular
 
 
 def open_es(path: Path) -> Recording:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events.events import Recording
 from amiwarp.io.files import errors_name
-from amiwarp.regular import check_regular
-from amiwarp.values import choice
+from amiwarp.regular_file import check_regular
+from amiwarp.validation import choice
 
 
 class Format(enum.StrEnum):

@@ -13,15 +13,15 @@ from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name
-from amiwarp.regular import check_regular
-from amiwarp.values import real, shown, whole
+from amiwarp.regular_file import check_regular
+from amiwarp.validation import real, shown, whole
 
 Made = TypeVar("Made")
 
 MOST_BYTES = 64 << 20
 """Largest JSON file that is read; a calibration with all points of its search takes about 1 MB."""
 LARGEST_INTEGER = 2**62
-"""Largest magnitude of a whole number: that of times, see :data:`amiwarp.events.TIME_LIMIT`."""
+"""Largest magnitude of a whole number: that of times, see :data:`amiwarp.events.events.TIME_LIMIT`."""
 
 
 def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:

@@ -20,10 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MetadataValue, as_times, check_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MetadataValue, as_times, check_events
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name
 from amiwarp.io.native import open_native
@@ -37,9 +36,10 @@ from amiwarp.io.native_writer import (
     write_header,
 )
 from amiwarp.io.output import allocate, check_output, put_in_place
+from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:
-    from amiwarp.prism import NominalPrism
+    from amiwarp.optics.prism import NominalPrism
 
 SMALL_CHUNK = 4096
 """Elements of a chunk of the small datasets: stored plain, so that they grow in place."""

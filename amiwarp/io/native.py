@@ -11,16 +11,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import DEFAULT_BLOCK, Events, MetadataValue, Recording, Truth, as_times, check_events, regroup
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import (
+    DEFAULT_BLOCK,
+    Events,
+    MetadataValue,
+    Recording,
+    Truth,
+    as_times,
+    check_events,
+    regroup,
+)
 from amiwarp.io.attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order
 from amiwarp.io.files import errors_name, register_reader
 from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.native_writer import FORMAT, FORMAT_VERSION
 from amiwarp.io.scan import smallest_sensor
-from amiwarp.regular import check_regular
+from amiwarp.regular_file import check_regular
 
 DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px]; its files do not tell."""
@@ -112,7 +121,7 @@ class NativeEvents:
             return np.asarray(self._read(name, max(start, 0), min(max(stop, 0), self._count)), np.bool_)
 
     def find(self, t: int) -> int:
-        """See :meth:`amiwarp.events.EventSource.find`; the file's millisecond index helps."""
+        """See :meth:`amiwarp.events.events.EventSource.find`; the file's millisecond index helps."""
         if not self._count or t <= self.t_first:
             return 0
         if t > self.t_last:
@@ -130,7 +139,7 @@ class NativeEvents:
             return self.slice(self.find(t_start), self.find(t_end))
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """See :meth:`amiwarp.events.EventSource.blocks`."""
+        """See :meth:`amiwarp.events.events.EventSource.blocks`."""
         return regroup(self._pieces_in_order(), count=count, duration_us=duration_us)
 
     def pieces(self, count: int) -> Iterator[Callable[[], Events]]:

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.camera import Camera
-from amiwarp.encoder import Encoder
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, MetadataValue, Recording, check_events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MetadataValue, Recording, check_events
 from amiwarp.io.attributes import camera_attributes, prism_attributes
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name
 from amiwarp.io.output import NewFile
+from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:
-    from amiwarp.prism import NominalPrism
+    from amiwarp.optics.prism import NominalPrism
 
 FORMAT = "amiwarp-recording"
 FORMAT_VERSION = 1

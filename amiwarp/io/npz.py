@@ -18,10 +18,10 @@ import numpy as np
 from numpy.lib import format as npy
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import DEFAULT_BLOCK, Recording
+from amiwarp.events.events import DEFAULT_BLOCK, Recording
 from amiwarp.io.files import errors_name
 from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular import check_regular
+from amiwarp.regular_file import check_regular
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What NumPy writes; other compressions may take any amount of memory."""

@@ -19,7 +19,7 @@ from types import TracebackType
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import inputs_in_use, inputs_noted, same_file
-from amiwarp.regular import KINDS
+from amiwarp.regular_file import KINDS
 
 HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:32]
 """Names the machine in the names of unfinished files: process ids mean nothing on another one."""

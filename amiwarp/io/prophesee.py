@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import DEFAULT_BLOCK, Recording
+from amiwarp.events.events import DEFAULT_BLOCK, Recording
 from amiwarp.io.files import errors_name
 from amiwarp.io.reading_process import packets
 from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular import check_regular
+from amiwarp.regular_file import check_regular
 
 WIDEST = (2048, 2048)
 """What EVT's coordinates can hold [px]: for the decoder where the header tells no size, so that it refuses nothing."""

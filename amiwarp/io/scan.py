@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import DEFAULT_BLOCK, Events, as_times, regroup
+from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, regroup
 from amiwarp.io.files import errors_name, register_reader
 
 Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
@@ -133,7 +133,7 @@ class FileEvents:
         return Events.concatenate([block for block in found if len(block)])
 
     def find(self, t: int) -> int:
-        """See :meth:`amiwarp.events.EventSource.find`."""
+        """See :meth:`amiwarp.events.events.EventSource.find`."""
         seen = 0
         for block in self._all():
             if block.t[-1] >= t:
@@ -153,7 +153,7 @@ class FileEvents:
         return Events.concatenate(found)
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """See :meth:`amiwarp.events.EventSource.blocks`."""
+        """See :meth:`amiwarp.events.events.EventSource.blocks`."""
         return regroup(self._all(), count=count, duration_us=duration_us)
 
     def _all(self) -> Iterator[Events]:

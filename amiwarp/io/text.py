@@ -15,12 +15,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.camera import Camera, RadialTangential
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Recording
+from amiwarp.events.events import Recording
 from amiwarp.io.files import errors_name, note_input
 from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular import check_regular
+from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.regular_file import check_regular
 
 READ_BYTES = 1 << 22
 """Text that is parsed at once: some 200,000 events."""

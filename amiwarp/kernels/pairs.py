@@ -1,4 +1,4 @@
-"""Device side of :mod:`amiwarp.pairs`: from events to the pairs that the equations are made of.
+"""Device side of :mod:`amiwarp.brightness.solver.event_pairs`: from events to the pairs that the equations are made of.
 
 Events are sorted by pixel, and stay in time's order within one. Every event is then a candidate for up to three pairs,
 and every pixel for one in each span of time in which it kept quiet: candidates are marked, counted and written.

@@ -1,4 +1,4 @@
-"""Device side of :mod:`amiwarp.brightness`: where the events of a pair fall on the map."""
+"""Device side of :mod:`amiwarp.brightness.solver.solver`: where the events of a pair fall on the map."""
 
 from typing import Any
 

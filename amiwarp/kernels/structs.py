@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.camera import Camera, Fisheye, RadialTangential
 from amiwarp.kernels import camera as kernels
 from amiwarp.kernels.encoder import EncoderParams
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
 
 if TYPE_CHECKING:
-    from amiwarp.encoder import Encoder
+    from amiwarp.events.encoder import Encoder
 
 
 @lru_cache(maxsize=16)

@@ -1,7 +1,7 @@
 """Voting the same events again and again on CUDA: sorted by image tile once, voted in shared memory, flushed.
 
 A block of threads takes a chunk of one tile's events and a few candidates (parameters) at a time: every event is read
-once for all of them. Votes that leave the window around the tile go to the image at once. Used by :mod:`amiwarp.tiles`.
+once for all of them. Votes that leave the window around the tile go to the image at once. Used by :mod:`amiwarp.imaging.tile_votes`.
 """
 
 import math

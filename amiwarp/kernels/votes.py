@@ -4,7 +4,7 @@ A cell is the square between four pixel centres. Its word holds four sums over t
 fx, fy and b = fx fy of their places in it, in 1/256. They are the bilinear weights' sums: n - fx - fy + b for the
 cell's first pixel, fx - b for the next column, fy - b for the next row, b for both. Integers: the image does not depend
 on order and is the same bit for bit. A word is full with 1,023 events. What is carried out of a field is taken down at
-once, exactly, in 64-bit totals; or, faster on CUDA, words are emptied before, and checked: see :mod:`amiwarp.iwe`.
+once, exactly, in 64-bit totals; or, faster on CUDA, words are emptied before, and checked: see :mod:`amiwarp.imaging.warped_image`.
 """
 
 from typing import Any

@@ -12,20 +12,20 @@ import numpy as np
 
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
-from amiwarp.camera import Camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import Events, Recording
-from amiwarp.iwe import CanvasShape, Votes
-from amiwarp.optics import apex_from_deflection
-from amiwarp.sharpness import Sharpness, SharpnessMeter
-from amiwarp.uploads import DeviceEvents, upload_events
+from amiwarp.events.events import Events, Recording
+from amiwarp.imaging.device_events import DeviceEvents, upload_events
+from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter
+from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import apex_from_deflection
 from amiwarp.viewer.timeline import Span, event_rate, read_span
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.encoder import Encoder
-    from amiwarp.optics import Model
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.optics.models import Model
 
 MOST_EVENTS = 4_000_000
 """Of a window, that its image is made of; one that holds more is read in evenly spaced runs."""
@@ -185,7 +185,7 @@ class Inspector:
     @cached_property
     def hot(self) -> NDArray[np.bool_]:
         """Hot and flickering pixels of the recording, shape (height, width)."""
-        from amiwarp.calib.pixels import strange_pixels, stretch
+        from amiwarp.calib.bad_pixels import strange_pixels, stretch
 
         source, encoder = self.recording.events, self.encoder
         return strange_pixels(stretch(source, encoder), encoder, source.size)[0]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.errors import AmiwarpError
-from amiwarp.picture_files import save_film
+from amiwarp.reconstruction.export import save_film
 
 if TYPE_CHECKING:
     import numpy as np

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.optics import MODELS
+from amiwarp.optics.models import MODELS
 from amiwarp.viewer.scene import Axis, Colour, View
 
 if TYPE_CHECKING:

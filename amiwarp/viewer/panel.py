@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.figures import Images
-from amiwarp.picture_files import Tone, tones
-from amiwarp.reconstruct import reconstruct
+from amiwarp.plotting.figures import Images
+from amiwarp.reconstruction.export import Tone, tones
+from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.viewer.exports import export_path
 from amiwarp.viewer.frames import room
 from amiwarp.viewer.gate import finite

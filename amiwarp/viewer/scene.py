@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.clouds import OFF_COLOUR, ON_COLOUR
 from amiwarp.errors import AmiwarpError
-from amiwarp.values import choice
+from amiwarp.plotting.clouds import OFF_COLOUR, ON_COLOUR
+from amiwarp.validation import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -237,7 +237,7 @@ class Scene:
 
     def save(self, path: Path) -> None:
         """Writes the picture as PNG, beside and then renamed."""
-        from amiwarp.iwe_files import save_png
+        from amiwarp.imaging.export import save_png
 
         save_png(path, self.picture())
 

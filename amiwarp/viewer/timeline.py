@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.events import Events
+from amiwarp.events.events import Events
 from amiwarp.io.scan import FileEvents
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events import EventSource
+    from amiwarp.events.events import EventSource
 
 RUNS = 64
 """Stretches, evenly spaced, of which a window is read that holds more events than asked for."""

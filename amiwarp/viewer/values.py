@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.optics import MODELS
+from amiwarp.optics.models import MODELS
 from amiwarp.viewer.gate import Check, flag, list_of, number, one_of, text
 from amiwarp.viewer.layout import NAMES, SPEEDS
 from amiwarp.viewer.scene import Axis, Colour, View

@@ -1,0 +1,338 @@
+"""Pairs of consecutive events of a pixel: what the equations of :mod:`amiwarp.brightness.solver.solver` are made of.
+
+Built on the device: events are sorted by pixel, candidates for pairs marked, and those that are marked written.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.optics.models import model_camera
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import Events
+    from amiwarp.optics.camera_rotation import Turning
+    from amiwarp.optics.models import Model
+
+
+COLUMNS = {"x": 1, "y": 1, "tile": 1, "on": 1, "azimuth": 4, "time": 2, "slope": 2}
+"""Of the kernels' ``Pairs``: how many parts each array has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What is known of the sensor's timing [us]; zero where nothing is."""
+
+    latency_us: float = 0.0
+    """Time from a change of brightness to its stamp."""
+    refractory_us: float = 0.0
+    """Time after an event at whose end a pixel takes its new reference."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairSet:
+    """Pairs on a device, as the kernels' ``Pairs``: two events of a pixel each, or an event and a window's end."""
+
+    arrays: Any
+    device: Any
+
+    def __len__(self) -> int:
+        return int(self.arrays.count)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """``x``, ``y``, ``tile`` or ``on`` on the host, shape (n,)."""
+        values: NDArray[Any] = getattr(self.arrays, name).numpy()
+        return values[: len(self)]
+
+    @property
+    def time(self) -> NDArray[np.float32]:
+        """Times of both [s] from the window's middle, shape (2, n)."""
+        values: NDArray[np.float32] = self.arrays.time.numpy()
+        return values.reshape(2, -1)[:, : len(self)]
+
+    def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
+        """The same; ``slope_of``: change of the encoder's angle at times [us] per unit of a drifting parameter."""
+        import warp as wp
+
+        values = np.zeros((2, self.arrays.stride), np.float32)
+        for k, t in enumerate(self.time.astype(np.float64)):
+            values[k, : len(self)] = slope_of(np.rint(t * 1e6).astype(np.int64) + middle_us)
+        self.arrays.slope = wp.array(values.ravel(), dtype=float, device=self.device)
+        return self
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[PairSet]) -> PairSet:
+        """One behind the other; all of one weight of silence."""
+        import warp as wp
+
+        if len(parts) == 1:
+            return parts[0]
+        first = parts[0].arrays
+        drifts = any(part.arrays.slope.shape[0] for part in parts)
+        out = _empty(sum(map(len, parts)), parts[0].device, weak=first.weak, drifts=drifts)
+        at = 0
+        for part in parts:
+            for name, columns in COLUMNS.items():
+                here, there = getattr(part.arrays, name), getattr(out, name)
+                for k in range(columns if len(there) and len(here) else 0):
+                    wp.copy(there, here, k * out.stride + at, k * part.arrays.stride, len(part))
+            at += len(part)
+        return cls(out, parts[0].device)
+
+    def of_tiles(self, listed: NDArray[np.bool_]) -> PairSet:
+        """The pairs of the tiles that are ``listed``."""
+        from amiwarp.kernels import pairs as k
+
+        return self._select(k.mark_listed, [self.arrays.tile, _ints(listed, self.device)])
+
+    def of_square(self, left: int, top: int, side: int) -> PairSet:
+        """The pairs of a square of pixels."""
+        from amiwarp.kernels import pairs as k
+
+        return self._select(k.mark_square, [self.arrays, left, top, side])
+
+    def on_tiles(
+        self, model: Model, turning: Turning, drift: float, tile_of: NDArray[np.int32], listed: NDArray[np.bool_]
+    ) -> PairSet:
+        """The pairs whose compensated events both fall on one tile (``tile_of``, by pixel) of those ``listed``."""
+        import warp as wp
+
+        from amiwarp.kernels import pairs as k
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.places import find_places
+
+        places = wp.empty(len(self), dtype=wp.vec4, device=self.device)
+        inputs = [model.params(self.device), model_camera(model, self.device), self.arrays, drift, turning.params()]
+        launch(find_places, len(self), inputs, [places], device=self.device)
+        tiles = wp.array(tile_of, dtype=int, device=self.device)
+        marked = [places, tiles, _ints(listed, self.device)]
+        return self._select(k.mark_same_tile, marked, [self.arrays.tile])
+
+    def hold_out(self, every: int) -> int:
+        """Marks every so many-th pair of two events, which must come first, as not to be used; how many."""
+        from amiwarp.kernels import pairs as k
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.photometric import HELD
+
+        launch(k.hold_out, len(self), [every], [self.arrays.on], device=self.device)
+        return int(np.count_nonzero(self.column("on") & int(HELD)))
+
+    def _select(self, kernel: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> PairSet:
+        import warp as wp
+
+        from amiwarp.kernels import pairs as k
+        from amiwarp.kernels.launch import launch
+
+        flag = wp.empty(len(self), dtype=int, device=self.device)
+        launch(kernel, len(self), inputs, [*outputs, flag], device=self.device)
+        place, count = _places(flag)
+        out = _empty(count, self.device, drifts=self.arrays.slope.shape[0] > 0)
+        launch(k.select, len(self), [self.arrays, flag, place], [out], device=self.device)
+        return PairSet(out, self.device)
+
+
+class EventTable:
+    """Events of one or more spans of time on a device, in the order of their pixels."""
+
+    def __init__(self, spans: Sequence[Events], tile_of: Any, device: Any) -> None:
+        """Of pixels of a tile (``tile_of`` (height, width) >= 0, NumPy or on the device) alone."""
+        import warp as wp
+
+        from amiwarp.kernels import pairs as k
+
+        self.device = wp.get_device(device)
+        if isinstance(tile_of, np.ndarray):
+            tile_of = wp.array(tile_of, dtype=int, device=device)
+        self.tile_of, self.spans = tile_of, [span for span in spans if len(span)]
+        self.arrays = k.Sorted()
+        self.arrays.columns = tile_of.shape[1]
+        self.arrays.pixels = tile_of.shape[0] * tile_of.shape[1]
+        for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8)):
+            setattr(self.arrays, name, _upload([getattr(span, name) for span in self.spans], dtype, self.device))
+        self.arrays.count = 0
+
+    @property
+    def covers(self) -> tuple[int, int]:
+        """Times of the first and the last event [us]."""
+        return min(int(s.t[0]) for s in self.spans), max(int(s.t[-1]) for s in self.spans)
+
+    def sort(self) -> None:
+        """By span and pixel; within a pixel events stay in order."""
+        import warp as wp
+
+        from amiwarp.kernels import pairs as k
+        from amiwarp.kernels.launch import launch
+
+        s, n = self.arrays, len(self.arrays.x)
+        flag = wp.empty(n, dtype=int, device=self.device)
+        launch(k.mark_inside, n, [s.x, s.y, self.tile_of], [flag], device=self.device)
+        place, s.count = _places(flag)
+        s.key, s.order = (wp.empty(2 * s.count, dtype=int, device=self.device) for _ in "ko")
+        first = np.cumsum([0, *(len(span) for span in self.spans[:-1])])
+        inputs = [s.x, s.y, self.tile_of, place, wp.array(first, dtype=int, device=self.device)]
+        launch(k.fill_keys, n, inputs, [s.key, s.order], device=self.device)
+        if s.count:
+            bits = (s.pixels * max(1, len(self.spans))).bit_length()
+            wp.utils.radix_sort_pairs(s.key, s.order, s.count, end_bit=bits)
+
+    def pairs(
+        self,
+        encoder: Encoder,
+        *,
+        longest_gap_us: int,
+        shortest_gap_us: float = 0.0,
+        sensor: Sensor | None = None,
+        middle_us: int = 0,
+        weak: float = 0.0,
+        window: tuple[int, int] | None = None,
+        quiet: tuple[NDArray[np.int64], int] | None = None,
+    ) -> PairSet:
+        """Consecutive events of each pixel, no further apart than ``longest_gap_us``, further than ``shortest_gap_us``.
+
+        With a ``window`` (start, stop) [us] come the pairs of open ends and of silence, of weight ``weak``:
+
+        - From the window's start to each pixel's first event, and from its last to the stop. At the start the
+          brightness is anywhere within a threshold of the reference, so that the first event finds it one threshold
+          further in the mean; after the last it stays within one. Without the former, every edge that enters would look
+          lower than it looks when it leaves, and the map would slope.
+        - ``quiet``: rising edges [us] of spans, and a number: spans of pixels that fire in none of so many spans about
+          them. Silence is information: along the pixel's way brightness changed by no more than about a threshold.
+        """
+        import warp as wp
+
+        from amiwarp.kernels import pairs as k
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.structs import encoder_params
+
+        self.sort()
+        sensor = sensor or Sensor()
+        times = k.Window()
+        times.start, times.stop = window or (0, 0)
+        times.middle, times.longest, times.shortest = middle_us, longest_gap_us, shortest_gap_us
+        times.late_first, times.late_second = sensor.refractory_us - sensor.latency_us, -sensor.latency_us
+        m, device = self.arrays.count, self.device
+        ends, base = (0, m) if window is None else (m, 3 * m)
+        edges, at_least = (np.zeros(1, np.int64), 0) if quiet is None else quiet
+        spans = (len(edges) - 1) * self.arrays.pixels
+        flag = wp.empty(base + spans, dtype=int, device=device)
+        launch(k.mark_pairs, m, [self.arrays, times], [flag], device=device)
+        launch(k.mark_ends, ends, [self.arrays], [flag], device=device)
+        edges_d = wp.array(edges, dtype=wp.int64, device=device)
+        if spans:
+            self._mark_quiet(edges_d, at_least, base, flag)
+        place, count = _places(flag)
+        out = _empty(count, device, weak=weak)
+        if not count:
+            return PairSet(out, device)
+        span = self.covers if window is None else (min(self.covers[0], window[0]), max(self.covers[1], window[1]))
+        angles = encoder_params(encoder, *span, device)
+        launch(k.write_pairs, base, [self.arrays, times, angles, self.tile_of, flag, place], [out], device=device)
+        inputs = [edges_d, times, angles, self.tile_of, base, flag, place]
+        launch(k.write_quiet, spans, inputs, [out], device=device)
+        return PairSet(out, device)
+
+    def _mark_quiet(self, edges: Any, at_least: int, base: int, flag: Any) -> None:
+        import warp as wp
+
+        from amiwarp.kernels import pairs as k
+        from amiwarp.kernels.launch import launch
+
+        fired = wp.zeros((len(edges) - 1) * self.arrays.pixels, dtype=wp.uint8, device=self.device)
+        launch(k.mark_spans, len(self.arrays.x), [self.arrays, edges], [fired], device=self.device)
+        inputs = [fired, self.tile_of.flatten(), at_least, base]
+        launch(k.mark_quiet, self.arrays.pixels, inputs, [flag], device=self.device)
+
+    def leave_out_hot(self) -> NDArray[np.int32]:
+        """Marks pixels that fire far more than the busiest of those around them -1 in ``tile_of``.
+
+        Returns how many events each pixel fired, shape (height, width).
+        """
+        import warp as wp
+
+        from amiwarp.kernels import pairs as k
+        from amiwarp.kernels.launch import launch
+
+        rows, columns = self.tile_of.shape
+        count = wp.zeros(rows * columns, dtype=int, device=self.device)
+        n = len(self.arrays.x)
+        launch(k.count_pixels, n, [self.arrays], [count], device=self.device, smallest=n + 1)  # slices would collide
+        launch(k.mark_hot, rows * columns, [count.reshape((rows, columns)), 0], [self.tile_of.flatten()],
+               device=self.device)  # fmt: skip
+        counts: NDArray[np.int32] = count.numpy().reshape(rows, columns)
+        return counts
+
+
+def off_excess(pairs: PairSet, *, with_leak: bool = False) -> float:
+    """Excess of the OFF threshold over the ON threshold, counted, not solved for: that would shrink it with the map.
+
+    Over a whole turn brightness comes back to where it was, so ON steps and OFF steps add up to nothing, or
+    ``with_leak`` to what leaked meanwhile: then places with many and with few events tell the two apart.
+    """
+    on = pairs.column("on") == 1
+    if not with_leak:
+        count = int(on.sum())
+        return count / max(1, len(pairs) - count) - 1.0
+    cell = (pairs.column("y") // 8).astype(np.int64) * (1 << 13) + pairs.column("x") // 8
+    _, index = np.unique(cell, return_inverse=True)
+    ons, offs = np.bincount(index, weights=on), np.bincount(index, weights=~on)
+    first, second = pairs.time.astype(np.float64)
+    time = np.bincount(index, weights=second - first)
+    columns = np.stack([offs, time], axis=1) / np.sqrt(ons + offs)[:, None]
+    found = np.linalg.lstsq(columns, ons / np.sqrt(ons + offs), rcond=None)[0]
+    return float(found[0]) - 1.0
+
+
+def _upload(parts: Sequence[NDArray[Any]], dtype: Any, device: Any) -> Any:
+    """Arrays one behind the other on a device, without a copy of them all on the host."""
+    import warp as wp
+
+    if len(parts) == 1:
+        return wp.array(np.ascontiguousarray(parts[0]), dtype=dtype, device=device, copy=False)
+    out = wp.empty(sum(map(len, parts)), dtype=dtype, device=device)
+    at = 0
+    for part in parts:
+        here = wp.array(np.ascontiguousarray(part), dtype=dtype, device="cpu", copy=False)
+        wp.copy(out, here, at, 0, len(part))
+        at += len(part)
+    return out
+
+
+def _ints(values: NDArray[Any], device: Any) -> Any:
+    import warp as wp
+
+    return wp.array(values.astype(np.int32), dtype=int, device=device)
+
+
+def _places(flag: Any) -> tuple[Any, int]:
+    """Running count of the marks, and the whole."""
+    import warp as wp
+
+    place = wp.empty_like(flag)
+    if not len(flag):
+        return place, 0
+    wp.utils.array_scan(flag, place, inclusive=True)
+    return place, int(place[-1:].numpy()[0])
+
+
+def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) -> Any:
+    """Pairs to be written, padded with zeros to whole blocks."""
+    import warp as wp
+
+    from amiwarp.kernels.photometric import BLOCK, Pairs
+
+    out = Pairs()
+    block = int(BLOCK)
+    out.count, out.stride, out.weak = count, -(-count // block) * block, weak
+    dtypes = {"x": wp.uint16, "y": wp.uint16, "tile": int, "on": wp.uint8}
+    for name, columns in COLUMNS.items():
+        n = columns * out.stride if drifts or name != "slope" else 0
+        setattr(out, name, wp.zeros(n, dtype=dtypes.get(name, float), device=device))
+    return out

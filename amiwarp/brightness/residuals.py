@@ -1,0 +1,110 @@
+"""What the residuals of a map's equations come to: costs, sums, and their median, found on the device."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.brightness.event_pairs import PairSet
+
+CHUNKS = 8
+"""Vectors of fewer chunks are not worth a second CPU thread."""
+
+
+class Residuals:
+    """Of the equations of ``pairs`` [thresholds], NaN for pairs off the map, and their weights."""
+
+    def __init__(self, pairs: PairSet, tiles: int) -> None:
+        import warp as wp
+
+        from amiwarp.kernels.descent import CPU_WIDTH
+
+        self.pairs, self.tiles, self.device, self.count = pairs, tiles, wp.get_device(pairs.device), len(pairs)
+        n = pairs.arrays.stride
+        self.values, self.weight = (wp.zeros(n, dtype=float, device=self.device) for _ in "vw")
+        self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
+
+    def mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> float:
+        """Mean of Cauchy's cost, log(1 + (r / ``scale``)²), of the residuals of all pairs or of those held out.
+
+        A pair off the map has the residual ``missing``, or is left out.
+        """
+        from amiwarp.kernels.photometric import HELD
+        from amiwarp.kernels.slopes import sum_costs
+
+        threads, parts = self._sum_shape
+        partial = self._doubles(2, parts)
+        inputs = [self.values, self.pairs.arrays.on, int(HELD) * held, self.count, scale, missing, self._width]
+        self._launch_sum(sum_costs, threads, inputs, partial)
+        total, number = partial.numpy().sum(axis=1)
+        return float(total / number) if number else math.nan
+
+    def products(self, factors: list[tuple[Any, Any]]) -> NDArray[np.float64]:
+        """Sums over the pairs of a b weight, for each (a, b) on the device."""
+        from amiwarp.kernels.slopes import sum_products
+
+        threads, parts = self._sum_shape
+        partial = self._doubles(len(factors), parts)
+        for k, (a, b) in enumerate(factors):
+            self._launch_sum(sum_products, threads, [a, b, self.weight, self.count, self._width], partial[k])
+        return np.asarray(partial.numpy().sum(axis=1))
+
+    def clusters(self, slopes: list[Any]) -> NDArray[np.float64]:
+        """Sums of slope x weight x residual over clusters of pairs near each other, shape (slopes, clusters)."""
+        import warp as wp
+
+        from amiwarp.kernels.slopes import add_clusters
+
+        size = self.tiles if self.tiles > 1 else 1 << 20
+        rows = []
+        for slope in slopes:
+            sums = wp.zeros((2, size), dtype=wp.int64, device=self.device)
+            inputs = [self.pairs.arrays, self.tiles, slope, self.weight, self.values, 0, sums]
+            wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)  # CPU slices would collide
+            total, number = sums.numpy()
+            rows.append(total[number > 0] / 2.0**32)
+        return np.array(rows)
+
+    def median(self, first: int | None = None) -> float:
+        """Median of the absolute residuals of the ``first`` pairs, or all; NaN where there is none."""
+        import warp as wp
+
+        from amiwarp.kernels.slopes import magnitudes
+
+        n = self.count if first is None else first
+        if self.device.is_cpu:
+            values = np.abs(self.values.numpy()[:n])
+            values = values[np.isfinite(values)]
+            return float(np.median(values)) if len(values) else math.nan
+        keys, order = (wp.empty(2 * n, dtype=t, device=self.device) for t in (float, int))
+        number = wp.zeros(1, dtype=int, device=self.device)
+        wp.launch(magnitudes, n, inputs=[self.values, 0, keys, number], device=self.device)
+        wp.utils.radix_sort_pairs(keys, order, n)
+        known = int(number.numpy()[0])
+        return float(keys[(known - 1) // 2 : known // 2 + 1].numpy().mean()) if known else math.nan
+
+    @cached_property
+    def _sum_shape(self) -> tuple[int, int]:
+        """Threads and partial sums of a sum over all pairs."""
+        from amiwarp.kernels.replay import BLOCK_DIM
+
+        threads = -(-self.count // self._width)
+        return threads, threads if self.device.is_cpu else -(-threads // BLOCK_DIM)
+
+    def _doubles(self, *shape: int) -> Any:
+        import warp as wp
+
+        return wp.zeros(shape, dtype=wp.float64, device=self.device)
+
+    def _launch_sum(self, kernel: Any, threads: int, inputs: list[Any], out: Any) -> None:
+        from amiwarp.kernels.replay import Program
+
+        program = Program(self.device)
+        program.add(kernel, threads, inputs, [out], smallest=CHUNKS)
+        program.launch()

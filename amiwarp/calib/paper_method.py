@@ -1,0 +1,102 @@
+"""The calibration of He et al., Science Robotics 2024, to compare with: a circle, their cost J, and a grid.
+
+Coarse to fine about what the hardware says: the nominal prism, and the phase as mounted. The paper gives neither the
+grid nor η; no refusals, no uncertainty, as there.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.calib.calibration import prepare
+from amiwarp.calib.result import Calibration, StageSummary
+from amiwarp.calib.sharpness.search import STAGES, Settings
+from amiwarp.calib.solve import Stage
+from amiwarp.events.events import MemoryEvents
+from amiwarp.imaging.sharpness_costs import Sharpness
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from amiwarp.calib.sharpness.search import Progress, Search
+    from amiwarp.events.events import Recording
+
+WINDOW_US = 2_000_000
+"""The paper calibrates on 2 s."""
+LEVELS, SIDE = 3, 11
+"""Grids one after the other, each as wide as two steps of the one before; values of a parameter on each."""
+SIZE_RANGE = (0.5, 1.5)
+"""Of the nominal deflection."""
+PHASE_RANGE = math.radians(45.0)
+"""About the phase that the hardware tells; the whole turn where it tells none."""
+
+
+def calibrate_as_paper(
+    recording: Recording,
+    *,
+    start: Mapping[str, float] | None = None,
+    device: Any = "cpu",
+    progress: Progress | None = None,
+) -> Calibration:
+    """The paper's method on the recording's first 2 s; ``start`` may give the phase [rad] as mounted.
+
+    Raises :class:`AmiwarpError` where there is nothing to search: too few events, an encoder that does not cover them.
+    """
+    began = time.perf_counter()
+    source = recording.events
+    cut = source.between(source.t_first, source.t_first + WINDOW_US)
+    given = dict(start or {})
+    settings = Settings(model="circle", sharpness=Sharpness.PAPER_J, events=len(cut), stages=STAGES[:1], start=given)
+    search = prepare(replace(recording, events=MemoryEvents(cut, *source.size)), settings, device=device)[0]
+    stage = _grids(search, "phase" in given, progress)
+    best = search.space.to_values(stage.x)
+    return Calibration(
+        model_name="circle",
+        camera=search.space.camera,
+        prism=search.space.prism,
+        parameters=best,
+        uncertainty={},
+        free=search.space.names,
+        sharpness_name=Sharpness.PAPER_J.value,
+        sharpness_before=search.fine.values({**best, search.space.size_name: 0.0}),
+        sharpness_after=stage.score,
+        stages=(StageSummary.of("grid", stage, search.space),),
+        events=len(cut),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _grids(search: Search, mounted: bool, progress: Progress | None) -> Stage:
+    space, began = search.space, time.perf_counter()
+    nominal = space.start
+    size, phase = nominal[space.size_name], nominal["phase"]
+    size_half = 0.5 * (SIZE_RANGE[1] - SIZE_RANGE[0]) * size
+    phase_half = PHASE_RANGE if mounted else math.pi
+    columns = SIDE if mounted else round(SIDE * math.pi / PHASE_RANGE)
+    points: list[NDArray[np.float64]] = []
+    scores: list[float] = []
+    budget = SIDE * columns + (LEVELS - 1) * SIDE * SIDE
+    for _ in range(LEVELS):
+        sizes = np.linspace(size - size_half, size + size_half, SIDE)
+        phases = np.linspace(phase - phase_half, phase + phase_half, columns)
+        for s in sizes:
+            for p in phases:
+                v = space.to_vector({**nominal, space.size_name: float(s), "phase": float(p)})
+                points.append(v)
+                scores.append(search.fine(v))
+                if progress is not None:
+                    progress("global", len(points), budget)
+        size, phase = (space.to_values(points[int(np.argmax(scores))])[n] for n in (space.size_name, "phase"))
+        size_half, phase_half, columns = 2.0 * size_half / (SIDE - 1), 2.0 * phase_half / (columns - 1), SIDE
+    best = int(np.argmax(scores))
+    return Stage(
+        "grid", points[best], scores[best], len(points), time.perf_counter() - began, "its budget",
+        np.array(points), np.array(scores),
+    )  # fmt: skip

@@ -1,0 +1,47 @@
+"""Which parts of the scene the photometric stage makes maps of."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.brightness.solver import Tiles
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+TILE = 32
+"""Side of a tile of the scene [px]."""
+GRID = (4, 3)
+"""One tile, the busiest, from each of so many columns and rows of the image."""
+
+
+def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
+    """The busiest cell of :data:`TILE` px from each part of the scene: tile of each pixel (or -1), and the tiles.
+
+    ``image``: of events at the first stage's answer, shape (height, width).
+    """
+    height, width = image.shape
+    columns, rows = max(1, width // TILE), max(1, height // TILE)
+    cells = image[: rows * TILE, : columns * TILE]
+    counts = cells.reshape(rows, cells.shape[0] // rows, columns, cells.shape[1] // columns).sum(axis=(1, 3))
+    tile_of = np.full((height, width), -1, dtype=np.int32)
+    corners: list[tuple[int, int]] = []
+    for part_rows in np.array_split(np.arange(rows), min(GRID[1], rows)):
+        for part_columns in np.array_split(np.arange(columns), min(GRID[0], columns)):
+            part = counts[np.ix_(part_rows, part_columns)]
+            row, column = np.unravel_index(int(part.argmax()), part.shape)
+            x, y = int(part_columns[column]) * TILE, int(part_rows[row]) * TILE
+            tile_of[y : y + TILE, x : x + TILE] = len(corners)
+            corners.append((x - margin, y - margin))
+    side = math.ceil((TILE + 2 * margin) * density) + 2
+    return tile_of, Tiles(np.array(corners, dtype=np.float32), side, side, density)
+
+
+def one_tile(width: int, height: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
+    """The whole image as one tile: where there are few events none is left out."""
+    origin = np.array([[-margin, -margin]], dtype=np.float32)
+    rows, columns = (math.ceil((n + 2 * margin) * density) + 2 for n in (height, width))
+    return np.zeros((height, width), dtype=np.int32), Tiles(origin, rows, columns, density)

@@ -1,0 +1,156 @@
+"""Presets: settings for ``calibrate`` or ``compensate`` that a chart chose for a budget, as JSON files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.calib import Settings
+from amiwarp.calib.parameters import size_name
+from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name
+from amiwarp.io.json_files import fields_of, read_json
+from amiwarp.io.output import write_text
+from amiwarp.optics.models import MODELS
+from amiwarp.validation import one_of, shown
+
+if TYPE_CHECKING:
+    from amiwarp.calib import Calibration
+    from amiwarp.optics.models import Model
+
+FORMAT, VERSION = "amiwarp-preset", 1
+KINDS = ("calibration", "compensation")
+CALIBRATION = ("model", "global_algorithm", "local_algorithm", "global_evaluations", "events", "fold", "stages")
+"""What a preset may say of :class:`amiwarp.calib.Settings`."""
+PHOTOMETRIC = ("pairs", "algorithm")
+"""What it may say of :class:`amiwarp.calib.photometric.stage.PhotometricSettings`, under ``photometric``."""
+ONLY_EXACT = ("apex", "index", "tilt_x", "tilt_y")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What a file holds. ``measured``: of the row of the chart that it comes from."""
+
+    kind: str
+    settings: Mapping[str, Any]
+    measured: Mapping[str, Any]
+
+    def save(self, path: Path) -> None:
+        """Write the JSON file. Raises :class:`AmiwarpError` if it exists or cannot be made."""
+        data = {"format": FORMAT, "version": VERSION, "kind": self.kind, "settings": dict(self.settings),
+                "measured": dict(self.measured)}  # fmt: skip
+        write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: Path, kind: str) -> Preset:
+        """Reads a preset of one ``kind``. Raises :class:`AmiwarpError` naming file and field."""
+        data = read_json(path, "a preset")
+        if data.get("format") != FORMAT or data.get("version") != VERSION:
+            raise AmiwarpError(f"{path}: is no {FORMAT} file of version {VERSION}; make one with 'amiwarp chart'")
+        if data.get("kind") != kind:
+            given = shown(data.get("kind"))
+            raise AmiwarpError(f"{path}: kind is {given}, needed here is a preset for {kind}")
+        with errors_name(path, lambda: "damaged preset, make it again with 'amiwarp chart'"):
+            fields_of(data, "", "format", "version", "kind", "settings", optional=("measured",))
+            settings, measured = data["settings"], data.get("measured") or {}
+            for name, value in (("settings", settings), ("measured", measured)):
+                if not isinstance(value, dict):
+                    fields_of(value, name)
+            check(kind, settings)
+        return cls(kind, settings, measured)
+
+    def calibration_settings(self) -> Settings:
+        """The settings, what the preset leaves open being the defaults."""
+        return settings_from(self.settings)
+
+
+def settings_from(values: Mapping[str, Any]) -> Settings:
+    """Settings from a preset's plain values."""
+    plain: dict[str, Any] = {n: values[n] for n in CALIBRATION if n in values}
+    if "stages" in plain:
+        plain["stages"] = tuple(plain["stages"])
+    return Settings(**plain, photometric=PhotometricSettings(**values.get("photometric", {})))
+
+
+def settings_to(settings: Settings) -> dict[str, Any]:
+    """The reverse: every field that a preset may have, as plain values."""
+    out = {n: getattr(settings, n) for n in CALIBRATION}
+    out["stages"] = list(settings.stages)
+    out["photometric"] = {n: getattr(settings.photometric, n) for n in PHOTOMETRIC}
+    return out
+
+
+def check(kind: str, settings: Mapping[str, Any]) -> None:
+    """Raises :class:`AmiwarpError` naming the field that is unknown, or the value that makes no sense."""
+    if kind == "compensation":
+        _check_names(settings, ("model",), "")
+        one_of(settings.get("model"), MODELS, "model")
+        return
+    _check_names(settings, (*CALIBRATION, "photometric"), "")
+    photometric = settings.get("photometric", {})
+    if not isinstance(photometric, dict):
+        raise AmiwarpError(f"photometric is {shown(photometric)}, not an object")
+    _check_names(photometric, PHOTOMETRIC, "photometric.")
+    plain = {n: v for n, v in settings.items() if n != "photometric"}
+    for name, value in plain.items():
+        _check_type(name, value, getattr(Settings(), name))
+    for name, value in photometric.items():
+        _check_type(f"photometric.{name}", value, getattr(PhotometricSettings(), name))
+    settings_from(settings).check()
+
+
+def _check_names(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise AmiwarpError(f"field {where}{shown(unknown[0])[1:-1]} is unknown; a preset may have {', '.join(known)}")
+
+
+def _check_type(name: str, value: Any, default: Any) -> None:
+    wanted = (list, tuple) if isinstance(default, tuple) else type(default)
+    good = isinstance(value, wanted) and not isinstance(value, bool)
+    if not (good or (name == "global_algorithm" and value is None)):
+        raise AmiwarpError(f"{name} is {shown(value)}; it should look like {default!r}")
+
+
+def simplified(calibration: Calibration, model: str) -> Calibration:
+    """The same prism by another model of the ladder: an exact calibration as an ellipse, a radial circle or a circle.
+
+    Of a circle the size is the one that comes nearest over image and turn. Raises :class:`AmiwarpError` where ``model``
+    needs more than the calibration found.
+    """
+    if one_of(model, MODELS, "model") == calibration.model_name:
+        return calibration
+    calibration = calibration.exact
+    found, known = calibration.parameters, size_name(calibration.model_name)
+    if size_name(model) == "apex" == known:
+        return replace(calibration, model_name=model)
+    if size_name(model) == "apex" or (model, calibration.model_name) == ("radial", "circle"):
+        raise AmiwarpError(
+            f"the model {model} needs more than a calibration by {calibration.model_name} tells; calibrate with exact"
+        )
+    prism = replace(calibration.prism, apex=found.get("apex", calibration.prism.apex),
+                    index=found.get("index", calibration.prism.index))  # fmt: skip
+    values = {n: v for n, v in found.items() if n not in ONLY_EXACT}
+    exact = replace(calibration, model_name="exact") if known == "apex" else calibration
+    start = found.get("deflection", prism.deflection)
+    simple = replace(calibration, model_name=model, prism=prism, parameters={**values, "deflection": start})
+    size = start * _gain(simple.model, exact.model)
+    return replace(simple, parameters={**values, "deflection": size}, uncertainty={})
+
+
+def _gain(model: Model, other: Model) -> float:
+    """By how much the displacement of ``model`` is too small, by least squares over the image and one turn."""
+    x, y, theta = np.meshgrid(
+        np.linspace(0, other.camera.width - 1, 24), np.linspace(0, other.camera.height - 1, 18),
+        np.arange(16) * (np.pi / 8), indexing="ij",
+    )  # fmt: skip
+    xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    ours, theirs = (each.compensate_points(xy, theta.ravel()) - xy for each in (model, other))
+    finite = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
+    return float(np.sum(ours[finite] * theirs[finite]) / np.sum(ours[finite] ** 2))

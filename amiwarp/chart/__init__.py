@@ -1,5 +1,0 @@
-"""What each bit of speed costs: compensation and calibration, measured every sensible way on one recording."""
-
-from amiwarp.chart.make import Charts, make, simulated
-
-__all__ = ["Charts", "make", "simulated"]

@@ -1,0 +1,157 @@
+"""Events on a device, with the prism's angle at each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import check_sensor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import Events
+
+TURNS = 1 << 16
+"""Angles of the prism that are told apart: 0.0055 deg, 0.0005 px on an orbit of 10 px."""
+LARGEST_FOLD = 1 << 16
+LARGEST_WEIGHT = 63
+"""Events that a point stands for at most, see :mod:`amiwarp.kernels.tiles`."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEvents:
+    """Events with their angles on a device; see :func:`upload_events`."""
+
+    arrays: Any
+    """``amiwarp.kernels.votes.EventArrays``: OFF goes to the first image, ON to the second, or both to the only one."""
+    count: int
+    base: Any
+    """Angles without drift, where there is a slope."""
+    slope: Any
+    """Change of the angles [1/65536 turn] per unit of the drifting parameter, or None."""
+
+    def drift(self, value: float) -> None:
+        """Sets the angles to what they are where the drifting parameter has ``value``."""
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.votes import drift_turns
+
+        launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
+
+    def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:
+        """The same events, each going to the image of its part, and there of its polarity."""
+        import warp as wp
+
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.votes import EventArrays, layer_events
+
+        a, e = self.arrays, EventArrays()
+        e.x, e.y, e.turn, e.azimuths, e.time, e.weight = a.x, a.y, a.turn, a.azimuths, a.time, a.weight
+        e.layer = wp.empty_like(a.layer)
+        inputs = [a.layer, parts, int(per_polarity)]
+        launch(layer_events, len(e.layer), inputs, [e.layer], device=e.layer.device)
+        return replace(self, arrays=e)
+
+
+def upload_events(
+    events: Events,
+    angles: Encoder | NDArray[np.float64],
+    device: Any,
+    *,
+    slope: NDArray[np.float64] | None = None,
+    middle_us: int | None = None,
+    fold: int = 0,
+) -> DeviceEvents:
+    """Events and their angles on ``device``: an encoder's, or given [rad]; pixels must be whole (uint16).
+
+    ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events get
+    their times from it, so that the camera's turning can be taken back. ``fold``: of a still scene, events of one pixel
+    and polarity become one point for each of so many bins of a turn, in its middle, with their number for a weight;
+    without slope and times. Raises :class:`AmiwarpError` where the encoder does not cover the events.
+    """
+    import warp as wp
+
+    from amiwarp.kernels.launch import launch
+    from amiwarp.kernels.structs import azimuths, encoder_params
+    from amiwarp.kernels.votes import EventArrays, time_events, turn_events
+
+    check_sensor(events)
+    n, device = len(events), wp.get_device(device)
+    padded = _padded(n, device)
+
+    def put(values: NDArray[Any], dtype: Any) -> Any:
+        return _put(values, dtype, device)
+
+    e = EventArrays()
+    e.x, e.y = put(events.x, wp.uint16), put(events.y, wp.uint16)
+    e.layer = put(events.p, wp.uint8)
+    e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
+    e.weight = wp.empty(0, dtype=wp.uint8, device=device)
+    if not isinstance(angles, np.ndarray) or middle_us is not None:
+        t = wp.array(events.t, dtype=wp.int64, device=device)
+    if isinstance(angles, np.ndarray):
+        e.turn = put(np.rint(angles * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
+    else:
+        e.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
+        if n:
+            encoder = encoder_params(angles, int(events.t[0]), int(events.t[-1]), device)
+            launch(turn_events, n, [encoder, t], [e.turn], device=device)
+    if middle_us is not None:
+        e.time = wp.empty(n, dtype=float, device=device)
+        launch(time_events, n, [t, middle_us], [e.time], device=device)
+    if fold:
+        return _folded(e, n, fold)
+    if slope is None:
+        return DeviceEvents(e, n, None, None)
+    return DeviceEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
+
+
+def _padded(n: int, device: Any) -> int:
+    """CPUs vote whole blocks."""
+    from amiwarp.kernels.votes import BLOCK
+
+    return -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
+
+
+def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
+    import warp as wp
+
+    n = len(values)
+    if _padded(n, device) == n:
+        return wp.array(values, dtype=dtype, device=device)
+    array = wp.zeros(_padded(n, device), dtype=dtype, device=device)
+    array.numpy()[:n] = values
+    return array
+
+
+def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
+    """Equal keys of pixel, polarity and bin, sorted and counted on the device; by bin first, so that angles repeat."""
+    import warp as wp
+
+    from amiwarp.kernels.launch import launch
+    from amiwarp.kernels.votes import EventArrays, fold_keys, unfold_keys
+
+    device = e.x.device
+    if not 1 <= bins <= LARGEST_FOLD:
+        raise AmiwarpError(f"fold = {bins} angles a turn; give 1 .. {LARGEST_FOLD}, or 0 for none")
+    keys, unused = wp.empty(2 * n, dtype=wp.int64, device=device), wp.zeros(2 * n, dtype=int, device=device)
+    launch(fold_keys, n, [e.x, e.y, e.layer, e.turn, bins], [keys], device=device)
+    wp.utils.radix_sort_pairs(keys, unused, n)
+    every = keys[:n].numpy()
+    first = np.flatnonzero(np.concatenate([[True], every[1:] != every[:-1]])[:n])
+    key, count = every[first], np.diff(np.append(first, n))
+    times = -(-count // LARGEST_WEIGHT)  # points that stand for too many events come more than once
+    key, weight = np.repeat(key, times), np.minimum(np.repeat(count, times), LARGEST_WEIGHT)
+    last = np.cumsum(times) - 1
+    weight[last] = count - (times - 1) * LARGEST_WEIGHT
+    m = len(key)
+    out = EventArrays()
+    out.x, out.y, out.turn = (wp.zeros(_padded(m, device), dtype=wp.uint16, device=device) for _ in range(3))
+    out.layer = wp.zeros(_padded(m, device), dtype=wp.uint8, device=device)
+    out.weight, out.azimuths, out.time = _put(weight, wp.uint8, device), e.azimuths, e.time
+    launch(unfold_keys, m, [wp.array(key, dtype=wp.int64, device=device), bins], [out], device=device)
+    return DeviceEvents(out, m, None, None)

@@ -1,0 +1,143 @@
+"""Sharpness of an image of warped events: five costs under one signature, all the higher the sharper."""
+
+from __future__ import annotations
+
+import enum
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.warped_image import CanvasShape, Image
+from amiwarp.validation import array, choice, real
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PAPER_ETA = 1.0
+"""η of the paper's J [events]; He et al. give none."""
+
+
+LARGEST_SMOOTHING = 1000.0
+"""Largest standard deviation of a Gaussian [px]."""
+FEW_SUMS = 256
+"""Sums that are left for the host to add."""
+
+
+class Sharpness(enum.StrEnum):
+    """What is measured; higher is sharper for each."""
+
+    VARIANCE = "variance"
+    """Variance over mean: 1 for events scattered at random, more where they gather."""
+    GRADIENT = "gradient"
+    """Mean squared gradient over mean."""
+    LAPLACIAN = "laplacian"
+    """Mean squared Laplacian over mean."""
+    PAPER_J = "paper_j"
+    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)); ``docs/calibration.md`` says where it fails."""
+    ENTROPY = "entropy"
+    """Minus the entropy of the votes' distribution over pixels [nat]."""
+
+
+class SharpnessMeter:
+    """Smooths and measures images of one canvas; owns its buffers."""
+
+    def __init__(self, canvas: CanvasShape, kind: Sharpness, *, smoothing: float, device: Any) -> None:
+        """``smoothing``: standard deviation of the Gaussian in canvas pixels; 0 for none."""
+        import warp as wp
+
+        from amiwarp.kernels.iwe import STRIP
+
+        weights = gaussian(smoothing)
+        self.kind = choice(Sharpness, kind, "sharpness")
+        self.device = wp.get_device(device)
+        self.image = Image(canvas, len(weights), self.device)
+        """Where the image to measure is put [events]."""
+        self._weights = wp.array(weights, dtype=float, device=device)
+        self._half, self._smooth = (wp.zeros_like(self.image.pixels) for _ in range(2))
+        layers, rows, columns = canvas.shape
+        self._parts = canvas.parts
+        self._n = layers // canvas.parts * rows * columns
+        strips = -(-rows // int(STRIP)) * self.image.frame.blocks
+        self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
+        few = (layers, min(strips, FEW_SUMS))
+        self._few = wp.empty(few, dtype=wp.vec2d, device=device)
+        self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=self.device.is_cuda)
+
+    def launch(self) -> None:
+        """Measures :attr:`image` on the device, without waiting for it."""
+        import warp as wp
+
+        from amiwarp.kernels import iwe as kernels
+        from amiwarp.kernels.launch import launch
+
+        smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
+        if len(self._weights) > 1:
+            for step, out in ((1, self._half), (frame.stride, self._smooth)):
+                inputs = [smoothed, self._weights, step, frame]
+                launch(kernels.smooth(width), self.image.blocks, inputs, [out], device=self.device, smallest=512)
+                smoothed = out
+        kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
+        inputs = [smoothed, frame, PAPER_ETA]
+        launch(kernel, self._sums.size, inputs, [self._sums.flatten()], device=self.device, smallest=64)
+        wp.launch(kernels.gather_sums, self._few.shape, [self._sums], [self._few], device=self.device)
+        wp.copy(self._host, self._few)
+
+    def results(self) -> list[float]:
+        """Sharpness of each part of the image that was measured last."""
+        import warp as wp
+
+        if self.device.is_cuda:
+            wp.synchronize_stream(self.device)
+        sums = self._host.numpy().reshape(self._parts, -1, 2).sum(axis=1)
+        return [self._score(float(total), float(terms)) for total, terms in sums]
+
+    def measure(self) -> float:
+        """Sharpness of :attr:`image`, of one part."""
+        self.launch()
+        return self.results()[0]
+
+    def _score(self, total: float, terms: float) -> float:
+        if total <= 0.0:
+            return 0.0
+        if self.kind is Sharpness.VARIANCE:
+            return terms / total - total / self._n
+        if self.kind is Sharpness.PAPER_J:
+            return -terms
+        if self.kind is Sharpness.ENTROPY:
+            return terms / total - math.log(total)
+        return terms / total
+
+
+def gaussian(sigma: float) -> NDArray[np.float32]:
+    """Weights of a Gaussian at 0, 1, … 3 sigma, the full symmetric kernel summing to 1; just [1] for sigma 0."""
+    sigma = real(sigma, "smoothing", 0.0, LARGEST_SMOOTHING, " px, a standard deviation")
+    if sigma == 0.0:
+        return np.ones(1, dtype=np.float32)
+    k = np.arange(math.ceil(3.0 * sigma) + 1)
+    weights = np.exp(-0.5 * (k / sigma) ** 2)
+    return (weights / (weights[0] + 2.0 * weights[1:].sum())).astype(np.float32)
+
+
+def sharpness(
+    image: NDArray[np.float32],
+    kind: Sharpness = Sharpness.VARIANCE,
+    *,
+    smoothing: float = 0.0,
+    device: Any = "cpu",
+) -> float:
+    """Sharpness of an image [events per pixel] of shape (height, width) or (layers, height, width).
+
+    ``smoothing``: standard deviation [px].
+    """
+    image = array(image, "image")
+    if image.ndim not in (2, 3) or not image.size:
+        raise AmiwarpError(f"image has shape {image.shape}; expected (height, width) or (2, height, width)")
+    stack = image if image.ndim == 3 else image[None]
+    canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
+    if len(stack) > 2 or not np.all(np.isfinite(image)):
+        raise AmiwarpError(f"image of shape {image.shape} is not a finite (height, width) or (2, height, width) image")
+    meter = SharpnessMeter(canvas, kind, smoothing=smoothing, device=device)
+    meter.image.write(stack)
+    return meter.measure()

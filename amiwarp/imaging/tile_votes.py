@@ -1,0 +1,132 @@
+"""Events prepared for being voted many times on CUDA, under several candidates for the parameters a pass."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.optics.camera_rotation import Turning
+
+if TYPE_CHECKING:
+    from amiwarp.imaging.device_events import DeviceEvents
+    from amiwarp.imaging.warped_image import CanvasShape, Image
+    from amiwarp.optics.models import Model
+
+
+class TileVotes:
+    """Events sorted by image tile, and the images of a few candidates; buffers are allocated once.
+
+    ``launch`` only launches: it can be captured in a CUDA graph. Parameters are read from device memory when it runs.
+    """
+
+    def __init__(
+        self, image: Image, canvas: CanvasShape, events: DeviceEvents, like: Model, *, candidates: int = 1
+    ) -> None:
+        """``image``: of the canvas, to be read into; ``like``: a model of the kind and camera of the candidates."""
+        import warp as wp
+
+        from amiwarp.kernels import tiles as kernels
+        from amiwarp.kernels.camera import TurningParams
+        from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams
+        from amiwarp.kernels.structs import pinhole_params
+        from amiwarp.optics.models import CircleModel, ExactModel, RadialCircleModel, model_camera
+
+        device = self.device = image.device
+        self.canvas, self.candidates = canvas, candidates
+        still = len(events.arrays.time) == 0 and events.slope is None
+        self._params = canvas.params()
+        self._camera = (pinhole_params(like.camera) if still else None) or model_camera(like, self.device)
+        self._arrays = self._sort(events)
+        self.votes = wp.zeros((candidates, len(image.pixels)), dtype=wp.int64, device=device)
+        """Votes of each candidate in 1/256, laid out as the image."""
+        frame, self._layout = image.frame, kernels.Layout()
+        self._layout.stride, self._layout.layer, self._layout.first = frame.stride, frame.layer, frame.first
+        self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
+        kind = {CircleModel: CircleParams, RadialCircleModel: RadialCircleParams, ExactModel: ExactParams}[type(like)]
+        self._host = [
+            wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True) for dtype in (kind, float, TurningParams)
+        ]
+        self._drifts = self._host[1].numpy()
+        self._there = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
+        motion = kernels.Motion()
+        motion.drift, motion.turning = self._there[1:]
+        self._motion = kernels.Still() if still else motion
+
+    def _sort(self, events: DeviceEvents) -> Any:
+        import warp as wp
+
+        from amiwarp.kernels import tiles as kernels
+
+        a, n, device = events.arrays, events.count, self.device
+        layers = self.canvas.shape[0]
+        size = min(kernels.TILE, max(1, int(kernels.TILE / self.canvas.scale)))
+        across, down = -(-self.canvas.width // size), -(-self.canvas.height // size)
+        keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))
+        counts = wp.zeros(layers * across * down, dtype=int, device=device)
+        inputs = [a.x, a.y, a.layer, layers, across, across * down, size]
+        wp.launch(kernels.key_events, n, inputs, [keys, order, counts], device=device)
+        wp.utils.radix_sort_pairs(keys, order, n)
+        slope = events.slope if events.slope is not None else wp.empty(0, dtype=float, device=device)
+        out = kernels.TileEvents()
+        out.packed = wp.empty(n, dtype=wp.uint32, device=device)
+        out.slope, out.time = (wp.empty(n if len(v) else 0, dtype=float, device=device) for v in (slope, a.time))
+        turn = events.base if events.base is not None else a.turn
+        wp.launch(kernels.pack_events, n, [a.x, a.y, turn, slope, a.time, a.weight, order, size], [out], device=device)
+        out.chunks = wp.array(self._chunks(counts.numpy(), size, across, down), dtype=kernels.Chunk, device=device)
+        return out
+
+    def _chunks(self, counts: Any, size: int, across: int, down: int) -> Any:
+        """Runs of at most CHUNK events, one tile and layer each, the window centred on the tile."""
+        from amiwarp.kernels import tiles as kernels
+
+        stops = np.cumsum(counts)
+        pieces = [
+            (start, min(start + kernels.CHUNK, stop), key)
+            for key, (stop, count) in enumerate(zip(stops, counts, strict=True))
+            for start in range(stop - count, stop, kernels.CHUNK)
+        ]
+        struct: Any = kernels.Chunk
+        chunks = np.zeros(max(1, len(pieces)), dtype=struct.numpy_dtype())
+        start, stop, key = np.array(pieces or [(0, 0, 0)]).T
+        tile = key % (across * down)
+        chunks["start"], chunks["stop"], chunks["layer"] = start, stop, key // (across * down)
+        chunks["x"], chunks["y"] = tile % across * size, tile // across * size
+        for name, origin, window in (("column", "x", kernels.COLUMNS), ("row", "y", kernels.ROWS)):
+            middle = (chunks[origin] + size / 2.0 + self.canvas.pad) * self.canvas.scale
+            chunks[name] = np.rint(middle - int(window) / 2)
+        return chunks
+
+    def set(self, k: int, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:
+        """Parameters of candidate ``k`` for the next :meth:`launch`, which must not be under way."""
+        import warp as wp
+
+        self._drifts[k] = drift
+        for array, struct in (
+            (self._host[0], model.params(self.device)),
+            (self._host[2], (turning or Turning()).params()),
+        ):
+            size = wp.types.type_size_in_bytes(array.dtype)
+            ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)
+
+    def launch(self) -> None:
+        """Votes all events under all candidates."""
+        import warp as wp
+
+        from amiwarp.kernels.tiles import AT_ONCE, THREADS, vote_tiles
+
+        for host, there in zip(self._host, self._there, strict=True):
+            wp.copy(there, host)
+        self.votes.zero_()
+        blocks = len(self._arrays.chunks) * -(-self.candidates // int(AT_ONCE))
+        inputs = [self._there[0], self._camera, self._arrays, self._motion, self._params, self._layout]
+        wp.launch(vote_tiles, (blocks, int(THREADS)), inputs, [self.votes], device=self.device, block_dim=int(THREADS))
+
+    def read(self, k: int, image: Image) -> None:
+        """Writes candidate ``k``'s image [events]."""
+        import warp as wp
+
+        from amiwarp.kernels.tiles import read_tiles
+
+        wp.launch(read_tiles, len(image.pixels), [self.votes[k], 0], [image.pixels], device=self.device)

@@ -1,0 +1,134 @@
+"""An emulated controller behind a pseudo-terminal: a serial port to whoever opens it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.live.link.clocks import monotonic_us
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from amiwarp.live.link.emulator import Controller
+
+STEP_S = 1e-3
+RETRY_S = 0.2
+"""Between attempts to open a pseudo-terminal while none can be had."""
+
+
+class PseudoTerminal:
+    """Runs a controller in real time until it is closed, in a thread of its own.
+
+    ``path``: a symbolic link to the port, kept while the cable is in and made anew with it, so that a lost port comes
+    back by the same name. ``now_us``: the world's time; default: since now. Raises :class:`AmiwarpError` where ``path``
+    is taken, or where the system has no pseudo-terminals.
+    """
+
+    def __init__(
+        self, controller: Controller, path: str | os.PathLike[str] | None = None,
+        *, now_us: Callable[[], int] | None = None,
+    ) -> None:  # fmt: skip
+        if not hasattr(os, "openpty"):
+            raise AmiwarpError("this system has no pseudo-terminals; the emulator needs Linux or macOS")
+        self._path = None if path is None else Path(path)
+        # a link that leads nowhere was left by one that was killed
+        if self._path is not None and self._path.exists():
+            raise AmiwarpError(f"{path}: is there already; give another path for the link, or remove it")
+        origin = monotonic_us()
+        self._now_us = now_us or (lambda: monotonic_us() - origin)
+        self._controller = controller
+        self._ended = threading.Event()
+        self._master: int | None = None
+        self._plug()
+        self._thread = threading.Thread(target=self._run, name="amiwarp-emulator", daemon=True)
+        self._thread.start()
+
+    @property
+    def name(self) -> str:
+        """To open it by: the link, or the port where there is none."""
+        return self._port if self._path is None else str(self._path)
+
+    def __enter__(self) -> PseudoTerminal:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends it; port and link are gone."""
+        self._ended.set()
+        self._thread.join()
+        self._unplug()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            data = self._read(self._master)
+            now = self._now_us()
+            self._controller.feed(data, now)
+            out = self._controller.advance(now)
+            if self._controller.plugged and self._master is None:
+                try:
+                    self._plug()
+                except OSError:  # no descriptor is free now
+                    self._ended.wait(RETRY_S)
+            elif not self._controller.plugged and self._master is not None:
+                self._unplug()
+            # Nobody there, or too slow: bytes are lost, as on any line without flow control.
+            if out and self._master is not None and not self._alone(self._master):
+                with contextlib.suppress(OSError):
+                    os.write(self._master, out)
+
+    def _read(self, master: int | None) -> bytes:
+        """Bytes from the other end, waited for until the next step."""
+        if master is None or self._alone(master):
+            self._ended.wait(STEP_S)
+            return b""
+        poll = select.poll()
+        poll.register(master, select.POLLIN)
+        if not poll.poll(round(1e3 * STEP_S)):
+            return b""
+        with contextlib.suppress(OSError):
+            return os.read(master, 4096)
+        return b""
+
+    def _alone(self, master: int) -> bool:
+        poll = select.poll()
+        poll.register(master, 0)
+        return any(event & select.POLLHUP for _, event in poll.poll(0))
+
+    def _plug(self) -> None:
+        import tty
+
+        master, port = os.openpty()
+        try:
+            self._port = os.ttyname(port)
+            tty.setraw(port)
+            os.set_blocking(master, False)
+        except BaseException:
+            os.close(master)
+            raise
+        finally:
+            os.close(port)
+        self._master = master
+        if self._path is not None:
+            self._remove_link()
+            self._path.symlink_to(self._port)
+
+    def _remove_link(self) -> None:
+        if self._path is not None and self._path.is_symlink():  # a file that was put there meanwhile stays
+            self._path.unlink()
+
+    def _unplug(self) -> None:
+        self._remove_link()
+        if self._master is not None:
+            os.close(self._master)
+            self._master = None

@@ -1,0 +1,140 @@
+"""A queue of packets, bounded in events and in bytes, between a source and a consumer."""
+
+from __future__ import annotations
+
+import enum
+import threading
+from collections import deque
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.events.events import Events
+from amiwarp.live.stream.background_worker import QUEUE_BYTES
+from amiwarp.validation import choice, whole
+
+if TYPE_CHECKING:
+    from amiwarp.live.stream.packets import Packet
+
+THIN_FROM = 0.5
+"""Fill from which on events are thinned, the more the fuller the queue is."""
+
+
+class Policy(enum.StrEnum):
+    """What a queue does that is full."""
+
+    BLOCK = "block"
+    """The source waits, and with it whoever sends: nothing is lost here."""
+    DROP_OLDEST = "drop-oldest"
+    """The events that have waited longest go: what comes out is late by no more than the queue is long."""
+    THIN = "thin"
+    """Events are left out evenly, so that all places and times are still seen."""
+
+
+class PacketQueue:
+    """Hold at most ``most_events`` and ``most_bytes``, whichever is less.
+
+    The policy decides over events alone: triggers and encoder samples are never dropped. If these alone fill the bytes,
+    the source waits under every policy. A single packet larger than the bounds still passes, alone.
+    For one thread that puts and one that gets. Raises :class:`AmiwarpError` for a size under 1.
+    """
+
+    def __init__(self, most_events: int, policy: Policy, most_bytes: int = QUEUE_BYTES) -> None:
+        self.most_events = whole(most_events, "queue's most_events", 1, 1 << 40)
+        self.most_bytes = whole(most_bytes, "queue's most_bytes", 1, 1 << 40)
+        self.policy = choice(Policy, policy, "policy")
+        self.received = self.dropped = 0
+        """Events put, and those of them that never come out."""
+        self._packets: deque[Packet] = deque()
+        self._held = 0
+        self._spent = 0
+        """Packets at the front whose events were dropped."""
+        self.held_bytes = 0
+        """Memory that the packets take [bytes], see :attr:`Packet.held_bytes`."""
+        self._phase = 0.0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    @property
+    def held(self) -> int:
+        """Events that wait in it."""
+        return self._held
+
+    @property
+    def fill(self) -> float:
+        """Share of the room that is taken; above 1 while a single packet is larger than all of it."""
+        return self._share(self._held, self.held_bytes)
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was closed and all has come out."""
+        with self._changed:
+            return self._closed and not self._packets
+
+    def put(self, packet: Packet) -> None:
+        """Take a packet once there is room, which dropping makes if the policy says so, or the queue is closed."""
+        with self._changed:
+            self.received += len(packet.events)
+            if self.policy is Policy.THIN:
+                packet = self._thinned(packet)
+            while self.policy is Policy.DROP_OLDEST and self._held and not self._fits(packet):
+                self._drop_oldest()
+            if packet.bare:  # a source's sign of life: nothing to consume
+                return
+            self._changed.wait_for(lambda: not self._packets or self._fits(packet) or self._closed)
+            self._packets.append(packet)
+            self._held += len(packet.events)
+            self.held_bytes += packet.held_bytes
+            self._changed.notify_all()
+
+    def get(self, timeout_s: float) -> Packet | None:
+        """The next packet, or None where none came in time or the queue has ended."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._packets) or self._closed, timeout_s)
+            if not self._packets:
+                return None
+            packet = self._packets.popleft()
+            self._spent = max(0, self._spent - 1)
+            self._held -= len(packet.events)
+            self.held_bytes -= packet.held_bytes
+            self._changed.notify_all()
+            return packet
+
+    def close(self) -> None:
+        """Nothing more comes; what is held can still be got."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def _fits(self, packet: Packet) -> bool:
+        return self._share(self._held + len(packet.events), self.held_bytes + packet.held_bytes) <= 1.0
+
+    def _share(self, events: int, held_bytes: int) -> float:
+        return max(events / self.most_events, held_bytes / self.most_bytes)
+
+    def _drop_oldest(self) -> None:
+        """Empty the first packet that has events; what else it carries stays."""
+        while not len(self._packets[self._spent].events):
+            self._spent += 1
+        packet = self._packets[self._spent]
+        self._held -= len(packet.events)
+        self.dropped += len(packet.events)
+        rest = replace(packet, events=Events.empty())
+        self.held_bytes -= packet.held_bytes - (0 if rest.bare else rest.held_bytes)
+        if rest.bare:
+            del self._packets[self._spent]
+        else:
+            self._packets[self._spent] = rest
+
+    def _thinned(self, packet: Packet) -> Packet:
+        n = len(packet.events)
+        free = 1.0 - self._share(self._held + n, self.held_bytes + packet.held_bytes)
+        share = min(max(free / (1.0 - THIN_FROM), 0.0), 1.0)
+        if share == 1.0 or not n:
+            return packet
+        steps = np.floor(self._phase + share * np.arange(n + 1))
+        self._phase = (self._phase + share * n) % 1.0
+        kept = steps[1:] > steps[:-1]
+        self.dropped += n - int(np.count_nonzero(kept))
+        return replace(packet, events=packet.events[kept])

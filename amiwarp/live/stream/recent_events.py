@@ -1,0 +1,123 @@
+"""The last seconds of a stream in memory, as a recording at any moment."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.compensation.streams import OVERHEAD, held_bytes
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.live.stream.queues import Policy
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.live.link.link import Link
+    from amiwarp.live.stream.packets import Source
+    from amiwarp.optics.camera import Camera
+    from amiwarp.optics.prism import NominalPrism
+
+SECONDS, MOST_BYTES = 2.0, 1 << 27
+"""Kept of events, whichever is less: about eight million. Samples may take as many bytes again."""
+FIRST_S = 15.0
+"""Longest wait for the first turn."""
+
+
+class Ring:
+    """Takes what a :class:`LiveWriter` takes; for one thread that appends and any that ask."""
+
+    def __init__(self, source: Source, camera: Camera | None = None, prism: NominalPrism | None = None) -> None:
+        self._size, self._name = source.size, source.name
+        self._camera, self._prism = camera or source.camera, prism or source.prism
+        self._events: deque[Events] = deque()
+        self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
+        self.event_bytes = self.sample_bytes = 0
+        """Memory that events and samples take [bytes]."""
+        self._lock = threading.Lock()
+
+    def append(self, events: Events) -> None:
+        """Events in order."""
+        with self._lock:
+            self._events.append(events)
+            self.event_bytes += held_bytes(events)
+            since = int(events.t[-1]) - round(SECONDS * 1e6)
+            while len(self._events) > 1 and (self.event_bytes > MOST_BYTES or self._events[0].t[-1] < since):
+                self.event_bytes -= held_bytes(self._events.popleft())
+
+    def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
+        """Samples in order, on the events' clock; index pulses are in the angles."""
+        if len(t_us):
+            with self._lock:
+                self._samples.append((t_us, angle))
+                self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
+                since = int(t_us[-1]) - round(2e6 * SECONDS)
+                while len(self._samples) > 1 and (self.sample_bytes > MOST_BYTES or self._samples[0][0][-1] < since):
+                    t_us, angle = self._samples.popleft()
+                    self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
+
+    def tick(self) -> None:
+        """Nothing waits here."""
+
+    def recording(self) -> Recording | None:
+        """What the encoder covers of it; None while that is under a turn."""
+        with self._lock:
+            events, samples = list(self._events), list(self._samples)
+        if not samples or not events:
+            return None
+        t, angle = (np.concatenate(column) for column in zip(*samples, strict=True))
+        if len(t) < 2:
+            return None
+        joined = Events.concatenate(events)
+        since = max(min(int(np.searchsorted(t, joined.t[0])) - 2, len(t) - 2), 0)  # its speed is that of the events
+        encoder = Encoder(t[since:], angle[since:])
+        first, last = np.searchsorted(joined.t, encoder.coverage)
+        covered = joined[first:last]
+        if not len(covered) or abs(encoder.rpm) * float(covered.t[-1] - covered.t[0]) < 60e6:
+            return None
+        return Recording(MemoryEvents(covered, *self._size), self._camera, encoder, self._prism, name=self._name)
+
+
+@contextlib.contextmanager
+def followed(source: Source, link: Link | None, ring: Ring, say: Callable[[str], None]) -> Iterator[None]:
+    """Fills the ring from a source, in a thread, for as long as the ``with`` block lasts.
+
+    Waits for the first turn. Raises :class:`AmiwarpError` where none comes in time, or what the source raised.
+    """
+    from amiwarp.live.stream.session import Session
+
+    stop, failed = threading.Event(), []
+
+    def run() -> None:
+        session = Session(source, link=link, raw=[ring], policy=Policy.DROP_OLDEST, say=say)
+        try:
+            ended = session.run(stop, lambda status: None)
+            problem = getattr(source, "problem", None)
+            how = "has ended" if problem is None else f"broke off: {problem}"
+            say(f"{source.name}: the stream {how}; what is shown are the last of its {ended.events:,} events")
+        except Exception as error:
+            failed.append(error)
+            say(str(error))
+
+    thread = threading.Thread(target=run, name="amiwarp-follow", daemon=True)
+    thread.start()
+    try:
+        until = time.monotonic() + FIRST_S
+        while ring.recording() is None:
+            if not thread.is_alive() or time.monotonic() > until:
+                how = f"in {FIRST_S:g} s" if thread.is_alive() else "before the stream ended"
+                problem = getattr(source, "problem", None)
+                why = "" if problem is None else f": it broke off, {problem}"
+                raise failed[0] if failed else AmiwarpError(f"{source.name}: gave no whole turn {how}{why}")
+            time.sleep(0.05)
+        yield
+    finally:
+        stop.set()
+        thread.join()

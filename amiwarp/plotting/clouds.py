@@ -1,0 +1,104 @@
+"""Events as clouds of points in x, y and prism angle, drawn off screen.
+
+VTK ends the whole process where it finds no OpenGL to draw with, so it runs in a process of its own; where that fails
+Matplotlib draws the same points.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+OFF_COLOUR, ON_COLOUR = "#0072b2", "#d55e00"
+"""Okabe and Ito's blue and vermilion, told apart by all common kinds of colour vision."""
+MISSING = "VTK found no OpenGL to draw with, Matplotlib drew the clouds; on Debian install libegl1 and libgl1-mesa-dri"
+SECONDS = 60.0
+HALF = (0.4, 0.5, 0.5)
+"""Half width of the box about the origin in which the points lie."""
+_SIZE = (1100, 1000)
+_CAMERA = ((2.75, -2.75, 1.55), (0.0, 0.0, -0.03), (0.0, 0.0, 1.0))
+"""Position, focal point and up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """Points of one cloud."""
+
+    xyz: NDArray[np.float32]
+    """x, y (up) and angle within :data:`HALF` of the origin, where they are not outside the region; shape (n, 3)."""
+    on: NDArray[np.bool_]
+    """Which are ON events, shape (n,)."""
+
+
+def render(clouds: Sequence[Cloud]) -> list[NDArray[np.uint8]] | None:
+    """A picture of each cloud by VTK, shape (height, width, 3); None where VTK cannot draw here."""
+    with tempfile.TemporaryDirectory() as folder:
+        for k, cloud in enumerate(clouds):
+            np.savez(Path(folder) / f"{k}.npz", xyz=cloud.xyz, on=cloud.on)
+        environment = dict(os.environ)
+        if sys.platform.startswith("linux"):
+            # By default VTK tries X first, and crashes where libX11 is missing; EGL needs no display.
+            environment["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
+        command = [sys.executable, "-m", "amiwarp.plotting.clouds", folder]
+        try:
+            done = subprocess.run(command, env=environment, capture_output=True, timeout=SECONDS, check=False)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        pictures = [Path(folder) / f"{k}.npy" for k in range(len(clouds))]
+        if done.returncode != 0 or not all(picture.is_file() for picture in pictures):
+            return None
+        return [np.asarray(np.load(picture), np.uint8) for picture in pictures]
+
+
+def draw_plain(axes: Any, cloud: Cloud) -> None:
+    """The same cloud on Matplotlib's three-dimensional ``axes``."""
+    colours = np.where(cloud.on, ON_COLOUR, OFF_COLOUR)
+    axes.scatter(*cloud.xyz.T, s=1.6, c=colours, linewidths=0, alpha=0.7, depthshade=False)
+    axes.set_box_aspect(HALF, zoom=1.1)
+    axes.set(xlim=(-HALF[0], HALF[0]), ylim=(-HALF[1], HALF[1]), zlim=(-HALF[2], HALF[2]))
+    axes.view_init(elev=22, azim=-45)
+    axes.set(xlabel="x", ylabel="y", xticks=(), yticks=(), zticks=())
+    axes.text2D(0.03, 0.9, "angle", transform=axes.transAxes)
+
+
+def _render_here(points: Path, picture: Path) -> None:
+    import pyvista
+
+    data = np.load(points)
+    plotter = pyvista.Plotter(off_screen=True, window_size=list(_SIZE))
+    plotter.set_background("white")
+    for which, colour in ((~data["on"], OFF_COLOUR), (data["on"], ON_COLOUR)):
+        if which.any():
+            plotter.add_points(data["xyz"][which], color=colour, point_size=2.6, opacity=0.85, lighting=False)
+    x, y, z = HALF
+    plotter.add_mesh(pyvista.Box((-x, x, -y, y, -z, z)).outline(), color="#555555", line_width=1.5)
+    ends = np.array([[0.0, -y - 0.1, -z - 0.04], [x + 0.1, 0.0, -z - 0.04], [-x - 0.02, -y - 0.02, z + 0.07]])
+    plotter.add_point_labels(
+        ends, ["x", "y", "angle"], font_size=36, text_color="black", shape=None, show_points=False, always_visible=True
+    )
+    plotter.camera_position = list(_CAMERA)
+    plotter.camera.view_angle = 25.0
+    np.save(picture, _cropped(plotter.screenshot(None, return_img=True)))
+
+
+def _cropped(picture: NDArray[np.uint8], border: int = 8) -> NDArray[np.uint8]:
+    """Without the empty margins."""
+    rows, columns = (np.flatnonzero((picture < 255).any(axis=(2, axis))) for axis in (1, 0))
+    top, left = max(0, rows[0] - border), max(0, columns[0] - border)
+    return picture[top : rows[-1] + border, left : columns[-1] + border]
+
+
+if __name__ == "__main__":
+    for file in sorted(Path(sys.argv[1]).glob("*.npz")):
+        _render_here(file, file.with_suffix(".npy"))

@@ -1,0 +1,350 @@
+"""Figures of a calibration and of the demo, drawn with Matplotlib into PNG files."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from amiwarp.calib.parameters import size_name
+from amiwarp.calib.result import cost_surface
+from amiwarp.calib.thinning import thin
+from amiwarp.imaging.export import PERCENTILE, save_png
+from amiwarp.imaging.warped_image import iwe
+from amiwarp.io.output import write_text
+from amiwarp.plotting import clouds
+from amiwarp.reconstruction.export import Tone, limits, tones
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib import Calibration
+    from amiwarp.events.events import Events, Recording
+    from amiwarp.imaging.metrics import PictureQuality
+    from amiwarp.reconstruction.picture import Picture
+
+EVENTS = 2_000_000
+"""At most so many events, thinned evenly, make an image of a figure."""
+POINTS = 60_000
+"""At most so many points make a cloud."""
+REGION = (64, 80)
+"""Part of the image that is shown enlarged and as clouds [px]."""
+WIDTH, TITLE = 15.0, 14.0
+"""Of the demo's figure [inch], and of its titles' letters [point]."""
+GREYS, FAINT = 128, 8
+"""Of a figure's 256 colours so many are grey; a colour whose channels differ by no more counts as grey."""
+FOUND, TRUTH, LOCAL = "#d55e00", "#000000", "#e69f00"
+
+
+@dataclass(frozen=True)
+class Images:
+    """The image of the events before and after compensation, [events per pixel], shape (height, width) each."""
+
+    before: NDArray[np.float32]
+    after: NDArray[np.float32]
+
+    @property
+    def top(self) -> float:
+        """What both show as white."""
+        return float(np.percentile(self.after[self.after > 0], PERCENTILE)) if (self.after > 0).any() else 1.0
+
+
+def draw_calibration(path: Path, recording: Recording, calibration: Calibration, *, device: Any) -> None:
+    """Cost surface with the samples of all stages, and the image of the events before and after."""
+    figure, axes = _figure((14.0, 4.2), 1, 3, (1.0, 1.0, 0.8))
+    draw_images(axes[:2], images(thin(recording, EVENTS), recording, calibration, device=device))
+    draw_cost(figure, axes[2], calibration)
+    save(figure, path)
+
+
+def images(events: Events, recording: Recording, calibration: Calibration, *, device: Any) -> Images:
+    """The two images of ``events``."""
+    size = recording.events.size
+    encoder = calibration.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
+    after = iwe(events, *size, model=calibration.model, encoder=encoder, device=device)
+    return Images(iwe(events, *size, device=device), after)
+
+
+def draw_images(axes: Any, pair: Images) -> None:
+    """Both images on the same scale."""
+    for ax, image, title in zip(axes, (pair.before, pair.after), ("before", "after"), strict=True):
+        show(ax, image, pair.top, f"events {title} compensation")
+
+
+def show(ax: Any, image: NDArray[np.float32], top: float, title: str) -> None:
+    """An image of events, its counts under a square root."""
+    from matplotlib.colors import PowerNorm
+
+    ax.imshow(image, cmap="gray", norm=PowerNorm(0.5, 0.0, top, clip=True), interpolation="nearest")
+    ax.set(xticks=(), yticks=())
+    ax.set_title(title)
+
+
+def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float, float] | None = None) -> None:
+    """The global search's cost over (size cos phase, size sin phase), all samples, what was found, and the ``truth``.
+
+    ``truth``: size and phase [rad]. Where there was no global search the samples stand alone.
+    """
+    calibration = calibration.exact
+    size = size_name(calibration.model_name)
+    samples = cost_surface(calibration.stages, size)
+    x, y = (np.degrees(samples[:, 0]) * f(samples[:, 1]) for f in (np.cos, np.sin))
+    coarse = np.array([stage.name == "global" for stage in calibration.stages], bool)[samples[:, 3].astype(int)]
+    if coarse.sum() >= 10 and np.ptp(x[coarse]) > 0 and np.ptp(y[coarse]) > 0:
+        surface = ax.tricontourf(x[coarse], y[coarse], samples[coarse, 2], levels=24, cmap="cividis")
+        ax.set_facecolor(surface.cmap(0.0))
+        figure.colorbar(surface, ax=ax, label=f"sharpness ({calibration.sharpness_name}, coarse image)", shrink=0.85)
+        ax.plot(x[coarse], y[coarse], ".", color="white", markersize=2.2, label="global search")
+    ax.plot(x[~coarse], y[~coarse], "+", color=LOCAL, markersize=5, label="local search")
+    found = _polar(calibration.parameters[size], calibration.parameters["phase"])
+    ax.plot(*found, "o", markersize=13, fillstyle="none", color=FOUND, markeredgewidth=2.2, label="found")
+    if truth is not None:
+        ax.plot(*_polar(*truth), "x", color=TRUTH, markersize=9, markeredgewidth=1.8, label="true")
+    reach = 1.05 * max(np.abs([*x, *y, *found]))
+    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1.0)
+    ax.set(xlabel=f"{size} · cos phase [deg]", ylabel=f"{size} · sin phase [deg]")
+    ax.set_title("cost surface and its samples")
+    ax.legend(loc="lower left", fontsize=8, framealpha=1.0, facecolor="#9a9a9a", markerscale=0.7)
+
+
+def _polar(size: float, phase: float) -> tuple[float, float]:
+    return math.degrees(size) * math.cos(phase), math.degrees(size) * math.sin(phase)
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """A reconstructed picture beside the truth."""
+
+    picture: Picture
+    original: NDArray[np.float32]
+    """What the camera would see without the prism: log intensity, shape (height, width)."""
+    quality: PictureQuality
+
+    def tones(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Both for the eye, 0 .. 1, with the original's black and white: gain and offset are those of the fit."""
+        log = np.float32(self.quality.gain) * self.picture.log + np.float32(self.quality.offset)
+        original = replace(self.picture, log=self.original, known=np.ones(self.original.shape, np.bool_))
+        between = limits(original, 1.0)
+        found = tones(replace(self.picture, log=log), Tone.MAPPED, contrast=1.0, between=between)
+        return found, tones(original, Tone.MAPPED, contrast=1.0, between=between)
+
+
+def draw_demo(
+    path: Path,
+    recording: Recording,
+    calibration: Calibration,
+    reconstructed: Reconstructed,
+    *,
+    headline: str,
+    truth: tuple[float, float],
+    device: Any,
+) -> tuple[str, ...]:
+    """What came in and what came of it, the marked region enlarged, clouds and cost surface in one figure.
+
+    Returns notes on what could not be drawn as it should.
+    """
+    pair = images(thin(recording, EVENTS), recording, calibration, device=device)
+    corner = busiest(pair.after)
+    found, original = reconstructed.tones()
+    grid = Grid.make(*recording.events.size)
+    figure, ax = grid.figure, grid.axes
+    figure.text(0.5, 1.0 - 0.34 / grid.height, headline, ha="center", va="center", fontsize=18)
+    show(ax["raw"], pair.before, pair.top, "events as they come")
+    show_grey(ax["picture"], found, f"reconstructed from one turn, correlation {reconstructed.quality.correlation:.3f}")
+    show_grey(ax["original"], original, "the original, as seen without the prism")
+    show(ax["compensated"], pair.after, pair.top, "events, compensated")
+    for name in ("raw", "picture", "original", "compensated"):
+        mark(ax[name], corner)
+    part = (slice(corner[1], corner[1] + REGION[1]), slice(corner[0], corner[0] + REGION[0]))
+    show(ax["part raw"], pair.before[part], pair.top, "marked region: as it comes")
+    show(ax["part compensated"], pair.after[part], pair.top, "compensated")
+    show_grey(ax["part picture"], found[part], "reconstructed")
+    notes = _draw_clouds(figure, (ax["cloud before"], ax["cloud after"]), recording, calibration, corner, device)
+    draw_cost(figure, ax["cost"], calibration, truth)
+    enlarge(figure, ax["cost"])
+    save(figure, path)
+    return notes
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The demo's figure: axes by name at places that follow from the image's proportions, so that nothing overlaps."""
+
+    figure: Any
+    axes: dict[str, Any]
+    height: float
+    """Of the figure [inch]."""
+
+    @classmethod
+    def make(cls, columns: int, rows: int) -> Grid:
+        """For images of ``columns`` x ``rows`` pixels: three in the first row, one and its region in the second."""
+        gap, title = 0.12, 0.42
+        width = (WIDTH - 4 * gap) / 3.0
+        tall = width * rows / columns
+        part = min(tall * REGION[0] / REGION[1], (WIDTH - 5 * gap - width) / 3.0)
+        third = 4.1
+        height = 0.6 + 2 * (title + tall + gap) + title + third + 0.65
+        figure = _blank((WIDTH, height))
+
+        def place(left: float, top: float, wide: float, high: float) -> Any:
+            return figure.add_axes((left / WIDTH, 1.0 - (top + high) / height, wide / WIDTH, high / height))
+
+        axes = {}
+        top = 0.6 + title
+        for k, name in enumerate(("raw", "picture", "original")):
+            axes[name] = place(gap + k * (width + gap), top, width, tall)
+        top += tall + gap + title
+        axes["compensated"] = place(gap, top, width, tall)
+        spare = (WIDTH - 2 * gap - width - 3 * part) / 3.0
+        for k, name in enumerate(("part raw", "part compensated", "part picture")):
+            axes[name] = place(gap + width + spare + k * (part + spare), top, part, tall)
+        top += tall + gap + title
+        for k, name in enumerate(("cloud before", "cloud after")):
+            axes[name] = place(gap + k * (width + gap), top, width, third)
+        axes["cost"] = place(2 * (width + gap) + 0.75, top, width - 0.65, third)
+        return cls(figure, axes, height)
+
+
+def enlarge(figure: Any, cost: Any) -> None:
+    """Letters that can still be read where the figure is shown at half its size."""
+    for each in figure.axes:
+        each.title.set_fontsize(TITLE)
+        each.tick_params(labelsize=TITLE - 2.0)
+        each.xaxis.label.set_fontsize(TITLE - 2.0)
+        each.yaxis.label.set_fontsize(TITLE - 2.0)
+    for text in cost.get_legend().get_texts():
+        text.set_fontsize(TITLE - 3.0)
+
+
+def mark(ax: Any, corner: tuple[int, int]) -> None:
+    """Marks the region whose left top pixel is ``corner``."""
+    from matplotlib.patches import Rectangle
+
+    ax.add_patch(Rectangle(corner, *REGION, fill=False, edgecolor=LOCAL, linewidth=2.0))
+
+
+def show_grey(ax: Any, image: NDArray[np.float32], title: str) -> None:
+    """A picture of values 0 .. 1."""
+    ax.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
+    ax.set(xticks=(), yticks=())
+    ax.set_title(title)
+
+
+def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
+    """Left top pixel of the region in which the image has most contrast, away from its border.
+
+    Single bright spots count no more than a strong edge.
+    """
+    from scipy.ndimage import uniform_filter
+
+    width, height = REGION
+    clipped = np.minimum(image, Images(image, image).top).astype(np.float64)
+    mean, square = (uniform_filter(power, (height, width)) for power in (clipped, clipped**2))
+    contrast = square - mean**2
+    margin_y, margin_x = min(height // 2 + 8, image.shape[0] // 2 - 1), min(width // 2 + 8, image.shape[1] // 2 - 1)
+    inner = contrast[margin_y:-margin_y, margin_x:-margin_x]
+    row, column = np.unravel_index(int(np.argmax(inner)), inner.shape)
+    return max(0, int(column) + margin_x - width // 2), max(0, int(row) + margin_y - height // 2)
+
+
+def _draw_clouds(
+    figure: Any, axes: Any, recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
+) -> tuple[str, ...]:
+    pair = region_clouds(recording, calibration, corner, device)
+    pictures = clouds.render(pair)
+    for k, (ax, title) in enumerate(zip(axes, ("before", "after"), strict=True)):
+        ax.set_axis_off()
+        ax.set_title(f"{title}: one turn of the marked region")
+        if pictures is not None:
+            ax.imshow(pictures[k])
+            continue
+        ax.set_visible(False)
+        plain = figure.add_axes(ax.get_position(), projection="3d")
+        plain.set_title(ax.get_title())
+        clouds.draw_plain(plain, pair[k])
+    return () if pictures is not None else (clouds.MISSING,)
+
+
+def region_clouds(
+    recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
+) -> tuple[clouds.Cloud, clouds.Cloud]:
+    """The same events of one turn before and after: those that end up in the region."""
+    from amiwarp.compensation.recordings import compensate_events
+
+    source = recording.events
+    encoder = calibration.encoder_for(recording.encoder, source.t_first, source.t_last)
+    turn_us = round(60e6 / max(abs(encoder.rpm), 1e-3))
+    middle = (source.t_first + source.t_last) // 2
+    events = source.between(middle - turn_us // 2, middle + turn_us // 2)
+    after = compensate_events(events, calibration.model, encoder, device=device)
+    inside = np.all((after >= corner) & (after < np.add(corner, REGION)), axis=1)
+    which = np.flatnonzero(inside)
+    which = which[:: max(1, -(-len(which) // POINTS))]
+    raw = np.stack([events.x, events.y], axis=1).astype(np.float32)
+    angle = encoder.angle_at(events.t[which])
+    height = (angle - angle.mean()) / (2.0 * math.pi) if len(angle) else angle
+    on = events.p[which] == 1
+    before, moved = (clouds.Cloud(_box(xy[which], height, corner), on) for xy in (raw, after))
+    return before, moved
+
+
+def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int, int]) -> NDArray[np.float32]:
+    centred = (xy - np.array(corner) - np.array(REGION) / 2.0) / max(REGION)
+    return np.column_stack([centred[:, 0], -centred[:, 1], height]).astype(np.float32)
+
+
+def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[float, ...]) -> tuple[Any, Any]:
+    figure = _blank(size, layout="compressed")
+    return figure, figure.subplots(rows, columns, width_ratios=widths)
+
+
+def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
+    # Not through pyplot: nothing global is touched, and no display is looked for.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=110, layout=layout)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Any, path: Path, *, overwrite: bool = False) -> None:
+    """Writes a figure as a PNG of 256 colours, which is a third of the size and looks the same; whole or not at all."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
+    save_png(path, indexed(np.asarray(Image.open(buffer).convert("RGB"))), overwrite=overwrite)
+
+
+def save_svg(figure: Any, path: Path) -> None:
+    """Writes a figure as an SVG without its date; whole or not at all."""
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None})
+    write_text(path, text.getvalue())
+
+
+def indexed(rgb: NDArray[np.uint8]) -> Any:
+    """The picture (height, width, 3) with a palette of :data:`GREYS` even greys, and the rest for what has colour.
+
+    A palette chosen for all at once has too few greys, and smooth areas show steps, or too few colours.
+    """
+    from PIL import Image
+
+    coloured = np.ptp(rgb.astype(np.int16), axis=2) > FAINT
+    index = np.rint(rgb.mean(axis=2) * ((GREYS - 1) / 255.0)).astype(np.uint8)
+    palette = np.repeat(np.rint(np.linspace(0.0, 255.0, GREYS)), 3).astype(np.uint8).tolist()
+    if coloured.any():
+        colours = Image.fromarray(rgb[coloured][None]).quantize(256 - GREYS, Image.Quantize.MEDIANCUT)
+        index[coloured] = GREYS + np.asarray(colours)[0]
+        palette += colours.getpalette() or []
+    picture = Image.fromarray(index)
+    picture.putpalette(palette[: 3 * 256])
+    return picture
+
+
+__all__ = ["draw_calibration", "draw_cost", "draw_demo", "draw_images", "images"]

@@ -1,0 +1,163 @@
+"""Reconstructed pictures into files: tones for the eye, 8 and 16 bit, arrays, video; each whole or not at all."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.export import encode_image
+from amiwarp.io.output import NewFile, check_output
+from amiwarp.validation import choice
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.reconstruction.picture import Picture
+
+DARK, BRIGHT = 0.5, 99.5
+"""Percentiles of the known pixels that become black and white."""
+GAMMA = 2.2
+CONTRAST = 0.25
+"""ON threshold where none is given [log intensity]."""
+STEADY = 0.1
+"""Share of a new picture in a video's black and white points: they do not flicker."""
+STILLS = (".png", ".tif", ".tiff", ".npy")
+VIDEO = ".mp4"
+
+
+class Tone(enum.StrEnum):
+    """How intensity becomes a pixel's value."""
+
+    MAPPED = "mapped"
+    """For the eye: the 0.5th percentile of intensity is black, the 99.5th white, with gamma 2.2."""
+    LINEAR = "linear"
+    """Proportional to intensity: 0 is dark, the 99.5th percentile the largest value."""
+
+
+def limits(picture: Picture, contrast: float = CONTRAST) -> tuple[float, float]:
+    """Intensities that become black and white."""
+    shown = picture.known if picture.known.any() else np.isfinite(picture.log)
+    dark, bright = np.exp(contrast * np.percentile(picture.log[shown], [DARK, BRIGHT]))
+    return float(dark), float(max(bright, dark * (1.0 + 1e-6)))
+
+
+def tones(
+    picture: Picture, tone: Tone, *, contrast: float = CONTRAST, between: tuple[float, float] | None = None
+) -> NDArray[np.float32]:
+    """The picture as values 0 .. 1, shape (height, width); 0 where it is not filled.
+
+    ``contrast``: the ON threshold [log intensity]; ``between``: see :func:`limits`.
+    """
+    tone = choice(Tone, tone, "tone")
+    dark, bright = between or limits(picture, contrast)
+    light = picture.intensity(contrast)
+    if tone is Tone.LINEAR:
+        value = np.clip(light / bright, 0.0, 1.0)
+    else:
+        value = np.clip((light - dark) / (bright - dark), 0.0, 1.0) ** (1.0 / GAMMA)
+    return np.nan_to_num(value).astype(np.float32)
+
+
+def check_path(path: Path, endings: tuple[str, ...] = (*STILLS, VIDEO)) -> None:
+    """Raises :class:`AmiwarpError` for another ending, or where there is no folder."""
+    if path.suffix.lower() not in endings:
+        raise AmiwarpError(f"{path}: ends in {path.suffix or 'nothing'}; expected one of {', '.join(endings)}")
+    check_output(path)
+
+
+def save_picture(
+    picture: Picture, path: Path, *, tone: Tone = Tone.MAPPED, bits: int = 8, contrast: float = CONTRAST
+) -> None:
+    """Writes .png (8 bit, or 16), .tif (16 bit), or .npy: natural log intensity, float32, NaN where not filled."""
+    check_path(path, STILLS)
+    tone = choice(Tone, tone, "tone")
+    if bits not in (8, 16):
+        raise AmiwarpError(f"{path}: {bits} bits; expected 8 or 16")
+    ending = path.suffix.lower()
+    if ending == ".npy":
+        with NewFile(path) as new, open(new.part, "wb") as file:
+            np.save(file, (contrast * picture.log).astype(np.float32))
+        return
+    save_grey(tones(picture, tone, contrast=contrast), path, bits=bits if ending == ".png" else 16)
+
+
+def save_mask(picture: Picture, path: Path) -> None:
+    """Writes where the events determine the picture: white where they do, .png or .tif."""
+    check_path(path, STILLS[:3])
+    save_grey(picture.known.astype(np.float32), path, bits=8)
+
+
+def save_grey(value: NDArray[np.float32], path: Path, *, bits: int) -> None:
+    from PIL import Image
+
+    kind = np.uint8 if bits == 8 else np.uint16
+    image = Image.fromarray(np.rint(value * np.iinfo(kind).max).astype(kind))
+    with NewFile(path) as new:
+        encode_image(new.part, image, "PNG" if path.suffix.lower() == ".png" else "TIFF")
+
+
+def save_video(
+    pictures: Iterable[Picture], path: Path, *, fps: float, tone: Tone = Tone.MAPPED, contrast: float = CONTRAST
+) -> int:
+    """Writes an MP4 (H.264) and returns how many frames it has. Black and white follow the scene slowly."""
+
+    def frames() -> Iterator[NDArray[np.uint8]]:
+        between: tuple[float, float] | None = None
+        for picture in pictures:
+            dark, bright = limits(picture, contrast)
+            if between is not None:
+                dark = between[0] + STEADY * (dark - between[0])
+                bright = between[1] + STEADY * (bright - between[1])
+            between = (dark, bright)
+            yield np.rint(255.0 * tones(picture, tone, contrast=contrast, between=between)).astype(np.uint8)
+
+    return save_film(frames(), path, fps=fps)
+
+
+def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) -> int:
+    """Writes frames, shape (height, width) or (height, width, 3) each, as MP4 (H.264) or, if ``path`` ends so, GIF.
+
+    Returns how many there were. Raises :class:`AmiwarpError` for none, another ending, or where there is no folder.
+    """
+    import av
+
+    check_path(path, (VIDEO, ".gif"))
+    count, kind = 0, path.suffix.lower().removeprefix(".")
+    with NewFile(path) as new, av.open(str(new.part), "w", format=kind) as container:
+        stream: Any = None
+        for value in map(even, frames):
+            if stream is None:
+                stream = add_stream(container, fps, value.shape[:2], kind)
+            frame = av.VideoFrame.from_ndarray(value, format="gray" if value.ndim == 2 else "rgb24")
+            container.mux(stream.encode(frame))
+            count += 1
+        if stream is None:
+            raise AmiwarpError(f"{path}: no picture to write")
+        container.mux(stream.encode())
+    return count
+
+
+def add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -> Any:
+    from fractions import Fraction
+
+    rate = Fraction(fps).limit_denominator(1000)
+    stream = container.add_stream("gif" if kind == "gif" else "libx264", rate=rate)
+    stream.height, stream.width = shape
+    stream.pix_fmt = "rgb8" if kind == "gif" else "yuv420p"
+    if kind != "gif":
+        stream.options = {"crf": "16", "preset": "fast"}
+    return stream
+
+
+def even(value: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Grown by a repeated row and column to even sizes, which the codec needs."""
+    rows, columns = value.shape[:2]
+    return np.pad(value, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (value.ndim - 2)), mode="edge")
+
+
+__all__ = ["Tone", "check_path", "limits", "save_film", "save_mask", "save_picture", "save_video", "tones"]

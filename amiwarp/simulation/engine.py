@@ -1,0 +1,269 @@
+"""The simulator's engine: host tables, launches, sorting; :class:`amiwarp.simulation.simulator.Simulation` is the way in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.events.events import Events
+from amiwarp.kernels import launch as launching
+from amiwarp.kernels import sight
+from amiwarp.kernels import event_generation as kernels
+from amiwarp.kernels.structs import camera_params
+from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
+from amiwarp.simulation.scenery import MapRing, place_scene, step_us
+
+if TYPE_CHECKING:
+    from amiwarp.simulation.simulator import SensorModel, Simulation
+
+FRAMES_PER_CHUNK = 8
+
+CHUNK_US = {True: 100_000, False: 500_000}
+"""Span of a chunk [us] on a CPU (True) and on CUDA, for up to 640x480 pixels; shorter for more."""
+
+LATEST_US = 1 << 16
+"""More than a stamp can lie past its chunk's end."""
+
+CPU_RUN = 8192
+"""Consecutive pixels that a CPU thread takes together."""
+
+CUDA_SEGMENTS = 1024
+"""Buffers of events on CUDA, each for every 1024th pixel."""
+
+CACHE_LINE = 64
+"""Bytes between the counters of CPU threads, which else would wait for each other."""
+
+EVENTS_PER_PIXEL = 128
+"""Room for events in a chunk at first; it grows where it must."""
+
+
+@dataclass(slots=True)
+class DeviceBlock:
+    """Sorted events of one span, on the device."""
+
+    arrays: Any
+    """The struct :class:`amiwarp.kernels.event_generation.Block`."""
+    count: int
+
+    def to_host(self) -> tuple[Events, NDArray[np.float32]]:
+        """Events and their points without the prism, shape (n, 2)."""
+        if not self.count:
+            return Events.empty(), np.empty((0, 2), np.float32)
+        b = self.arrays
+        return Events(b.x.numpy(), b.y.numpy(), b.t.numpy(), b.p.numpy()), b.points.numpy()
+
+
+class Engine:
+    """One run of a simulation, from its start to its end."""
+
+    def __init__(self, simulation: Simulation, chunk_us: int | None = None) -> None:
+        self._simulation = simulation
+        self._device = wp.get_device(simulation.device)
+        self._pixels = simulation.camera.width * simulation.camera.height
+        self._step = step_us(simulation)
+        self._chunk_steps = self._steps_per_chunk(chunk_us)
+        self._margin = int(kernels.LARGEST_LAG) // (int(kernels.TICKS) * self._step) + 2
+        placement = place_scene(simulation)
+        self._maps = MapRing(simulation, placement)
+        self._axis = axis_rotation(*simulation.motion.tilt)
+        self._to_texel = placement.to_texel()
+        turns = bool(simulation.camera_motion.largest_rates.any())
+        self._orientation = simulation.camera_motion.orientation(simulation.duration_s) if turns else None
+        self._sensor = sensor_params(simulation.sensor, self._step)
+        self._view = sight.View()
+        self._view.camera = camera_params(simulation.camera, str(self._device))
+        self._view.prism = ExactModel(simulation.camera, simulation.prism, 0.0, simulation.motion.tilt).params(
+            self._device
+        )
+        self._view.width, self._view.height = placement.width, placement.height
+        self._state = wp.empty(self._pixels, dtype=kernels.Pixel, device=self._device)
+        self._buffer = KeyBuffer(self._pixels, self._device)
+        self._nothing: wp.array = wp.empty(0, dtype=wp.int64, device=self._device)
+        self._carry = self._nothing
+        self.now_us = 0
+
+    def _steps_per_chunk(self, chunk_us: int | None) -> int:
+        longest = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
+        interval = self._simulation.scene.frames.interval_us
+        if interval is not None:
+            longest = min(longest, int(FRAMES_PER_CHUNK * interval))
+        return max(1, longest // self._step)
+
+    def prepare(self) -> None:
+        """Read the first pictures and load the kernels, which else happens in the first span."""
+        launching.load(kernels.run_pixels, self._device)
+        self._maps.cover(0, self._chunk_steps * self._step)
+
+    def run(self) -> Iterator[DeviceBlock]:
+        """Blocks of successive spans."""
+        self.prepare()
+        total = -(-self._simulation.duration_us // self._step)
+        for first in range(0, total, self._chunk_steps):
+            count = min(self._chunk_steps, total - first)
+            steps = self._tables(first, count)
+            if first == 0:
+                self._start(steps)
+            keys = self._gather(steps, count)
+            block = self._unpack(keys, steps, first, count)
+            self.now_us = (first + count) * self._step
+            yield block
+
+    def _tables(self, first: int, count: int) -> Any:
+        """Tables of a chunk's steps, made in float64."""
+        simulation, margin = self._simulation, self._margin
+        t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
+        angle = simulation.motion.phase + simulation.motion.angle(t)
+        times, slots = self._maps.cover(first * self._step, (first + count) * self._step)
+        self._view.maps = self._maps.maps
+        before = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
+        after = np.minimum(before + 1, len(times) - 1)
+        weight = np.clip((t - times[before]) / np.maximum(times[after] - times[before], 1.0), 0.0, 1.0)
+        weight[before == after] = 0.0  # one look-up is enough
+        to_texel = self._to_texel @ self._axis
+        if self._orientation is not None:
+            to_texel = self._to_texel @ self._orientation(np.maximum(t, 0.0) * 1e-6) @ self._axis
+        steps = sight.Steps()
+        table: NDArray[Any] = np.zeros(len(t), cast("Any", sight.Step).numpy_dtype())
+        table["azimuth"] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        table["to_texel"] = to_texel
+        table["before"], table["after"], table["weight"] = slots[before], slots[after], weight
+        steps.at = wp.array(table, dtype=sight.Step, device=self._device)
+        if self._device.is_cpu:
+            steps.ahead = wp.array(instants_ahead(table[margin + 1 :]), dtype=sight.Instants, device=self._device)
+        steps.angle = self._upload(wrap_angle(angle))
+        steps.turn = self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
+        steps.per_tick = 1.0 / (self._step * int(kernels.TICKS))
+        steps.shift = int(kernels.LOW_BITS) + (self._pixels - 1).bit_length()
+        steps.margin, steps.count, steps.ticks = margin, count, self._step * int(kernels.TICKS)
+        return steps
+
+    def _upload(self, values: NDArray[np.float64]) -> wp.array:
+        return wp.array(values.astype(np.float32), dtype=float, device=self._device)
+
+    def _start(self, steps: Any) -> None:
+        inputs = [self._view, steps, self._sensor, self._simulation.seed, 0, self._state]
+        wp.launch(kernels.start_pixels, dim=self._pixels, inputs=inputs, device=self._device)
+
+    def _gather(self, steps: Any, count: int) -> wp.array:
+        """Walk through the steps; the keys of the chunk's events, sorted, those before its end."""
+        keys = self._buffer.run([self._view, steps, self._sensor, self._state], self._carry)
+        limit = min(count * self._step, self._simulation.duration_us - self.now_us)
+        total = len(keys) // 2
+        if not total:  # an empty array has no slices
+            return keys
+        top = (limit + LATEST_US).bit_length() + steps.shift
+        cut = self._sort(keys, total, limit << steps.shift, top)
+        keys, self._carry = keys[:cut], wp.clone(keys[cut:total]) if cut < total else self._nothing
+        if len(self._carry):  # on the next chunk's clock
+            wp.launch(kernels.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
+                      device=self._device)  # fmt: skip
+        return keys
+
+    def _sort(self, keys: wp.array, total: int, limit: int, top: int) -> int:
+        """Sort the first ``total`` keys, of ``top`` bits; how many are below ``limit``."""
+        if self._device.is_cpu:
+            values = keys.numpy()[:total]  # the same memory
+            values.sort()
+            return int(np.searchsorted(values, limit))
+        # no two events of a pixel share a microsecond, so the bits below the pixel need no sorting
+        order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
+        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=int(kernels.LOW_BITS), end_bit=top)
+        found = wp.empty(1, dtype=int, device=self._device)
+        wp.launch(kernels.find, dim=1, inputs=[keys, total, limit], outputs=[found], device=self._device)
+        return int(found.numpy()[0])
+
+    def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
+        n = len(keys)
+        block = kernels.Block()
+        for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8), ("points", wp.vec2)):
+            setattr(block, name, wp.empty(n, dtype=dtype, device=self._device))
+        inputs = [self._view, steps, keys, first * self._step]
+        launching.launch(kernels.unpack, n, inputs, [block], device=self._device)
+        return DeviceBlock(block, n)
+
+
+class KeyBuffer:
+    """Room for the keys of a chunk, by segments of pixels; it grows when a chunk has more events."""
+
+    def __init__(self, pixels: int, device: Any) -> None:
+        self._pixels, self._device = pixels, device
+        self._segments = -(-pixels // CPU_RUN) if device.is_cpu else min(CUDA_SEGMENTS, pixels)
+        self._sink = kernels.Sink()
+        self._sink.run = CPU_RUN if device.is_cpu else 1
+        columns = CACHE_LINE // 4 if device.is_cpu else 1
+        self._sink.count = wp.zeros((self._segments, columns), dtype=int, device=device)
+        self._reserve(EVENTS_PER_PIXEL * -(-pixels // self._segments))
+
+    def _reserve(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._sink.keys = wp.empty((self._segments, capacity), dtype=wp.int64, device=self._device)
+
+    def run(self, inputs: list[Any], carry: wp.array) -> wp.array:
+        """Run the pixels, whose state is the last of ``inputs``; the keys of their events and ``carry``, unsorted.
+
+        As many places again lie behind them, which the sorting on CUDA needs.
+        """
+        state = inputs[-1]
+        before = wp.clone(state)
+        while True:
+            self._sink.count.zero_()
+            self._launch(inputs)
+            counts = self._sink.count.numpy()[:, 0]
+            if counts.max() <= self._capacity:
+                return self._pack(counts, carry)
+            wp.copy(state, before)  # no room: once more from the start
+            self._reserve(int(counts.max()) * 5 // 4)
+
+    def _pack(self, counts: NDArray[np.int32], carry: wp.array) -> wp.array:
+        ends = np.cumsum(counts, dtype=np.int64)
+        n = int(ends[-1]) + len(carry)
+        keys = wp.empty(2 * n, dtype=wp.int64, device=self._device)
+        if self._device.is_cpu:
+            rows = self._sink.keys.numpy()
+            parts = [row[:count] for row, count in zip(rows, counts.tolist(), strict=True)]
+            np.concatenate([*parts, carry.numpy()], out=keys.numpy()[:n])
+            return keys
+        offset = wp.array((ends - counts).astype(np.int32), dtype=int, device=self._device)
+        wp.launch(kernels.pack, dim=(self._segments, int(counts.max())), inputs=[self._sink, offset, keys],
+                  device=self._device)  # fmt: skip
+        if len(carry):
+            wp.copy(keys, carry, dest_offset=int(ends[-1]))
+        return keys
+
+    def _launch(self, inputs: list[Any]) -> None:
+        kernel = kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
+
+        def run(start: int, stop: int) -> None:
+            wp.launch(kernel, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)
+
+        if not self._device.is_cpu:
+            run(0, self._pixels)
+            return
+        starts = range(0, self._pixels, CPU_RUN)
+        list(launching.pool().map(run, starts, [min(start + CPU_RUN, self._pixels) for start in starts]))
+
+
+def instants_ahead(table: NDArray[Any]) -> NDArray[np.float32]:
+    """Azimuths and matrices of a table of instants, in blocks, shape (n, 11, 16); the last is repeated to fill up."""
+    ahead = int(sight.AHEAD)
+    columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9)], axis=1)
+    filled = np.concatenate([columns, np.repeat(columns[-1:], -len(columns) % ahead, axis=0)])
+    return np.ascontiguousarray(filled.reshape(-1, ahead, 11).swapaxes(1, 2))
+
+
+def sensor_params(sensor: SensorModel, step: int) -> Any:
+    """The sensor in the kernels' units: ticks of 1/16 us, and steps of ``step`` [us]."""
+    ticks = float(kernels.TICKS)
+    s = kernels.SensorParams()
+    s.on, s.off, s.mismatch = sensor.contrast_on, sensor.contrast_off, sensor.mismatch
+    s.leak = sensor.leak_hz * step * 1e-6
+    s.noise = sensor.shot_noise_hz * 1e-6 / ticks
+    s.hot_fraction, s.hot = sensor.hot_fraction, sensor.hot_hz * 1e-6 / ticks
+    s.refractory = round(sensor.refractory_us * ticks)
+    s.latency, s.jitter = sensor.latency_us * ticks, sensor.latency_jitter_us * ticks
+    return s

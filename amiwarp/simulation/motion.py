@@ -1,0 +1,192 @@
+"""What moves in a simulation: the prism, the camera, and the encoder that watches the prism."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.optics.prism import check_phase, check_tilt
+from amiwarp.validation import array, real, whole
+
+ROTATION_INTERVAL = 1e-3
+"""Interval at which a changing rate of rotation is integrated [s]."""
+LARGEST_SPEED = 1e9
+"""Largest speed of a prism [turns/min], and of a camera's rotation [rad/s]: more is a mistake."""
+LONGEST_S = 86400.0
+"""Longest simulation [s]."""
+LARGEST_OFFSET_US = 1e7
+"""Largest offset between the clocks [us]: the encoder is sampled for so much longer on either side."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrismMotion:
+    """How the prism turns: its tilt azimuth is ``phase + angle(t)``, and ``angle(0) = 0``."""
+
+    rpm: float | ArrayLike = 720.0
+    """Speed [turns/min], negative backwards; or a table of rows (time [s], speed), linear between, constant outside."""
+    phase: float = 0.0
+    """Azimuth at angle 0, θ_b [rad]."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """Tilt of the axis of rotation about the camera's x and y [rad], as in :class:`amiwarp.optics.models.ExactModel`."""
+
+    def __post_init__(self) -> None:
+        _check_table("prism speed", self._table())
+        object.__setattr__(self, "phase", check_phase(self.phase, "prism phase"))
+        object.__setattr__(self, "tilt", check_tilt(self.tilt))
+
+    @classmethod
+    def from_function(
+        cls,
+        rpm: Callable[[NDArray[np.float64]], ArrayLike],
+        duration_s: float,
+        *,
+        phase: float = 0.0,
+        tilt: tuple[float, float] = (0.0, 0.0),
+    ) -> PrismMotion:
+        """Speed as a function of times [s], sampled each millisecond from 0 to past ``duration_s``."""
+        duration_s = real(duration_s, "duration_s", 0.0, LONGEST_S, " s")
+        t = np.arange(math.ceil(duration_s * 1e3) + 2, dtype=np.float64) * 1e-3
+        speed = array(rpm(t), "prism speed")
+        if speed.shape not in ((), t.shape):
+            raise AmiwarpError(f"prism speed has shape {speed.shape}; return one number, or one per time, {t.shape}")
+        return cls(np.column_stack([t, np.broadcast_to(speed, t.shape)]), phase, tilt)
+
+    def _table(self) -> NDArray[np.float64]:
+        """Rows (time [s], speed [rad/s])."""
+        rpm = array(self.rpm, "prism speed").astype(np.float64)
+        table = np.array([[0.0, rpm], [1.0, rpm]]) if rpm.ndim == 0 else rpm
+        return table * np.array([1.0, TURN / 60.0]) if table.ndim == 2 and table.shape[1] == 2 else table
+
+    def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Unwrapped angle [rad] at times [us]: the exact integral of the speed."""
+        at, speed = self._table().T
+        before = np.concatenate([[0.0], np.cumsum(np.diff(at) * (speed[1:] + speed[:-1]) / 2.0)])
+
+        def integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
+            inside = np.clip(t, at[0], at[-1])
+            i = np.clip(np.searchsorted(at, inside, side="right") - 1, 0, len(at) - 2)
+            mean = (speed[i] + np.interp(inside, at, speed)) / 2.0
+            return before[i] + mean * (inside - at[i]) + np.interp(t, at, speed) * (t - inside)
+
+        return np.asarray(integral(np.asarray(t_us, np.float64) * 1e-6) - integral(np.zeros(1)))
+
+    @property
+    def largest_speed(self) -> float:
+        """Largest magnitude of the speed [rad/s]."""
+        return float(np.abs(self._table()[:, 1]).max())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraMotion:
+    """How the camera turns about its own axes, from the orientation in which it faces the picture at t = 0."""
+
+    rates: ArrayLike = (0.0, 0.0, 0.0)
+    """Angular velocity in the camera's frame [rad/s]; or rows (time [s], ωx, ωy, ωz), as the speed of the prism."""
+
+    def __post_init__(self) -> None:
+        _check_table("camera rotation", self._table(), columns=4)
+
+    def _table(self) -> NDArray[np.float64]:
+        rates = array(self.rates, "camera rotation").astype(np.float64)
+        return np.array([[0.0, *rates], [1.0, *rates]]) if rates.shape == (3,) else rates
+
+    @property
+    def largest_rates(self) -> NDArray[np.float64]:
+        """Largest magnitude of each rate [rad/s], shape (3,)."""
+        return np.asarray(np.abs(self._table()[:, 1:]).max(axis=0))
+
+    @property
+    def constant(self) -> bool:
+        """Whether the rates never change."""
+        return bool((self._table()[:, 1:] == self._table()[0, 1:]).all())
+
+    def orientation(self, duration_s: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+        """Function of times [s], 0 to ``duration_s``: matrices (n, 3, 3) from the camera's frame to the picture's."""
+        from scipy.spatial.transform import Rotation
+
+        table = self._table()
+        if self.constant:
+            return lambda t: np.asarray(Rotation.from_rotvec(np.outer(t, table[0, 1:])).as_matrix())
+        step = ROTATION_INTERVAL
+        grid = np.arange(math.ceil(duration_s / step) + 2) * step
+        rates = np.stack([np.interp(grid + step / 2.0, table[:, 0], column) for column in table[:, 1:].T], axis=1)
+        nodes = [np.eye(3)]
+        for matrix in Rotation.from_rotvec(rates * step).as_matrix()[:-1]:
+            nodes.append(nodes[-1] @ matrix)
+        corners = np.stack(nodes)
+
+        def at(t: NDArray[np.float64]) -> NDArray[np.float64]:
+            i = np.clip((t / step).astype(np.int64), 0, len(grid) - 1)
+            rest = Rotation.from_rotvec(rates[i] * (t - grid[i])[:, None]).as_matrix()
+            return np.asarray(corners[i] @ rest)
+
+        return at
+
+
+def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> None:
+    if table.ndim != 2 or table.shape[1] != columns or len(table) < 2:
+        raise AmiwarpError(f"{what} has shape {table.shape}; give one value or at least 2 rows of {columns} numbers")
+    if not (np.abs(table) <= LARGEST_SPEED).all():  # NaN fails
+        worst = table[~(np.abs(table) <= LARGEST_SPEED)][0]
+        raise AmiwarpError(f"{what} holds {worst:g}; expected finite numbers within {LARGEST_SPEED:g} either way")
+    if not (np.diff(table[:, 0]) > 0).all():
+        raise AmiwarpError(f"{what}: the times of its rows do not rise; sort them")
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderModel:
+    """What is wrong with an encoder. Raises :class:`AmiwarpError` for values that make no sense."""
+
+    counts_per_turn: int | None = 8192
+    """Resolution: the angle is rounded to the nearest count; None for none."""
+    rate_hz: float = 1000.0
+    """Samples per second."""
+    jitter_us: float = 1.0
+    """Standard deviation of a sample's time stamp [us]."""
+    clock_offset_us: float = 0.0
+    """Encoder's clock minus the camera's [us]."""
+    dropouts_hz: float = 0.0
+    """Mean number of drop-outs per second."""
+    dropout_us: float = 5000.0
+    """Time for which a drop-out loses all samples [us]."""
+
+    def __post_init__(self) -> None:
+        if self.counts_per_turn is not None:
+            counts = whole(self.counts_per_turn, "encoder counts_per_turn", 1, 2**31, ", or None")
+            object.__setattr__(self, "counts_per_turn", counts)
+        limits = {"rate_hz": (0.1, 1e6), "jitter_us": (0.0, 1e6), "dropouts_hz": (0.0, 1e5), "dropout_us": (0.0, 1e9),
+                  "clock_offset_us": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US)}  # fmt: skip
+        for name, (low, high) in limits.items():
+            object.__setattr__(self, name, real(getattr(self, name), f"encoder {name}", low, high))
+
+    @classmethod
+    def ideal(cls) -> EncoderModel:
+        """No rounding, no jitter."""
+        return cls(counts_per_turn=None, jitter_us=0.0)
+
+    def sample(self, motion: PrismMotion, duration_us: int, seed: int) -> Encoder:
+        """The samples of a recording from 0 to ``duration_us`` on the camera's clock, with some to spare.
+
+        Their times are the encoder's; the offset between the clocks is not told, :class:`Encoder` starts from 0.
+        """
+        rng = np.random.default_rng([seed, 0xE2C])  # its own stream, apart from the pixels'
+        interval = 1e6 / self.rate_hz
+        spare = math.ceil((abs(self.clock_offset_us) + 8.0 * self.jitter_us) / interval) + 2
+        true_t = np.rint(np.arange(-spare, math.ceil(duration_us / interval) + spare + 1) * interval).astype(np.int64)
+        angle = motion.angle(true_t - self.clock_offset_us)
+        if self.counts_per_turn is not None:
+            angle = np.rint(angle * (self.counts_per_turn / TURN)) * (TURN / self.counts_per_turn)
+        stamp = true_t + np.rint(rng.normal(0.0, self.jitter_us, len(true_t))).astype(np.int64)
+        kept = np.ones(len(stamp), np.bool_)
+        for start in rng.uniform(0.0, duration_us, rng.poisson(self.dropouts_hz * duration_us * 1e-6)):
+            kept &= (true_t < start) | (true_t >= start + self.dropout_us)
+        kept[[0, -1]] = True
+        stamp, angle = stamp[kept], angle[kept]
+        rising = np.concatenate([[True], stamp[1:] > np.maximum.accumulate(stamp)[:-1]])
+        return Encoder(stamp[rising], angle[rising])

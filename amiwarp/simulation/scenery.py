@@ -1,0 +1,198 @@
+"""What is seen in a simulation: where the picture lies, how fast the image moves, the maps on the device."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import sight
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.structs import camera_params
+from amiwarp.optics.models import ExactModel
+from amiwarp.simulation.pictures import Placement, log_map, place
+
+if TYPE_CHECKING:
+    from amiwarp.simulation.simulator import Simulation
+
+LARGEST_MOTION = 0.5
+"""Nothing moves further in one step [px]."""
+
+LONGEST_STEP = 2000
+"""Steps are no longer than this even where nothing moves [us]."""
+
+STEPS_PER_FRAME = 4
+"""Steps between two pictures of a sequence, at least."""
+
+TEXELS_PER_PIXEL = 1.75
+SMALLEST_COSINE = 0.25
+"""Of the angle between a bearing and the picture's axis: a plane does not reach round the camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Speeds across the image."""
+
+    prism: float
+    """Largest motion per angle of the prism [px/rad]."""
+    camera: NDArray[np.float64]
+    """Largest motion per angle of the camera about each of its axes [px/rad], shape (3,)."""
+
+
+def step_us(simulation: Simulation) -> int:
+    """Length of a step [us] in which nothing moves more than half a pixel."""
+    motion = image_motion(simulation)
+    rates = simulation.camera_motion.largest_rates
+    speed = motion.prism * simulation.motion.largest_speed + float(motion.camera @ rates)
+    step = min(float(LONGEST_STEP), 1e6 * LARGEST_MOTION / max(speed, 1e-9))
+    interval = simulation.scene.frames.interval_us
+    if interval is not None:
+        step = min(step, interval / STEPS_PER_FRAME)
+    if step < 1.0:
+        raise AmiwarpError(f"the image moves at {speed:.3g} px/s, over half a pixel a microsecond; slow it down")
+    return int(step)
+
+
+def image_motion(simulation: Simulation) -> Motion:
+    """Motion on a grid of pixels that includes the corners, over one turn."""
+    camera, device = simulation.camera, simulation.device
+    grid = np.stack(
+        [m.ravel() for m in np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))], 1
+    )
+    turns = 72
+    theta = np.linspace(0.0, 2.0 * np.pi, turns + 1)
+    model = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt)
+    xy = wp.array(np.repeat(grid, turns + 1, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
+    angles = wp.array(np.tile(theta, len(grid)).astype(np.float32), dtype=float, device=device)
+    path = model.compensate_points(xy, angles).numpy().reshape(len(grid), turns + 1, 2)
+    arc = (theta[1] / 2.0) / math.sin(theta[1] / 2.0)  # a step along a circle is longer than its chord
+    along = np.linalg.norm(np.diff(path, axis=1), axis=2)
+    prism = float(np.max(along, initial=0.0, where=np.isfinite(along))) * arc / theta[1]
+    return Motion(prism, _camera_motion(simulation, grid))
+
+
+def _camera_motion(simulation: Simulation, grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    camera = simulation.camera
+    rays = camera.pixels_to_rays(wp.array(grid.astype(np.float32), dtype=wp.vec2, device=simulation.device)).numpy()
+    angle = 1e-2
+    result = []
+    for axis in np.eye(3, dtype=np.float32):
+        turned = wp.array(rays + angle * np.cross(axis, rays), dtype=wp.vec3, device=simulation.device)
+        distance = np.linalg.norm(camera.rays_to_pixels(turned).numpy() - grid, axis=1) / angle
+        result.append(float(np.max(distance, initial=0.0, where=np.isfinite(distance))))
+    return np.array(result) * 1.02  # the grid and the finite angle may miss the very largest
+
+
+def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
+    """Bearings in the camera's frame that the border of the image sees over a turn of the prism, shape (n, 3)."""
+    camera, device = simulation.camera, simulation.device
+    right, bottom = camera.width - 1.0, camera.height - 1.0
+    along = np.linspace(0.0, 1.0, 33)
+    zero, one = np.zeros(33), np.ones(33)
+    border = np.concatenate(
+        [np.stack([x * right, y * bottom], 1) for x, y in ((along, zero), (along, one), (zero, along), (one, along))]
+    )
+    border = np.round(border)
+    theta = np.arange(24) * (2.0 * np.pi / 24)
+    xy = wp.array(np.repeat(border, 24, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
+    angles = wp.array(np.tile(theta, len(border)).astype(np.float32), dtype=float, device=device)
+    out = wp.empty(len(xy), dtype=wp.vec3, device=device)
+    prism = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt).params(device)
+    inputs = [camera_params(camera, str(wp.get_device(device))), prism, xy, angles]
+    launch(sight.scene_bearings, len(xy), inputs, [out], device=device)
+    bearings = out.numpy().astype(np.float64)
+    return np.asarray(bearings[np.isfinite(bearings).all(axis=1)])
+
+
+def place_scene(simulation: Simulation) -> Placement:
+    """Where the picture lies, so that all that is ever seen is on it. Raises where the camera turns away from it."""
+    bearings = seen_bearings(simulation)
+    if not len(bearings):
+        raise AmiwarpError("no pixel at the image's border has a ray; check the camera's distortion and the prism")
+    duration = simulation.duration_s
+    at = simulation.camera_motion.orientation(duration)(np.linspace(0.0, duration, 400))
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for orientation in at if simulation.camera_motion.largest_rates.any() else at[:1]:
+        x, y, z = orientation @ bearings.T
+        if z.min() < SMALLEST_COSINE:
+            angle = math.degrees(math.acos(max(-1.0, float(z.min()))))
+            limit = math.degrees(math.acos(SMALLEST_COSINE))
+            raise AmiwarpError(f"the camera looks up to {angle:.0f} deg away from the picture's centre, which ends at "
+                               f"{limit:.0f} deg; turn it less far, or narrow its field of view")  # fmt: skip
+        plane = np.stack([x / z, y / z])
+        low, high = np.minimum(low, plane.min(axis=1)), np.maximum(high, plane.max(axis=1))
+    focal = max(simulation.camera.fx, simulation.camera.fy)
+    spare = 2.0 / focal
+    view = (*(low - spare).tolist(), *(high + spare).tolist())
+    return place(simulation.scene.frames.size, view, TEXELS_PER_PIXEL * focal, fov=simulation.scene.fov)
+
+
+class MapRing:
+    """The maps of the pictures around a span of time, read as they are needed; each has a slot on the device."""
+
+    def __init__(self, simulation: Simulation, placement: Placement) -> None:
+        focal = max(simulation.camera.fx, simulation.camera.fy)
+        self._blur = simulation.scene.blur * math.sqrt(placement.pitch[0] * placement.pitch[1]) / focal
+        self._placement = placement
+        self._frames = simulation.scene.frames.read()
+        self._device = simulation.device
+        self._texels = placement.width * placement.height
+        self._held: list[tuple[int, int]] = []  # time [us], slot
+        self._free: list[int] = []
+        self.maps: wp.array = wp.empty(0, dtype=wp.vec4, device=self._device)
+
+    def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Times [us] and slots of the maps around ``start`` .. ``stop``, at least one."""
+        while not self._held or self._held[-1][0] < stop:
+            following = next(self._frames, None)
+            if following is None:
+                break
+            if len(self._held) > 1 and self._held[1][0] <= start:
+                self._free.append(self._held.pop(0)[1])
+            slot = self._slot()
+            pieces = bilinear_pieces(log_map(following[1], self._placement, self._blur)).reshape(-1, 4)
+            wp.copy(self.maps, wp.array(pieces, dtype=wp.vec4, device=self._device), dest_offset=slot * self._texels)
+            self._held.append((following[0], slot))
+        while len(self._held) > 1 and self._held[1][0] <= start:
+            self._free.append(self._held.pop(0)[1])
+        times, slots = zip(*self._held, strict=True)
+        return np.array(times, np.float64), np.array(slots, np.int32)
+
+    def _slot(self) -> int:
+        if not self._free:
+            slots = len(self.maps) // self._texels
+            grown = wp.empty((2 * slots or 1) * self._texels, dtype=wp.vec4, device=self._device)
+            wp.copy(grown, self.maps, count=len(self.maps))
+            self._free.extend(range(slots, 2 * slots or 1))
+            self.maps = grown
+        return self._free.pop()
+
+
+def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Coefficients of 1, x, y, xy between each texel and its right and lower neighbours, shape (height, width, 4)."""
+    pieces = np.zeros((*texels.shape, 4), np.float32)
+    pieces[..., 0] = texels
+    pieces[:, :-1, 1] = np.diff(texels, axis=1)
+    pieces[:-1, :, 2] = np.diff(texels, axis=0)
+    pieces[:-1, :, 3] = np.diff(pieces[..., 1], axis=0)
+    return pieces
+
+
+def log_view(simulation: Simulation) -> NDArray[np.float32]:
+    """The first picture as the camera would see it with no prism, at t = 0: log intensity, shape (height, width)."""
+    camera, device = simulation.camera, wp.get_device(simulation.device)
+    placement = place_scene(simulation)
+    ring = MapRing(simulation, placement)
+    ring.cover(0, 0)
+    view = sight.View()
+    view.camera, view.maps = camera_params(camera, str(device)), ring.maps
+    view.width, view.height = placement.width, placement.height
+    out = wp.empty(camera.width * camera.height, dtype=float, device=device)
+    inputs = [view, wp.mat33(*placement.to_texel().ravel().tolist())]
+    launch(sight.see_without_prism, len(out), inputs, [out], device=device)
+    return np.asarray(out.numpy().reshape(camera.height, camera.width))

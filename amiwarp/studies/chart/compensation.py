@@ -1,0 +1,267 @@
+"""The compensation's rows: models, votes, angles and shares into an image; other libraries; whole files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from amiwarp.calib.presets import simplified
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.device_events import TURNS, upload_events
+from amiwarp.imaging.warped_image import CanvasShape, Image, Vote, Votes
+from amiwarp.optics.models import MODELS, Model
+from amiwarp.studies.chart.rows import Row, Task, measure
+from amiwarp.studies.chart.truth import Known, exact_image, exact_places, raw_places, rms
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib import Calibration
+
+IMAGE, FILE = "image of events", "file to file"
+ANGLES = (TURNS, 4096, 1024, 256)
+"""Angles of a turn that are told apart."""
+SHARES = (4, 16)
+"""Every so many events make the image."""
+SAMPLE = 200_000
+"""At most so many events, thinned evenly, measure an error."""
+MANY = 64_000_000
+"""On CUDA the recording is repeated to about so many events: fewer would measure the launches."""
+REST_S = 0.02
+"""Threads of other libraries spin a while after their work."""
+WRONG = 0.02
+"""Difference of the exact model's bilinear image from the float64 one, above which something is broken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Some of the recording's events with their exact places."""
+
+    known: Known
+    step: int
+    xy: NDArray[np.float64]
+    theta: NDArray[np.float64]
+    exact: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, known: Known) -> Sample:
+        step = -(-len(known.events) // SAMPLE)
+        some = known.events[::step]
+        xy, theta = raw_places(some), known.encoder.angle_at(some.t)
+        return cls(known, step, xy, theta, exact_places(known.model, xy, theta))
+
+    def error(self, places: NDArray[np.floating[Any]], vote: Vote) -> float:
+        """Rms distance [px] of ``places`` (n, 2) from the exact ones; a nearest vote adds what it rounds."""
+        voted = np.rint(places) if vote is Vote.NEAREST else places
+        return rms(voted - self.exact)
+
+
+def coarse(theta: NDArray[np.float64], angles: int) -> NDArray[np.float64]:
+    """Angles [rad] rounded to so many a turn."""
+    step = 2.0 * math.pi / angles
+    return np.asarray(np.rint(theta / step) * step)
+
+
+class Uploads:
+    """The recording's events on the device under different angles and shares, each uploaded once."""
+
+    def __init__(self, known: Known, device: str) -> None:
+        import warp as wp
+
+        self.known, self.device = known, device
+        copies = 1 if wp.get_device(device).is_cpu else max(1, MANY // len(known.events))
+        self.events = known.events if copies == 1 else _repeated(known, copies)
+        self.theta = np.tile(known.encoder.angle_at(known.events.t), copies)
+        self.copies = copies
+        self._made: dict[tuple[int, int], Any] = {}
+
+    def get(self, angles: int, share: int) -> Any:
+        if (angles, share) not in self._made:
+            theta = coarse(self.theta[::share], angles)
+            self._made[angles, share] = upload_events(self.events[::share], theta, self.device)
+        return self._made[angles, share]
+
+
+def _repeated(known: Known, copies: int) -> Any:
+    e = known.events
+    return replace(e, **{n: np.tile(getattr(e, n), copies) for n in ("x", "y", "t", "p")})
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to an image."""
+
+    model: str
+    vote: Vote
+    angles: int = TURNS
+    share: int = 1
+
+    @property
+    def label(self) -> str:
+        words = [self.model, self.vote.value]
+        words += [] if self.angles == TURNS else [f"{self.angles} angles"]
+        words += [] if self.share == 1 else [f"1/{self.share} of events"]
+        return ", ".join(words)
+
+    def fields(self, device: str) -> dict[str, Any]:
+        """Of the row."""
+        settings = {"model": self.model, "vote": self.vote.value, "angles": self.angles, "share": 1.0 / self.share,
+                    "device": device}  # fmt: skip
+        default = self == Setting("exact", Vote.BILINEAR)
+        return {"chart": "compensation", "job": IMAGE, "label": self.label, "family": self.model, "mark": self._mark,
+                "settings": settings, "default": default, "comparable": self.share == 1}  # fmt: skip
+
+    @property
+    def _mark(self) -> str:
+        return self.vote.value if self.share == 1 else "share of events"
+
+
+def settings(*, quick: bool) -> list[Setting]:
+    """The sensible combinations."""
+    angles, models = (ANGLES[::2], ("circle", "exact")) if quick else (ANGLES, tuple(MODELS))
+    # a nearest vote rounds away what coarse angles cost
+    whole = [Setting(m, v, a) for m in models for v in Vote for a in (angles if v is Vote.BILINEAR else angles[:1])]
+    return whole + [Setting("exact", Vote.BILINEAR, TURNS, share) for share in SHARES]
+
+
+@dataclass(frozen=True, eq=False)
+class LibraryTask:
+    """The same image made by another library."""
+
+    task: Task
+    places: Callable[[slice], NDArray[np.float32]]
+    """Give the places [px], shape ``(n, 2)``, to which the library moves the events of a slice."""
+
+
+Libraries: TypeAlias = Callable[["Sample", "Uploads", str], tuple[list[LibraryTask], list[str]]]
+"""Make the tasks of other libraries from a sample, its uploads and a device, and notes on those left out."""
+
+
+def rows(
+    known: Known,
+    device: str,
+    *,
+    repeats: int,
+    quick: bool,
+    tell: Callable[[str, float], None],
+    folder: Path,
+    libraries: Libraries | None = None,
+) -> tuple[list[Row], list[str]]:
+    """Measure all rows; return them with notes on what is missing. Temporary files go to ``folder``.
+
+    Raises :class:`AmiwarpError` where the exact model's image is not the float64 one.
+    """
+    tell("measuring images of events: the truth", 0.0)
+    sample, truth = Sample.of(known), exact_image(known)
+    models = {name: simplified(known.calibration(), name).model for name in MODELS}
+    uploads, ways = Uploads(known, device), settings(quick=quick)
+    others, notes = libraries(sample, uploads, device) if libraries is not None else ([], [])
+    tasks = [*_image_tasks(ways, models, uploads, device), *(other.task for other in others)]
+    timed = measure(tasks, repeats, lambda share: tell("measuring images of events", share), rest_s=REST_S)
+    out = []
+    for t, way in zip(timed, ways, strict=False):
+        places = _places(models[way.model], sample, way.angles, device)
+        image = _image_error(t.result, truth, uploads.copies / way.share)
+        out.append(t.row(sample.error(places, way.vote), image_error=image))
+    for t, other in zip(timed[len(ways) :], others, strict=True):
+        places = other.places(slice(0, len(known.events), sample.step)).astype(np.float64)
+        image = _image_error(t.result, truth, t.task.events / len(known.events))
+        out.append(t.row(sample.error(places, Vote.BILINEAR), image_error=image))
+    _check(out)
+    files, missing = _file_rows(sample, device, repeats, quick, tell, folder)
+    return out + files, notes + missing
+
+
+def _image_tasks(ways: list[Setting], models: dict[str, Model], uploads: Uploads, device: str) -> Iterator[Task]:
+    import warp as wp
+
+    camera = uploads.known.camera
+    buffers = {}
+    for vote in Vote:
+        canvas = CanvasShape(camera.width, camera.height, vote=vote)
+        buffers[vote] = Votes(canvas, device), Image(canvas, 1, device)
+
+    def run(way: Setting) -> Image:
+        votes, image = buffers[way.vote]
+        votes.clear()
+        votes.add_events(models[way.model], uploads.get(way.angles, way.share))
+        votes.read(image)
+        wp.synchronize_device(device)
+        return image
+
+    for way in ways:
+        fields = way.fields(device)
+        yield Task(partial(run, way), len(uploads.theta), fields, lambda image: image.numpy()[0])
+
+
+def _places(model: Model, sample: Sample, angles: int, device: str) -> NDArray[np.float64]:
+    """By the functions that the votes call, on the same device, at the angles that the events have."""
+    import warp as wp
+
+    from amiwarp.optics.models import wrap_angle
+
+    theta = wrap_angle(coarse(sample.theta, angles)).astype(np.float32)
+    xy = wp.array(sample.xy.astype(np.float32), dtype=wp.vec2, device=device)
+    return model.compensate_points(xy, wp.array(theta, dtype=float, device=device)).numpy().astype(np.float64)
+
+
+def _image_error(image: NDArray[Any], truth: NDArray[np.float64], times: float) -> float:
+    """Rms difference of an image of ``times`` the events, over the true one's standard deviation."""
+    return float(np.sqrt(np.mean((image / times - truth) ** 2)) / np.std(truth))
+
+
+def _check(rows: list[Row]) -> None:
+    default = next(row for row in rows if row.default)
+    if default.image_error is None or not default.image_error < WRONG:
+        raise AmiwarpError(
+            f"the image by {default.label} differs from the float64 one by {default.image_error} of its contrast; "
+            "this device computes something else: run the tests on it"
+        )
+
+
+def circle(sample: Sample) -> tuple[float, float]:
+    """Radius [px] and phase [rad] of the pixels' circle that is nearest to the exact displacement of the events."""
+    moved = (sample.xy - sample.exact) @ (1.0, 1.0j)
+    best = complex(np.nanmean(moved * np.exp(-1j * sample.theta)))
+    return abs(best), float(np.angle(best))
+
+
+def _file_rows(
+    sample: Sample, device: str, repeats: int, quick: bool, tell: Callable[[str, float], None], folder: Path
+) -> tuple[list[Row], list[str]]:
+    """Whole files by each model, reading and writing included; the error is that of the file that was written."""
+    from amiwarp.compensation.recordings import compensate
+    from amiwarp.io import open_recording, save_recording
+    from amiwarp.io.output import scratch_folder
+
+    if missing := [name for name in ("h5py", "hdf5plugin") if find_spec(name) is None]:
+        return [], [f"files: left out, {' and '.join(missing)} not installed"]
+    known = sample.known
+
+    def error(path: Path) -> float:
+        events = open_recording(path).events.slice(0, len(known.events))
+        return sample.error(raw_places(events[:: sample.step]), Vote.BILINEAR)
+
+    def run(calibration: Calibration) -> Path:
+        compensate(source, calibration, place / "out.h5", device=device, overwrite=True)
+        return place / "out.h5"
+
+    with scratch_folder(folder) as place:
+        save_recording(place / "in.h5", replace(known.recording, truth=None))
+        source = open_recording(place / "in.h5")
+        tasks = []
+        for model in ("circle", "exact") if quick else MODELS:
+            calibration = simplified(known.calibration(), model)
+            fields = {"chart": "compensation", "job": FILE, "label": f"{model}, file to file", "family": model,
+                      "mark": FILE, "settings": {"model": model, "device": device},
+                      "default": model == "exact"}  # fmt: skip
+            tasks.append(Task(partial(run, calibration), len(known.events), fields, error))
+        timed = measure(tasks, repeats, lambda share: tell("measuring files", share))
+        return [t.row(t.result) for t in timed], []

@@ -1,0 +1,7 @@
+"""The choice of prism and speed for a camera, before either is bought."""
+
+from amiwarp.studies.design.choice import Choice, Design, Limits, Timing, design
+from amiwarp.studies.design.orbit import Orbit
+from amiwarp.studies.design.volume import Volume
+
+__all__ = ["Choice", "Design", "Limits", "Orbit", "Timing", "Volume", "design"]

@@ -1,0 +1,39 @@
+"""What a figure was measured on: the processor or GPU, and versions of the packages that matter."""
+
+from __future__ import annotations
+
+import platform
+import re
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+
+from amiwarp.kernels.cores import cpu_threads
+
+
+def processor() -> str:
+    """Name of the CPU."""
+    info = Path("/proc/cpuinfo")
+    found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
+    return (found.group(1) if found else platform.processor() or platform.machine()).strip()
+
+
+def machine(device: str) -> str:
+    """The GPU's name, or the processor's with the cores that may be used."""
+    import warp as wp
+
+    there = wp.get_device(device)
+    return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Of amiwarp, Python and those of the packages that are installed."""
+    from amiwarp._version import __version__
+
+    out = {"amiwarp": __version__, "python": platform.python_version()}
+    for name in packages:
+        try:
+            out[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return out

@@ -1,0 +1,13 @@
+"""The atlas of failures: recordings simulated along each axis that breaks calibration, and how methods fare."""
+
+from amiwarp.studies.stability.cells import METHODS, Cell, Method, Outcome, Result, Store, Stored, identity, run_cell
+from amiwarp.studies.stability.conditions import AXES, Axis, Condition, make, sensible
+from amiwarp.studies.stability.figures import draw
+from amiwarp.studies.stability.report import Atlas, aggregate, load, summary
+from amiwarp.studies.stability.run import QUICK_METHODS, chosen, quick_axes, run
+
+__all__ = [
+    "AXES", "METHODS", "QUICK_METHODS", "Atlas", "Axis", "Cell", "Condition", "Method", "Outcome", "Result", "Store",
+    "Stored", "aggregate", "chosen", "draw", "identity", "load", "make", "quick_axes", "run", "run_cell", "sensible",
+    "summary",
+]  # fmt: skip

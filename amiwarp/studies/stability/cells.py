@@ -1,0 +1,234 @@
+"""One cell of the atlas: a condition, a seed, and what each method makes of that recording."""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+import json
+import math
+import time
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from amiwarp._version import __version__
+from amiwarp.calib import Settings, calibrate
+from amiwarp.calib.paper_method import calibrate_as_paper
+from amiwarp.calib.parameters import build_model, size_name
+from amiwarp.calib.presets import settings_to
+from amiwarp.calib.selection.smaller_models import Places
+from amiwarp.calib.sharpness.search import AUTO, STAGES
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.metrics import model_error
+from amiwarp.imaging.sharpness_costs import Sharpness
+from amiwarp.io.output import write_text
+from amiwarp.optics.models import ExactModel, predicted_error
+from amiwarp.studies.machine import machine
+from amiwarp.studies.stability.conditions import Condition, Sample, make
+
+if TYPE_CHECKING:
+    from amiwarp.calib import Calibration
+
+LIMIT_PX = 0.1
+"""A success is nearer to the truth than this, or than"""
+BEST_FIT = 1.5
+"""times what the best fit of the same model to the truth leaves."""
+FORMAT = 1
+"""Of a stored cell; part of its identity."""
+
+
+class Outcome(enum.StrEnum):
+    """What came of a calibration."""
+
+    SUCCESS = "success"
+    REFUSAL = "refusal"
+    """A clear error."""
+    SILENT = "silent failure"
+    """An answer that is wrong, with nothing said; a crash counts as such."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to calibrate; no settings: the paper's."""
+
+    name: str
+    settings: Settings | None
+
+    @property
+    def model(self) -> str:
+        """The largest that an answer can be of."""
+        if self.settings is None:
+            return "circle"
+        return "exact" if self.settings.model == AUTO else self.settings.model
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return (
+            {"method": "paper"}
+            if self.settings is None
+            else settings_to(self.settings) | {"sharpness": self.settings.sharpness.value}
+        )
+
+    def run(self, sample: Sample, condition: Condition, seed: int, device: str) -> Calibration:
+        """Raises :class:`AmiwarpError` where the method refuses."""
+        if self.settings is None:
+            return calibrate_as_paper(sample.recording, start=sample.hardware, device=device)
+        known = sample.hardware if condition.start != "none" else {}
+        return calibrate(sample.recording, replace(self.settings, seed=seed, start=known), device=device)
+
+
+_SHARP = Settings(model="exact", stages=STAGES[:1])
+METHODS = (
+    Method("default", Settings()),
+    Method("paper", None),
+    Method("sharpness", _SHARP),
+    Method("circle", Settings(model="circle")),
+    Method("gradient", replace(_SHARP, sharpness=Sharpness.GRADIENT)),
+    Method("entropy", replace(_SHARP, sharpness=Sharpness.ENTROPY)),
+    Method("J by DIRECT", replace(_SHARP, sharpness=Sharpness.PAPER_J)),
+    Method("CRS + Sbplx", replace(_SHARP, global_algorithm="GN_CRS2_LM", local_algorithm="LN_SBPLX")),
+)
+"""Cost × model × algorithms, sharpness alone and with the photometric stage; the paper's always among them."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a method made of a recording."""
+
+    outcome: Outcome
+    error_px: float | None
+    """Model error against the truth; None where there was no answer."""
+    limit_px: float
+    seconds: float
+    message: str = ""
+    """The refusal, or the answer's warnings."""
+    machine: str = ""
+    """On which it was run."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {**asdict(self), "outcome": self.outcome.value}
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Result:
+        return cls(**{**data, "outcome": Outcome(data["outcome"])})
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A condition and a seed."""
+
+    condition: Condition
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.condition.key}_{self.seed}"
+
+
+@dataclass
+class Stored:
+    """What is known of a cell."""
+
+    cell: Cell
+    events: int = 0
+    results: dict[str, Result] = field(default_factory=dict)
+    """By :func:`identity` of the method."""
+
+
+def identity(method: Method) -> str:
+    """Tells methods apart by their settings, and by the version that ran them."""
+    text = json.dumps([FORMAT, __version__, method.identity], sort_keys=True, default=str)
+    return f"{method.name} {hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
+    """Makes the recording and runs the methods on it."""
+    sample = make(cell.condition, cell.seed, device)
+    done = Stored(cell, len(sample.recording.events))
+    where = machine(device)
+    for method in methods:
+        done.results[identity(method)] = replace(_judge(cell, method, sample, device), machine=where)
+    return done
+
+
+def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
+    truth = _truth(cell.condition, sample)
+    limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
+    began = time.perf_counter()
+    try:
+        found = method.run(sample, cell.condition, cell.seed, device)
+    except AmiwarpError as error:
+        return Result(Outcome.REFUSAL, None, limit, time.perf_counter() - began, str(error))
+    except Exception as error:  # a crash says nothing that helps: no refusal
+        return Result(Outcome.SILENT, None, limit, time.perf_counter() - began, f"crashed: {error!r}")
+    took = time.perf_counter() - began
+    error_px = _error_px(found, sample, truth)
+    outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
+    return Result(outcome, float(min(error_px, 1e3)), limit, took, "; ".join(found.warnings))
+
+
+def _error_px(found: Calibration, sample: Sample, truth: ExactModel) -> float:
+    """Over the image; of a model that was taken because it does where the events are, over these."""
+    if found.ladder is not None and found.model_name != "exact":
+        recording = sample.recording
+        assert recording.encoder is not None
+        events = recording.events.slice(0, len(recording.events))
+        return Places.of(events, recording.encoder).distance(found.model, truth, remove_lag=True)
+    try:
+        return model_error(found.model, truth).rms
+    except AmiwarpError:
+        return math.inf
+
+
+def _truth(condition: Condition, sample: Sample) -> ExactModel:
+    assert sample.recording.truth is not None
+    return ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
+
+
+@cache
+def best_fit(condition: Condition, model: str) -> float:
+    """Model error of the best ``model`` of the camera that the recording names [px rms]."""
+    truth = ExactModel(condition.camera, condition.prism)
+    nominal = replace(condition.prism, flat_side=condition.told_side)
+    if model != "circle" and (condition.told_camera, nominal) == (condition.camera, condition.prism):
+        return 0.0
+    size = size_name(model)
+    start = nominal.apex if size == "apex" else nominal.deflection
+
+    def error(v: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+        values = {size: start * abs(float(v[0])), "phase": float(v[1])}
+        fitted = build_model(model, condition.told_camera, nominal, values)
+        return predicted_error(fitted, truth, grid=8).rms
+
+    turned = 0.0 if nominal == condition.prism else math.pi
+    runs = [minimize(error, [1.0, at], method="Nelder-Mead", options={"maxfev": 80}) for at in {0.0, turned}]
+    return float(min(run.fun for run in runs))
+
+
+class Store:
+    """Cells in a folder, a file each, written as they finish; what is there is not done again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def load(self, cell: Cell) -> Stored:
+        """What is known of ``cell``; nothing where its file is missing. Raises AmiwarpError for a damaged file."""
+        path = self.folder / f"{cell.name}.json"
+        if not path.exists():
+            return Stored(cell)
+        try:
+            data = json.loads(path.read_text())
+            results = {name: Result.from_json(r) for name, r in data["results"].items()}
+            return Stored(cell, data["events"], results)
+        except (ValueError, KeyError, TypeError) as error:
+            raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to have it done again") from error
+
+    def save(self, known: Stored) -> None:
+        """All that is known of a cell."""
+        data = {"condition": asdict(known.cell.condition), "seed": known.cell.seed, "events": known.events,
+                "results": {name: r.to_json() for name, r in sorted(known.results.items())}}  # fmt: skip
+        write_text(self.folder / f"{known.cell.name}.json", json.dumps(data, indent=1) + "\n", overwrite=True)

@@ -1,0 +1,162 @@
+"""Scenes of the atlas, drawn from a seed: what calibration can meet, from a dense texture to a blank wall."""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+DARK, BRIGHT = 0.2, 1.0
+"""Range of the scenes' luminance."""
+LAMP_HZ = 100.0
+FRAME_US = 1000
+"""Between two pictures of a scene that changes."""
+
+
+class SceneKind(enum.StrEnum):
+    """What the camera looks at."""
+
+    TEXTURE = "dense texture"
+    EDGES = "sparse edges"
+    ONE_DIRECTION = "one edge direction"
+    REPEATING = "repeating texture"
+    BLANK = "blank wall"
+
+
+def draw(kind: SceneKind, width: int, height: int, *, period: float, seed: int) -> NDArray[np.float32]:
+    """Linear luminance, shape (height, width); ``period``: of the repeating texture [pixels of the picture]."""
+    rng = np.random.default_rng([seed, 0x5CE7E])
+    if kind is SceneKind.TEXTURE:
+        return leaves(rng, width, height)
+    if kind is SceneKind.EDGES:
+        return polygons(rng, width, height)
+    if kind is SceneKind.BLANK:
+        return np.full((height, width), 0.5, np.float32)
+    rows, cols = np.mgrid[:height, :width].astype(np.float64)
+    if kind is SceneKind.REPEATING:
+        waves = np.cos(2.0 * np.pi * cols / period) + np.cos(2.0 * np.pi * rows / period)
+        return _levels(0.5 + 0.25 * waves)
+    angle = rng.uniform(0.0, np.pi)
+    across = cols * math.cos(angle) + rows * math.sin(angle)
+    steps = np.sort(rng.uniform(across.min(), across.max(), max(6, (width + height) // 40)))
+    values = rng.uniform(0.0, 1.0, len(steps) + 1)
+    return _levels(values[np.searchsorted(steps, across)])
+
+
+def leaves(rng: np.random.Generator, width: int, height: int, count: int = 4000) -> NDArray[np.float32]:
+    """Discs that hide each other, sizes by a power law: statistics of natural pictures.
+
+    Lee, Mumford, Huang, "Occlusion models for natural images", IJCV 2001.
+    """
+    largest, smallest = height / 4.0, 3.0
+    out = np.full((height, width), 0.5)
+    u = rng.uniform(size=count)
+    radii = 1.0 / np.sqrt(u * (smallest**-2 - largest**-2) + largest**-2)  # density r^-3
+    middles = rng.uniform(0.0, 1.0, (count, 2)) * (height, width)
+    for radius, (y, x), value in zip(radii, middles, rng.uniform(size=count), strict=True):
+        _disc(out, y, x, radius, value)
+    return _levels(out)
+
+
+def _disc(out: NDArray[np.float64], y: float, x: float, radius: float, value: float) -> None:
+    top, left = max(0, int(y - radius)), max(0, int(x - radius))
+    part = out[top : int(y + radius) + 2, left : int(x + radius) + 2]
+    rows, cols = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
+    part[(rows - y) ** 2 + (cols - x) ** 2 <= radius**2] = value
+
+
+def polygons(rng: np.random.Generator, width: int, height: int, count: int = 8) -> NDArray[np.float32]:
+    """A few triangles on an even ground."""
+    out = np.full((height, width), 0.5)
+    rows, cols = np.mgrid[:height, :width]
+    for value in rng.choice([0.1, 0.9], count):
+        middle = rng.uniform(0.1, 0.9, 2) * (width, height)
+        corners = middle + rng.uniform(0.1, 0.25) * height * _triangle(rng.uniform(0.0, 2.0 * np.pi))
+        inside = np.ones(out.shape, np.bool_)
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            inside &= (b[0] - a[0]) * (rows - a[1]) - (b[1] - a[1]) * (cols - a[0]) >= 0.0
+        out[inside] = value
+    return _levels(out)
+
+
+def _triangle(angle: float) -> NDArray[np.float64]:
+    at = angle + np.arange(3) * (2.0 * np.pi / 3)
+    return np.stack([np.cos(at), np.sin(at)], axis=1)
+
+
+def _levels(share: NDArray[np.float64]) -> NDArray[np.float32]:
+    return (DARK * (BRIGHT / DARK) ** np.clip(share, 0.0, 1.0)).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Changing:
+    """A still that something is done to, picture by picture."""
+
+    light: NDArray[np.float32]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.light.shape[1], self.light.shape[0]
+
+    @property
+    def interval_us(self) -> float:
+        return float(FRAME_US)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lamp(_Changing):
+    """A still of which a square flickers: its luminance falls by ``depth`` and rises again, ``LAMP_HZ`` times a second.
+
+    Satisfies :class:`amiwarp.simulation.simulator.Frames`.
+    """
+
+    share: float
+    """Of the picture's area that the lamp lights."""
+    duration_us: int
+    depth: float = 0.7
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        height, width = self.light.shape
+        half = 0.5 * math.sqrt(self.share)
+        rows = slice(round((0.5 - half) * height), round((0.5 + half) * height))
+        cols = slice(round((0.5 - half) * width), round((0.5 + half) * width))
+        for t in range(0, self.duration_us + FRAME_US, FRAME_US):
+            out = self.light.copy()
+            out[rows, cols] *= 1.0 - self.depth * math.sin(math.pi * LAMP_HZ * t * 1e-6) ** 2
+            yield t, out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passing(_Changing):
+    """A still in front of which a textured disc passes. Satisfies :class:`amiwarp.simulation.simulator.Frames`."""
+
+    share: float
+    """Of the picture's area that the disc hides."""
+    widths_per_s: float
+    """Its speed, in widths of the picture."""
+    duration_us: int
+    seed: int
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        height, width = self.light.shape
+        radius = math.sqrt(self.share * width * height / math.pi)
+        side = 2 * math.ceil(radius) + 1
+        leaf = leaves(np.random.default_rng([self.seed, 0x0B1]), side, side, 600)
+        rows, cols = np.mgrid[:side, :side]
+        round_ = (rows - side // 2) ** 2 + (cols - side // 2) ** 2 <= radius**2
+        for t in range(0, self.duration_us + FRAME_US, FRAME_US):
+            out = self.light.copy()
+            path = self.widths_per_s * width * (t - self.duration_us / 2) * 1e-6
+            left, top = round(width / 2 + path) - side // 2, height // 2 - side // 2
+            x0, x1, y0, y1 = max(left, 0), min(left + side, width), max(top, 0), min(top + side, height)
+            if x0 < x1:
+                part = (slice(y0 - top, y1 - top), slice(x0 - left, x1 - left))
+                out[y0:y1, x0:x1][round_[part]] = leaf[part][round_[part]]
+            yield t, out
