@@ -15,14 +15,19 @@ if TYPE_CHECKING:
     from amiwarp.compensation.streams import Compensated, Compensator
     from amiwarp.errors import AmiwarpError
     from amiwarp.events.encoder import Encoder, EncoderStream
-    from amiwarp.events.events import Events, MemoryEvents, Recording, Truth
+    from amiwarp.events.events import Events, MemoryEvents
+    from amiwarp.events.recording import Recording, Truth
+    from amiwarp.imaging.choices import Sharpness
     from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
-    from amiwarp.imaging.sharpness_costs import Sharpness, sharpness
+    from amiwarp.imaging.sharpness_costs import sharpness
     from amiwarp.imaging.warped_image import iwe
     from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
-    from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-    from amiwarp.optics.models import CircleModel, EllipseModel, ExactModel, FlatSide, Prism, RadialCircleModel
-    from amiwarp.reconstruction.picture import Fill, Picture, Reconstruction, reconstruct
+    from amiwarp.optics.camera import Camera
+    from amiwarp.optics.lens import Fisheye, RadialTangential
+    from amiwarp.optics.models import CircleModel, EllipseModel, ExactModel, RadialCircleModel
+    from amiwarp.optics.prism import FlatSide, Prism
+    from amiwarp.reconstruction.choices import Fill
+    from amiwarp.reconstruction.picture import Picture, Reconstruction, reconstruct
     from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
     from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
     from amiwarp.simulation.translator import translate

@@ -27,11 +27,11 @@ import numpy as np
 import warp as wp
 
 from amiwarp.kernels.cores import cpu_threads
-from benchmarks.libraries import Missing
 from amiwarp.studies.machine import processor
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case
 from benchmarks.job import Job
+from benchmarks.libraries import Missing
 
 ROOT = Path(__file__).parents[1]
 LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy")

@@ -31,10 +31,11 @@ from amiwarp.events.events import Events
 from amiwarp.io.output import write_text
 from amiwarp.kernels import sight
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.structs import camera_params
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.device_camera import camera_params
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import save
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.scenery import MapRing, place_scene, step_us
@@ -69,7 +70,7 @@ MARGIN = 24
 
 @dataclass(eq=False)
 class Driven:
-    """A prism whose speed is told as it turns, for :class:`amiwarp.simulation.simulator.Simulation` in place of a PrismMotion."""
+    """A prism whose speed is told as it turns, for :class:`amiwarp.Simulation` in place of a PrismMotion."""
 
     rpm: float
     largest_rpm: float

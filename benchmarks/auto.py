@@ -28,10 +28,11 @@ from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection.model_choice import calibrate_auto
 from amiwarp.calib.selection.smaller_models import Places, fit, rung_space
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, EllipseModel, FlatSide, Prism
+from amiwarp.optics.models import MODELS, EllipseModel
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.machine import machine

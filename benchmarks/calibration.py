@@ -41,11 +41,12 @@ from amiwarp.calib.sharpness.search import STAGES
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents, Recording, Truth
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording, Truth
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
-from amiwarp.imaging.sharpness_costs import Sharpness
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
@@ -66,14 +67,14 @@ def simulated(
     *,
     every: int = EVERY,
     sensor: SensorModel | None = None,
-    turning: CameraMotion | None = None,
+    camera_rotation: CameraMotion | None = None,
 ) -> Recording:
     """A recording thinned evenly while it is made; its phase differs from seed to seed."""
     prism = Prism(math.radians(apex_deg))
     phase = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
     simulation = Simulation(
         scene, camera, prism, seconds, PrismMotion(720.0, phase=phase),
-        camera_motion=turning or CameraMotion(), sensor=sensor or SensorModel(), seed=seed, device=device,
+        camera_motion=camera_rotation or CameraMotion(), sensor=sensor or SensorModel(), seed=seed, device=device,
         nominal_prism=replace(prism, apex=NOMINAL * prism.apex),
     )  # fmt: skip
     kept, count = [], 0
@@ -219,7 +220,7 @@ def run_moving(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 rate = np.eye(3)[axis] * math.radians(speed)
                 recording = simulated(
                     scene, camera, 1.0, axis, 0.18, args.device, every=1, sensor=MISMATCHED,
-                    turning=CameraMotion(tuple(rate)),
+                    camera_rotation=CameraMotion(tuple(rate)),
                 )  # fmt: skip
                 label = {"picture": name, "axis": "xyz"[axis], "deg_per_s": speed}
                 yield {**label, **moving_row(recording, rate, args.device)}

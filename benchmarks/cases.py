@@ -11,10 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import libraries
 from amiwarp.calib.sharpness.search import STAGES
-from amiwarp.imaging.warped_image import Vote
-from benchmarks import ours
+from amiwarp.imaging.choices import Vote
+from benchmarks import libraries, ours
 from benchmarks.job import Job
 from benchmarks.peers import image
 from benchmarks.scenes import RECORDED, event_scene, file_scene, recording_scene

@@ -66,8 +66,15 @@ def _measured(args: argparse.Namespace) -> Charts:
     recording = simulated(args.picture, seed=args.seed, device=args.device, quick=args.quick)
     args.out.mkdir(parents=True, exist_ok=True)
     with own_folder(args.out):
-        charts = make(recording, args.out, device=args.device, seed=args.seed, quick=args.quick,
-                      libraries=library_tasks, progress=tell)
+        charts = make(
+            recording,
+            args.out,
+            device=args.device,
+            seed=args.seed,
+            quick=args.quick,
+            libraries=library_tasks,
+            progress=tell,
+        )
     tell("done", 1.0)
     return charts
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.imaging.warped_image import Vote
+from amiwarp.imaging.choices import Vote
 from amiwarp.studies.chart.compensation import IMAGE, LibraryTask, Sample, Uploads, circle
 from amiwarp.studies.chart.rows import Task
 from benchmarks import libraries

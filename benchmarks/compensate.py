@@ -39,7 +39,8 @@ from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import in_order
 from amiwarp.kernels.cores import cpu_threads
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, Model, Prism
+from amiwarp.optics.models import MODELS, Model
+from amiwarp.optics.prism import Prism
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

@@ -15,18 +15,18 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
 from amiwarp.optics.models import (
     CircleModel,
     EllipseModel,
     ExactModel,
-    FlatSide,
     ModelError,
-    Prism,
     RadialCircleModel,
     apex_from_deflection,
     predicted_error,
 )
+from amiwarp.optics.prism import FlatSide, Prism
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import reference

@@ -12,15 +12,16 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib import Calibration, calibrate
+from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import TURNS, upload_events
 from amiwarp.imaging.metrics import PictureQuality, model_error, picture_quality
 from amiwarp.imaging.tile_votes import TileVotes
-from amiwarp.imaging.warped_image import CanvasShape, Image, Vote, Votes
+from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
 from amiwarp.optics.models import MODELS, Model
-from benchmarks.libraries import Peer
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from benchmarks import peers, truth
 from benchmarks.job import Job
+from benchmarks.libraries import Peer
 from benchmarks.scenes import PHASE, EventScene, FileScene, RecordingScene
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from amiwarp.imaging.warped_image import Vote
-from benchmarks.libraries import Peer, PeerEvents
+from amiwarp.imaging.choices import Vote
 from benchmarks import truth
 from benchmarks.job import Job
+from benchmarks.libraries import Peer, PeerEvents
 from benchmarks.scenes import MARGIN, EventScene
 
 

@@ -33,14 +33,15 @@ from skimage.metrics import structural_similarity
 
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.metrics import RANGE, picture_quality
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import Turning
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction, reconstruct
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.scenery import place_scene
@@ -98,12 +99,12 @@ def scene_fov(through: Simulation) -> float:
     return 2.0 * math.atan(0.5 * plane * through.scene.frames.size[0])
 
 
-def panning(through: Simulation, fov: float) -> tuple[Recording, Turning]:
+def panning(through: Simulation, fov: float) -> tuple[Recording, CameraRotation]:
     """The same scene, at the same scale, from a camera that turns instead of a prism; and how it turns."""
     rate = speed() / CAMERA.fx / math.sqrt(2.0)
-    turn = Turning((rate, rate, 0.0))
+    turn = CameraRotation((rate, rate, 0.0))
     still = replace(
-        through, prism=Prism(0.0), motion=PrismMotion(0.0), camera_motion=CameraMotion(turn.rate),
+        through, prism=Prism(0.0), motion=PrismMotion(0.0), camera_motion=CameraMotion(turn.angular_velocity),
         scene=replace(through.scene, fov=fov),
     )  # fmt: skip
     return still.run(), turn
@@ -168,7 +169,7 @@ class Seen:
     recording: Recording
     truth: NDArray[np.float32]
     turning: Recording
-    turn: Turning
+    turn: CameraRotation
     noise: float
 
     @classmethod
@@ -201,11 +202,11 @@ class Seen:
     def panned(self, length: int) -> tuple[NDArray[np.float32], int, dict[str, dict[str, float]]]:
         """The picture of the camera that turns, its equations, and its quality."""
         found = Reconstruction(
-            self.turning, model=ExactModel(CAMERA, Prism(0.0)), turning=self.turn, device=self.through.device,
+            self.turning, model=ExactModel(CAMERA, Prism(0.0)), camera_rotation=self.turn, device=self.through.device,
             encoder=Encoder.constant_speed(0.0, 0, self.turning.events.t_last),
         ).window(START_US, length)  # fmt: skip
         middle = (START_US + length / 2.0) * 1e-6
-        truth = seen_at(self.through, np.array(self.turn.rate) * middle, self.fov)
+        truth = seen_at(self.through, np.array(self.turn.angular_velocity) * middle, self.fov)
         return found.log, found.pairs, judged(found.log, truth)
 
 
@@ -263,7 +264,7 @@ def real(folder: Path, device: str) -> dict[str, dict[str, NDArray[np.float32]]]
             x, y, z = (sign * omega).tolist()
             found = reconstruct(
                 recording, model=model, encoder=Encoder.constant_speed(0.0, first, last), 
-                turning=Turning((x, y, z), middle_us=(first + last) // 2),
+                camera_rotation=CameraRotation((x, y, z), middle_us=(first + last) // 2),
                 length_us=last - first + 1, device=device,
             )  # fmt: skip
             print(json.dumps({"recording": name, "omega": title, "pairs": found.pairs, "residual": found.residual}))

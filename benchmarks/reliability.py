@@ -123,7 +123,8 @@ def prepare(folder: Path) -> Path:
 def many_events(inputs: Path, count: int = 3_000_000) -> None:
     """Write a recording of two seconds, evenly filled, as large as the time of a kill needs."""
     from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events, MemoryEvents, Recording
+    from amiwarp.events.events import Events, MemoryEvents
+    from amiwarp.events.recording import Recording
     from amiwarp.io import save_recording
 
     rng = np.random.default_rng(2)

@@ -17,15 +17,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.events.events import Events, Recording
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.kernels.cores import cpu_threads
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism, apex_from_deflection
-from benchmarks.libraries import Missing
+from amiwarp.optics.models import ExactModel, apex_from_deflection
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import SensorModel, Simulation
 from amiwarp.studies.demo import Demo, simulation
 from benchmarks import compensate
+from benchmarks.libraries import Missing
 
 Array = NDArray[np.float64]
 

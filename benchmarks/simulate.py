@@ -21,7 +21,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import EncoderModel
 from amiwarp.simulation.scenery import step_us

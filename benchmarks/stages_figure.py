@@ -23,7 +23,7 @@ from amiwarp.calib.calibration import prepare
 from amiwarp.calib.photometric.stage import Cost, gather_pairs, off_excess
 from amiwarp.imaging.export import save_png
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.demo import earth
 

@@ -36,7 +36,8 @@ from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import Packet
 from amiwarp.live.stream.session import IMAGE_US, Session, Status
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import CircleModel, ExactModel, Model, Prism
+from amiwarp.optics.models import CircleModel, ExactModel, Model
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.machine import machine
 

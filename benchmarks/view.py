@@ -25,10 +25,11 @@ import warp as wp
 
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.studies.machine import machine
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.scene import Look, Scene, View

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import simulate
 

@@ -33,8 +33,9 @@ from amiwarp.cli.inputs import read_camera
 from amiwarp.events.events import check_events
 from amiwarp.io import open_recording, read_encoder_csv
 from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera, Fisheye
-from amiwarp.optics.models import Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Fisheye
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.translator import open_pictures
 

@@ -11,7 +11,8 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.live.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, SpeedController, prism_path
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.simulator import Scene, Simulation
 from amiwarp.studies.stability.scenes import SceneKind, draw

@@ -19,10 +19,12 @@ from amiwarp.calib.sharpness.search import Material
 from amiwarp.calib.thinning import thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, Recording
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, CircleModel, ExactModel, FlatSide, Prism
+from amiwarp.optics.models import MODELS, CircleModel, ExactModel
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
 

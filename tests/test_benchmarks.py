@@ -14,11 +14,11 @@ from PIL import Image
 
 from amiwarp.compensation.recordings import PIECE
 from amiwarp.events.events import Events
-from amiwarp.imaging.warped_image import Vote
-from benchmarks.libraries import Missing
+from amiwarp.imaging.choices import Vote
 from benchmarks import __main__ as runner
 from benchmarks import cases, compensate, ours, report, scenes, truth
 from benchmarks.job import Job
+from benchmarks.libraries import Missing
 from benchmarks.scenes import SECONDS, TURNS_PER_S, EventScene, RecordingScene, event_scene
 
 EVENTS = 4_000

@@ -19,12 +19,14 @@ from amiwarp.calib.sharpness.search import PARTS
 from amiwarp.calib.thinning import RUN, thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.imaging.sharpness_costs import Sharpness
 from amiwarp.io import open_recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, FlatSide, Prism, predicted_error, wrap_angle
+from amiwarp.optics.models import MODELS, predicted_error, wrap_angle
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import SensorModel, simulate
 

@@ -11,8 +11,9 @@ import pytest
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.result import camera_from_json, camera_to_json
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Recording
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.events.recording import Recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Fisheye, RadialTangential
 
 
 @pytest.fixture(scope="module")

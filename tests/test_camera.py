@@ -11,8 +11,9 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.camera import CameraParams, solve_ray
-from amiwarp.kernels.structs import camera_params, fold
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.device_camera import camera_params, fold
+from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
 
 # as the package's kernels: a GPU would else fuse multiplications and additions here alone
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

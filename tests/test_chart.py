@@ -17,16 +17,19 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 import benchmarks.chart
-from benchmarks import libraries as peers
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.presets import Preset, check, settings_from, settings_to, simplified
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents, Recording
-from amiwarp.imaging.warped_image import Vote, iwe
+from amiwarp.events.events import MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.choices import Vote
+from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import MODELS, ExactModel, FlatSide, Prism, predicted_error
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.models import MODELS, ExactModel, predicted_error
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.plotting import figures
 from amiwarp.studies.chart import Charts, calibration, compensation
 from amiwarp.studies.chart.rows import (
@@ -41,6 +44,7 @@ from amiwarp.studies.chart.rows import (
     told_apart,
 )
 from amiwarp.studies.chart.truth import Known, exact_image, exact_places, rms
+from benchmarks import libraries as peers
 
 
 def run(*args: str | Path) -> Result:

@@ -20,17 +20,20 @@ from amiwarp.calib.presets import simplified
 from amiwarp.calib.sharpness.search import STAGES, Settings
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents, Recording
-from amiwarp.imaging.export import IweFiles, Layers, to_picture
-from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter, sharpness
-from amiwarp.imaging.warped_image import CanvasShape, Vote, iwe
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.choices import Layers, Sharpness, Vote
+from amiwarp.imaging.export import IweFiles, to_picture
+from amiwarp.imaging.sharpness_costs import SharpnessMeter, sharpness
+from amiwarp.imaging.warped_image import CanvasShape, iwe
 from amiwarp.io.formats import Format, open_recording
 from amiwarp.live.stream.queues import PacketQueue, Policy
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, CircleModel, ExactModel, Prism, RadialCircleModel
-from amiwarp.optics.prism import FlatSide, UnsizedPrism, apex_from_deflection, deflection_from_apex
-from amiwarp.reconstruction.export import Tone, save_picture, tones
-from amiwarp.reconstruction.picture import Fill, Picture, Reconstruction
+from amiwarp.optics.models import MODELS, CircleModel, ExactModel, RadialCircleModel
+from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism, apex_from_deflection, deflection_from_apex
+from amiwarp.reconstruction.choices import Fill, Tone
+from amiwarp.reconstruction.export import save_picture, tones
+from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.viewer.scene import Axis, Colour, Look, View
 
 CAMERA = Camera.from_fov(8, 6, 1.0)

@@ -15,8 +15,10 @@ from conftest import TRUE_PRISM
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks, inside_image
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.encoder import TURN, Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import edge_blur, truth_model
 from amiwarp.imaging.sharpness_costs import sharpness
 from amiwarp.imaging.warped_image import iwe
@@ -24,9 +26,10 @@ from amiwarp.io import open_recording, save_recording
 from amiwarp.io.chunks import CHUNK
 from amiwarp.kernels.encoder import EncoderParams, angle_at
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.structs import encoder_params
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.models import MODELS, CircleModel, ExactModel, FlatSide
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.optics.models import MODELS, CircleModel, ExactModel
+from amiwarp.optics.prism import FlatSide
 
 
 @wp.kernel

@@ -14,8 +14,10 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.imaging.warped_image import iwe
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import MODELS, ExactModel, Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.models import MODELS, ExactModel
+from amiwarp.optics.prism import Prism
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(60))

@@ -19,8 +19,10 @@ from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import ExactModel, FlatSide, Prism, apex_from_deflection
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.models import ExactModel, apex_from_deflection
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 from amiwarp.studies.design import Design, Limits, Timing, design

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, EventSource, MemoryEvents, Truth, check_events, regroup
+from amiwarp.events.events import Events, EventSource, MemoryEvents, check_events, regroup
+from amiwarp.events.recording import Truth
 
 
 def make(t: list[int]) -> Events:

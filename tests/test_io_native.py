@@ -17,11 +17,13 @@ from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, EventSource, MemoryEvents, Recording, Truth
+from amiwarp.events.events import Events, EventSource, MemoryEvents
+from amiwarp.events.recording import Recording, Truth
 from amiwarp.io import RecordingWriter, open_recording, save_recording
 from amiwarp.io.chunks import CHUNK, StoredColumn, checksum, decode, encode, in_order
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.optics.prism import FlatSide, Prism
 
 SIZE = (320, 240)
 

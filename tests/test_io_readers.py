@@ -10,9 +10,10 @@ from io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sam
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, EventSource, MemoryEvents
-from amiwarp.io import Format, Summary, convert, detect_format, open_recording, scan
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import Prism
+from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording, scan
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.prism import Prism
 
 EVENTS = make_events()
 
@@ -307,7 +308,7 @@ def test_convert_puts_in_encoder_camera_and_prism(tmp_path):
     assert (back.camera, back.prism, back.events.size) == (camera, prism, SIZE)
     assert back.metadata == {"source_name": "events", "source_format": "npz", "format": "native"}
     assert seen == [(600, 600)]
-    assert summary == Summary(
+    assert summary == ConversionSummary(
         events=600,
         t_first=int(EVENTS.t[0]),
         t_last=int(EVENTS.t[-1]),

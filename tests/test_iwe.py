@@ -9,10 +9,12 @@ import warp as wp
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
+from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import upload_events
-from amiwarp.imaging.warped_image import PROBE, CanvasShape, Image, Vote, Votes, iwe
+from amiwarp.imaging.warped_image import PROBE, CanvasShape, Image, Votes, iwe
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, ExactModel, Prism
+from amiwarp.optics.models import MODELS, ExactModel
+from amiwarp.optics.prism import Prism
 
 
 def random_events(n: int, width: int, height: int, seed: int = 0) -> Events:

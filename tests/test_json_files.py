@@ -14,7 +14,7 @@ from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.presets import Preset
 from amiwarp.cli.inputs import read_camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.io.json_files import MOST_BYTES, read_json
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.translator import open_pictures

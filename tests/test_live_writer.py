@@ -22,8 +22,9 @@ from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.live_writer import WASTE, LiveWriter
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.prism import FlatSide, Prism
 
 SIZE = (320, 240)
 CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))

@@ -8,7 +8,8 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import contrast, edge_blur, entropy, find_edges, model_error, picture_quality
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 
 
 def circle_events(sigma: float, noise: int = 0, seed: int = 0) -> np.ndarray:

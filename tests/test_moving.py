@@ -19,14 +19,14 @@ from amiwarp.calib.rotation_estimate import estimate_rates
 from amiwarp.calib.thinning import thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import Turning
-from amiwarp.optics.models import FlatSide
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.prism import FlatSide
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
@@ -65,7 +65,7 @@ def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -
     assert c.photometric.accepted
     assert np.linalg.norm(rates_of(c) - rate) <= 0.02 * np.linalg.norm(rate)
     assert error_px(c, recording) <= 0.05
-    assert c.turning == Turning(tuple(rates_of(c).tolist()), middle_us=c.middle_us or 0)
+    assert c.camera_rotation == CameraRotation(tuple(rates_of(c).tolist()), middle_us=c.middle_us or 0)
 
 
 def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8], tmp_path: Path) -> None:
@@ -77,14 +77,15 @@ def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8]
     recording = simulation.run()
     c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN, events=200_000)
     assert c.parameters["change_y"] == pytest.approx(5.0, rel=0.05)
-    assert c.turning is not None
-    assert c.turning.about(0).rate[1] == pytest.approx(0.2, abs=0.02)
+    assert c.camera_rotation is not None
+    assert c.camera_rotation.about(0).angular_velocity[1] == pytest.approx(0.2, abs=0.02)
     assert error_px(c, recording) <= 0.05
     c.save(tmp_path / "c.json")
     loaded = Calibration.load(tmp_path / "c.json")
     assert loaded == c
     following, still = (
-        reconstruct(recording, loaded, start_us=0, turns=1.0, turning=turning) for turning in (None, Turning())
+        reconstruct(recording, loaded, start_us=0, turns=1.0, camera_rotation=rotation)
+        for rotation in (None, CameraRotation())
     )
     assert following.residual < 0.3 * still.residual
 
@@ -156,8 +157,8 @@ def test_real_recordings_from_zero(data_dir: Path, name: str, gain: float) -> No
 
     def variance(rates: NDArray[np.float64]) -> float:
         x, y, z = rates.tolist()
-        turning = Turning((x, y, z), middle_us=c.middle_us or 0)
-        return float(iwe(events, width, height, model=c.model, encoder=encoder, turning=turning).var())
+        camera_rotation = CameraRotation((x, y, z), middle_us=c.middle_us or 0)
+        return float(iwe(events, width, height, model=c.model, encoder=encoder, camera_rotation=camera_rotation).var())
 
     still = variance(np.zeros(3))
     for rates in (sharp, photometric):

@@ -10,21 +10,21 @@ import reference
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Fisheye, RadialTangential
 from amiwarp.optics.models import (
     MODELS,
     CircleModel,
     EllipseModel,
     ExactModel,
-    FlatSide,
     Model,
-    Prism,
     RadialCircleModel,
     apex_from_deflection,
     deflection_from_apex,
     predicted_error,
     wrap_angle,
 )
+from amiwarp.optics.prism import FlatSide, Prism
 
 ATOL = 1e-3  # px, the promise; docs/optics.md has what was measured
 SIDES = list(FlatSide)

@@ -8,18 +8,18 @@ import numpy as np
 import reference
 from hypothesis import HealthCheck, assume, given, settings
 
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
 from amiwarp.optics.models import (
     MODELS,
     CircleModel,
     ExactModel,
-    FlatSide,
-    Prism,
     RadialCircleModel,
     apex_from_deflection,
     deflection_from_apex,
     predicted_error,
 )
+from amiwarp.optics.prism import FlatSide, Prism
 
 ATOL = 1e-3  # px, the promise for float32
 COUNT = 300

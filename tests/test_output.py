@@ -22,13 +22,15 @@ from amiwarp.calib import Calibration
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
-from amiwarp.imaging.export import IweFiles, Layers
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.choices import Layers
+from amiwarp.imaging.export import IweFiles
 from amiwarp.io import RecordingWriter, convert, open_recording, output, save_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.io.output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 
 SIZE = (64, 48)
 CAMERA = Camera.from_fov(*SIZE, math.radians(40.0))

@@ -16,10 +16,12 @@ from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric.stage import PhotometricSettings, _spread
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, FlatSide, Prism
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import SensorModel, simulate
 

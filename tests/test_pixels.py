@@ -20,10 +20,11 @@ from amiwarp.calib.bad_pixels import (
     unlocked_counts,
 )
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
 from amiwarp.simulation.simulator import Scene, SensorModel, simulate

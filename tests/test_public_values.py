@@ -18,9 +18,10 @@ from amiwarp.events.encoder import LARGEST_ANGLE, Encoder
 from amiwarp.events.events import TIME_LIMIT, Events, MemoryEvents, check_events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.optics.camera import LARGEST_FOCAL, Camera, Fisheye, RadialTangential
-from amiwarp.optics.models import CircleModel, EllipseModel, ExactModel, Prism, RadialCircleModel
-from amiwarp.optics.prism import UnsizedPrism
+from amiwarp.optics.camera import LARGEST_FOCAL, Camera
+from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.optics.models import CircleModel, EllipseModel, ExactModel, RadialCircleModel
+from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 

@@ -18,14 +18,17 @@ from amiwarp.calib.result import Calibration
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import Turning
-from amiwarp.optics.models import ExactModel, Prism
-from amiwarp.reconstruction.export import Tone, save_picture, save_video, tones
-from amiwarp.reconstruction.picture import Fill, Picture, Reconstruction, grown, reconstruct, without_pinholes
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
+from amiwarp.reconstruction.choices import Fill, Tone
+from amiwarp.reconstruction.export import save_picture, save_video, tones
+from amiwarp.reconstruction.picture import Picture, Reconstruction, grown, reconstruct, without_pinholes
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
@@ -225,8 +228,8 @@ def test_while_the_camera_turns(texture: NDArray[np.uint8]) -> None:
     rate = (0.0, math.radians(20.0), math.radians(-15.0))
     turning = simulation(texture, camera_motion=CameraMotion(rate), duration_s=0.1).run()
     still = reconstruct(turning, model=MODEL, start_us=0)
-    right = reconstruct(turning, model=MODEL, start_us=0, turning=Turning(rate))
-    wrong = reconstruct(turning, model=MODEL, start_us=0, turning=Turning(tuple(-r for r in rate)))
+    right = reconstruct(turning, model=MODEL, start_us=0, camera_rotation=CameraRotation(rate))
+    wrong = reconstruct(turning, model=MODEL, start_us=0, camera_rotation=CameraRotation(tuple(-r for r in rate)))
     assert right.residual < 0.7 * still.residual
     assert right.residual < 0.7 * wrong.residual
 
@@ -245,8 +248,8 @@ def test_real_rotation_without_a_prism(data_dir: Path, name: str, expected: floa
         "encoder": Encoder.constant_speed(0.0, first, last),
         "length_us": last - first + 1,
     }
-    right = reconstruct(real, turning=Turning((x, y, z)), **still)
-    wrong = reconstruct(real, turning=Turning((-x, -y, -z)), **still)
+    right = reconstruct(real, camera_rotation=CameraRotation((x, y, z)), **still)
+    wrong = reconstruct(real, camera_rotation=CameraRotation((-x, -y, -z)), **still)
     assert right.residual < expected
     assert wrong.residual > 2.0 * right.residual
 

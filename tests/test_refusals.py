@@ -18,9 +18,10 @@ from amiwarp.calib.sharpness.search import Settings
 from amiwarp.cli.inputs import interval, number
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TURN, Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.simulator import simulate
 

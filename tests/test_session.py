@@ -20,20 +20,22 @@ from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.compensation.streams import OUTSIDE, Compensated
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
-from amiwarp.live.stream.background_worker import Beside
+from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
 from amiwarp.live.stream.packets import Packet, packet
 from amiwarp.live.stream.queues import Policy
 from amiwarp.live.stream.session import Session, Status
 from amiwarp.live.stream.sources import open_source
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.4)
@@ -453,12 +455,12 @@ def test_a_status_tells_rate_latency_coverage_and_sharpness(monkeypatch: pytest.
 
 def test_what_runs_beside_keeps_its_order_and_tells_what_failed() -> None:
     done: list[int] = []
-    beside = Beside()
+    beside = BackgroundWorker()
     for k in range(500):
         beside.put(lambda k=k: done.append(k))
     beside.close()
     assert done == list(range(500))
-    failing = Beside()
+    failing = BackgroundWorker()
 
     def fail() -> None:
         raise AmiwarpError("full")

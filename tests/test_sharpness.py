@@ -5,7 +5,8 @@ import pytest
 from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.sharpness_costs import PAPER_ETA, Sharpness, gaussian, sharpness
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import PAPER_ETA, gaussian, sharpness
 
 
 @pytest.fixture

@@ -13,11 +13,14 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, Recording
-from amiwarp.kernels import launch as launching
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.kernels import event_generation as kernels
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import ExactModel, FlatSide, Prism
+from amiwarp.kernels import launch as launching
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place, read_picture
 from amiwarp.simulation.scenery import step_us

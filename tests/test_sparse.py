@@ -9,10 +9,10 @@ from scipy.ndimage import gaussian_filter
 
 from amiwarp.calib import calibrate
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 

@@ -26,16 +26,16 @@ from amiwarp.live.link.emulator import MOST_OUT, Controller, Fault
 from amiwarp.live.link.news import News
 from amiwarp.live.link.rotors import MOST_PIECES, Motor, Played
 from amiwarp.live.link.terminal import RETRY_S, PseudoTerminal
+from amiwarp.live.stream import phase_check as watch_module
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream import speed_control as speed_module
-from amiwarp.live.stream import phase_check as watch_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.live.stream.background_worker import Beside
+from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, encode_hello, packet
-from amiwarp.live.stream.phase_check import PhaseWatch
+from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.queues import PacketQueue, Policy
-from amiwarp.live.stream.recent_events import Ring
+from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.live.stream.session import Session
 from amiwarp.live.stream.sockets import MOST_CLIENTS, PIECE, REST_S, PipeSink, SocketSink
 from amiwarp.live.stream.speed_control import SpeedKeeper
@@ -165,7 +165,7 @@ class Flood(Made):
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions whose queues are small."""
-    monkeypatch.setattr("amiwarp.live.stream.session.Beside", partial(Beside, MOST))
+    monkeypatch.setattr("amiwarp.live.stream.session.Beside", partial(BackgroundWorker, MOST))
     monkeypatch.setattr("amiwarp.live.stream.session.PacketQueue", partial(PacketQueue, most_bytes=MOST))
 
 
@@ -198,7 +198,7 @@ def test_a_flood_without_events_ends_when_it_is_told(make: Callable[[int], Packe
         if source.given > 2000:
             stop.set()
 
-    Session(source, raw=[Ring(source)]).run(stop, report, every_s=0.0)
+    Session(source, raw=[RecentEvents(source)]).run(stop, report, every_s=0.0)
     assert source.given > 2000
     assert source.closed
 
@@ -228,7 +228,7 @@ def test_a_second_interrupt_drops_what_waits() -> None:
 
 
 def test_jobs_without_events_count_for_their_memory() -> None:
-    beside, go = Beside(16_384), threading.Event()
+    beside, go = BackgroundWorker(16_384), threading.Event()
     thread = threading.Thread(target=lambda: [beside.put(lambda: go.wait(LONG_S)) for _ in range(100)], daemon=True)
     thread.start()
     reached(lambda: beside.held_bytes == 16_384)
@@ -254,7 +254,7 @@ def test_a_compensator_bounds_packets_of_one_event() -> None:
 
 def test_the_last_seconds_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ring_module, "MOST_BYTES", MOST)
-    ring = Ring(Made([]))
+    ring = RecentEvents(Made([]))
     for k in range(2000):
         ring.append(events(1, 7))
         ring.append_encoder(np.array([k]), np.array([0.1 * k]))
@@ -264,7 +264,7 @@ def test_the_last_seconds_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_the_watch_remembers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch_module, "MOST_BYTES", MOST)
-    watch = PhaseWatch(KNOWN, 1.0, print)
+    watch = PhaseCheck(KNOWN, 1.0, print)
     for k in range(3000):
         watch.put(events(1, k))
         assert watch.held_bytes <= MOST + 2 * held_bytes(events(1, 0))

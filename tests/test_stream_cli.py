@@ -28,12 +28,13 @@ from amiwarp.cli.app import app
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
 from amiwarp.live.stream.sockets import listen, shut
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 SCRIPT = (

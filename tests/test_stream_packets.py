@@ -33,8 +33,9 @@ from amiwarp.live.stream.packets import (
     encode_hello,
     encode_triggers,
 )
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.optics.prism import FlatSide, Prism
 
 CAMERAS = (
     None,

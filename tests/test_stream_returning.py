@@ -25,11 +25,11 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import open_recording
 from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
-from amiwarp.live.stream.recent_events import Ring, followed
+from amiwarp.live.stream.recent_events import RecentEvents, followed
 from amiwarp.live.stream.sockets import listen, shut
 from amiwarp.live.stream.sources import open_source
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 HELLO = encode_hello(64, 48, CAMERA, PRISM)
@@ -232,7 +232,7 @@ def test_a_view_says_that_its_stream_broke_off(tmp_path: Path) -> None:
     said: list[str] = []
     with sender(tmp_path / "s", HELLO + part(0)) as address:
         source = open_source(address)
-        ring = Ring(source)
+        ring = RecentEvents(source)
         with followed(source, None, ring, said.append):
             until = time.monotonic() + LONG_S
             while not said:
@@ -245,7 +245,7 @@ def test_a_view_says_that_its_stream_broke_off(tmp_path: Path) -> None:
 def test_a_view_of_less_than_a_turn_says_how_it_ended(tmp_path: Path) -> None:
     with sender(tmp_path / "s", HELLO) as address:
         source = open_source(address)
-        view = followed(source, None, Ring(source), print)
+        view = followed(source, None, RecentEvents(source), print)
         with pytest.raises(AmiwarpError, match="no whole turn before the stream ended: it broke off"):
             view.__enter__()
 

@@ -35,7 +35,7 @@ from amiwarp.live.stream.packets import (
 from amiwarp.live.stream.sockets import PipeSink, SocketSink, open_sink
 from amiwarp.live.stream.sources import FileSource, StreamSource, open_source
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 
 SIZE = (320, 240)
 CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5)

@@ -19,18 +19,19 @@ from amiwarp.calib.result import Calibration
 from amiwarp.compensation.streams import Compensated, Compensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import EncoderStream
-from amiwarp.events.events import Events, Recording
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.io import save_recording
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.live.stream.forward import Forward
 from amiwarp.live.stream.packets import Angles, Decoder, Packet
-from amiwarp.live.stream.phase_check import PhaseWatch
-from amiwarp.live.stream.recent_events import SECONDS, Ring, followed
+from amiwarp.live.stream.phase_check import PhaseCheck
+from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
 from amiwarp.live.stream.sources import FileSource, open_source
 from amiwarp.live.stream.speed_control import WINDOW_US, SpeedKeeper
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import SensorModel, simulate
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
@@ -56,7 +57,7 @@ def streamed(recording: Recording) -> EncoderStream:
     return stream
 
 
-def looked(watch: PhaseWatch, encoder: EncoderStream, until_s: float = 120.0) -> float:
+def looked(watch: PhaseCheck, encoder: EncoderStream, until_s: float = 120.0) -> float:
     """What the watch finds, which it is asked again and again as by a session."""
     end = time.monotonic() + until_s
     while (found := watch.look(encoder)) is None:
@@ -68,7 +69,7 @@ def looked(watch: PhaseWatch, encoder: EncoderStream, until_s: float = 120.0) ->
 def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
     """Of 4 deg the second time: told; the first look is what it is compared with."""
     said: list[str] = []
-    watch, encoder = PhaseWatch(known(recording, 1.0), 0.0, said.append), streamed(recording)
+    watch, encoder = PhaseCheck(known(recording, 1.0), 0.0, said.append), streamed(recording)
     watch.put(recording.events.slice(0, len(recording.events)))
     first = looked(watch, encoder)
     assert first == pytest.approx(1.0, abs=BIAS_DEG)
@@ -88,7 +89,7 @@ def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
 
 def test_a_watch_tells_a_phase_that_is_far_off(recording: Recording) -> None:
     said: list[str] = []
-    watch = PhaseWatch(known(recording, 12.0), 0.0, said.append)
+    watch = PhaseCheck(known(recording, 12.0), 0.0, said.append)
     watch.put(recording.events.slice(0, len(recording.events)))
     assert looked(watch, streamed(recording)) == pytest.approx(12.0, abs=BIAS_DEG)
     assert "calibrate anew" in said[0]
@@ -96,7 +97,7 @@ def test_a_watch_tells_a_phase_that_is_far_off(recording: Recording) -> None:
 
 
 def test_a_watch_says_nothing_of_too_little(recording: Recording) -> None:
-    watch = PhaseWatch(known(recording, 0.0), 0.0, print)
+    watch = PhaseCheck(known(recording, 0.0), 0.0, print)
     assert not watch.begin(streamed(recording))
     watch.put(recording.events.slice(0, 1000))
     assert not watch.begin(streamed(recording))
@@ -184,7 +185,7 @@ def test_a_keeper_passes_over_what_the_samples_do_not_cover(recording: Recording
 
 def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:
     source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made"})()
-    ring = Ring(source)
+    ring = RecentEvents(source)
     assert ring.recording() is None
     rng = np.random.default_rng(0)
     for start in range(0, 10_000_000, 50_000):
@@ -219,7 +220,7 @@ def test_a_stream_is_followed_while_one_looks(
                 yield packet
 
     source = Held(tmp_path / "r.h5")
-    ring = Ring(source)
+    ring = RecentEvents(source)
     with followed(source, None, ring, said.append):
         first = ring.recording()
         assert first is not None
@@ -240,7 +241,10 @@ def test_a_stream_without_a_turn_is_told(tmp_path: Path, recording: Recording) -
     still = replace(recording.encoder, angle=np.zeros(recording.encoder.t.size))
     save_recording(tmp_path / "r.h5", replace(recording, encoder=still, truth=None))
     source = open_source(str(tmp_path / "r.h5"), pace=None)
-    with pytest.raises(AmiwarpError, match="no whole turn"), followed(source, None, Ring(source), lambda _: None):
+    with (
+        pytest.raises(AmiwarpError, match="no whole turn"),
+        followed(source, None, RecentEvents(source), lambda _: None),
+    ):
         raise AssertionError("followed")
 
 

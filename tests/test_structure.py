@@ -26,7 +26,7 @@ HEAVY = (
     "aiohttp",
 )
 
-KERNELS_MAY_IMPORT = {"amiwarp.optics.models.camera", "amiwarp.errors", "amiwarp.kernels"}
+KERNELS_MAY_IMPORT = {"amiwarp.optics.camera", "amiwarp.errors", "amiwarp.kernels"}
 """Kernels turn host objects to structs, so they know the camera; nothing of files, users or recordings."""
 
 ORDER = (

@@ -8,12 +8,15 @@ import warp as wp
 
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
+from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import upload_events
 from amiwarp.imaging.tile_votes import TileVotes
-from amiwarp.imaging.warped_image import CanvasShape, Image, Vote, Votes
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.camera_rotation import Turning
-from amiwarp.optics.models import CircleModel, ExactModel, Model, Prism
+from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.models import CircleModel, ExactModel, Model
+from amiwarp.optics.prism import Prism
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 
@@ -29,20 +32,20 @@ def events(n: int = 300_000) -> Events:
 
 def both(canvas: CanvasShape, models: list[Model], **kwargs: object) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Images of all models, by tiles and by one pass."""
-    turning = kwargs.pop("turning", None)
-    middle = None if turning is None else turning.middle_us
+    camera_rotation = kwargs.pop("camera_rotation", None)
+    middle = None if camera_rotation is None else camera_rotation.middle_us
     uploaded = upload_events(events(), Encoder.constant_speed(720.0, 0, 250_000), "cuda:0", middle_us=middle, **kwargs)
     image = Image(canvas, 3, "cuda:0")
     tiles = TileVotes(image, canvas, uploaded, models[0], candidates=len(models))
     for k, model in enumerate(models):
-        tiles.set(k, model, turning=turning)
+        tiles.set(k, model, camera_rotation=camera_rotation)
     tiles.launch()
     found, expected = [], []
     for k, model in enumerate(models):
         tiles.read(k, image)
         found.append(image.numpy())
         votes = Votes(canvas, "cuda:0")
-        votes.add_events(model, uploaded, turning=turning)
+        votes.add_events(model, uploaded, camera_rotation=camera_rotation)
         expected.append(votes.take())
     return found, expected
 
@@ -66,8 +69,8 @@ def test_tiles_vote_as_one_pass_does(vote: Vote, scale: float, apex_deg: float) 
 
 def test_distorted_and_turning_cameras() -> None:
     camera = Camera(200, 150, 180.0, 180.0, 99.5, 74.5, RadialTangential(-0.2, 0.05, 0.0, 0.0, 0.0))
-    turning = Turning((0.3, 0.2, 0.5), (0.0, 0.0, 0.0), 125_000)
-    found, expected = both(CanvasShape(200, 150, 8), [CircleModel(camera, 0.02, 0.1)], turning=turning)
+    camera_rotation = CameraRotation((0.3, 0.2, 0.5), (0.0, 0.0, 0.0), 125_000)
+    found, expected = both(CanvasShape(200, 150, 8), [CircleModel(camera, 0.02, 0.1)], camera_rotation=camera_rotation)
     assert np.abs(found[0] - expected[0]).max() < 0.004 * expected[0].max()
 
 

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, Recording
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.simulator import SensorModel
 from amiwarp.simulation.translator import open_pictures, translate, translation

@@ -15,7 +15,7 @@ from amiwarp.calib import Calibration, calibrate
 from amiwarp.cli.app import app
 from amiwarp.cli.inputs import NominalPrismOptions
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.attributes import prism_attributes, read_prism
 from amiwarp.optics.camera import Camera

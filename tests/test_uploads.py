@@ -11,7 +11,8 @@ from amiwarp.events.events import Events
 from amiwarp.imaging.device_events import LARGEST_WEIGHT, TURNS, upload_events
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Prism
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism
 
 
 def still_scene(n: int, points: int = 200, seed: int = 0) -> Events:

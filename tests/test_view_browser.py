@@ -17,10 +17,11 @@ from PIL import Image
 from test_serve import WAIT_S, served, until
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.events.events import MemoryEvents, Recording
+from amiwarp.events.events import MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.export import save_film
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import simulate

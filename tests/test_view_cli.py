@@ -20,7 +20,7 @@ from amiwarp.calib import Calibration
 from amiwarp.cli.app import app
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import app as viewer_app
 from amiwarp.viewer.app import BROWSERS, export_folder, has_display, open_window

@@ -16,11 +16,13 @@ from amiwarp.calib.parameters import build_model
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, Prism
+from amiwarp.optics.models import MODELS
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection

@@ -1,1 +1,1 @@
-"""TODO"""
+"""The scene's log brightness from pairs of events: equations, solver, residuals."""

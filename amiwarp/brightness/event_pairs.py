@@ -1,4 +1,4 @@
-"""Pairs of consecutive events of a pixel: what the equations of :mod:`amiwarp.brightness.solver.solver` are made of.
+"""Pairs of consecutive events of a pixel: what the equations of :mod:`amiwarp.brightness.solver` are made of.
 
 Built on the device: events are sorted by pixel, candidates for pairs marked, and those that are marked written.
 """
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events
-    from amiwarp.optics.camera_rotation import Turning
+    from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
 
@@ -100,7 +100,12 @@ class PairSet:
         return self._select(k.mark_square, [self.arrays, left, top, side])
 
     def on_tiles(
-        self, model: Model, turning: Turning, drift: float, tile_of: NDArray[np.int32], listed: NDArray[np.bool_]
+        self,
+        model: Model,
+        camera_rotation: CameraRotation,
+        drift: float,
+        tile_of: NDArray[np.int32],
+        listed: NDArray[np.bool_],
     ) -> PairSet:
         """The pairs whose compensated events both fall on one tile (``tile_of``, by pixel) of those ``listed``."""
         import warp as wp
@@ -110,7 +115,13 @@ class PairSet:
         from amiwarp.kernels.places import find_places
 
         places = wp.empty(len(self), dtype=wp.vec4, device=self.device)
-        inputs = [model.params(self.device), model_camera(model, self.device), self.arrays, drift, turning.params()]
+        inputs = [
+            model.params(self.device),
+            model_camera(model, self.device),
+            self.arrays,
+            drift,
+            camera_rotation.params(),
+        ]
         launch(find_places, len(self), inputs, [places], device=self.device)
         tiles = wp.array(tile_of, dtype=int, device=self.device)
         marked = [places, tiles, _ints(listed, self.device)]
@@ -208,9 +219,9 @@ class EventTable:
         """
         import warp as wp
 
+        from amiwarp.events.device_encoder import encoder_params
         from amiwarp.kernels import pairs as k
         from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.structs import encoder_params
 
         self.sort()
         sensor = sensor or Sensor()

@@ -16,7 +16,7 @@ import numpy as np
 from amiwarp.brightness.multigrid import Levels
 from amiwarp.brightness.residuals import CHUNKS, Residuals
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.models import model_camera
 
 if TYPE_CHECKING:
@@ -152,21 +152,26 @@ class BrightnessMap:
 
     # -- where pairs fall
 
-    def place(self, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:
+    def place(self, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
         """Where the pairs fall for these parameters, the camera's ``turning`` taken back to ``middle_us``."""
-        self._place(model, drift, turning, self._geometry)
+        self._place(model, drift, camera_rotation, self._geometry)
 
-    def _place(self, model: Model, drift: float, turning: Turning | None, out: Any) -> None:
+    def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
         from amiwarp.kernels import places as k
         from amiwarp.kernels.launch import launch
         from amiwarp.kernels.photometric import BLOCK
-        from amiwarp.kernels.structs import pinhole_params
+        from amiwarp.optics.device_camera import pinhole_params
 
         arrays, params = self.pairs.arrays, model.params(self.device)
-        turning = (turning or Turning()).about(self.middle_us)
+        camera_rotation = (camera_rotation or CameraRotation()).about(self.middle_us)
         pinhole = pinhole_params(model.camera)
-        if pinhole is None or arrays.slope.shape[0] or any(turning.rate) or any(turning.change):
-            inputs = [params, model_camera(model, self.device), arrays, self._atlas, drift, turning.params()]
+        if (
+            pinhole is None
+            or arrays.slope.shape[0]
+            or any(camera_rotation.angular_velocity)
+            or any(camera_rotation.angular_acceleration)
+        ):
+            inputs = [params, model_camera(model, self.device), arrays, self._atlas, drift, camera_rotation.params()]
             launch(k.place_pairs, self.count, inputs, [out], device=self.device)
             return
         inputs = [params, pinhole, arrays, self._atlas]
@@ -190,7 +195,7 @@ class BrightnessMap:
         from amiwarp.kernels.slopes import slope_between
 
         for side, at in zip(self._sides, (plus, minus), strict=True):
-            self._place(at["model"], at["drift"], at["turning"], side)
+            self._place(at["model"], at["drift"], at["camera_rotation"], side)
         out = self._zeros(self.pairs.arrays.stride)
         inputs = [self.pairs.arrays, self._atlas, *self._sides, self._image, width]
         launch(slope_between, self.count, inputs, [out], device=self.device)

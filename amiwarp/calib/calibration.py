@@ -24,7 +24,7 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
     from amiwarp.optics.camera import Camera
 
 LINEAR = ("off_ratio", "leak")
@@ -137,12 +137,12 @@ def _why_doubtful(
     A slow camera motion explains some of what a wrong scale does to the events, and the reverse: where it leaves more
     than a still scene does, the cause that leaves less is named.
     """
-    turning = found if settings.free is not None else _turning(recording, settings, found, device, progress)
-    if turning is not found and _cost(turning) <= STILL_COST:
-        return turning
+    moving = found if settings.free is not None else _turning(recording, settings, found, device, progress)
+    if moving is not found and _cost(moving) <= STILL_COST:
+        return moving
     scaled = _scaled(recording, settings, found, device, progress)
-    if scaled is None or (turning is not found and _cost(turning) <= scaled[1]):
-        return turning
+    if scaled is None or (moving is not found and _cost(moving) <= scaled[1]):
+        return moving
     turns, cost = scaled
     return checks.wrong_scale(recording.name, turns, "the events repeat", _cost(found), cost)
 
@@ -184,21 +184,21 @@ def _turning(
 ) -> Calibration | AmiwarpError:
     """The same with the camera's motion free, where that explains the events so much better; else ``found``."""
     free = (size_name(settings.model), "phase", "motion")
-    turning = _try(recording, replace(settings, free=free), device, progress)
-    if isinstance(turning, AmiwarpError) or turning.photometric is None or not turning.photometric.accepted:
+    moving = _try(recording, replace(settings, free=free), device, progress)
+    if isinstance(moving, AmiwarpError) or moving.photometric is None or not moving.photometric.accepted:
         return found
-    if turning.photometric.cost > TURNING_GAIN * _cost(found):
+    if moving.photometric.cost > TURNING_GAIN * _cost(found):
         return found
-    speed = math.degrees(math.hypot(*(turning.parameters[n] for n in RATES)))
+    speed = math.degrees(math.hypot(*(moving.parameters[n] for n in RATES)))
     # the prism is what the calibration is for; the camera's motion was that of two turns in the middle
-    prism = {n: x for n, x in turning.parameters.items() if n not in MOTION}
+    prism = {n: x for n, x in moving.parameters.items() if n not in MOTION}
     return replace(
-        turning,
+        moving,
         parameters=prism,
-        uncertainty={n: x for n, x in turning.uncertainty.items() if n not in MOTION},
-        free=tuple(n for n in turning.free if n not in MOTION),
+        uncertainty={n: x for n, x in moving.uncertainty.items() if n not in MOTION},
+        free=tuple(n for n in moving.free if n not in MOTION),
         middle_us=None,
-        warnings=(*turning.warnings, f"the camera turned at {speed:.1f} deg/s: found with its motion free"),
+        warnings=(*moving.warnings, f"the camera turned at {speed:.1f} deg/s: found with its motion free"),
     )
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.bad_pixels import StrangeSummary
     from amiwarp.events.encoder import Encoder
-    from amiwarp.optics.models import Prism
+    from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000
 SMALLEST_TURN = math.pi / 2

@@ -18,7 +18,7 @@ from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.sharpness.search import STAGES, Settings
 from amiwarp.calib.solve import Stage
 from amiwarp.events.events import MemoryEvents
-from amiwarp.imaging.sharpness_costs import Sharpness
+from amiwarp.imaging.choices import Sharpness
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.sharpness.search import Progress, Search
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 WINDOW_US = 2_000_000
 """The paper calibrates on 2 s."""

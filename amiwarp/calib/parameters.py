@@ -15,17 +15,9 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera_rotation import Turning
-from amiwarp.optics.models import (
-    MODELS,
-    CircleModel,
-    EllipseModel,
-    ExactModel,
-    Prism,
-    RadialCircleModel,
-    deflection_from_apex,
-)
-from amiwarp.optics.prism import UnsizedPrism
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.models import MODELS, CircleModel, EllipseModel, ExactModel, RadialCircleModel, deflection_from_apex
+from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.validation import instance, one_of, real, shown, vector
 
 if TYPE_CHECKING:
@@ -161,7 +153,7 @@ class Space:
     def build(self, values: Mapping[str, float]) -> Model:
         return build_model(self.model, self.camera, self.prism, values)
 
-    def turning(self, values: Mapping[str, float]) -> Turning:
+    def camera_rotation(self, values: Mapping[str, float]) -> CameraRotation:
         return turning_of(values, self.middle_us)
 
     def drift(self, values: Mapping[str, float]) -> float:
@@ -198,11 +190,11 @@ def size_name(model: str) -> str:
     return "apex" if model in ("exact", "ellipse") else "deflection"
 
 
-def turning_of(values: Mapping[str, float], middle_us: int) -> Turning:
+def turning_of(values: Mapping[str, float], middle_us: int) -> CameraRotation:
     """The camera's motion among parameter values; none where they do not name it."""
     x, y, z = (values.get(n, 0.0) for n in RATES)
     a, b, c = (values.get(n, 0.0) for n in CHANGES)
-    return Turning((x, y, z), (a, b, c), middle_us)
+    return CameraRotation((x, y, z), (a, b, c), middle_us)
 
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:

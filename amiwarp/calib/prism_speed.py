@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 CELL = 8
 """Side of the cells in which events are counted [px]."""

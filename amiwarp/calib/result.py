@@ -15,13 +15,15 @@ import numpy as np
 from amiwarp.calib.parameters import MOTION, UNITS, build_model, size_name, turning_of
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.imaging.sharpness_costs import Sharpness
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.io.files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
 from amiwarp.io.output import write_text
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
-from amiwarp.optics.camera_rotation import Turning
-from amiwarp.optics.models import MODELS, Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
+from amiwarp.optics.models import MODELS
+from amiwarp.optics.prism import Prism
 from amiwarp.validation import one_of, real, shown
 
 if TYPE_CHECKING:
@@ -194,7 +196,7 @@ class Calibration:
         return replace(self, model_name="exact", parameters=found, uncertainty=std, free=free, ladder=None)
 
     @property
-    def turning(self) -> Turning | None:
+    def camera_rotation(self) -> CameraRotation | None:
         """The camera's own motion, about ``middle_us``; None where it was neither free nor given."""
         if not any(n in self.parameters for n in MOTION):
             return None

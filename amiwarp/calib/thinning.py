@@ -11,7 +11,7 @@ from amiwarp.events.events import Events, MemoryEvents
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 RUN = 8
 """Events that stay together where a recording is thinned: a cache line of times."""

@@ -14,13 +14,13 @@ from amiwarp.cli.console import Advance, choose_device, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, interval, number, span
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.sharpness_costs import Sharpness
+from amiwarp.imaging.choices import Sharpness
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration, Settings
     from amiwarp.calib.photometric.stage import PhotometricSettings
     from amiwarp.calib.result import Ladder
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
 

@@ -11,10 +11,11 @@ import typer
 from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.export import IweFiles, Layers
+from amiwarp.imaging.choices import Layers
 
 if TYPE_CHECKING:
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
+    from amiwarp.imaging.export import IweFiles
 
 EXAMPLE = "amiwarp compensate recording.h5 compensated.h5 --calibration calibration.json --iwe iwe.png"
 
@@ -51,6 +52,8 @@ class IweOptions:
             if self.iwe_window_ms is not None or self.iwe_layers is not Layers.MERGED:
                 raise AmiwarpError("--iwe-window-ms and --iwe-layers describe an image; give --iwe too")
             return None
+        from amiwarp.imaging.export import IweFiles
+
         window_us = None if self.iwe_window_ms is None else max(1, round(self.iwe_window_ms * 1000.0))
         return IweFiles(self.iwe, recording.events, window_us=window_us, layers=self.iwe_layers, device=device)
 

@@ -16,7 +16,7 @@ from amiwarp.cli.console import choose_device, plain, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, numbers
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.prism import FlatSide, Prism
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera

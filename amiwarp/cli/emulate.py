@@ -19,7 +19,7 @@ from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"
 

@@ -15,7 +15,8 @@ from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import EventSource, Recording
+    from amiwarp.events.events import EventSource
+    from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp info recording.h5"
 

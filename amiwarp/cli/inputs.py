@@ -14,7 +14,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
 
 if TYPE_CHECKING:
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 _CAMERA = "Camera"
 _PRISM = "Prism"

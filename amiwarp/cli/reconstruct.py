@@ -14,9 +14,8 @@ from amiwarp.cli.console import Advance, choose_device, progress, report
 from amiwarp.cli.inputs import numbers
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera_rotation import Turning
-from amiwarp.reconstruction.export import CONTRAST, VIDEO, Tone, check_path, save_mask, save_picture, save_video
-from amiwarp.reconstruction.picture import Fill
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.reconstruction.choices import CONTRAST, Fill, Tone
 
 if TYPE_CHECKING:
     from amiwarp.reconstruction.picture import Picture, Reconstruction
@@ -57,12 +56,12 @@ class WindowOptions:
         start = work.recording.events.t_first + round((self.start or 0.0) * 1e6)
         return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
 
-    def turning(self) -> Turning | None:
+    def camera_rotation(self) -> CameraRotation | None:
         """The camera's rotation where it was given."""
         if self.omega is None:
             return None
         x, y, z = numbers(self.omega, 3, "--omega")
-        return Turning((x, y, z))
+        return CameraRotation((x, y, z))
 
 
 @dataclass(frozen=True)
@@ -110,6 +109,7 @@ def run(
     """
     from amiwarp.calib import Calibration
     from amiwarp.io import open_recording
+    from amiwarp.reconstruction.export import VIDEO, check_path
     from amiwarp.reconstruction.picture import Reconstruction
 
     check_path(out)
@@ -120,8 +120,8 @@ def run(
         raise AmiwarpError(f"{out}: --fps goes with a video; give a name that ends in {VIDEO}")
     device = choose_device(common.device)
     work = Reconstruction(
-        open_recording(recording), Calibration.load(calibration), turning=window.turning(), fill=picture.fill,
-        device=device,
+        open_recording(recording), Calibration.load(calibration), camera_rotation=window.camera_rotation(),
+        fill=picture.fill, device=device,
     )  # fmt: skip
     start, length = window.span(work)
     began = time.perf_counter()
@@ -136,6 +136,8 @@ def run(
 
 
 def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]:
+    from amiwarp.reconstruction.export import save_mask, save_picture
+
     save_picture(found, out, tone=options.tone, bits=options.bits, contrast=options.contrast)
     if options.mask is not None:
         save_mask(found, options.mask)
@@ -153,6 +155,8 @@ def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]
 def _video(
     work: Reconstruction, out: Path, span: tuple[int, int], fps: float, options: PictureOptions, advance: Advance
 ) -> dict[str, Any]:
+    from amiwarp.reconstruction.export import save_video
+
     step = 1e6 / fps
     count = work.count(*span, step_us=step)
     pairs: list[int] = []

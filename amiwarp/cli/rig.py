@@ -12,7 +12,7 @@ import typer
 from amiwarp.cli.inputs import numbers, read_camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.optics.prism import FlatSide, Prism
 
 if TYPE_CHECKING:
     from amiwarp.simulation.motion import EncoderModel, PrismMotion

@@ -19,7 +19,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.scene import Axis, Colour, Look, View
 
 if TYPE_CHECKING:
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
     from amiwarp.viewer.inspector import Inspector
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
@@ -167,13 +167,13 @@ def inspector(
 def _following(spec: str, controller: str | None) -> Iterator[Callable[[], Recording]]:
     """What a stream's last seconds are by now; waits for the first turn."""
     from amiwarp.cli.streams import SourceOptions, check_angles
-    from amiwarp.live.stream.recent_events import Ring, followed
+    from amiwarp.live.stream.recent_events import RecentEvents, followed
     from amiwarp.live.stream.sources import open_source
 
     with SourceOptions(port=controller).link() as link:
         source = open_source(spec)
         check_angles(source, link)
-        ring = Ring(source)
+        ring = RecentEvents(source)
         with followed(source, link, ring, say):
             recording = ring.recording()
             assert recording is not None

@@ -1,1 +1,1 @@
-"""TODO"""
+"""Motion compensation of recordings and streams."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.launch_plan import Placing
-from amiwarp.compensation.packet_copy import PIECE, Gatherer, address
+from amiwarp.compensation.packet_copy import PIECE, PacketCopier, address
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 
@@ -60,7 +60,7 @@ class Started:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Begun:
+class BatchInFlight:
     """A batch that a device works on: from ``at`` to ``end`` of the buffers."""
 
     at: int
@@ -103,7 +103,7 @@ class Batches:
         self._host = {name: getattr(self._ours, name).numpy() for name in dtypes}
         self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
         self._recorded: dict[bool, Recorded] = {}
-        self._spare, self._gatherers = Spare(batch), [Gatherer(), Gatherer()]
+        self._spare, self._gatherers = PinnedPool(batch), [PacketCopier(), PacketCopier()]
         self._votes = Votes(CanvasShape(*self._placing.size), device)
         self._stretches = self._votes.stretches(columns.out_x, columns.out_y, self._layer)
         if device.is_cuda and batch > DIRECT:
@@ -113,8 +113,8 @@ class Batches:
         """Puts its pieces over a span of event times [us] into one bucket, where a search finds them: they are few."""
         import warp as wp
 
+        from amiwarp.events.device_encoder import encoder_pieces
         from amiwarp.kernels.encoder import EncoderParams
-        from amiwarp.kernels.structs import encoder_pieces
 
         origin, *pieces = encoder_pieces(encoder, first, last)
         n, p = len(pieces[0]), self._encoder
@@ -162,7 +162,7 @@ class Batches:
         found = bool((t[1:] < t[:-1]).any()), int(to[0].max()), int(to[1].max())
         return Started(parts, at, end, t, p, arrived_us, lent, lambda: found)
 
-    def begin(self, started: Started, unknown: int) -> Begun:
+    def begin(self, started: Started, unknown: int) -> BatchInFlight:
         """Sends a batch on its way; the first ``unknown`` get no place. Raises :class:`AmiwarpError` where unsorted."""
         import warp as wp
 
@@ -191,9 +191,9 @@ class Batches:
             done = wp.record_event(wp.Event(self._device))
         self._vote(least=VOTED)
         t = s.t if s.lent else s.t.copy() if len(s.parts) > 1 else s.parts[0].t
-        return Begun(at, end, t, s.p, unknown, s.arrived_us, out, done)
+        return BatchInFlight(at, end, t, s.p, unknown, s.arrived_us, out, done)
 
-    def end(self, begun: Begun) -> list[NDArray[Any]]:
+    def end(self, begun: BatchInFlight) -> list[NDArray[Any]]:
         """Places x, y [px] and flags, outside the image or not."""
         import warp as wp
 
@@ -271,7 +271,7 @@ class Batches:
         return self._votes.take()[0]
 
 
-class Spare:
+class PinnedPool:
     """Arrays to hand out that a GPU writes to at full speed; again when nobody holds them, for making one is slow."""
 
     def __init__(self, size: int) -> None:

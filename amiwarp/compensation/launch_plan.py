@@ -15,9 +15,10 @@ class Placing:
         """``device``: a ``wp.Device``. The kernel is loaded here, before threads would each try."""
         import warp as wp
 
+        from amiwarp.events.device_encoder import azimuths
         from amiwarp.kernels import compensation as kernels
         from amiwarp.kernels.launch import load
-        from amiwarp.kernels.structs import azimuths, camera_params, pinhole_params
+        from amiwarp.optics.device_camera import camera_params, pinhole_params
 
         name = str(device)
         self.size = model.camera.width, model.camera.height

@@ -21,7 +21,7 @@ HEAD = object.__basicsize__
 ask NumPy for the address takes 1.5 us, of 100 packets' columns nearly as long as to copy them."""
 
 
-class Gatherer:
+class PacketCopier:
     """Puts packets together by several threads, see :mod:`amiwarp.kernels.packet_copy`."""
 
     def __init__(self) -> None:

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.result import Calibration
     from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import EventSource, MetadataValue, Recording
+    from amiwarp.events.events import EventSource
+    from amiwarp.events.recording import MetadataValue, Recording
     from amiwarp.optics.models import Model
 
 BLOCK = 1 << 20
@@ -62,7 +63,7 @@ class Mover:
     def __init__(self, model: Model, encoder: Encoder, t_first: int, t_last: int, device: Any) -> None:
         import warp as wp
 
-        from amiwarp.kernels.structs import encoder_params
+        from amiwarp.events.device_encoder import encoder_params
 
         self._device = wp.get_device(device)
         self._placing = Placing(model, self._device)

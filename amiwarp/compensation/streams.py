@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from amiwarp.compensation.batches import Batches, Begun, Started
+from amiwarp.compensation.batches import Batches, BatchInFlight, Started
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, check_sensor
 
@@ -87,7 +87,7 @@ class Compensator:
         self.waiting_bytes = 0
         """Memory that these take [bytes], see :func:`held_bytes`."""
         self._started: Started | None = None
-        self._begun: tuple[Begun, NDArray[np.bool_] | None] | None = None
+        self._begun: tuple[BatchInFlight, NDArray[np.bool_] | None] | None = None
         self._t_last = -(2**62)
         self._covered: tuple[int, int] | None = None
 
@@ -166,7 +166,7 @@ class Compensator:
     def _start(self, packets: list[Waiting]) -> Started:
         return self._work.start([events for events, *_ in packets], packets[0][3])
 
-    def _begin(self, started: Started) -> tuple[Begun, NDArray[np.bool_] | None]:
+    def _begin(self, started: Started) -> tuple[BatchInFlight, NDArray[np.bool_] | None]:
         """With which of its events have a guessed angle, None for none: by the samples there are now."""
         parts, n = started.parts, started.end - started.at
         first, last = int(parts[0].t[0]), int(parts[-1].t[-1])
@@ -180,7 +180,7 @@ class Compensator:
         begun = self._work.begin(started, unknown)
         return begun, None if self.encoder.knows(first, last) else self.encoder.guessed(begun.t)
 
-    def _end(self, begun: Begun, guessed: NDArray[np.bool_] | None) -> Compensated:
+    def _end(self, begun: BatchInFlight, guessed: NDArray[np.bool_] | None) -> Compensated:
         x, y, flags = self._work.end(begun)
         if guessed is not None:
             flags[guessed] |= EXTRAPOLATED

@@ -1,1 +1,1 @@
-"""TODO"""
+"""Events, recordings and the prism's encoder."""

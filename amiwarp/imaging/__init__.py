@@ -1,1 +1,1 @@
-"""TODO"""
+"""Images of warped events (IWE), their sharpness and their metrics."""

@@ -75,8 +75,8 @@ def upload_events(
     """
     import warp as wp
 
+    from amiwarp.events.device_encoder import azimuths, encoder_params
     from amiwarp.kernels.launch import launch
-    from amiwarp.kernels.structs import azimuths, encoder_params
     from amiwarp.kernels.votes import EventArrays, time_events, turn_events
 
     check_sensor(events)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import io
 import itertools
 import os
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.warped_image import PIECE, CanvasShape, Votes
 from amiwarp.io.output import NewFile, allocate, check_output
 from amiwarp.validation import choice
@@ -30,17 +30,6 @@ GAMMA = 0.5
 OFF_COLOUR, ON_COLOUR = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)
 """Blue and orange: told apart by all common kinds of colour vision."""
 MOST_WINDOWS = 100_000
-
-
-class Layers(enum.StrEnum):
-    """What becomes of polarity."""
-
-    MERGED = "merged"
-    """All events count alike: (height, width)."""
-    SIGNED = "signed"
-    """ON minus OFF: (height, width)."""
-    POLARITY = "polarity"
-    """OFF, then ON: (2, height, width)."""
 
 
 def tone(counts: NDArray[Any]) -> NDArray[np.float32]:

@@ -11,16 +11,19 @@ from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.imaging.sharpness_costs import Sharpness, sharpness
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import sharpness
 from amiwarp.imaging.warped_image import iwe
-from amiwarp.optics.models import ExactModel, ModelError, Prism, predicted_error
+from amiwarp.optics.models import ExactModel, ModelError, predicted_error
+from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events.events import Truth
+    from amiwarp.events.recording import Truth
     from amiwarp.optics.camera import Camera
-    from amiwarp.optics.models import FlatSide, Model
+    from amiwarp.optics.models import Model
+    from amiwarp.optics.prism import FlatSide
 
 ACROSS = 3.0
 """Half width of the strip about an edge whose events are counted to it [px]."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import enum
 import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.warped_image import CanvasShape, Image
 from amiwarp.validation import array, choice, real
 
@@ -23,21 +23,6 @@ LARGEST_SMOOTHING = 1000.0
 """Largest standard deviation of a Gaussian [px]."""
 FEW_SUMS = 256
 """Sums that are left for the host to add."""
-
-
-class Sharpness(enum.StrEnum):
-    """What is measured; higher is sharper for each."""
-
-    VARIANCE = "variance"
-    """Variance over mean: 1 for events scattered at random, more where they gather."""
-    GRADIENT = "gradient"
-    """Mean squared gradient over mean."""
-    LAPLACIAN = "laplacian"
-    """Mean squared Laplacian over mean."""
-    PAPER_J = "paper_j"
-    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)); ``docs/calibration.md`` says where it fails."""
-    ENTROPY = "entropy"
-    """Minus the entropy of the votes' distribution over pixels [nat]."""
 
 
 class SharpnessMeter:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.camera_rotation import CameraRotation
 
 if TYPE_CHECKING:
     from amiwarp.imaging.device_events import DeviceEvents
@@ -28,9 +28,9 @@ class TileVotes:
         import warp as wp
 
         from amiwarp.kernels import tiles as kernels
-        from amiwarp.kernels.camera import TurningParams
+        from amiwarp.kernels.camera import CameraRotationParams
         from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams
-        from amiwarp.kernels.structs import pinhole_params
+        from amiwarp.optics.device_camera import pinhole_params
         from amiwarp.optics.models import CircleModel, ExactModel, RadialCircleModel, model_camera
 
         device = self.device = image.device
@@ -46,12 +46,13 @@ class TileVotes:
         self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
         kind = {CircleModel: CircleParams, RadialCircleModel: RadialCircleParams, ExactModel: ExactParams}[type(like)]
         self._host = [
-            wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True) for dtype in (kind, float, TurningParams)
+            wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True)
+            for dtype in (kind, float, CameraRotationParams)
         ]
         self._drifts = self._host[1].numpy()
         self._there = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
         motion = kernels.Motion()
-        motion.drift, motion.turning = self._there[1:]
+        motion.drift, motion.camera_rotation = self._there[1:]
         self._motion = kernels.Still() if still else motion
 
     def _sort(self, events: DeviceEvents) -> Any:
@@ -98,14 +99,14 @@ class TileVotes:
             chunks[name] = np.rint(middle - int(window) / 2)
         return chunks
 
-    def set(self, k: int, model: Model, *, drift: float = 0.0, turning: Turning | None = None) -> None:
+    def set(self, k: int, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
         """Parameters of candidate ``k`` for the next :meth:`launch`, which must not be under way."""
         import warp as wp
 
         self._drifts[k] = drift
         for array, struct in (
             (self._host[0], model.params(self.device)),
-            (self._host[2], (turning or Turning()).params()),
+            (self._host[2], (camera_rotation or CameraRotation()).params()),
         ):
             size = wp.types.type_size_in_bytes(array.dtype)
             ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)

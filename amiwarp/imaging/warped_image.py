@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import DeviceEvents, upload_events
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.optics.camera_rotation import Turning
+from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:
@@ -30,13 +30,6 @@ first few; then as many as the fullest word has room for, at most :data:`BATCH`.
 once, every event looks."""
 FILL = 600
 """Events that the fullest word of a batch should get: it has room for 1,023."""
-
-
-class Vote(enum.StrEnum):
-    """How an event's vote is shared among pixels."""
-
-    NEAREST = "nearest"
-    BILINEAR = "bilinear"
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,23 +187,23 @@ class Votes:
         return bool(self.device.is_cuda or self._spilled.numpy().any())
 
     def add_events(
-        self, model: Model, events: DeviceEvents, *, drift: float = 0.0, turning: Turning | None = None
+        self, model: Model, events: DeviceEvents, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None
     ) -> None:
         """Votes events on the same device after compensation by ``model``.
 
         ``turning`` is taken back where the events were given their times.
         """
         from amiwarp.kernels.launch import launch_slices
-        from amiwarp.kernels.structs import pinhole_params
         from amiwarp.kernels.votes import BLOCK, vote_blocks, vote_events, vote_turning
+        from amiwarp.optics.device_camera import pinhole_params
         from amiwarp.optics.models import model_camera
 
         if events.slope is not None:
             events.drift(drift)
         params, camera = model.params(self.device), pinhole_params(model.camera)
         inputs = [params, camera or model_camera(model, self.device), events.arrays, self._params]
-        if turning is not None and events.arrays.time.shape[0]:
-            inputs = [params, model_camera(model, self.device), *inputs[2:], turning.params()]
+        if camera_rotation is not None and events.arrays.time.shape[0]:
+            inputs = [params, model_camera(model, self.device), *inputs[2:], camera_rotation.params()]
             self._exactly(vote_turning, inputs, events.count)
         elif self.device.is_cuda and not len(events.arrays.weight):
             self._in_batches(inputs, events.count)
@@ -349,7 +342,7 @@ def iwe(
     *,
     model: Model | None = None,
     encoder: Encoder | None = None,
-    turning: Turning | None = None,
+    camera_rotation: CameraRotation | None = None,
     pad: int = 0,
     per_polarity: bool = False,
     vote: Vote = Vote.BILINEAR,
@@ -367,9 +360,9 @@ def iwe(
     for start in range(0, len(events), PIECE):
         piece = events[start : start + PIECE]
         if model is not None and encoder is not None:
-            middle = None if turning is None else turning.middle_us
+            middle = None if camera_rotation is None else camera_rotation.middle_us
             arrays = upload_events(piece, encoder, device, middle_us=middle)
-            votes.add_events(model, arrays, turning=turning)
+            votes.add_events(model, arrays, camera_rotation=camera_rotation)
         else:
             votes.add_as_they_are(piece)
     image = votes.take()

@@ -1,14 +1,14 @@
 """Recordings in and out: :func:`open_recording` reads every format, :class:`RecordingWriter` writes the native one."""
 
-from amiwarp.io.conversion import Summary, convert
+from amiwarp.io.conversion import ConversionSummary, convert
 from amiwarp.io.encoder_csv import read_encoder_csv
 from amiwarp.io.formats import Format, detect_format, open_recording
 from amiwarp.io.native_writer import RecordingWriter, save_recording
 
 __all__ = [
+    "ConversionSummary",
     "Format",
     "RecordingWriter",
-    "Summary",
     "convert",
     "detect_format",
     "open_recording",

@@ -9,7 +9,8 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import LARGEST_INTEGER
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
 from amiwarp.validation import array, instance, one_of, real, shown, whole
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ GAP_INTERVALS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class ConversionSummary:
     """What a conversion did."""
 
     events: int
@@ -54,7 +54,7 @@ def convert(
     prism: NominalPrism | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
-) -> Summary:
+) -> ConversionSummary:
     """Convert a recording to the native format in constant memory; what is given replaces what the file holds.
 
     Where the file does not tell the sensor's size, the camera's is taken. Raises :class:`AmiwarpError` for what cannot
@@ -84,10 +84,12 @@ def convert(
     return _summary(source, (width, height), encoder, dict(getattr(source, "repairs", {})))
 
 
-def _summary(source: EventSource, size: tuple[int, int], encoder: Encoder | None, repairs: dict[str, int]) -> Summary:
+def _summary(
+    source: EventSource, size: tuple[int, int], encoder: Encoder | None, repairs: dict[str, int]
+) -> ConversionSummary:
     ends = (source.t_first, source.t_last) if len(source) else None
     slip = np.zeros(0) if encoder is None else encoder.slip()
-    return Summary(
+    return ConversionSummary(
         events=len(source),
         t_first=ends[0] if ends else None,
         t_last=ends[1] if ends else None,

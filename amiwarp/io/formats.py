@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.io.files import errors_name
 from amiwarp.regular_file import check_regular
 from amiwarp.validation import choice

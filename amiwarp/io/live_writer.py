@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MetadataValue, as_times, check_events
+from amiwarp.events.events import Events, as_times, check_events
+from amiwarp.events.recording import MetadataValue
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name
 from amiwarp.io.native import open_native

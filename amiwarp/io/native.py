@@ -13,16 +13,8 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import (
-    DEFAULT_BLOCK,
-    Events,
-    MetadataValue,
-    Recording,
-    Truth,
-    as_times,
-    check_events,
-    regroup,
-)
+from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, check_events, regroup
+from amiwarp.events.recording import MetadataValue, Recording, Truth
 from amiwarp.io.attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order
 from amiwarp.io.files import errors_name, register_reader

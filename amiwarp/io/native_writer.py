@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MetadataValue, Recording, check_events
+from amiwarp.events.events import Events, check_events
+from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.attributes import camera_attributes, prism_attributes
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name

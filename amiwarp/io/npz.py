@@ -18,7 +18,8 @@ import numpy as np
 from numpy.lib import format as npy
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import DEFAULT_BLOCK, Recording
+from amiwarp.events.events import DEFAULT_BLOCK
+from amiwarp.events.recording import Recording
 from amiwarp.io.files import errors_name
 from amiwarp.io.scan import FileEvents, Packet
 from amiwarp.regular_file import check_regular

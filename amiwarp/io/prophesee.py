@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import DEFAULT_BLOCK, Recording
+from amiwarp.events.events import DEFAULT_BLOCK
+from amiwarp.events.recording import Recording
 from amiwarp.io.files import errors_name
 from amiwarp.io.reading_process import packets
 from amiwarp.io.scan import FileEvents, Packet

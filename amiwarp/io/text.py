@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Recording
+from amiwarp.events.recording import Recording
 from amiwarp.io.files import errors_name, note_input
 from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
 from amiwarp.regular_file import check_regular
 
 READ_BYTES = 1 << 22

@@ -185,17 +185,17 @@ def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), start: int, x
 
 
 @wp.struct
-class TurningParams:
-    """Angular velocity at time 0 [rad/s], and its change [rad/s²]."""
+class CameraRotationParams:
+    """Angular velocity at time 0 [rad/s], and its acceleration [rad/s²]."""
 
-    rate: wp.vec3
-    change: wp.vec3
+    velocity: wp.vec3
+    acceleration: wp.vec3
 
 
 @wp.func
-def turn_back(camera: CameraParams, xy: wp.vec2, turning: TurningParams, time: float) -> wp.vec2:
+def turn_back(camera: CameraParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float) -> wp.vec2:
     """The pixel at time 0 of the scene point that is at ``xy`` at ``time`` [s]."""
-    rotation = turning.rate * time + turning.change * (0.5 * time * time)
+    rotation = camera_rotation.velocity * time + camera_rotation.acceleration * (0.5 * time * time)
     angle = wp.length(rotation)
     if angle < 1.0e-9:
         return xy

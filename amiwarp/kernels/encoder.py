@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class EncoderParams:
-    """Linear pieces between samples, the first and last also beyond them; see ``structs.encoder_params``."""
+    """Linear pieces between samples, the first and last also beyond them; see ``events.device_encoder``."""
 
     origin: wp.int64  # event time at which the first bucket starts [us]
     shift: int  # a bucket is 2**shift us long

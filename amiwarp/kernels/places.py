@@ -1,10 +1,10 @@
-"""Device side of :mod:`amiwarp.brightness.solver.solver`: where the events of a pair fall on the map."""
+"""Device side of :mod:`amiwarp.brightness.solver`: where the events of a pair fall on the map."""
 
 from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
 from amiwarp.kernels.native import load_float, load_int, load_uint16, store_float, store_int
 from amiwarp.kernels.optics import MODEL_STRUCTS, compensate, place
 from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs
@@ -35,7 +35,7 @@ def azimuth_of(model: Any, pairs: Pairs, k: int, i: int):
 
 @wp.func
 def place_of(
-    model: Any, camera: CameraParams, turning: TurningParams, pairs: Pairs, drift: float, i: int, k: int
+    model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
     """Compensated place of the first (k = 0) or second event of a pair [px], whatever moves."""
     w0, w1 = azimuth_of(model, pairs, k, i)
@@ -47,7 +47,7 @@ def place_of(
         w1 = w1 * c + w0 * s
         w0 = a
     xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), wp.vec2(w0, w1))
-    return turn_back(camera, xy, turning, pairs.time[k * pairs.stride + i])
+    return turn_back(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
 
 
 @wp.kernel
@@ -56,14 +56,14 @@ def find_places(
     camera: CameraParams,
     pairs: Pairs,
     drift: float,
-    turning: TurningParams,
+    camera_rotation: CameraRotationParams,
     start: int,
     places: wp.array(dtype=wp.vec4),
 ):
     """Compensated places of both events of a pair [px]."""
     i = start + wp.tid()
-    a = place_of(model, camera, turning, pairs, drift, i, 0)
-    b = place_of(model, camera, turning, pairs, drift, i, 1)
+    a = place_of(model, camera, camera_rotation, pairs, drift, i, 0)
+    b = place_of(model, camera, camera_rotation, pairs, drift, i, 1)
     places[i] = wp.vec4(a[0], a[1], b[0], b[1])
 
 
@@ -84,14 +84,14 @@ def place_pairs(
     pairs: Pairs,
     atlas: Atlas,
     drift: float,
-    turning: TurningParams,
+    camera_rotation: CameraRotationParams,
     start: int,
     geometry: Geometry,
 ):
     """Compensated places of both events of a pair, on the map."""
     i = start + wp.tid()
-    a = place_of(model, camera, turning, pairs, drift, i, 0)
-    b = place_of(model, camera, turning, pairs, drift, i, 1)
+    a = place_of(model, camera, camera_rotation, pairs, drift, i, 0)
+    b = place_of(model, camera, camera_rotation, pairs, drift, i, 1)
     tile = pairs.tile[i]
     cell_a, ax, ay = node_at(atlas, tile, a[0], a[1])
     cell_b, bx, by = node_at(atlas, tile, b[0], b[1])

@@ -1,7 +1,8 @@
 """Voting the same events again and again on CUDA: sorted by image tile once, voted in shared memory, flushed.
 
 A block of threads takes a chunk of one tile's events and a few candidates (parameters) at a time: every event is read
-once for all of them. Votes that leave the window around the tile go to the image at once. Used by :mod:`amiwarp.imaging.tile_votes`.
+once for all of them. Votes that leave the window around the tile go to the image at once.
+Used by :mod:`amiwarp.imaging.tile_votes`.
 """
 
 import math
@@ -9,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
 from amiwarp.kernels.native import load_uint32
 from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams, place
 from amiwarp.kernels.votes import Canvas, somewhere
@@ -76,7 +77,7 @@ class Motion:
     """What candidates have besides the model, one each."""
 
     drift: wp.array(dtype=float)
-    turning: wp.array(dtype=TurningParams)
+    camera_rotation: wp.array(dtype=CameraRotationParams)
 
 
 @wp.struct
@@ -206,7 +207,7 @@ def turned_back(motion: Still, camera: Any, x: float, y: float, events: TileEven
 def turned_back(motion: Motion, camera: CameraParams, x: float, y: float, events: TileEvents, candidate: int, i: int):
     if events.time.shape[0] == 0:
         return x, y
-    xy = turn_back(camera, wp.vec2(x, y), motion.turning[candidate], events.time[i])
+    xy = turn_back(camera, wp.vec2(x, y), motion.camera_rotation[candidate], events.time[i])
     return xy[0], xy[1]
 
 

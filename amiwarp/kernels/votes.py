@@ -4,14 +4,15 @@ A cell is the square between four pixel centres. Its word holds four sums over t
 fx, fy and b = fx fy of their places in it, in 1/256. They are the bilinear weights' sums: n - fx - fy + b for the
 cell's first pixel, fx - b for the next column, fy - b for the next row, b for both. Integers: the image does not depend
 on order and is the same bit for bit. A word is full with 1,023 events. What is carried out of a field is taken down at
-once, exactly, in 64-bit totals; or, faster on CUDA, words are emptied before, and checked: see :mod:`amiwarp.imaging.warped_image`.
+once, exactly, in 64-bit totals; or, faster on CUDA, words are emptied before, and checked:
+see :mod:`amiwarp.imaging.warped_image`.
 """
 
 from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, PinholeParams, TurningParams, turn_back
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
 from amiwarp.kernels.encoder import EncoderParams, angle_at
 from amiwarp.kernels.native import add_word, load_float, load_uint8, load_uint16, store_int, store_word
 from amiwarp.kernels.optics import MODEL_STRUCTS, place
@@ -193,7 +194,7 @@ def vote_turning(
     camera: CameraParams,
     events: EventArrays,
     canvas: Canvas,
-    turning: TurningParams,
+    camera_rotation: CameraRotationParams,
     start: int,
     cells: Cells,
 ):
@@ -201,7 +202,7 @@ def vote_turning(
     i = start + wp.tid()
     w0, w1 = azimuth_at(model, events, i)
     x, y = place(model, camera, float(events.x[i]), float(events.y[i]), w0, w1)
-    xy = turn_back(camera, wp.vec2(x, y), turning, events.time[i])
+    xy = turn_back(camera, wp.vec2(x, y), camera_rotation, events.time[i])
     dx, dy = somewhere(i)
     layer = int(events.layer[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, xy[0] + canvas.dither * dx, xy[1] + canvas.dither * dy, layer)

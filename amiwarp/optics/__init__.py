@@ -1,1 +1,1 @@
-"""TODO"""
+"""The camera, the prism, and the models of its refraction."""

@@ -1,14 +1,15 @@
-"""The pinhole camera: size, intrinsics, lens distortion."""
+"""The pinhole camera: size, intrinsics and lens distortion."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.optics.lens import Distortion
 from amiwarp.validation import array, real, shown, whole
 
 LARGEST_SIZE = 65536
@@ -19,45 +20,6 @@ LARGEST_FOCAL = 1e6
 """Largest focal length [px]: a microradian per pixel. Beyond it float32 no longer holds the prism's displacement."""
 LEAST_FOV = 1e-9
 """Least field of view [rad]; the focal length then decides."""
-LARGEST_COEFFICIENT = 1e6
-"""Largest magnitude of a coefficient of distortion: those of long lenses run to thousands."""
-
-
-@dataclass(frozen=True, slots=True)
-class RadialTangential:
-    """OpenCV's radial-tangential distortion, coefficients in its order k1, k2, p1, p2, k3."""
-
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check_coefficients(self)
-
-
-@dataclass(frozen=True, slots=True)
-class Fisheye:
-    """OpenCV's fisheye (equidistant) distortion, coefficients k1 .. k4."""
-
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check_coefficients(self)
-
-
-Distortion = RadialTangential | Fisheye
-
-
-def _check_coefficients(lens: Distortion) -> None:
-    for field in fields(lens):
-        what = f"camera distortion {field.name}"
-        value = real(getattr(lens, field.name), what, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
-        object.__setattr__(lens, field.name, value)
 
 
 Rows = TypeVar("Rows")
@@ -137,7 +99,7 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
 
     from amiwarp.kernels import camera as kernels
     from amiwarp.kernels.launch import launch
-    from amiwarp.kernels.structs import camera_params
+    from amiwarp.optics.device_camera import camera_params
 
     given, wanted = ({2: wp.vec2, 3: wp.vec3}[size] for size in sizes)
     if isinstance(rows, wp.array):

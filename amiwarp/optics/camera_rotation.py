@@ -16,36 +16,43 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Turning:
-    """Angular velocity in the camera's frame, ``rate + change (t - middle_us)``; places are turned back to the middle.
+class CameraRotation:
+    """Angular velocity in the camera's frame, constant or linear in time.
 
-    Over a window the rotation vector is rate τ + change τ²/2, τ from the middle: exact while the axis stays.
+    At time t it is ``angular_velocity + angular_acceleration * (t - middle_us)``. Places are turned back to the middle.
+
+    Over a window the rotation vector is ωτ + ατ²/2, τ from the middle: exact while the axis stays.
     """
 
-    rate: Vector = (0.0, 0.0, 0.0)
+    angular_velocity: Vector = (0.0, 0.0, 0.0)
     """At the middle [rad/s]."""
-    change: Vector = (0.0, 0.0, 0.0)
+    angular_acceleration: Vector = (0.0, 0.0, 0.0)
     """[rad/s²]."""
     middle_us: int = 0
 
-    def about(self, middle_us: int) -> Turning:
+    def about(self, middle_us: int) -> CameraRotation:
         """The same motion seen from another middle."""
         later = (middle_us - self.middle_us) * 1e-6
-        x, y, z = (r + c * later for r, c in zip(self.rate, self.change, strict=True))
-        return replace(self, rate=(x, y, z), middle_us=middle_us)
+        x, y, z = (r + c * later for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True))
+        return replace(self, angular_velocity=(x, y, z), middle_us=middle_us)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera rotates at all."""
+        return any(self.angular_velocity) or any(self.angular_acceleration)
 
     def rotation(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rotation vectors [rad] since the middle at ``tau`` [s] from it, shape (n, 3)."""
-        return np.outer(tau, self.rate) + np.outer(0.5 * tau**2, self.change)
+        return np.outer(tau, self.angular_velocity) + np.outer(0.5 * tau**2, self.angular_acceleration)
 
     def params(self) -> Any:
         """For kernels."""
         import warp as wp
 
-        from amiwarp.kernels.camera import TurningParams
+        from amiwarp.kernels.camera import CameraRotationParams
 
-        p = TurningParams()
-        p.rate, p.change = wp.vec3(*self.rate), wp.vec3(*self.change)
+        p = CameraRotationParams()
+        p.velocity, p.acceleration = wp.vec3(*self.angular_velocity), wp.vec3(*self.angular_acceleration)
         return p
 
     def reach(self, camera: Camera, half_s: float) -> NDArray[np.float64]:

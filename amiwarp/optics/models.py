@@ -107,7 +107,7 @@ def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def model_camera(model: _Model, device: Any) -> Any:
     """The camera's struct on ``device``, made once for each camera."""
-    from amiwarp.kernels.structs import camera_params
+    from amiwarp.optics.device_camera import camera_params
 
     return camera_params(model.camera, str(device))
 

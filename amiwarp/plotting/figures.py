@@ -17,13 +17,15 @@ from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io.output import write_text
 from amiwarp.plotting import clouds
-from amiwarp.reconstruction.export import Tone, limits, tones
+from amiwarp.reconstruction.choices import Tone
+from amiwarp.reconstruction.export import limits, tones
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib import Calibration
-    from amiwarp.events.events import Events, Recording
+    from amiwarp.events.events import Events
+    from amiwarp.events.recording import Recording
     from amiwarp.imaging.metrics import PictureQuality
     from amiwarp.reconstruction.picture import Picture
 

@@ -1,1 +1,1 @@
-"""TODO"""
+"""Image reconstruction from events."""

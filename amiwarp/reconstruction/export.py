@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import encode_image
 from amiwarp.io.output import NewFile, check_output
+from amiwarp.reconstruction.choices import CONTRAST, Tone
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
@@ -22,21 +22,10 @@ if TYPE_CHECKING:
 DARK, BRIGHT = 0.5, 99.5
 """Percentiles of the known pixels that become black and white."""
 GAMMA = 2.2
-CONTRAST = 0.25
-"""ON threshold where none is given [log intensity]."""
 STEADY = 0.1
 """Share of a new picture in a video's black and white points: they do not flicker."""
 STILLS = (".png", ".tif", ".tiff", ".npy")
 VIDEO = ".mp4"
-
-
-class Tone(enum.StrEnum):
-    """How intensity becomes a pixel's value."""
-
-    MAPPED = "mapped"
-    """For the eye: the 0.5th percentile of intensity is black, the 99.5th white, with gamma 2.2."""
-    LINEAR = "linear"
-    """Proportional to intensity: 0 is dark, the 99.5th percentile the largest value."""
 
 
 def limits(picture: Picture, contrast: float = CONTRAST) -> tuple[float, float]:

@@ -1,12 +1,12 @@
 """A picture of the scene from the events of a window: log intensity, solved for, with no network and no training.
 
 The pairs of consecutive events of each pixel are linear equations in the log-intensity map (see
-:mod:`amiwarp.brightness.solver.solver`). One tile, the image grown by the prism's orbit, is solved for; the picture is cut out of it.
+:mod:`amiwarp.brightness.solver`). One tile, the image grown by the prism's orbit, is solved for; the picture is cut
+out of it.
 """
 
 from __future__ import annotations
 
-import enum
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -21,14 +21,15 @@ from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TURN, Encoder
-from amiwarp.optics.camera_rotation import Turning, border
+from amiwarp.optics.camera_rotation import CameraRotation, border
+from amiwarp.reconstruction.choices import Fill
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.result import Calibration
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
     from amiwarp.optics.models import Model
 
 SCALES = (1.0, 0.5, 0.5)
@@ -66,17 +67,6 @@ LARGEST_MARGIN = 0.5
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is."""
-
-
-class Fill(enum.StrEnum):
-    """What stands where the events say nothing."""
-
-    NONE = "none"
-    """Nothing: NaN."""
-    SMOOTH = "smooth"
-    """The membrane through what is known around it."""
-    EDGE = "edge"
-    """The same, but that it breaks rather than bends: flat parts with edges between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +111,7 @@ class Reconstruction:
         *,
         model: Model | None = None,
         encoder: Encoder | None = None,
-        turning: Turning | None = None,
+        camera_rotation: CameraRotation | None = None,
         fill: Fill = Fill.SMOOTH,
         device: Any = "cpu",
     ) -> None:
@@ -148,9 +138,9 @@ class Reconstruction:
                 f"{recording.name}: is {width}x{height}, the model is for {given}; calibrate this camera"
             )
         self.recording, self.model, self.encoder = recording, model, encoder
-        if turning is None and calibration is not None:
-            turning = calibration.turning
-        self.turning, self.device = turning or Turning(), device
+        if camera_rotation is None and calibration is not None:
+            camera_rotation = calibration.camera_rotation
+        self.camera_rotation, self.device = camera_rotation or CameraRotation(), device
         self.fill = choice(Fill, fill, "fill")
         self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
         self._smoothness: float | None = None
@@ -252,7 +242,7 @@ class Reconstruction:
     def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:
         prior = Smoothness(self._smoothness or SMOOTHNESS[0], EDGE if self.fill is Fill.EDGE else 0.0)
         solver = BrightnessMap(pairs, tiles, off_excess=off, damping=MEAN_HOLD, smoothness=prior, middle_us=middle_us)
-        solver.place(self.model, turning=self.turning)
+        solver.place(self.model, camera_rotation=self.camera_rotation)
         return solver
 
     def _off_excess(self, start_us: int, length_us: int) -> float:
@@ -287,8 +277,8 @@ class Reconstruction:
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
         """Columns and rows of the map before the image's first, and the map: all that the window's pixels can see."""
         camera = self.model.camera
-        turning = self.turning.about(start_us + length_us // 2)
-        margin = np.max(np.abs(orbit(self.model)), axis=0) + turning.reach(camera, length_us * 0.5e-6)
+        camera_rotation = self.camera_rotation.about(start_us + length_us // 2)
+        margin = np.max(np.abs(orbit(self.model)), axis=0) + camera_rotation.reach(camera, length_us * 0.5e-6)
         limit = LARGEST_MARGIN * camera.width
         left, top = (math.ceil(min(float(m), limit)) + 2 for m in margin)
         origin = np.array([[-left, -top]], np.float32)
@@ -304,7 +294,7 @@ def reconstruct(
     start_us: int | None = None,
     length_us: int | None = None,
     turns: float | None = None,
-    turning: Turning | None = None,
+    camera_rotation: CameraRotation | None = None,
     fill: Fill = Fill.SMOOTH,
     device: Any = "cpu",
 ) -> Picture:
@@ -313,7 +303,7 @@ def reconstruct(
     See :class:`Reconstruction` for the rest, and for several windows.
     """
     work = Reconstruction(
-        recording, calibration, model=model, encoder=encoder, turning=turning, fill=fill, device=device
+        recording, calibration, model=model, encoder=encoder, camera_rotation=camera_rotation, fill=fill, device=device
     )
     return work.window(*work.span(start_us, length_us, turns))
 

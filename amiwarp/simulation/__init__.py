@@ -1,1 +1,1 @@
-"""TODO"""
+"""The simulator: recordings with ground truth from pictures and video."""

@@ -1,4 +1,4 @@
-"""The simulator's engine: host tables, launches, sorting; :class:`amiwarp.simulation.simulator.Simulation` is the way in."""
+"""The simulator's engine: host tables, launches and sorting, behind :class:`amiwarp.Simulation`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.events.events import Events
+from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import launch as launching
 from amiwarp.kernels import sight
-from amiwarp.kernels import event_generation as kernels
-from amiwarp.kernels.structs import camera_params
+from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
 from amiwarp.simulation.scenery import MapRing, place_scene, step_us
 

@@ -33,7 +33,7 @@ class PrismMotion:
     phase: float = 0.0
     """Azimuth at angle 0, θ_b [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
-    """Tilt of the axis of rotation about the camera's x and y [rad], as in :class:`amiwarp.optics.models.ExactModel`."""
+    """Tilt of the axis of rotation about the camera's x and y [rad], as in :class:`amiwarp.ExactModel`."""
 
     def __post_init__(self) -> None:
         _check_table("prism speed", self._table())

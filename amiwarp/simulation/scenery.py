@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import sight
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.structs import camera_params
+from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel
 from amiwarp.simulation.pictures import Placement, log_map, place
 

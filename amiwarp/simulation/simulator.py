@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents, MetadataValue, Recording, Truth
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import MetadataValue, Recording, Truth
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.validation import instance, real, whole

@@ -26,8 +26,8 @@ from amiwarp.simulation.simulator import Progress, Scene, SensorModel, Simulatio
 from amiwarp.validation import real, shown
 
 if TYPE_CHECKING:
-    from amiwarp.events.events import Recording
-    from amiwarp.optics.models import Prism
+    from amiwarp.events.recording import Recording
+    from amiwarp.optics.prism import Prism
 
 MOST_TABLE_BYTES = 64 << 20
 """Largest ``times.csv`` that is read: a million pictures."""

@@ -1,1 +1,1 @@
-"""TODO"""
+"""Studies that run the library many times and report: chart, stability, design, demo."""

@@ -20,7 +20,7 @@ from amiwarp.imaging import metrics
 from amiwarp.io import open_recording
 from amiwarp.io.output import check_output, make_folder
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import Reconstructed, draw_demo
 from amiwarp.reconstruction.export import save_picture
 from amiwarp.reconstruction.picture import Picture, Reconstruction
@@ -30,7 +30,7 @@ from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
     from amiwarp.optics.models import ExactModel
 
 APEX, PHASE = math.radians(1.0), math.radians(126.0)

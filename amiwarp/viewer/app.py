@@ -26,7 +26,7 @@ from amiwarp.viewer.scene import Look, Scene, View
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge", "brave-browser")
 """Those that open a page in a window of its own."""

@@ -13,9 +13,11 @@ import numpy as np
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, Recording
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import DeviceEvents, upload_events
-from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter
+from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import apex_from_deflection

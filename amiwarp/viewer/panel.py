@@ -21,7 +21,8 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.plotting.figures import Images
-from amiwarp.reconstruction.export import Tone, tones
+from amiwarp.reconstruction.choices import Tone
+from amiwarp.reconstruction.export import tones
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.viewer.exports import export_path
 from amiwarp.viewer.frames import room

@@ -36,15 +36,16 @@ def first_values(inspector: Inspector) -> dict[str, Any]:
     """The page's state before anything was touched; the knobs come on top."""
     source, recording = inspector.recording.events, inspector.recording
     start, length = inspector.window or inspector.first_window()
-    turning = math.isfinite(inspector.turn_us)
+    has_turns = math.isfinite(inspector.turn_us)
     return {
         **of_source(inspector), "live": inspector.latest is not None,
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "size": list(source.size),
         "start_ms": round((start - source.t_first) * 1e-3, 3),
-        "length_ms": round(length * 1e-3, 3), "turn_ms": inspector.turn_us * 1e-3 if turning else 0.0,
+        "length_ms": round(length * 1e-3, 3), "turn_ms": inspector.turn_us * 1e-3 if has_turns else 0.0,
         "playing": False, "speed": 0.1, "polarity": "both", "hide_hot": False, "region_x": [0, source.size[0]],
         "region_y": [0, source.size[1]], "colour": Colour.POLARITY.value, "point_size": 2.0, "opacity": 1.0,
-        "axis": (Axis.ANGLE if turning else Axis.TIME).value, "dark": False, "overlaid": False, "view": View.FREE.value,
+        "axis": (Axis.ANGLE if has_turns else Axis.TIME).value, "dark": False, "overlaid": False,
+        "view": View.FREE.value,
         "knob": "apex", "has_encoder": inspector.has_encoder, "orbit_shown": True, "help_shown": False, "out": "",
         "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "events": "", "sharpness": "",
         "before": "", "after": "", "picture": "", "picture_note": "", "curve": "", "curve_mark": 0.0, "curve_text": "",

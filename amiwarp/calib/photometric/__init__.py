@@ -1,1 +1,1 @@
-"""TODO"""
+"""The photometric stage of the calibration."""

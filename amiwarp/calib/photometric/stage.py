@@ -1,6 +1,7 @@
 """The second stage: parameters that make the events' brightness changes agree with one map of the scene.
 
-Sharpness is biased by the sensor's hysteresis; here the hysteresis is the equation (see :mod:`amiwarp.brightness.solver.solver`).
+Sharpness is biased by the sensor's hysteresis. Here the hysteresis is the equation:
+see :mod:`amiwarp.brightness.solver`.
 For given parameters the map is a linear least-squares problem; the parameters minimise what remains of it, robustly.
 """
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from amiwarp.calib.parameters import Space
     from amiwarp.calib.sharpness.search import Progress, Search
     from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 MARGIN_PX, MOVING_MARGIN_PX = 3, 8
 """By which the map of a tile is grown: the parameters may move events so far."""
@@ -115,7 +116,7 @@ class _Gatherer:
         if material.slope_of is not None:
             pairs = pairs.with_slope(material.slope_of, space.middle_us)
         every = np.ones(int(self.tile_of.max()) + 1, np.bool_)
-        return pairs.on_tiles(space.build(best), space.turning(best), space.drift(best), self.tile_of, every)
+        return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self.tile_of, every)
 
 
 def turn_length(recording: Recording, encoder: Encoder) -> float:
@@ -198,7 +199,11 @@ class Cost:
         """Arguments of :meth:`BrightnessMap.place`."""
         values = self.space.to_values(v)
         space = self.space
-        return {"model": space.build(values), "drift": space.drift(values), "turning": space.turning(values)}
+        return {
+            "model": space.build(values),
+            "drift": space.drift(values),
+            "camera_rotation": space.camera_rotation(values),
+        }
 
     def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> None:
         """Leaves them with the map, on the device."""

@@ -15,7 +15,7 @@ from amiwarp.calib.selection.trial import FARTHEST_PX, SURE, Trial, in_pixels
 
 if TYPE_CHECKING:
     from amiwarp.calib.sharpness.search import Settings
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 GROUPS = {"clock_offset": ("clock_offset",), "tilt": ("tilt_x", "tilt_y"), "index": ("index",)}
 """What may be freed, together where one alone makes no sense."""

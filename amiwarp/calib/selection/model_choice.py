@@ -11,22 +11,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib.selection import free_parameters
 from amiwarp.calib.result import Calibration, Ladder, Rung
+from amiwarp.calib.selection import free_parameters
 from amiwarp.calib.selection.smaller_models import fit
 from amiwarp.calib.selection.trial import FACTOR, Trial, by_sharpness, in_pixels, make_trial
 from amiwarp.calib.sharpness.held_out import slope
 from amiwarp.calib.sharpness.objective import padding
 from amiwarp.calib.sharpness.search import Progress, Settings
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.models import MODELS, predicted_error
 
 if TYPE_CHECKING:
     from amiwarp.calib.parameters import Space
     from amiwarp.calib.selection.trial import Vector
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 NUMBERS = {"circle": "2", "radial": "2, index given", "ellipse": "6 a pixel", "exact": "2, index given"}
 
@@ -216,7 +217,9 @@ def _sharpness(trial: Trial, space: Space, values: Mapping[str, float], settings
     votes = Votes(canvas, device)
     meter = SharpnessMeter(canvas, kind, smoothing=0.0 if plain else settings.smoothing_px, device=device)
     events = trial.material.on(device, space.middle_us if space.moving else None)
-    votes.add_events(space.build(values), events, drift=space.drift(values), turning=space.turning(values))
+    votes.add_events(
+        space.build(values), events, drift=space.drift(values), camera_rotation=space.camera_rotation(values)
+    )
     votes.read(meter.image)
     meter.launch()
     return meter.results()[0]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.parameters import Space
     from amiwarp.calib.result import Calibration
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
     Vector = NDArray[np.float64]
 

@@ -1,1 +1,1 @@
-"""TODO"""
+"""The sharpness stage of the calibration: contrast maximisation."""

@@ -11,8 +11,9 @@ import numpy as np
 
 from amiwarp.calib.sharpness.curvature import STEP_PX, differences
 from amiwarp.calib.sharpness.objective import padding
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import upload_events
-from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter
+from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 
 if TYPE_CHECKING:
@@ -76,7 +77,9 @@ class Half:
         self._votes.clear()
         wp.synchronize_device(device)
         began = time.perf_counter()
-        self._votes.add_events(model, self._events, drift=space.drift(values), turning=space.turning(values))
+        self._votes.add_events(
+            model, self._events, drift=space.drift(values), camera_rotation=space.camera_rotation(values)
+        )
         wp.synchronize_device(device)
         took = (time.perf_counter() - began) / max(self._events.count, 1)
         self.fastest[space.model] = min(took, self.fastest.get(space.model, math.inf))

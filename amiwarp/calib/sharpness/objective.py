@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib.parameters import MOTION, build_model
-from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera_rotation import border
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.parameters import Space
     from amiwarp.imaging.device_events import DeviceEvents
-    from amiwarp.optics.camera_rotation import Turning
+    from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
 MOTION_ROOM_PX = 16.0
@@ -71,7 +72,7 @@ class Objective:
 
     def _measure(self, values: Mapping[str, float]) -> list[float]:
         self.evaluations += 1
-        self._image.measure(self._model(values), self.space.drift(values), self.space.turning(values))
+        self._image.measure(self._model(values), self.space.drift(values), self.space.camera_rotation(values))
         return self._meter.results()
 
     def values(self, values: Mapping[str, float]) -> float:
@@ -98,9 +99,9 @@ class _Voted:
     def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter) -> None:
         self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
 
-    def measure(self, model: Model, drift: float, turning: Turning) -> None:
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
         self._votes.clear()
-        self._votes.add_events(model, self._events, drift=drift, turning=turning)
+        self._votes.add_events(model, self._events, drift=drift, camera_rotation=camera_rotation)
         self._votes.read(self._meter.image)
         self._meter.launch()
 
@@ -114,10 +115,10 @@ class _Captured:
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
         self._graph: Any = None
 
-    def measure(self, model: Model, drift: float, turning: Turning) -> None:
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
         import warp as wp
 
-        self._tiles.set(0, model, drift=drift, turning=turning)
+        self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
@@ -153,5 +154,5 @@ def reach(space: Space, values: Mapping[str, float]) -> float:
     xy = np.tile(at, (16, 1))
     moved = build_model(kind, camera, space.prism, values).compensate_points(xy, theta) - xy
     radius = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
-    turned = space.turning(values).reach(camera, space.duration_us * 0.5e-6)
+    turned = space.camera_rotation(values).reach(camera, space.duration_us * 0.5e-6)
     return float(radius.max(initial=0.0)) + float(np.linalg.norm(turned))

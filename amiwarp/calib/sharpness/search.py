@@ -17,8 +17,8 @@ from amiwarp.calib.sharpness.curvature import differences
 from amiwarp.calib.sharpness.objective import Objective
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import upload_events
-from amiwarp.imaging.sharpness_costs import Sharpness
 from amiwarp.optics.models import MODELS
 from amiwarp.validation import choice, one_of, real, shown, whole
 

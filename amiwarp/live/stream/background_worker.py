@@ -14,11 +14,11 @@ LAST_JOB_S = 5.0
 """Longest wait for the job at work when the others are given up."""
 
 
-class Beside:
+class BackgroundWorker:
     """Runs jobs one after the other in a background thread. :meth:`put` waits while ``most_bytes`` of them are held.
 
-    Each job counts for the bytes it is put with and :data:`~amiwarp.compensation.streams.OVERHEAD`, so that jobs without events
-    are bounded too. A single job larger than the bound still passes, alone.
+    Each job counts for the bytes it is put with and :data:`~amiwarp.compensation.streams.OVERHEAD`, so that jobs
+    without events are bounded too. A single job larger than the bound still passes, alone.
     """
 
     def __init__(self, most_bytes: int = QUEUE_BYTES) -> None:

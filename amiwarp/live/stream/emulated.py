@@ -15,7 +15,7 @@ from amiwarp.live.stream.sockets import SocketSink
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
     from amiwarp.live.link.emulator import Controller
     from amiwarp.live.link.rotors import Played
 

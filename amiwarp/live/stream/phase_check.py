@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from amiwarp.compensation.streams import held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TURN
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 
 if TYPE_CHECKING:
     from amiwarp.calib.result import Calibration
@@ -40,7 +41,7 @@ class Phase:
     """[rad]"""
 
 
-class PhaseWatch:
+class PhaseCheck:
     """Finds the phase anew by sharpness, on the CPU and in a thread of its own; give it what the compensator gets.
 
     Sharpness has a bias that the sensor gives it, so what counts is the change since the first look.

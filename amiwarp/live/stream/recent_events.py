@@ -14,7 +14,8 @@ import numpy as np
 from amiwarp.compensation.streams import OVERHEAD, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.live.stream.queues import Policy
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ FIRST_S = 15.0
 """Longest wait for the first turn."""
 
 
-class Ring:
+class RecentEvents:
     """Takes what a :class:`LiveWriter` takes; for one thread that appends and any that ask."""
 
     def __init__(self, source: Source, camera: Camera | None = None, prism: NominalPrism | None = None) -> None:
@@ -86,7 +87,7 @@ class Ring:
 
 
 @contextlib.contextmanager
-def followed(source: Source, link: Link | None, ring: Ring, say: Callable[[str], None]) -> Iterator[None]:
+def followed(source: Source, link: Link | None, ring: RecentEvents, say: Callable[[str], None]) -> Iterator[None]:
     """Fills the ring from a source, in a thread, for as long as the ``with`` block lasts.
 
     Waits for the first turn. Raises :class:`AmiwarpError` where none comes in time, or what the source raised.

@@ -15,13 +15,14 @@ import numpy as np
 
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator, held_bytes
 from amiwarp.events.encoder import EncoderStream
-from amiwarp.imaging.sharpness_costs import Sharpness, SharpnessMeter
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.background_worker import Beside
+from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.clocking import CameraClock, clock_offset
 from amiwarp.live.stream.packets import NO_TIMES, Sorter
-from amiwarp.live.stream.phase_check import PhaseWatch
+from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.queues import PacketQueue, Policy
 
 if TYPE_CHECKING:
@@ -123,8 +124,8 @@ class Session:
     ) -> None:
         self.status = Status()
         self._source, self._link, self._sinks, self._keeper, self._say = source, link, list(sinks), keeper, say
-        self._raw: list[tuple[Raw | LiveWriter, Beside]] = [(taker, Beside()) for taker in raw]
-        self._out = None if out is None else (out, Beside())
+        self._raw: list[tuple[Raw | LiveWriter, BackgroundWorker]] = [(taker, BackgroundWorker()) for taker in raw]
+        self._out = None if out is None else (out, BackgroundWorker())
         self._stop = threading.Event()
         self._queue = PacketQueue(queue_events, policy)
         self._sorter, self._camera_clock = Sorter(), CameraClock()
@@ -137,13 +138,13 @@ class Session:
         self._hasty = False
         self._compensator: Compensator | None = None
         self._meter: SharpnessMeter | None = None
-        self._watch: PhaseWatch | None = None
+        self._watch: PhaseCheck | None = None
         if calibration is not None:
             model = calibration.model
             self._compensator = Compensator(model, self.encoder, wait_us=wait_us, device=device)
             self._meter = SharpnessMeter(CanvasShape(*source.size), Sharpness.VARIANCE, smoothing=1.0, device=device)
             if watch_s is not None:
-                self._watch = PhaseWatch(calibration, watch_s, say)
+                self._watch = PhaseCheck(calibration, watch_s, say)
         self._failed: BaseException | None = None
         self._image_us: int | None = None
         self._wants_image = True
@@ -207,10 +208,10 @@ class Session:
             beside.abandon()
 
     @property
-    def _takers(self) -> list[tuple[Raw | LiveWriter, Beside]]:
+    def _takers(self) -> list[tuple[Raw | LiveWriter, BackgroundWorker]]:
         return [*self._raw, *([] if self._out is None else [self._out])]
 
-    def _hand(self, taker: tuple[Raw | LiveWriter, Beside], job: Callable[[], object], held: int = 0) -> None:
+    def _hand(self, taker: tuple[Raw | LiveWriter, BackgroundWorker], job: Callable[[], object], held: int = 0) -> None:
         """To a taker; of one that failed no more is asked, the others get all that came until the session ends."""
         try:
             taker[1].put(job, held)

@@ -23,7 +23,7 @@ from amiwarp.studies.chart.truth import Known
 from amiwarp.studies.machine import machine, versions
 
 if TYPE_CHECKING:
-    from amiwarp.events.events import Recording
+    from amiwarp.events.recording import Recording
 
 PACKAGES = ("warp-lang", "numpy", "nlopt", "numba", "torch", "cupy-cuda12x", "cupy-cuda13x")
 ABOUT = ("format", "version", "date", "machine", "device", "processor", "versions", "recording")
@@ -137,10 +137,11 @@ def make(
     libraries: compensation.Libraries | None = None,
     progress: Progress | None = None,
 ) -> Charts:
-    """Measures a recording with truth and writes both charts and their data into the folder ``out``.
+    """Measure a recording with truth; write both charts and their data into the folder ``out``.
 
-    ``quick`` measures a few settings, once each. ``libraries`` adds rows of other libraries. Raises :class:`AmiwarpError` for a recording without truth, a folder that
-    cannot be made or holds these files, and an image that is wrong.
+    ``quick`` measures a few settings, once each. ``libraries`` adds rows of other libraries. Raises
+    :class:`AmiwarpError` for a recording without truth, a folder that cannot be made or holds these files, and an image
+    that is wrong.
     """
     known = Known.of(recording)
     make_folder(out)
@@ -150,7 +151,12 @@ def make(
     tell = progress or (lambda what, share: None)
     repeats = dict.fromkeys(REPEATS, 1) if quick else REPEATS
     compensated, notes = compensation.rows(
-        known, device, repeats=repeats["compensation"], quick=quick, folder=out, tell=_part(tell, 0.0, 0.3),
+        known,
+        device,
+        repeats=repeats["compensation"],
+        quick=quick,
+        folder=out,
+        tell=_part(tell, 0.0, 0.3),
         libraries=libraries,
     )
     calibrated, more = calibration.rows(

@@ -14,8 +14,9 @@ import numpy as np
 
 from amiwarp.calib.presets import simplified
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import TURNS, upload_events
-from amiwarp.imaging.warped_image import CanvasShape, Image, Vote, Votes
+from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.studies.chart.rows import Row, Task, measure
 from amiwarp.studies.chart.truth import Known, exact_image, exact_places, raw_places, rms

@@ -10,9 +10,11 @@ import numpy as np
 
 from amiwarp.calib import Calibration
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents, Recording
+from amiwarp.events.events import MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
-from amiwarp.optics.models import FlatSide, axis_rotation
+from amiwarp.optics.models import axis_rotation
+from amiwarp.optics.prism import FlatSide
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

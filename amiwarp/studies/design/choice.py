@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 from amiwarp.calib.selection.smaller_models import QUANTISATION_PX, SHARE
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS, Prism
+from amiwarp.optics.models import MODELS
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 from amiwarp.studies.design.orbit import Orbit, orbit_of
 from amiwarp.studies.design.volume import Progress, Volume, filled, measure

@@ -9,15 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import (
-    MODELS,
-    CircleModel,
-    EllipseModel,
-    ExactModel,
-    Prism,
-    RadialCircleModel,
-    predicted_error,
-)
+from amiwarp.optics.models import MODELS, CircleModel, EllipseModel, ExactModel, RadialCircleModel, predicted_error
+from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import Prism
+from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import Scene, Simulation
 from amiwarp.studies.design.orbit import Orbit, orbit_radii

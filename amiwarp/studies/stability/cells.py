@@ -23,8 +23,8 @@ from amiwarp.calib.presets import settings_to
 from amiwarp.calib.selection.smaller_models import Places
 from amiwarp.calib.sharpness.search import AUTO, STAGES
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error
-from amiwarp.imaging.sharpness_costs import Sharpness
 from amiwarp.io.output import write_text
 from amiwarp.optics.models import ExactModel, predicted_error
 from amiwarp.studies.machine import machine

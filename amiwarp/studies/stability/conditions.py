@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from amiwarp.events.encoder import TURN, Encoder
-from amiwarp.events.events import Events, MemoryEvents, Recording
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import FlatSide, Prism
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, Still
 from amiwarp.studies.stability.scenes import Lamp, Passing, SceneKind, draw

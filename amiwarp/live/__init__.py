@@ -1,0 +1,1 @@
+"""Live work: the link to the prism's controller, and streams of events."""
