@@ -27,14 +27,16 @@ from amiwarp.imaging.export import IweFiles, to_picture
 from amiwarp.imaging.sharpness_costs import SharpnessMeter, sharpness
 from amiwarp.imaging.warped_image import CanvasShape, iwe
 from amiwarp.io.formats import Format, open_recording
-from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, CircleModel, ExactModel, RadialCircleModel
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism, apex_from_deflection, deflection_from_apex
 from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, tones
 from amiwarp.reconstruction.picture import Picture, Reconstruction
-from amiwarp.viewer.scene import Axis, Colour, Look, View
+from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.scene import Look
 
 CAMERA = Camera.from_fov(8, 6, 1.0)
 EVENTS = Events.from_arrays([1, 2, 1, 2], [1, 2, 1, 2], [0, 10, 20, 30], [0, 1, 0, 1])

@@ -30,7 +30,7 @@ from amiwarp.live.stream import sources
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
 from amiwarp.live.stream.packets import Packet, packet
-from amiwarp.live.stream.queues import Policy
+from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.session import Session, Status
 from amiwarp.live.stream.sources import open_source
 from amiwarp.optics.camera import Camera

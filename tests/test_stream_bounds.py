@@ -34,7 +34,8 @@ from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, encode_hello, packet
 from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.live.stream.session import Session
 from amiwarp.live.stream.sockets import MOST_CLIENTS, PIECE, REST_S, PipeSink, SocketSink

@@ -10,7 +10,8 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.live.stream.packets import Packet
-from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queues import PacketQueue
 
 
 def packet(first: int, n: int) -> Packet:

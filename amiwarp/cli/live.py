@@ -15,7 +15,7 @@ from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.stream.queues import Policy
+from amiwarp.live.stream.policy import Policy
 
 if TYPE_CHECKING:
     from collections.abc import Callable

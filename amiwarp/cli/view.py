@@ -16,7 +16,7 @@ from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, spa
 from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.scene import Axis, Colour, Look, View
+from amiwarp.viewer.choices import Axis, Colour, View
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -49,6 +49,7 @@ class PictureOptions:
     def write(self, first: Inspector, path: Path) -> dict[str, Any]:
         """What is drawn, for ``--json``. Raises :class:`AmiwarpError` for a format or a size that cannot be."""
         from amiwarp.viewer.app import save_screenshot
+        from amiwarp.viewer.scene import Look
 
         if path.suffix.lower() != ".png":
             raise AmiwarpError(f"{path}: pictures are written as .png")

@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.viewer.choices import View
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.scene import Look, Scene, View
+from amiwarp.viewer.scene import Look, Scene
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration

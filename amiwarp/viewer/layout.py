@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer.scene import Axis, Colour, View
+from amiwarp.viewer.choices import Axis, Colour, View
 
 if TYPE_CHECKING:
     from amiwarp.viewer.panel import Panel

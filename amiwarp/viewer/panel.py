@@ -24,13 +24,14 @@ from amiwarp.plotting.figures import Images
 from amiwarp.reconstruction.choices import Tone
 from amiwarp.reconstruction.export import tones
 from amiwarp.reconstruction.picture import reconstruct
+from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.exports import export_path
 from amiwarp.viewer.frames import room
 from amiwarp.viewer.gate import finite
 from amiwarp.viewer.inspector import Selection
 from amiwarp.viewer.jobs import Calibrating, Playing
 from amiwarp.viewer.layout import KEYS, NAMES, UNITS, build
-from amiwarp.viewer.scene import ORBIT_COLOUR, Axis, Colour, Look, Scene, View
+from amiwarp.viewer.scene import ORBIT_COLOUR, Look, Scene
 from amiwarp.viewer.values import event_text, first_values, jpeg, of_source, polyline, share
 
 if TYPE_CHECKING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import math
 import os
 import sys
@@ -17,6 +16,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.plotting.clouds import OFF_COLOUR, ON_COLOUR
 from amiwarp.validation import choice
+from amiwarp.viewer.choices import Axis, Colour, View
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,34 +31,6 @@ ORBIT_COLOUR = "#009e73"
 MARK_COLOUR = "#f0e442"
 PAPER = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
 """Background and ink, light and dark."""
-
-
-class Colour(enum.StrEnum):
-    """What a point's colour tells."""
-
-    POLARITY = "polarity"
-    ANGLE = "angle"
-    TIME = "time"
-    DENSITY = "density"
-    """Events in the pixel where it lies, up to the 99th percentile."""
-    RESIDUAL = "residual"
-    """Distance from the middle of the events about it, up to 2 px: of an edge, from its crest."""
-
-
-class Axis(enum.StrEnum):
-    """The third axis."""
-
-    ANGLE = "angle"
-    TIME = "time"
-
-
-class View(enum.StrEnum):
-    """Where the camera stands."""
-
-    FREE = "free"
-    XY = "x-y"
-    X_AXIS = "x-θ"
-    Y_AXIS = "y-θ"
 
 
 STANDS = {

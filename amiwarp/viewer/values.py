@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.optics.models import MODELS
+from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.gate import Check, flag, list_of, number, one_of, text
 from amiwarp.viewer.layout import NAMES, SPEEDS
-from amiwarp.viewer.scene import Axis, Colour, View
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import threading
 from collections import deque
 from dataclasses import replace
@@ -12,6 +11,7 @@ import numpy as np
 
 from amiwarp.events.events import Events
 from amiwarp.live.stream.background_worker import QUEUE_BYTES
+from amiwarp.live.stream.policy import Policy
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:
@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 
 THIN_FROM = 0.5
 """Fill from which on events are thinned, the more the fuller the queue is."""
-
-
-class Policy(enum.StrEnum):
-    """What a queue does that is full."""
-
-    BLOCK = "block"
-    """The source waits, and with it whoever sends: nothing is lost here."""
-    DROP_OLDEST = "drop-oldest"
-    """The events that have waited longest go: what comes out is late by no more than the queue is long."""
-    THIN = "thin"
-    """Events are left out evenly, so that all places and times are still seen."""
 
 
 class PacketQueue:

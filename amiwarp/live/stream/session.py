@@ -23,7 +23,8 @@ from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.clocking import CameraClock, clock_offset
 from amiwarp.live.stream.packets import NO_TIMES, Sorter
 from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queues import PacketQueue
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
