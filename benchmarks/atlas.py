@@ -55,11 +55,11 @@ def main() -> int:
     began = time.perf_counter()
     said = 0
 
-    def tell(done: int, of: int) -> None:
+    def tell(what: str, share: float) -> None:
         nonlocal said
-        if done * 20 // of > said:
-            said = done * 20 // of
-            print(f"{time.perf_counter() - began:6.0f} s  {done} of {of} cells", flush=True)
+        if int(20 * share) > said:
+            said = int(20 * share)
+            print(f"{time.perf_counter() - began:6.0f} s  {what}", flush=True)
 
     start = {"initializer": quiet, "initargs": (_started,), "mp_context": multiprocessing.get_context("spawn")}
     with ProcessPoolExecutor(1, **start) as one:  # compiles kernels once, for all

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.brightness.event_pairs import Sensor
+from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import RATES
@@ -208,7 +208,7 @@ def photometric_row(recording: Recording, settings: PhotometricSettings, device:
 
 
 MISMATCHED = SensorModel(contrast_on=0.22, contrast_off=0.28, mismatch=0.05)
-KNOWN = PhotometricSettings(sensor=Sensor(MISMATCHED.latency_us, MISMATCHED.refractory_us))
+KNOWN = PhotometricSettings(sensor=SensorTiming(MISMATCHED.latency_us, MISMATCHED.refractory_us))
 
 
 def run_moving(args: argparse.Namespace) -> Iterator[dict[str, Any]]:

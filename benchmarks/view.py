@@ -31,9 +31,9 @@ from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.studies.machine import machine
+from amiwarp.viewer.choices import View
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.scene import Look, Scene
-from amiwarp.viewer.choices import View
 from amiwarp.viewer.values import jpeg
 
 SIZE, WIDTH, HEIGHT = (1048, 514), 640, 480

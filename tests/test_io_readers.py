@@ -300,14 +300,14 @@ def test_convert_puts_in_encoder_camera_and_prism(tmp_path):
     t = t[(t < 1_002_000) | (t > 1_004_000)]
     encoder = Encoder.from_counts(t, np.round(t * 0.02) % 400, counts_per_turn=400, index_t_us=[1_000_000])
     camera, prism = Camera(*SIZE, 200.0, 200.0, 150.0, 110.0), Prism(0.03)
-    seen: list[tuple[int, int | None]] = []
+    seen: list[tuple[str, float]] = []
     summary = convert(
         path, tmp_path / "out.h5", encoder=encoder, camera=camera, prism=prism, progress=lambda *a: seen.append(a)
     )
     back = open_recording(tmp_path / "out.h5")
     assert (back.camera, back.prism, back.events.size) == (camera, prism, SIZE)
     assert back.metadata == {"source_name": "events", "source_format": "npz", "format": "native"}
-    assert seen == [(600, 600)]
+    assert seen == [("writing events", 1.0)]
     assert summary == ConversionSummary(
         events=600,
         t_first=int(EVENTS.t[0]),

@@ -11,7 +11,7 @@ import pytest
 from conftest import TRUE_PRISM
 from numpy.typing import NDArray
 
-from amiwarp.brightness.event_pairs import Sensor
+from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.parameters import RATES
 from amiwarp.calib.photometric.stage import PhotometricSettings
@@ -33,7 +33,7 @@ from amiwarp.simulation.pictures import linear_luminance
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
-KNOWN = PhotometricSettings(sensor=Sensor(latency_us=100.0, refractory_us=100.0))
+KNOWN = PhotometricSettings(sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
 ALL = replace(KNOWN, pairs=600_000)
 FREE = ("apex", "phase", "motion")
 

@@ -10,7 +10,7 @@ from conftest import TRUE_PHASE, TRUE_PRISM
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from amiwarp.brightness.event_pairs import EventTable, PairSet, Sensor
+from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.brightness.solver import BrightnessMap, Tiles
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric.stage import PhotometricSettings, _spread
@@ -25,7 +25,7 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import SensorModel, simulate
 
-KNOWN = PhotometricSettings(sensor=Sensor(latency_us=100.0, refractory_us=100.0))
+KNOWN = PhotometricSettings(sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
 
 
 def error_px(recording: Recording, c: Calibration) -> float:

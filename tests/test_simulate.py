@@ -207,7 +207,7 @@ class Film:
 
 def test_progress_rises_to_one() -> None:
     seen: list[float] = []
-    base(duration_s=0.25).run(progress=seen.append)
+    base(duration_s=0.25).run(progress=lambda _, share: seen.append(share))
     assert len(seen) > 1
     assert seen == sorted(seen)
     assert seen[-1] == 1.0

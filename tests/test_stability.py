@@ -156,12 +156,12 @@ def test_cells_are_kept_and_only_what_misses_is_run(tmp_path: Path) -> None:
     small = [replace(a, also=(("width", 96), ("height", 72), ("turns", 1.5))) for a in axes]
     methods = chosen(("sharpness",))
     assert [m.name for m in methods] == ["default", "paper", "sharpness"]
-    calls: list[tuple[int, int]] = []
+    calls: list[tuple[str, float]] = []
     with ThreadPoolExecutor(1) as pool:
-        some = run(small, 1, methods[:1], tmp_path, pool, progress=lambda done, of: calls.append((done, of)))
-        assert calls == [(1, 2), (2, 2)]
+        some = run(small, 1, methods[:1], tmp_path, pool, progress=lambda *a: calls.append(a))
+        assert calls == [("1 of 2 cells", 0.5), ("2 of 2 cells", 1.0)]
         every = run(small, 1, methods, tmp_path, pool)
-        again = run(small, 1, methods, tmp_path, pool, progress=lambda done, of: calls.append((done, of)))
+        again = run(small, 1, methods, tmp_path, pool, progress=lambda *a: calls.append(a))
     assert len(calls) == 2
     name = identity(methods[0])
     for a, b, c in zip(some, every, again, strict=True):

@@ -9,7 +9,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
+from amiwarp.events.device_encoder import encoder_params
+from amiwarp.kernels import pairs as kernels
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.photometric import BLOCK, HELD, Pairs
+from amiwarp.kernels.places import find_places
 from amiwarp.optics.models import model_camera
 
 if TYPE_CHECKING:
@@ -28,7 +34,7 @@ COLUMNS = {"x": 1, "y": 1, "tile": 1, "on": 1, "azimuth": 4, "time": 2, "slope":
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class SensorTiming:
     """What is known of the sensor's timing [us]; zero where nothing is."""
 
     latency_us: float = 0.0
@@ -60,8 +66,6 @@ class PairSet:
 
     def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
         """The same; ``slope_of``: change of the encoder's angle at times [us] per unit of a drifting parameter."""
-        import warp as wp
-
         values = np.zeros((2, self.arrays.stride), np.float32)
         for k, t in enumerate(self.time.astype(np.float64)):
             values[k, : len(self)] = slope_of(np.rint(t * 1e6).astype(np.int64) + middle_us)
@@ -71,8 +75,6 @@ class PairSet:
     @classmethod
     def concatenate(cls, parts: Sequence[PairSet]) -> PairSet:
         """One behind the other; all of one weight of silence."""
-        import warp as wp
-
         if len(parts) == 1:
             return parts[0]
         first = parts[0].arrays
@@ -89,15 +91,11 @@ class PairSet:
 
     def of_tiles(self, listed: NDArray[np.bool_]) -> PairSet:
         """The pairs of the tiles that are ``listed``."""
-        from amiwarp.kernels import pairs as k
-
-        return self._select(k.mark_listed, [self.arrays.tile, _ints(listed, self.device)])
+        return self._select(kernels.mark_listed, [self.arrays.tile, _ints(listed, self.device)])
 
     def of_square(self, left: int, top: int, side: int) -> PairSet:
         """The pairs of a square of pixels."""
-        from amiwarp.kernels import pairs as k
-
-        return self._select(k.mark_square, [self.arrays, left, top, side])
+        return self._select(kernels.mark_square, [self.arrays, left, top, side])
 
     def on_tiles(
         self,
@@ -108,12 +106,6 @@ class PairSet:
         listed: NDArray[np.bool_],
     ) -> PairSet:
         """The pairs whose compensated events both fall on one tile (``tile_of``, by pixel) of those ``listed``."""
-        import warp as wp
-
-        from amiwarp.kernels import pairs as k
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.places import find_places
-
         places = wp.empty(len(self), dtype=wp.vec4, device=self.device)
         inputs = [
             model.params(self.device),
@@ -125,28 +117,19 @@ class PairSet:
         launch(find_places, len(self), inputs, [places], device=self.device)
         tiles = wp.array(tile_of, dtype=int, device=self.device)
         marked = [places, tiles, _ints(listed, self.device)]
-        return self._select(k.mark_same_tile, marked, [self.arrays.tile])
+        return self._select(kernels.mark_same_tile, marked, [self.arrays.tile])
 
     def hold_out(self, every: int) -> int:
         """Marks every so many-th pair of two events, which must come first, as not to be used; how many."""
-        from amiwarp.kernels import pairs as k
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import HELD
-
-        launch(k.hold_out, len(self), [every], [self.arrays.on], device=self.device)
+        launch(kernels.hold_out, len(self), [every], [self.arrays.on], device=self.device)
         return int(np.count_nonzero(self.column("on") & int(HELD)))
 
     def _select(self, kernel: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> PairSet:
-        import warp as wp
-
-        from amiwarp.kernels import pairs as k
-        from amiwarp.kernels.launch import launch
-
         flag = wp.empty(len(self), dtype=int, device=self.device)
         launch(kernel, len(self), inputs, [*outputs, flag], device=self.device)
         place, count = _places(flag)
         out = _empty(count, self.device, drifts=self.arrays.slope.shape[0] > 0)
-        launch(k.select, len(self), [self.arrays, flag, place], [out], device=self.device)
+        launch(kernels.select, len(self), [self.arrays, flag, place], [out], device=self.device)
         return PairSet(out, self.device)
 
 
@@ -155,15 +138,11 @@ class EventTable:
 
     def __init__(self, spans: Sequence[Events], tile_of: Any, device: Any) -> None:
         """Of pixels of a tile (``tile_of`` (height, width) >= 0, NumPy or on the device) alone."""
-        import warp as wp
-
-        from amiwarp.kernels import pairs as k
-
         self.device = wp.get_device(device)
         if isinstance(tile_of, np.ndarray):
             tile_of = wp.array(tile_of, dtype=int, device=device)
         self.tile_of, self.spans = tile_of, [span for span in spans if len(span)]
-        self.arrays = k.Sorted()
+        self.arrays = kernels.Sorted()
         self.arrays.columns = tile_of.shape[1]
         self.arrays.pixels = tile_of.shape[0] * tile_of.shape[1]
         for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8)):
@@ -177,19 +156,14 @@ class EventTable:
 
     def sort(self) -> None:
         """By span and pixel; within a pixel events stay in order."""
-        import warp as wp
-
-        from amiwarp.kernels import pairs as k
-        from amiwarp.kernels.launch import launch
-
         s, n = self.arrays, len(self.arrays.x)
         flag = wp.empty(n, dtype=int, device=self.device)
-        launch(k.mark_inside, n, [s.x, s.y, self.tile_of], [flag], device=self.device)
+        launch(kernels.mark_inside, n, [s.x, s.y, self.tile_of], [flag], device=self.device)
         place, s.count = _places(flag)
         s.key, s.order = (wp.empty(2 * s.count, dtype=int, device=self.device) for _ in "ko")
         first = np.cumsum([0, *(len(span) for span in self.spans[:-1])])
         inputs = [s.x, s.y, self.tile_of, place, wp.array(first, dtype=int, device=self.device)]
-        launch(k.fill_keys, n, inputs, [s.key, s.order], device=self.device)
+        launch(kernels.fill_keys, n, inputs, [s.key, s.order], device=self.device)
         if s.count:
             bits = (s.pixels * max(1, len(self.spans))).bit_length()
             wp.utils.radix_sort_pairs(s.key, s.order, s.count, end_bit=bits)
@@ -200,7 +174,7 @@ class EventTable:
         *,
         longest_gap_us: int,
         shortest_gap_us: float = 0.0,
-        sensor: Sensor | None = None,
+        sensor: SensorTiming | None = None,
         middle_us: int = 0,
         weak: float = 0.0,
         window: tuple[int, int] | None = None,
@@ -217,15 +191,9 @@ class EventTable:
         - ``quiet``: rising edges [us] of spans, and a number: spans of pixels that fire in none of so many spans about
           them. Silence is information: along the pixel's way brightness changed by no more than about a threshold.
         """
-        import warp as wp
-
-        from amiwarp.events.device_encoder import encoder_params
-        from amiwarp.kernels import pairs as k
-        from amiwarp.kernels.launch import launch
-
         self.sort()
-        sensor = sensor or Sensor()
-        times = k.Window()
+        sensor = sensor or SensorTiming()
+        times = kernels.Window()
         times.start, times.stop = window or (0, 0)
         times.middle, times.longest, times.shortest = middle_us, longest_gap_us, shortest_gap_us
         times.late_first, times.late_second = sensor.refractory_us - sensor.latency_us, -sensor.latency_us
@@ -234,8 +202,8 @@ class EventTable:
         edges, at_least = (np.zeros(1, np.int64), 0) if quiet is None else quiet
         spans = (len(edges) - 1) * self.arrays.pixels
         flag = wp.empty(base + spans, dtype=int, device=device)
-        launch(k.mark_pairs, m, [self.arrays, times], [flag], device=device)
-        launch(k.mark_ends, ends, [self.arrays], [flag], device=device)
+        launch(kernels.mark_pairs, m, [self.arrays, times], [flag], device=device)
+        launch(kernels.mark_ends, ends, [self.arrays], [flag], device=device)
         edges_d = wp.array(edges, dtype=wp.int64, device=device)
         if spans:
             self._mark_quiet(edges_d, at_least, base, flag)
@@ -245,37 +213,29 @@ class EventTable:
             return PairSet(out, device)
         span = self.covers if window is None else (min(self.covers[0], window[0]), max(self.covers[1], window[1]))
         angles = encoder_params(encoder, *span, device)
-        launch(k.write_pairs, base, [self.arrays, times, angles, self.tile_of, flag, place], [out], device=device)
+        launch(kernels.write_pairs, base, [self.arrays, times, angles, self.tile_of, flag, place], [out], device=device)
         inputs = [edges_d, times, angles, self.tile_of, base, flag, place]
-        launch(k.write_quiet, spans, inputs, [out], device=device)
+        launch(kernels.write_quiet, spans, inputs, [out], device=device)
         return PairSet(out, device)
 
     def _mark_quiet(self, edges: Any, at_least: int, base: int, flag: Any) -> None:
-        import warp as wp
-
-        from amiwarp.kernels import pairs as k
-        from amiwarp.kernels.launch import launch
-
         fired = wp.zeros((len(edges) - 1) * self.arrays.pixels, dtype=wp.uint8, device=self.device)
-        launch(k.mark_spans, len(self.arrays.x), [self.arrays, edges], [fired], device=self.device)
+        launch(kernels.mark_spans, len(self.arrays.x), [self.arrays, edges], [fired], device=self.device)
         inputs = [fired, self.tile_of.flatten(), at_least, base]
-        launch(k.mark_quiet, self.arrays.pixels, inputs, [flag], device=self.device)
+        launch(kernels.mark_quiet, self.arrays.pixels, inputs, [flag], device=self.device)
 
     def leave_out_hot(self) -> NDArray[np.int32]:
         """Marks pixels that fire far more than the busiest of those around them -1 in ``tile_of``.
 
         Returns how many events each pixel fired, shape (height, width).
         """
-        import warp as wp
-
-        from amiwarp.kernels import pairs as k
-        from amiwarp.kernels.launch import launch
-
         rows, columns = self.tile_of.shape
         count = wp.zeros(rows * columns, dtype=int, device=self.device)
         n = len(self.arrays.x)
-        launch(k.count_pixels, n, [self.arrays], [count], device=self.device, smallest=n + 1)  # slices would collide
-        launch(k.mark_hot, rows * columns, [count.reshape((rows, columns)), 0], [self.tile_of.flatten()],
+        launch(
+            kernels.count_pixels, n, [self.arrays], [count], device=self.device, smallest=n + 1
+        )  # slices would collide
+        launch(kernels.mark_hot, rows * columns, [count.reshape((rows, columns)), 0], [self.tile_of.flatten()],
                device=self.device)  # fmt: skip
         counts: NDArray[np.int32] = count.numpy().reshape(rows, columns)
         return counts
@@ -303,8 +263,6 @@ def off_excess(pairs: PairSet, *, with_leak: bool = False) -> float:
 
 def _upload(parts: Sequence[NDArray[Any]], dtype: Any, device: Any) -> Any:
     """Arrays one behind the other on a device, without a copy of them all on the host."""
-    import warp as wp
-
     if len(parts) == 1:
         return wp.array(np.ascontiguousarray(parts[0]), dtype=dtype, device=device, copy=False)
     out = wp.empty(sum(map(len, parts)), dtype=dtype, device=device)
@@ -317,15 +275,11 @@ def _upload(parts: Sequence[NDArray[Any]], dtype: Any, device: Any) -> Any:
 
 
 def _ints(values: NDArray[Any], device: Any) -> Any:
-    import warp as wp
-
     return wp.array(values.astype(np.int32), dtype=int, device=device)
 
 
 def _places(flag: Any) -> tuple[Any, int]:
     """Running count of the marks, and the whole."""
-    import warp as wp
-
     place = wp.empty_like(flag)
     if not len(flag):
         return place, 0
@@ -335,10 +289,6 @@ def _places(flag: Any) -> tuple[Any, int]:
 
 def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) -> Any:
     """Pairs to be written, padded with zeros to whole blocks."""
-    import warp as wp
-
-    from amiwarp.kernels.photometric import BLOCK, Pairs
-
     out = Pairs()
     block = int(BLOCK)
     out.count, out.stride, out.weak = count, -(-count // block) * block, weak

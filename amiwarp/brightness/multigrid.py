@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import warp as wp
+
+from amiwarp.kernels import multilevel as k
+from amiwarp.kernels.descent import gather
+
 COARSEST = 6
 """A grid of fewer rows or columns has no coarser one."""
 STRIDE = 8
@@ -14,8 +19,6 @@ class Levels:
     """Grids over one tile of (rows, columns) nodes, each of twice the spacing of the one before."""
 
     def __init__(self, rows: int, columns: int, device: Any) -> None:
-        import warp as wp
-
         self.shapes = [(rows, columns)]
         while min(self.shapes[-1]) // 2 + 1 >= COARSEST:
             self.shapes.append((self.shapes[-1][0] // 2 + 1, self.shapes[-1][1] // 2 + 1))
@@ -26,9 +29,6 @@ class Levels:
 
     def prepare(self, program: Any, equations: list[Any], count: int, sums: Any, slices: list[Any]) -> None:
         """Adds to ``program`` what finds the grids' diagonals, for the equations' weights as they are."""
-        from amiwarp.kernels import multilevel as k
-        from amiwarp.kernels.descent import gather
-
         for level, diagonal in enumerate(self._diagonal, start=1):
             inputs = [*equations, float(2**level), self.shapes[level][1], STRIDE]
             program.add_slices(k.add_coarse_diagonal, count // STRIDE, inputs, slices)
@@ -36,8 +36,6 @@ class Levels:
 
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Adds to ``program``: ``out`` = the sum of all grids' corrections for the finest one's ``residual``."""
-        from amiwarp.kernels import multilevel as k
-
         program.add(k.divide, len(out), [diagonal, residual], [out])
         fine = residual
         for level, (rows, columns) in enumerate(self.shapes[1:], start=1):

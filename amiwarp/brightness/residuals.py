@@ -7,6 +7,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
+
+from amiwarp.kernels.descent import CPU_WIDTH
+from amiwarp.kernels.photometric import HELD
+from amiwarp.kernels.replay import BLOCK_DIM, Program
+from amiwarp.kernels.slopes import add_clusters, magnitudes, sum_costs, sum_products
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,10 +27,6 @@ class Residuals:
     """Of the equations of ``pairs`` [thresholds], NaN for pairs off the map, and their weights."""
 
     def __init__(self, pairs: PairSet, tiles: int) -> None:
-        import warp as wp
-
-        from amiwarp.kernels.descent import CPU_WIDTH
-
         self.pairs, self.tiles, self.device, self.count = pairs, tiles, wp.get_device(pairs.device), len(pairs)
         n = pairs.arrays.stride
         self.values, self.weight = (wp.zeros(n, dtype=float, device=self.device) for _ in "vw")
@@ -35,9 +37,6 @@ class Residuals:
 
         A pair off the map has the residual ``missing``, or is left out.
         """
-        from amiwarp.kernels.photometric import HELD
-        from amiwarp.kernels.slopes import sum_costs
-
         threads, parts = self._sum_shape
         partial = self._doubles(2, parts)
         inputs = [self.values, self.pairs.arrays.on, int(HELD) * held, self.count, scale, missing, self._width]
@@ -47,8 +46,6 @@ class Residuals:
 
     def products(self, factors: list[tuple[Any, Any]]) -> NDArray[np.float64]:
         """Sums over the pairs of a b weight, for each (a, b) on the device."""
-        from amiwarp.kernels.slopes import sum_products
-
         threads, parts = self._sum_shape
         partial = self._doubles(len(factors), parts)
         for k, (a, b) in enumerate(factors):
@@ -57,10 +54,6 @@ class Residuals:
 
     def clusters(self, slopes: list[Any]) -> NDArray[np.float64]:
         """Sums of slope x weight x residual over clusters of pairs near each other, shape (slopes, clusters)."""
-        import warp as wp
-
-        from amiwarp.kernels.slopes import add_clusters
-
         size = self.tiles if self.tiles > 1 else 1 << 20
         rows = []
         for slope in slopes:
@@ -73,10 +66,6 @@ class Residuals:
 
     def median(self, first: int | None = None) -> float:
         """Median of the absolute residuals of the ``first`` pairs, or all; NaN where there is none."""
-        import warp as wp
-
-        from amiwarp.kernels.slopes import magnitudes
-
         n = self.count if first is None else first
         if self.device.is_cpu:
             values = np.abs(self.values.numpy()[:n])
@@ -92,19 +81,13 @@ class Residuals:
     @cached_property
     def _sum_shape(self) -> tuple[int, int]:
         """Threads and partial sums of a sum over all pairs."""
-        from amiwarp.kernels.replay import BLOCK_DIM
-
         threads = -(-self.count // self._width)
         return threads, threads if self.device.is_cpu else -(-threads // BLOCK_DIM)
 
     def _doubles(self, *shape: int) -> Any:
-        import warp as wp
-
         return wp.zeros(shape, dtype=wp.float64, device=self.device)
 
     def _launch_sum(self, kernel: Any, threads: int, inputs: list[Any], out: Any) -> None:
-        from amiwarp.kernels.replay import Program
-
         program = Program(self.device)
         program.add(kernel, threads, inputs, [out], smallest=CHUNKS)
         program.launch()

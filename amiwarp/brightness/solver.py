@@ -12,11 +12,23 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.brightness.multigrid import Levels
 from amiwarp.brightness.residuals import CHUNKS, Residuals
 from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import descent as cg
+from amiwarp.kernels import photometric as kernels
+from amiwarp.kernels import places
+from amiwarp.kernels.descent import dot, gather, gather_diagonal
+from amiwarp.kernels.launch import launch, slice_count
+from amiwarp.kernels.pairs import keep_nodes
+from amiwarp.kernels.photometric import BLOCK, Geometry, add_diagonal, subtract, weigh
+from amiwarp.kernels.prior import EXTRA, Prior, link
+from amiwarp.kernels.replay import BLOCK_DIM, Program
+from amiwarp.kernels.slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.models import model_camera
 
 if TYPE_CHECKING:
@@ -77,12 +89,6 @@ class BrightnessMap:
 
         ``middle_us``: the time to which a turning camera is turned back, the pairs' times being from there.
         """
-        import warp as wp
-
-        from amiwarp.kernels import photometric as kernels
-        from amiwarp.kernels.launch import slice_count
-        from amiwarp.kernels.prior import EXTRA
-
         if not len(pairs):
             raise AmiwarpError("no pixel fired twice in time: there is no pair of events to learn the brightness from")
         self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
@@ -105,16 +111,9 @@ class BrightnessMap:
         self._geometry = self._new_geometry()
 
     def _zeros(self, n: int) -> Any:
-        import warp as wp
-
         return wp.zeros(n, dtype=float, device=self.device)
 
     def _make_vectors(self, unknowns: int) -> None:
-        import warp as wp
-
-        from amiwarp.kernels import descent as cg
-        from amiwarp.kernels.replay import BLOCK_DIM
-
         self._width = cg.CPU_WIDTH if self.device.is_cpu else 1
         self._threads = -(-unknowns // self._width)
         self._u, self._dots = cg.Unknowns(), cg.Dots()
@@ -125,8 +124,6 @@ class BrightnessMap:
             setattr(self._dots, name, wp.zeros(n, dtype=wp.float64, device=self.device))
 
     def _make_prior(self, damping: float, unknowns: int) -> None:
-        from amiwarp.kernels.prior import Prior
-
         linked = self.smoothness is not None
         self._prior = Prior()
         self._prior.damping, self._prior.columns = damping, self.tiles.columns
@@ -140,10 +137,6 @@ class BrightnessMap:
         self._z = self._zeros(unknowns * one)
 
     def _new_geometry(self) -> Any:
-        import warp as wp
-
-        from amiwarp.kernels.photometric import Geometry
-
         g = Geometry()
         g.stride = self.pairs.arrays.stride
         g.cell = wp.full(2 * g.stride, -1, dtype=int, device=self.device)
@@ -157,10 +150,6 @@ class BrightnessMap:
         self._place(model, drift, camera_rotation, self._geometry)
 
     def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
-        from amiwarp.kernels import places as k
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import BLOCK
-        from amiwarp.optics.device_camera import pinhole_params
 
         arrays, params = self.pairs.arrays, model.params(self.device)
         camera_rotation = (camera_rotation or CameraRotation()).about(self.middle_us)
@@ -172,14 +161,14 @@ class BrightnessMap:
             or any(camera_rotation.angular_acceleration)
         ):
             inputs = [params, model_camera(model, self.device), arrays, self._atlas, drift, camera_rotation.params()]
-            launch(k.place_pairs, self.count, inputs, [out], device=self.device)
+            launch(places.place_pairs, self.count, inputs, [out], device=self.device)
             return
         inputs = [params, pinhole, arrays, self._atlas]
         if self.device.is_cpu:
             blocks = arrays.stride // int(BLOCK)
-            launch(k.place_blocks, blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
+            launch(places.place_blocks, blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
         else:
-            launch(k.place_still, arrays.stride, inputs, [out], device=self.device)
+            launch(places.place_still, arrays.stride, inputs, [out], device=self.device)
 
     @cached_property
     def _sides(self) -> tuple[Any, Any]:
@@ -191,9 +180,6 @@ class BrightnessMap:
 
         ``plus`` and ``minus``: arguments of :meth:`place`, ``width`` apart; the pairs' own places stay.
         """
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.slopes import slope_between
-
         for side, at in zip(self._sides, (plus, minus), strict=True):
             self._place(at["model"], at["drift"], at["camera_rotation"], side)
         out = self._zeros(self.pairs.arrays.stride)
@@ -203,11 +189,6 @@ class BrightnessMap:
 
     def keep(self, nodes: NDArray[np.bool_]) -> None:
         """Pairs of two events that lie off ``nodes`` (tiles, rows, columns), either of them, are left out: noise."""
-        import warp as wp
-
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.pairs import keep_nodes
-
         on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
         inputs = [on, self.pairs.arrays.on, self._geometry.stride]
         launch(keep_nodes, self.count, inputs, [self._geometry.cell], device=self.device)
@@ -245,11 +226,6 @@ class BrightnessMap:
         The projection of variable projection (Golub and Pereyra 1973), by conjugate gradients from ``change``, a guess
         of the change that explains it; a better one is left there.
         """
-        import warp as wp
-
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.photometric import subtract
-
         inputs = [self.pairs.arrays, self._atlas, self._geometry, self._projection.image]
         wp.copy(self._projection.image, change)
         wp.copy(self._projection.residual, target)
@@ -266,26 +242,17 @@ class BrightnessMap:
 
     @cached_property
     def _weigh(self) -> Any:
-        from amiwarp.kernels.replay import Program
-
         program = Program(self.device)
         self._add_weigh(program)
         return program
 
     def _add_weigh(self, program: Any) -> None:
-        from amiwarp.kernels.photometric import weigh
-
         inputs = [self.pairs.arrays, self._atlas, self._geometry, self._image, self._scale]
         program.add(weigh, self.count, inputs, [self.residuals.weight, self.residuals.values])
 
     @cached_property
     def _prepare(self) -> Any:
         """Links and diagonals, for the weights and the map as they are."""
-        from amiwarp.kernels.descent import gather_diagonal
-        from amiwarp.kernels.photometric import add_diagonal
-        from amiwarp.kernels.prior import link
-        from amiwarp.kernels.replay import Program
-
         program = Program(self.device)
         if self.smoothness is not None:
             inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
@@ -323,10 +290,6 @@ class BrightnessMap:
 
     def coverage(self, scale: float = 1.0) -> NDArray[np.float32]:
         """How much pairs of two events say of each node, with weights of ``scale``, shape (tiles, rows, columns)."""
-        from amiwarp.kernels.descent import gather
-        from amiwarp.kernels.photometric import add_diagonal
-        from amiwarp.kernels.replay import Program
-
         self._scale.fill_(scale)
         weak, self.pairs.arrays.weak = self.pairs.arrays.weak, 0.0
         program = Program(self.device)
@@ -353,8 +316,6 @@ class _Descent:
     """
 
     def __init__(self, of: BrightnessMap, image: Any, residual: Any) -> None:
-        from amiwarp.kernels.replay import Program
-
         self.image, self.residual = image, residual
         self._of, self._begin, self._step = of, Program(of.device), Program(of.device)
         self._add_begin(self._begin)
@@ -365,18 +326,12 @@ class _Descent:
         self._step.run(steps)
 
     def _add_begin(self, program: Any) -> None:
-        from amiwarp.kernels import descent as cg
-        from amiwarp.kernels import photometric as k
-
         of = self._of
-        program.add_slices(k.apply_transpose, of.count, [*of._equations, self.residual], of._slices)
+        program.add_slices(kernels.apply_transpose, of.count, [*of._equations, self.residual], of._slices)
         self._add(program, cg.start_descent, [of._sums, of._prior, self.image], [of._u, of._dots])
         self._correct(program)
 
     def _add_step(self, program: Any) -> None:
-        from amiwarp.kernels import descent as cg
-        from amiwarp.kernels import photometric as k
-
         of = self._of
         if of._levels is None:
             self._add(program, cg.turn, [], [of._u, of._dots])
@@ -384,18 +339,16 @@ class _Descent:
             self._add(program, cg.turn_to, [of._z], [of._u, of._dots])
         inputs = [*of._equations, of._u.direction]
         if of.device.is_cpu:
-            blocks = of.pairs.arrays.stride // int(k.BLOCK)
-            program.add_slices(k.apply_normal_blocks, blocks, inputs, of._slices, smallest=FEW_BLOCKS)
+            blocks = of.pairs.arrays.stride // int(kernels.BLOCK)
+            program.add_slices(kernels.apply_normal_blocks, blocks, inputs, of._slices, smallest=FEW_BLOCKS)
         else:
-            program.add_slices(k.apply_normal, of.count, inputs, of._slices)
+            program.add_slices(kernels.apply_normal, of.count, inputs, of._slices)
         self._add(program, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
         self._add(program, cg.descend, [], [self.image, of._u, of._dots])
         self._correct(program)
 
     def _correct(self, program: Any) -> None:
         """The preconditioned residual, and its product with the residual."""
-        from amiwarp.kernels.descent import dot
-
         of = self._of
         if of._levels is not None:
             of._levels.correct(program, of._u.diagonal, of._prior, of._u.residual, of._z)

@@ -11,17 +11,18 @@ import numpy as np
 
 from amiwarp.calib import checks
 from amiwarp.calib.bad_pixels import Masked, strange_pixels, stretch
-from amiwarp.calib.parameters import MOTION, RATES, Space, make_space, nominal, size_name
+from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, make_space, nominal, size_name
 from amiwarp.calib.photometric.stage import refine
 from amiwarp.calib.prism_speed import estimate_rpm, turns_per_turn
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.calib.rotation_estimate import estimate_rates
-from amiwarp.calib.sharpness.search import AUTO, Material, Progress, Search, Settings
+from amiwarp.calib.sharpness.search import AUTO, Material, Search, Settings
 from amiwarp.calib.thinning import thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.optics.prism import Prism
+from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -349,7 +350,7 @@ def _space(
     events: Events,
     settings: Settings,
     free: tuple[str, ...],
-) -> Space:
+) -> ParameterSpace:
     duration = int(events.t[-1]) - int(events.t[0])
     turned = float(np.ptp(encoder.angle_at(events.t[[0, -1]])))
     start = dict(settings.start)
@@ -366,7 +367,7 @@ def _space(
     )  # fmt: skip
 
 
-def _material(events: Events, encoder: Encoder, space: Space, middle: int, fold: int) -> Material:
+def _material(events: Events, encoder: Encoder, space: ParameterSpace, middle: int, fold: int) -> Material:
     if fold and (space.moving or {"clock_offset", "rpm"} & set(space.names)):
         raise AmiwarpError(
             f"fold = {fold} with {', '.join(space.names)} free: folding forgets when an event came; leave it out"

@@ -16,7 +16,7 @@ import numpy as np
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.sharpness.search import STAGES, Settings
-from amiwarp.calib.solve import Stage
+from amiwarp.calib.solve import SearchStage
 from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness
 
@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from amiwarp.calib.sharpness.search import Progress, Search
+    from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.recording import Recording
+    from amiwarp.progress import Progress
 
 WINDOW_US = 2_000_000
 """The paper calibrates on 2 s."""
@@ -73,7 +74,7 @@ def calibrate_as_paper(
     )
 
 
-def _grids(search: Search, mounted: bool, progress: Progress | None) -> Stage:
+def _grids(search: Search, mounted: bool, progress: Progress | None) -> SearchStage:
     space, began = search.space, time.perf_counter()
     nominal = space.start
     size, phase = nominal[space.size_name], nominal["phase"]
@@ -92,11 +93,11 @@ def _grids(search: Search, mounted: bool, progress: Progress | None) -> Stage:
                 points.append(v)
                 scores.append(search.fine(v))
                 if progress is not None:
-                    progress("global", len(points), budget)
+                    progress("calibrating, global", len(points) / budget)
         size, phase = (space.to_values(points[int(np.argmax(scores))])[n] for n in (space.size_name, "phase"))
         size_half, phase_half, columns = 2.0 * size_half / (SIDE - 1), 2.0 * phase_half / (columns - 1), SIDE
     best = int(np.argmax(scores))
-    return Stage(
+    return SearchStage(
         "grid", points[best], scores[best], len(points), time.perf_counter() - began, "its budget",
         np.array(points), np.array(scores),
     )  # fmt: skip

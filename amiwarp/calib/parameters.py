@@ -65,7 +65,7 @@ TURN = (-math.pi, math.pi)
 
 
 @dataclass(frozen=True)
-class Space:
+class ParameterSpace:
     """Free parameters of one model of one camera: names, bounds, start, and the way to the vector and back."""
 
     model: str
@@ -104,11 +104,11 @@ class Space:
         """Whether the camera's motion is sought or given."""
         return any(self.start.get(n) or n in self.names for n in MOTION)
 
-    def without(self, names: tuple[str, ...]) -> Space:
+    def without(self, names: tuple[str, ...]) -> ParameterSpace:
         """The space in which ``names`` are held at their start."""
         return replace(self, names=tuple(n for n in self.names if n not in names))
 
-    def holding(self, values: Mapping[str, float]) -> Space:
+    def holding(self, values: Mapping[str, float]) -> ParameterSpace:
         """The same with another start."""
         return replace(self, start={**self.start, **values})
 
@@ -223,7 +223,7 @@ def make_space(
     rad_per_us: float,
     duration_us: float,
     middle_us: int = 0,
-) -> Space:
+) -> ParameterSpace:
     """Checks names and bounds and measures how far each parameter moves events.
 
     ``prism`` is the nominal one: the size may go from 0 to twice its apex unless ``bounds`` say otherwise.
@@ -248,7 +248,7 @@ def make_space(
         values[name] = min(max(values[name], low[name]), high[name])
     shifts = _pixels_per_unit(model, camera, prism, names, values, rad_per_us, duration_us)
     undrifted = {n: x for n, x in values.items() if n in DRIFTS}
-    return Space(model, camera, prism, names, low, high, values, shifts, middle_us, duration_us, undrifted)
+    return ParameterSpace(model, camera, prism, names, low, high, values, shifts, middle_us, duration_us, undrifted)
 
 
 def _order(model: str, free: tuple[str, ...]) -> tuple[str, ...]:

@@ -29,8 +29,8 @@ from amiwarp.validation import one_of, real, shown
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.calib.parameters import Space
-    from amiwarp.calib.solve import Stage
+    from amiwarp.calib.parameters import ParameterSpace
+    from amiwarp.calib.solve import SearchStage
     from amiwarp.optics.models import Model
 
 FORMAT = "amiwarp-calibration"
@@ -59,7 +59,7 @@ class StageSummary:
     """Parameters of every evaluation, each with its ``score``, in order."""
 
     @classmethod
-    def of(cls, name: str, stage: Stage, space: Space) -> StageSummary:
+    def of(cls, name: str, stage: SearchStage, space: ParameterSpace) -> StageSummary:
         points = []
         for x, score in zip(stage.points, stage.scores, strict=True):
             values = space.to_values(x)
@@ -68,7 +68,7 @@ class StageSummary:
 
 
 @dataclass(frozen=True)
-class Photometric:
+class PhotometricSummary:
     """What the second stage found, and whether to believe it."""
 
     accepted: bool
@@ -95,7 +95,7 @@ class Photometric:
 
 
 @dataclass(frozen=True)
-class Rung:
+class ModelCandidate:
     """One model of the ladder and what was found of it; see :mod:`amiwarp.calib.selection.model_choice`."""
 
     model: str
@@ -118,7 +118,7 @@ class Rung:
 
 
 @dataclass(frozen=True)
-class Freed:
+class FreedParameter:
     """One parameter, or a pair, that was held at first: whether it was freed, and why (not)."""
 
     name: str
@@ -132,7 +132,7 @@ class Freed:
 
 
 @dataclass(frozen=True)
-class Ladder:
+class ModelChoice:
     """How ``auto`` came to its model."""
 
     budget_px: float
@@ -143,8 +143,8 @@ class Ladder:
     exact: Mapping[str, float]
     """Parameters of the exact model, from which those of the chosen one were fitted."""
     exact_uncertainty: Mapping[str, float]
-    rungs: tuple[Rung, ...]
-    parameters: tuple[Freed, ...]
+    rungs: tuple[ModelCandidate, ...]
+    parameters: tuple[FreedParameter, ...]
     seconds: float
     """Beside the exact model's first calibration."""
 
@@ -174,11 +174,11 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     zero_us: int | None = None
     """Where there was no encoder: the time on the events' clock at which the prism's angle is taken as 0."""
-    photometric: Photometric | None = None
+    photometric: PhotometricSummary | None = None
     """What the second stage found; None where it did not run."""
     middle_us: int | None = None
     """Where the camera's motion was free: the time for which its rates hold, on the events' clock."""
-    ladder: Ladder | None = None
+    ladder: ModelChoice | None = None
     """How the model was chosen, where that was left to ``auto``."""
 
     @property
@@ -320,9 +320,9 @@ class _Rest:
     warnings: tuple[str, ...]
     stages: tuple[StageSummary, ...]
     zero_us: int | None
-    photometric: Photometric | None
+    photometric: PhotometricSummary | None
     middle_us: int | None = None
-    ladder: Ladder | None = None
+    ladder: ModelChoice | None = None
 
 
 def _entry(name: str, data: Any) -> _Entry:

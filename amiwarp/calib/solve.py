@@ -48,7 +48,7 @@ _NEEDS_TWO = ("LN_BOBYQA", "LN_NEWUOA", "LN_NEWUOA_BOUND")
 
 
 @dataclass(frozen=True)
-class Stage:
+class SearchStage:
     """What one run of an algorithm did."""
 
     algorithm: str
@@ -83,7 +83,7 @@ def maximise(
     step: float = 1.0,
     inner: str = "LN_SBPLX",
     seed: int = 0,
-) -> Stage:
+) -> SearchStage:
     """Runs one algorithm on ``score`` (higher is better) in the box ``low .. high``.
 
     ``tolerance`` and ``step``: end of the search and first step [px], in every dimension. ``inner``: the local
@@ -115,7 +115,7 @@ def maximise(
     points, scores = np.array(samples.points), np.array(samples.scores)
     best = int(np.argmax(scores))
     seconds = time.perf_counter() - began
-    return Stage(algorithm, points[best], float(scores[best]), len(scores), seconds, ended, points, scores)
+    return SearchStage(algorithm, points[best], float(scores[best]), len(scores), seconds, ended, points, scores)
 
 
 class _Samples:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.kernels.launch import pool
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,8 +33,6 @@ def thin(recording: Recording, most: int) -> Events:
 
 def _runs(block: Events, step: int) -> Events:
     """The first of every ``step`` runs, copied, so that the block itself can go."""
-    from amiwarp.kernels.launch import pool
-
     whole = len(block) // (step * RUN) * step * RUN
 
     def pick(values: NDArray[Any]) -> NDArray[Any]:

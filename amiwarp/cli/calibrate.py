@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.cli.console import Advance, choose_device, progress, report, table
+from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, interval, number, span
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness
+from amiwarp.io import open_recording
+from amiwarp.io.output import check_output
 
 if TYPE_CHECKING:
-    from amiwarp.calib import Calibration, Settings
+    from amiwarp.calib import Calibration
     from amiwarp.calib.photometric.stage import PhotometricSettings
-    from amiwarp.calib.result import Ladder
+    from amiwarp.calib.result import ModelChoice
     from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
@@ -106,14 +109,14 @@ class SearchOptions:
 
     def changes(self, base: PhotometricSettings) -> dict[str, Any]:
         """Fields of the settings that were given; ``base``: those of the photometric stage that were not."""
-        from amiwarp.brightness.event_pairs import Sensor
+        from amiwarp.brightness.event_pairs import SensorTiming
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
         if (given.get("global_algorithm") or "").lower() == "none":
             given["global_algorithm"] = None
         if self.stages is not None:
             given["stages"] = tuple(name.strip() for name in self.stages.split(","))
-        sensor = Sensor(given.pop("latency_us"), given.pop("refractory_us"))
+        sensor = SensorTiming(given.pop("latency_us"), given.pop("refractory_us"))
         algorithm = given.pop("photometric_algorithm", None)
         photometric = replace(base, sensor=sensor, algorithm=algorithm or base.algorithm)
         return given | {"photometric": photometric}
@@ -210,8 +213,6 @@ def run(
     from amiwarp.calib import Settings, calibrate
     from amiwarp.calib.paper_method import calibrate_as_paper
     from amiwarp.calib.presets import Preset
-    from amiwarp.io import open_recording
-    from amiwarp.io.output import check_output
 
     device = choose_device(common.device)
     base = Settings() if preset is None else Preset.load(preset, "calibration").calibration_settings()
@@ -225,11 +226,9 @@ def run(
     with progress("calibrating") as advance:
         if method is Method.PAPER:
             check_paper(search, parameters, preset)
-            found = calibrate_as_paper(
-                opened, start=settings.start, device=device, progress=staged(advance, replace(settings, stages=()))
-            )
+            found = calibrate_as_paper(opened, start=settings.start, device=device, progress=advance)
         else:
-            found = calibrate(opened, settings, device=device, progress=staged(advance, settings))
+            found = calibrate(opened, settings, device=device, progress=advance)
     found.save(out)
     if figure is not None:
         from amiwarp.plotting.figures import draw_calibration
@@ -250,8 +249,6 @@ def cut(recording: Recording, window: str) -> Recording:
 
     Raises :class:`AmiwarpError` for a window that is none or holds no event.
     """
-    from amiwarp.events.events import MemoryEvents
-
     first, last = recording.events.t_first, recording.events.t_last
     low, high = span(window, first, last)
     events = recording.events.between(low, high)
@@ -260,18 +257,6 @@ def cut(recording: Recording, window: str) -> Recording:
             f"{recording.name}: no events in the window {window} s; the recording has {(last - first) * 1e-6:.6g} s"
         )
     return replace(recording, events=MemoryEvents(events, *recording.events.size))
-
-
-def staged(advance: Advance, settings: Settings) -> Any:
-    """A calibration's progress as one share: each stage takes about as long as the others."""
-    names = [] if settings.global_algorithm is None else ["global"]
-    names += ["local", "photometric"][: len(settings.stages)]
-
-    def update(stage: str, done: int, budget: int) -> None:
-        share = min(done / max(budget, 1), 1.0)
-        advance((names.index(stage) + share) / len(names), f"calibrating, {stage}")
-
-    return update
 
 
 def summary(c: Calibration) -> dict[str, Any]:
@@ -302,7 +287,7 @@ def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
     ]
 
 
-def _ladder(ladder: Ladder | None) -> list[Any]:
+def _ladder(ladder: ModelChoice | None) -> list[Any]:
     """Why this model, and what was freed."""
     if ladder is None:
         return []
@@ -322,7 +307,7 @@ def _ladder(ladder: Ladder | None) -> list[Any]:
     ]
 
 
-def _exact(ladder: Ladder) -> list[str]:
+def _exact(ladder: ModelChoice) -> list[str]:
     """The prism itself, where the chosen model does not name its apex."""
     std = ladder.exact_uncertainty.get("apex", 0.0)
     return [f"the exact model's apex: {math.degrees(ladder.exact['apex']):.6g} ± {math.degrees(std):.2g} deg"]

@@ -10,6 +10,10 @@ import typer
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
+from amiwarp.io.output import check_output
+from amiwarp.progress import part
+from amiwarp.studies.chart.rows import beaten_by, fronts, told_apart
 
 if TYPE_CHECKING:
     from amiwarp.studies.chart import Charts
@@ -46,8 +50,6 @@ def run(
     if recording is not None and picture is not None:
         raise AmiwarpError("a recording and --picture both say what to measure on; give one of them")
     device = choose_device(common.device)
-    from amiwarp.io import open_recording
-    from amiwarp.io.output import check_output
     from amiwarp.studies.chart import make, simulated
 
     if budget_px is not None or budget_ms is not None:
@@ -60,16 +62,15 @@ def run(
             opened = open_recording(recording)
         else:
             opened = simulated(picture, seed=common.seed, device=device, quick=quick,
-                               progress=lambda share: advance(0.0, f"simulating, {100 * share:.0f} %"))  # fmt: skip
+                               progress=part(advance, 0.0, 0.0))  # fmt: skip
         charts = make(opened, out, device=device, seed=common.seed, quick=quick,
-                      progress=lambda what, share: advance(share, what))  # fmt: skip
+                      progress=advance)  # fmt: skip
     answers = charts.answer(out, budget_px=budget_px, budget_ms=budget_ms)
     report(common, summary(charts, answers, out) | {"device": device}, lines(charts, answers, out))
 
 
 def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
     """Fronts, defaults and answers; the whole table is in the files."""
-    from amiwarp.studies.chart.rows import fronts
 
     def fields(row: Row) -> dict[str, Any]:
         return {"label": row.label, "job": row.job, "mev_per_s": row.mev_per_s, "ms": row.seconds * 1e3,
@@ -89,8 +90,6 @@ def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[s
 
 def lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> list[Any]:
     """The same for people."""
-    from amiwarp.studies.chart.rows import beaten_by, fronts, told_apart
-
     shown: list[Any] = []
     for rows in (charts.compensation, charts.calibration):
         for job, chosen in fronts(rows):

@@ -12,6 +12,7 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Layers
+from amiwarp.io import open_recording
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -77,7 +78,6 @@ def run(
     from amiwarp.calib import Calibration
     from amiwarp.calib.presets import Preset, simplified
     from amiwarp.compensation.recordings import compensate
-    from amiwarp.io import open_recording
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)
@@ -86,15 +86,11 @@ def run(
     opened = open_recording(recording)
     files = iwe.build(opened, device)
     with progress("compensating") as advance:
-
-        def update(done: int, n: int) -> None:
-            advance(done / max(n, 1))
-
         if files is None:
-            done = compensate(opened, found, out, device=device, progress=update)
+            done = compensate(opened, found, out, device=device, progress=advance)
         else:
             with files:
-                done = compensate(opened, found, out, device=device, progress=update, on_block=files.add)
+                done = compensate(opened, found, out, device=device, progress=advance, on_block=files.add)
     data: dict[str, Any] = {
         "file": str(out),
         "model": found.model_name,

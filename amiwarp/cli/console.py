@@ -9,21 +9,17 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
-from typing import Any, Protocol
+from typing import Any
 
+import rich.progress
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from amiwarp.cli import say
 from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError, printable
-
-
-class Advance(Protocol):
-    """Called with the share that is done, 0 to 1, and with what is being done where that changes."""
-
-    def __call__(self, share: float, what: str | None = None, /) -> None: ...
+from amiwarp.progress import Progress
 
 
 def choose_device(name: str | None) -> str:
@@ -59,15 +55,13 @@ def _without(line: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def progress(what: str) -> Iterator[Advance]:
+def progress(what: str) -> Iterator[Progress]:
     """A progress bar on stderr, gone when it is done; nothing where stderr is no terminal."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(printable(what), total=1.0)
-        yield lambda share, what=None, /: bar.update(
-            task, completed=share, description=None if what is None else printable(what)
-        )
+        yield lambda what, share: bar.update(task, completed=share, description=printable(what))
 
 
 def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -> None:

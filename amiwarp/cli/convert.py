@@ -14,6 +14,7 @@ from amiwarp.cli.console import progress, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import convert, open_recording, read_encoder_csv
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -58,8 +59,6 @@ class EncoderOptions:
                 what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
                 raise AmiwarpError(f"{what}; give --encoder too")
             return None
-        from amiwarp.io import read_encoder_csv
-
         return read_encoder_csv(
             self.encoder,
             counts_per_turn=self.counts_per_turn,
@@ -77,8 +76,6 @@ def run(
     common: Common,
 ) -> None:
     """Convert a recording to amiwarp's HDF5, with its encoder, camera and prism put in. In constant memory."""
-    from amiwarp.io import convert, open_recording
-
     began = time.perf_counter()
     log = encoder.build()
     lens = wedge = None
@@ -90,7 +87,7 @@ def run(
     with progress("converting") as advance:
         summary = convert(
             source, out, encoder=log, camera=lens, prism=wedge,
-            progress=lambda done, n: advance(done / n if n else 0.0),
+            progress=advance,
         )  # fmt: skip
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}

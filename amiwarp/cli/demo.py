@@ -40,7 +40,7 @@ def run(
         width, height = parse_size(size)
         demo = Demo(out, picture, width, height, duration, common.seed, device)
         with own_folder(out) if out == OWN_FOLDER else contextlib.nullcontext():
-            outcome = run_demo(demo, lambda what, share: advance(share, what))
+            outcome = run_demo(demo, advance)
     data = asdict(outcome) | {"seconds": time.perf_counter() - began, "device": device}
     report(common, data, lines(data))
 

@@ -16,6 +16,8 @@ from amiwarp.cli.console import choose_device, plain, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, numbers
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
+from amiwarp.io.output import check_output, make_folder, write_text
+from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 
 if TYPE_CHECKING:
@@ -128,7 +130,6 @@ def run(
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.io.output import check_output, make_folder, write_text
     from amiwarp.simulation.simulator import Scene, SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import design
@@ -143,7 +144,7 @@ def run(
     with progress("starting") as advance:
         made = design(
             seen, scene, glass, apexes=grid.apexes, rpms=grid.rpms, timing=faults.timing(), limits=limits.build(),
-            sensor=sensor, seed=common.seed, device=device, progress=lambda what, share: advance(share, what),
+            sensor=sensor, seed=common.seed, device=device, progress=advance,
         )  # fmt: skip
     data = summary(made)
     write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
@@ -153,8 +154,6 @@ def run(
 
 
 def _camera(options: CameraOptions, size: str | None) -> Camera:
-    from amiwarp.optics.camera import Camera
-
     width, height = parse_size(size or "640x480")
     found = options.build(width, height, fixed=size is not None)
     return found or Camera.from_fov(width, height, math.radians(FOV_DEG))

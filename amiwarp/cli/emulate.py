@@ -16,6 +16,11 @@ from amiwarp.cli.console import report
 from amiwarp.cli.options import NO_FILE, Common
 from amiwarp.cli.streams import stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
+from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.link.emulator import Controller, Fault
+from amiwarp.live.link.rotors import Motor, Played
+from amiwarp.live.link.terminal import PseudoTerminal
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -62,10 +67,6 @@ def run(
     common: Common,
 ) -> None:
     """Be a controller with motor, encoder and index, for trying out without one, and with what goes wrong on demand."""
-    from amiwarp.live.link.clocks import monotonic_us
-    from amiwarp.live.link.emulator import Controller, Fault
-    from amiwarp.live.link.rotors import Motor, Played
-    from amiwarp.live.link.terminal import PseudoTerminal
     from amiwarp.live.stream.emulated import EmulatedCamera
 
     if (recording is None) != (camera is None):
@@ -112,8 +113,6 @@ def run(
 
 
 def _recording(path: Path) -> tuple[Recording, Encoder]:
-    from amiwarp.io import open_recording
-
     opened = open_recording(path)
     if opened.encoder is None:
         raise AmiwarpError(f"{path}: has no encoder; give a recording that has")

@@ -11,6 +11,8 @@ import typer
 
 from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import Common
+from amiwarp.io import open_recording
+from amiwarp.io.conversion import GAP_INTERVALS
 from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
@@ -25,8 +27,6 @@ def run(
     file: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")], common: Common
 ) -> None:
     """Say what a recording is: format, events, encoder, camera, prism, truth, repairs. Reads it once, in blocks."""
-    from amiwarp.io import open_recording
-
     recording = open_recording(file)
     data = describe(recording, str(file))
     report(common, data, [table(_rows(data))])
@@ -70,7 +70,7 @@ def _events(source: EventSource) -> dict[str, Any]:
                 inside = (np.rint(block.x) >= 0) & (np.rint(block.x) < source.size[0])
                 inside &= (np.rint(block.y) >= 0) & (np.rint(block.y) < source.size[1])
                 outside += int(np.count_nonzero(~inside))
-            advance(done / max(n, 1))
+            advance("reading", done / max(n, 1))
     first, last = (source.t_first, source.t_last) if n else (None, None)
     seconds = 0.0 if first is None or last is None else (last - first) * 1e-6
     out = {
@@ -86,8 +86,6 @@ def _events(source: EventSource) -> dict[str, Any]:
 
 
 def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
-    from amiwarp.io.conversion import GAP_INTERVALS
-
     slip = encoder.slip()
     first, last = encoder.coverage
     return {

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name
+from amiwarp.io.json_files import read_json
+from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
 
@@ -61,9 +64,6 @@ def read_camera(path: Path, width: int, height: int) -> Camera:
     Raises :class:`AmiwarpError` naming file and field.
     """
     from amiwarp.calib.result import camera_from_json
-    from amiwarp.io.files import errors_name
-    from amiwarp.io.json_files import read_json
-    from amiwarp.io.text import read_calib
 
     if path.suffix.lower() != ".json":
         return read_calib(path, width, height)

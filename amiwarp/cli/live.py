@@ -15,6 +15,9 @@ from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.live_writer import LiveWriter
+from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
+from amiwarp.live.stream.clocking import clock_offset
 from amiwarp.live.stream.policy import Policy
 
 if TYPE_CHECKING:
@@ -54,7 +57,6 @@ class AdaptiveOptions:
     ] = None
 
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
-        from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
         from amiwarp.live.stream.speed_control import SpeedKeeper
 
         if not self.adaptive:
@@ -106,7 +108,6 @@ def run(
     """
     from amiwarp.calib import Calibration
     from amiwarp.compensation.recordings import check_size
-    from amiwarp.live.stream.clocking import clock_offset
     from amiwarp.live.stream.forward import Forward
     from amiwarp.live.stream.session import Session
 
@@ -181,8 +182,6 @@ def _sent(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
 
 
 def _writer(path: Path, source: Source, found: Calibration, *, compensated: bool, offset_us: float = 0.0) -> LiveWriter:
-    from amiwarp.io.live_writer import LiveWriter
-
     width, height = source.size
     metadata: dict[str, Any] = {"recorded_from": source.name}
     if compensated:

@@ -12,6 +12,8 @@ import typer
 from amiwarp.cli.console import report, table
 from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.live.link.link import Link
+from amiwarp.live.link.protocol import FAULTS, STATES
 
 if TYPE_CHECKING:
     from amiwarp.live.link.link import Link
@@ -48,8 +50,6 @@ def run(
     common: Common,
 ) -> None:
     """Drive the prism's motor, and see what its controller says. The motor goes on as told when this ends."""
-    from amiwarp.live.link.link import Link
-
     if (rpm is None) == (action is Action.SET):
         raise AmiwarpError("--rpm is the speed to set; 'amiwarp motor set' needs it and nothing else takes it")
     if rpm is not None and not abs(rpm) <= limit_rpm:
@@ -82,8 +82,6 @@ def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
 
 
 def _described(link: Link, messages: list[str]) -> dict[str, Any]:
-    from amiwarp.live.link.protocol import FAULTS, STATES
-
     status = link.status
     if status is None:
         said = "; ".join([*messages, "docs/link-protocol.md says what it is to send"])

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.cli.console import Advance, choose_device, progress, report
+from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.inputs import numbers
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.progress import Progress
 from amiwarp.reconstruction.choices import CONTRAST, Fill, Tone
 
 if TYPE_CHECKING:
@@ -108,7 +110,6 @@ def run(
     A picture needs a quarter turn or more. Intensity is relative: events tell no absolute brightness.
     """
     from amiwarp.calib import Calibration
-    from amiwarp.io import open_recording
     from amiwarp.reconstruction.export import VIDEO, check_path
     from amiwarp.reconstruction.picture import Reconstruction
 
@@ -153,7 +154,7 @@ def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]
 
 
 def _video(
-    work: Reconstruction, out: Path, span: tuple[int, int], fps: float, options: PictureOptions, advance: Advance
+    work: Reconstruction, out: Path, span: tuple[int, int], fps: float, options: PictureOptions, advance: Progress
 ) -> dict[str, Any]:
     from amiwarp.reconstruction.export import save_video
 
@@ -165,7 +166,7 @@ def _video(
         for found in work.windows(*span, step_us=step):
             yield found
             pairs.append(found.pairs)
-            advance(len(pairs) / count)
+            advance("reconstructing", len(pairs) / count)
 
     frames = save_video(pictures(), out, fps=fps, tone=options.tone, contrast=options.contrast)
     return {"frames": frames, "fps": fps, "pairs": sum(pairs)}

@@ -12,6 +12,8 @@ from amiwarp.cli.console import report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
+from amiwarp.io.live_writer import LiveWriter
+from amiwarp.live.stream.clocking import clock_offset
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
@@ -31,8 +33,6 @@ def run(
 
     The file can be opened at any moment, also after a crash: NAME.part.h5 then, without at most its last second.
     """
-    from amiwarp.io.live_writer import LiveWriter
-    from amiwarp.live.stream.clocking import clock_offset
     from amiwarp.live.stream.session import Session
 
     stop = threading.Event()

@@ -13,6 +13,7 @@ from amiwarp.cli.inputs import numbers, read_camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.simulation.motion import EncoderModel, PrismMotion
 
 if TYPE_CHECKING:
     from amiwarp.simulation.motion import EncoderModel, PrismMotion
@@ -81,8 +82,6 @@ class RigOptions:
         return replace(self.build_prism(), apex=math.radians(nominal))
 
     def build_motion(self) -> PrismMotion:
-        from amiwarp.simulation.motion import PrismMotion
-
         x, y = (math.radians(v) for v in numbers(self.tilt_deg, 2, "--tilt-deg"))
         rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
         return PrismMotion(rpm, math.radians(self.phase_deg), (x, y))
@@ -149,8 +148,6 @@ class EncoderModelOptions:
     dropout_us: Annotated[float | None, _encoder("How long each loses all samples.")] = None
 
     def build(self) -> EncoderModel:
-        from amiwarp.simulation.motion import EncoderModel
-
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
         if self.counts_per_turn == 0:
             given["counts_per_turn"] = None

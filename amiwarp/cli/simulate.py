@@ -14,6 +14,8 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.inputs import numbers
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
+from amiwarp.io import open_recording
+from amiwarp.simulation.motion import CameraMotion
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
@@ -64,7 +66,6 @@ def run(
     common: Common,
 ) -> None:
     """Make a recording of a picture as an event camera behind the prism would see it; the truth is stored beside it."""
-    from amiwarp.simulation.motion import CameraMotion
     from amiwarp.simulation.simulator import Scene, Simulation
 
     device = choose_device(common.device)
@@ -86,8 +87,6 @@ def run(
 
 def write(simulation: Simulation, out: Path, common: Common) -> None:
     """Runs a simulation into a file and says how that went."""
-    from amiwarp.io import open_recording
-
     began = time.perf_counter()
     with progress("simulating") as advance:
         simulation.write(out, progress=advance)

@@ -19,6 +19,7 @@ from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.output import make_folder, own_folder
 from amiwarp.kernels.cores import cpu_threads
 
 if TYPE_CHECKING:
@@ -64,7 +65,6 @@ def run(
     stopped goes on with the same command, and a rerun does only what is missing.
     """
     device = choose_device(common.device)
-    from amiwarp.io.output import make_folder, own_folder
     from amiwarp.studies.stability import aggregate, draw, identity, load
 
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
@@ -120,10 +120,10 @@ def _run(
     end = None if minutes is None else time.monotonic() + 60.0 * minutes
     new = 0
 
-    def tell(finished: int, of: int) -> None:
+    def tell(what: str, share: float) -> None:
         nonlocal new
         new += 1
-        advance(finished / of, f"{finished:,} of {of:,} cells")
+        advance(what, share)
 
     try:
         with progress("starting workers") as advance, _executor(scheduler, device) as executor:

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from amiwarp.cli import say
 from amiwarp.errors import AmiwarpError, printable
+from amiwarp.live.link.link import Link
 
 if TYPE_CHECKING:
     from amiwarp.live.link.link import Link
@@ -67,8 +68,6 @@ class SourceOptions:
     @contextlib.contextmanager
     def link(self) -> Iterator[Link | None]:
         """The controller, or None where no port was given."""
-        from amiwarp.live.link.link import Link
-
         if self.port is None:
             yield None
             return

@@ -15,8 +15,11 @@ from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
 from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
+from amiwarp.cli.streams import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.hosts import warning
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -101,7 +104,6 @@ def run(
 ) -> None:
     """Look at events in x, y and prism angle, as recorded and compensated, and turn the prism's knobs."""
     from amiwarp.viewer.app import export_folder, has_display, open_window, serve_panel
-    from amiwarp.viewer.hosts import warning
     from amiwarp.viewer.scene import check_display
 
     device = choose_device(common.device)
@@ -146,7 +148,6 @@ def inspector(
 ) -> Inspector:
     """The recording with what the options add, at its first window."""
     from amiwarp.calib import Calibration
-    from amiwarp.io import open_recording
     from amiwarp.optics.models import MODELS
     from amiwarp.viewer.inspector import Inspector
 
@@ -167,7 +168,6 @@ def inspector(
 @contextlib.contextmanager
 def _following(spec: str, controller: str | None) -> Iterator[Callable[[], Recording]]:
     """What a stream's last seconds are by now; waits for the first turn."""
-    from amiwarp.cli.streams import SourceOptions, check_angles
     from amiwarp.live.stream.recent_events import RecentEvents, followed
     from amiwarp.live.stream.sources import open_source
 

@@ -10,12 +10,17 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.compensation.launch_plan import Placing
 from amiwarp.compensation.packet_copy import PIECE, PacketCopier, address
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_encoder import encoder_pieces
 from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.kernels.compensation import Columns
+from amiwarp.kernels.encoder import EncoderParams
+from amiwarp.kernels.launch import Recorded, beside, launch
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -81,10 +86,6 @@ class Batches:
 
     def __init__(self, model: Model, batch: int, device: Any) -> None:
         """``batch``: most events of one."""
-        import warp as wp
-
-        from amiwarp.kernels.compensation import Columns
-
         self._device, self._at = device, 0
         self._encoder: Any = None
         self._placed: list[tuple[int, int]] = []  # stretches that were not voted yet
@@ -111,11 +112,6 @@ class Batches:
 
     def set_encoder(self, encoder: Encoder, first: int, last: int) -> None:
         """Puts its pieces over a span of event times [us] into one bucket, where a search finds them: they are few."""
-        import warp as wp
-
-        from amiwarp.events.device_encoder import encoder_pieces
-        from amiwarp.kernels.encoder import EncoderParams
-
         origin, *pieces = encoder_pieces(encoder, first, last)
         n, p = len(pieces[0]), self._encoder
         if p is None or n > len(p.start):
@@ -164,8 +160,6 @@ class Batches:
 
     def begin(self, started: Started, unknown: int) -> BatchInFlight:
         """Sends a batch on its way; the first ``unknown`` get no place. Raises :class:`AmiwarpError` where unsorted."""
-        import warp as wp
-
         s, (unsorted, x, y) = started, started.found()
         at, end, n = s.at, s.end, s.end - s.at
         if unsorted:
@@ -195,8 +189,6 @@ class Batches:
 
     def end(self, begun: BatchInFlight) -> list[NDArray[Any]]:
         """Places x, y [px] and flags, outside the image or not."""
-        import warp as wp
-
         if begun.done is not None:
             wp.synchronize_event(begun.done)
         if begun.out is None:
@@ -207,8 +199,6 @@ class Batches:
 
     def _send_back(self, at: int, end: int, direct: bool) -> list[NDArray[Any]] | None:
         """Starts the results' way from a GPU, where there are many into arrays that are handed out."""
-        import warp as wp
-
         if not direct:
             self._copy(self._ours, self._columns, OUT, at, end)
             return None
@@ -218,15 +208,11 @@ class Batches:
         return [view for _, view in lent]
 
     def _copy(self, to: Any, source: Any, names: tuple[str, ...], at: int, end: int) -> None:
-        import warp as wp
-
         for name in names:
             columns = getattr(to, name), getattr(source, name)
             wp.copy(*columns, dest_offset=at, src_offset=at, count=end - at)
 
     def _launch(self, first: int, blocks: int, strays: bool) -> None:
-        from amiwarp.kernels.launch import Recorded, launch
-
         kernel, inputs = self._placing.kernel, self._placing.inputs(self._encoder, self._columns, strays=strays)
         if self._device.is_cpu and blocks >= SLICE:
             launch(kernel, blocks, inputs, [], device=self._device, first=first, smallest=SLICE // 2)
@@ -248,8 +234,6 @@ class Batches:
     def _vote(self, *, least: int) -> None:
         """What was not voted yet, if it is so many events: on CPUs by a thread beside, one for all, so that votes come
         one after the other."""
-        from amiwarp.kernels.launch import beside
-
         if sum(stop - start for start, stop in self._placed) < least:
             return
         for start, stop in _joined(self._placed):
@@ -287,8 +271,6 @@ class PinnedPool:
 
     def __call__(self, n: int, dtype: Any) -> Lent:
         """One of ``n`` values of any content."""
-        import warp as wp
-
         kept = self._kept[dtype]
         for array, view in kept:
             if sys.getrefcount(view) <= unused():

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import warp as wp
+
+from amiwarp.events.device_encoder import azimuths
+from amiwarp.kernels import compensation as kernels
+from amiwarp.kernels.launch import load
+from amiwarp.optics.device_camera import camera_params, pinhole_params
+
 if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
@@ -13,13 +20,6 @@ class Placing:
 
     def __init__(self, model: Model, device: Any) -> None:
         """``device``: a ``wp.Device``. The kernel is loaded here, before threads would each try."""
-        import warp as wp
-
-        from amiwarp.events.device_encoder import azimuths
-        from amiwarp.kernels import compensation as kernels
-        from amiwarp.kernels.launch import load
-        from amiwarp.optics.device_camera import camera_params, pinhole_params
-
         name = str(device)
         self.size = model.camera.width, model.camera.height
         self.kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events

@@ -7,9 +7,12 @@ from ctypes import c_uint64
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.events.events import Events
+from amiwarp.kernels.launch import Recorded, pool
+from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
 
 PIECE, THREADS, OURS = 1 << 17, 2, 8
 """Of more events than that, an eighth of the packets is put together by the caller and the rest by two threads beside:
@@ -31,11 +34,6 @@ class PacketCopier:
         self._make(64)
 
     def _make(self, rows: int) -> None:
-        import warp as wp
-
-        from amiwarp.kernels.launch import Recorded
-        from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
-
         table, found = (
             wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
             wp.zeros(rows * FOUND, dtype=int, device="cpu"),
@@ -51,8 +49,6 @@ class PacketCopier:
         What it returns waits for it, and tells whether any part is unsorted, and the largest x and y. Not before that
         may this be called again.
         """
-        from amiwarp.kernels.launch import pool
-
         goes_on: Any = 0  # whether a row's first event follows the last of the row before in memory
         counts = np.array([part.t.size for part in parts])
         if counts.max() > PIECE:

@@ -12,13 +12,18 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.compensation.launch_plan import Placing
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.events import Events, check_sensor
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native import NativeEvents
+from amiwarp.kernels.compensation import Columns
+from amiwarp.kernels.launch import launch
+from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +39,6 @@ BLOCK = 1 << 20
 PIECE = 2 * CHUNK
 """Events that a thread works on at a time, from the file and back: few, so that they stay in its core's cache."""
 
-Progress = Callable[[int, int], None]
 """Called with events done and all."""
 
 
@@ -61,10 +65,6 @@ class Mover:
     """
 
     def __init__(self, model: Model, encoder: Encoder, t_first: int, t_last: int, device: Any) -> None:
-        import warp as wp
-
-        from amiwarp.events.device_encoder import encoder_params
-
         self._device = wp.get_device(device)
         self._placing = Placing(model, self._device)
         self._encoder = encoder_params(encoder, t_first, t_last, str(self._device))
@@ -81,11 +81,6 @@ class Mover:
         return Events(x, y, events.t, events.p), inside
 
     def _move(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
-        import warp as wp
-
-        from amiwarp.kernels.compensation import Columns
-        from amiwarp.kernels.launch import launch
-
         placing, n = self._placing, len(events)
         padded = placing.padded(n)
         c = Columns()
@@ -104,8 +99,6 @@ class Mover:
 
 def _on(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
     """A column on the device, without a copy on CPUs where that can be."""
-    import warp as wp
-
     if len(values) < padded:
         values = np.concatenate([values, np.zeros(padded - len(values), values.dtype)])
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
@@ -174,7 +167,7 @@ def compensate(
         if on_block is not None:
             on_block(events)
         if progress is not None:
-            progress(done, n)
+            progress("compensating", done / n)
 
     with RecordingWriter(
         out_path, width=width, height=height, camera=recording.camera or calibration.camera, prism=recording.prism,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import warp as wp
 
 from amiwarp.compensation.batches import Batches, BatchInFlight, Started
 from amiwarp.errors import AmiwarpError
@@ -72,8 +73,6 @@ class Compensator:
         batch: int | None = None,
         device: Any = "cpu",
     ) -> None:
-        import warp as wp
-
         self.encoder = encoder
         self.wait_us, self.start_us = wait_us, start_us
         self.most_waiting, self.most_bytes = most_waiting, most_bytes

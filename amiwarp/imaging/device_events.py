@@ -6,9 +6,22 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_encoder import azimuths, encoder_params
 from amiwarp.events.events import check_sensor
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.votes import (
+    BLOCK,
+    EventArrays,
+    drift_turns,
+    fold_keys,
+    layer_events,
+    time_events,
+    turn_events,
+    unfold_keys,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,18 +50,10 @@ class DeviceEvents:
 
     def drift(self, value: float) -> None:
         """Sets the angles to what they are where the drifting parameter has ``value``."""
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.votes import drift_turns
-
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:
         """The same events, each going to the image of its part, and there of its polarity."""
-        import warp as wp
-
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.votes import EventArrays, layer_events
-
         a, e = self.arrays, EventArrays()
         e.x, e.y, e.turn, e.azimuths, e.time, e.weight = a.x, a.y, a.turn, a.azimuths, a.time, a.weight
         e.layer = wp.empty_like(a.layer)
@@ -73,12 +78,6 @@ def upload_events(
     and polarity become one point for each of so many bins of a turn, in its middle, with their number for a weight;
     without slope and times. Raises :class:`AmiwarpError` where the encoder does not cover the events.
     """
-    import warp as wp
-
-    from amiwarp.events.device_encoder import azimuths, encoder_params
-    from amiwarp.kernels.launch import launch
-    from amiwarp.kernels.votes import EventArrays, time_events, turn_events
-
     check_sensor(events)
     n, device = len(events), wp.get_device(device)
     padded = _padded(n, device)
@@ -112,14 +111,10 @@ def upload_events(
 
 def _padded(n: int, device: Any) -> int:
     """CPUs vote whole blocks."""
-    from amiwarp.kernels.votes import BLOCK
-
     return -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
 
 
 def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
-    import warp as wp
-
     n = len(values)
     if _padded(n, device) == n:
         return wp.array(values, dtype=dtype, device=device)
@@ -130,11 +125,6 @@ def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
 
 def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
     """Equal keys of pixel, polarity and bin, sorted and counted on the device; by bin first, so that angles repeat."""
-    import warp as wp
-
-    from amiwarp.kernels.launch import launch
-    from amiwarp.kernels.votes import EventArrays, fold_keys, unfold_keys
-
     device = e.x.device
     if not 1 <= bins <= LARGEST_FOLD:
         raise AmiwarpError(f"fold = {bins} angles a turn; give 1 .. {LARGEST_FOLD}, or 0 for none")

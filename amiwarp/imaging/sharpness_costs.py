@@ -6,10 +6,14 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.warped_image import CanvasShape, Image
+from amiwarp.kernels import iwe as kernels
+from amiwarp.kernels.iwe import STRIP
+from amiwarp.kernels.launch import launch
 from amiwarp.validation import array, choice, real
 
 if TYPE_CHECKING:
@@ -30,10 +34,6 @@ class SharpnessMeter:
 
     def __init__(self, canvas: CanvasShape, kind: Sharpness, *, smoothing: float, device: Any) -> None:
         """``smoothing``: standard deviation of the Gaussian in canvas pixels; 0 for none."""
-        import warp as wp
-
-        from amiwarp.kernels.iwe import STRIP
-
         weights = gaussian(smoothing)
         self.kind = choice(Sharpness, kind, "sharpness")
         self.device = wp.get_device(device)
@@ -52,10 +52,6 @@ class SharpnessMeter:
 
     def launch(self) -> None:
         """Measures :attr:`image` on the device, without waiting for it."""
-        import warp as wp
-
-        from amiwarp.kernels import iwe as kernels
-        from amiwarp.kernels.launch import launch
 
         smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
         if len(self._weights) > 1:
@@ -71,8 +67,6 @@ class SharpnessMeter:
 
     def results(self) -> list[float]:
         """Sharpness of each part of the image that was measured last."""
-        import warp as wp
-
         if self.device.is_cuda:
             wp.synchronize_stream(self.device)
         sums = self._host.numpy().reshape(self._parts, -1, 2).sum(axis=1)

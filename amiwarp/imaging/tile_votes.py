@@ -6,8 +6,15 @@ import ctypes
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
+from amiwarp.kernels import tiles as kernels
+from amiwarp.kernels.camera import CameraRotationParams
+from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams
+from amiwarp.kernels.tiles import AT_ONCE, THREADS, read_tiles, vote_tiles
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.device_camera import pinhole_params
+from amiwarp.optics.models import CircleModel, ExactModel, RadialCircleModel, model_camera
 
 if TYPE_CHECKING:
     from amiwarp.imaging.device_events import DeviceEvents
@@ -25,14 +32,6 @@ class TileVotes:
         self, image: Image, canvas: CanvasShape, events: DeviceEvents, like: Model, *, candidates: int = 1
     ) -> None:
         """``image``: of the canvas, to be read into; ``like``: a model of the kind and camera of the candidates."""
-        import warp as wp
-
-        from amiwarp.kernels import tiles as kernels
-        from amiwarp.kernels.camera import CameraRotationParams
-        from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams
-        from amiwarp.optics.device_camera import pinhole_params
-        from amiwarp.optics.models import CircleModel, ExactModel, RadialCircleModel, model_camera
-
         device = self.device = image.device
         self.canvas, self.candidates = canvas, candidates
         still = len(events.arrays.time) == 0 and events.slope is None
@@ -56,10 +55,6 @@ class TileVotes:
         self._motion = kernels.Still() if still else motion
 
     def _sort(self, events: DeviceEvents) -> Any:
-        import warp as wp
-
-        from amiwarp.kernels import tiles as kernels
-
         a, n, device = events.arrays, events.count, self.device
         layers = self.canvas.shape[0]
         size = min(kernels.TILE, max(1, int(kernels.TILE / self.canvas.scale)))
@@ -80,8 +75,6 @@ class TileVotes:
 
     def _chunks(self, counts: Any, size: int, across: int, down: int) -> Any:
         """Runs of at most CHUNK events, one tile and layer each, the window centred on the tile."""
-        from amiwarp.kernels import tiles as kernels
-
         stops = np.cumsum(counts)
         pieces = [
             (start, min(start + kernels.CHUNK, stop), key)
@@ -101,8 +94,6 @@ class TileVotes:
 
     def set(self, k: int, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
         """Parameters of candidate ``k`` for the next :meth:`launch`, which must not be under way."""
-        import warp as wp
-
         self._drifts[k] = drift
         for array, struct in (
             (self._host[0], model.params(self.device)),
@@ -113,10 +104,6 @@ class TileVotes:
 
     def launch(self) -> None:
         """Votes all events under all candidates."""
-        import warp as wp
-
-        from amiwarp.kernels.tiles import AT_ONCE, THREADS, vote_tiles
-
         for host, there in zip(self._host, self._there, strict=True):
             wp.copy(there, host)
         self.votes.zero_()
@@ -126,8 +113,4 @@ class TileVotes:
 
     def read(self, k: int, image: Image) -> None:
         """Writes candidate ``k``'s image [events]."""
-        import warp as wp
-
-        from amiwarp.kernels.tiles import read_tiles
-
         wp.launch(read_tiles, len(image.pixels), [self.votes[k], 0], [image.pixels], device=self.device)

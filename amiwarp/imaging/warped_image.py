@@ -7,12 +7,29 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import DeviceEvents, upload_events
+from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_totals, empty_words, read_votes
+from amiwarp.kernels.launch import Recorded, launch, launch_slices, slice_count
+from amiwarp.kernels.votes import (
+    BLOCK,
+    TRASH,
+    Canvas,
+    Cells,
+    vote_blocks,
+    vote_events,
+    vote_point_blocks,
+    vote_points,
+    vote_quickly,
+    vote_turning,
+)
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.device_camera import pinhole_params
+from amiwarp.optics.models import model_camera
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:
@@ -71,8 +88,6 @@ class CanvasShape:
         return (self.layers, rows, columns)
 
     def params(self) -> Any:
-        from amiwarp.kernels.votes import Canvas
-
         c = Canvas()
         c.pad, c.scale = float(self.pad), self.scale
         c.nearest, c.dither = int(self.vote is Vote.NEAREST), float(self.dither)
@@ -86,10 +101,6 @@ class Image:
 
     def __init__(self, canvas: CanvasShape, radius: int, device: Any) -> None:
         """``radius``: how far kernels look [px]."""
-        import warp as wp
-
-        from amiwarp.kernels.iwe import CPU_WIDTH, Frame
-
         self.shape = canvas.shape
         self.device = wp.get_device(device)
         self.width = CPU_WIDTH if self.device.is_cpu else 1
@@ -115,8 +126,6 @@ class Image:
 
     def write(self, image: NDArray[np.float32]) -> None:
         """Sets all pixels; shape (layers, rows, columns)."""
-        import warp as wp
-
         flat = np.zeros(len(self.pixels), np.float32)
         self._view(flat)[...] = image
         wp.copy(self.pixels, wp.array(flat, dtype=float, device="cpu"))
@@ -129,11 +138,6 @@ class Votes:
     """
 
     def __init__(self, canvas: CanvasShape, device: Any) -> None:
-        import warp as wp
-
-        from amiwarp.kernels.launch import slice_count
-        from amiwarp.kernels.votes import TRASH, Cells
-
         self.canvas = canvas
         self.device = wp.get_device(device)
         self._params = canvas.params()
@@ -154,11 +158,6 @@ class Votes:
             self._make_fast()
 
     def _make_fast(self) -> None:
-        import warp as wp
-
-        from amiwarp.kernels.iwe import add_totals, empty_words
-        from amiwarp.kernels.votes import Cells
-
         self._counts = wp.zeros((64, 1024), dtype=wp.int64, device=self.device)
         self._fullest = wp.zeros(1, dtype=int, device=self.device)
         self._batch = PROBE
@@ -193,11 +192,6 @@ class Votes:
 
         ``turning`` is taken back where the events were given their times.
         """
-        from amiwarp.kernels.launch import launch_slices
-        from amiwarp.kernels.votes import BLOCK, vote_blocks, vote_events, vote_turning
-        from amiwarp.optics.device_camera import pinhole_params
-        from amiwarp.optics.models import model_camera
-
         if events.slope is not None:
             events.drift(drift)
         params, camera = model.params(self.device), pinhole_params(model.camera)
@@ -218,9 +212,6 @@ class Votes:
 
         ``count``: so many of them, all without.
         """
-        from amiwarp.kernels.launch import launch_slices
-        from amiwarp.kernels.votes import BLOCK, vote_point_blocks, vote_points
-
         inputs, count = [x, y, layer, self._params], len(x) if count is None else count
         blocks = count // int(BLOCK) if self.device.is_cpu else 0
         launch_slices(vote_point_blocks, blocks, inputs, self._cells, device=self.device, smallest=8192)
@@ -228,29 +219,20 @@ class Votes:
 
     def stretches(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
         """For points of long-lived arrays: votes some from one on, on a CPU in blocks of 64 and by one thread."""
-        from amiwarp.kernels.launch import Recorded
-        from amiwarp.kernels.votes import vote_point_blocks, vote_points
-
         kernel = vote_point_blocks if self.device.is_cpu else vote_points
         return Recorded(kernel, [x, y, layer, self._params], [self._cells[0]], device=self.device)
 
     def add_as_they_are(self, events: Events) -> None:
         """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""
-        import warp as wp
-
         x, y = (wp.array(v.astype(np.float32), dtype=float, device=self.device) for v in (events.x, events.y))
         self.add_points(x, y, wp.array(events.p, dtype=wp.uint8, device=self.device))
 
     def _exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
         """Every event looks at what its word held."""
-        from amiwarp.kernels.launch import launch_slices
-
         launch_slices(kernel, count, inputs, self._cells, device=self.device, first=first)
 
     def _in_batches(self, inputs: list[Any], count: int) -> None:
         """On CUDA: fast, then checked; where words overflow, and for few events, exactly at once."""
-        from amiwarp.kernels.votes import vote_events
-
         start, vote = 0, None
         while start < count:
             batch = min(count - start, self._batch)
@@ -271,10 +253,6 @@ class Votes:
 
     def _recording(self, inputs: list[Any]) -> Any:
         """The launch of a batch's votes, kept: to launch again what was recorded takes a tenth of the time."""
-        import warp as wp
-
-        from amiwarp.kernels.votes import vote_quickly
-
         if self._recorded is not None:
             before, vote = self._recorded
             if type(inputs[0]) is type(before[0]) and all(a is b for a, b in zip(inputs[1:], before[1:], strict=True)):
@@ -288,8 +266,6 @@ class Votes:
 
     def _settle(self) -> None:
         """Keeps what was voted fast, or votes it again, exactly, where words overflowed."""
-        from amiwarp.kernels.votes import vote_events
-
         if not self._batches:
             return
         counts = self._counts[: len(self._batches)].numpy().sum(axis=1)
@@ -312,11 +288,6 @@ class Votes:
 
     def read(self, image: Image) -> None:
         """Writes the image so far [events]; the votes stay."""
-        import warp as wp
-
-        from amiwarp.kernels.iwe import read_votes
-        from amiwarp.kernels.launch import launch
-
         self._settle()
         kernel = read_votes(image.width)
         inputs = [self._words, self._totals, int(self._any_total), self._params, image.frame]

@@ -11,6 +11,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import LARGEST_INTEGER
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
+from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.validation import array, instance, one_of, real, shown, whole
 
 if TYPE_CHECKING:
@@ -78,16 +79,12 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
 
 def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
     """A nominal prism's attributes; no apex where it is unknown."""
-    from amiwarp.optics.prism import Prism
-
     known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
     return {**known, "index": prism.index, "flat_side": prism.flat_side.value}
 
 
 def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
     """A nominal prism from its attributes; one of unknown apex where that is missing."""
-    from amiwarp.optics.prism import FlatSide, UnsizedPrism
-
     side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
     prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
     return prism.with_apex(attribute(attributes, where, "apex", float)) if "apex" in attributes else prism

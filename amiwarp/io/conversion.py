@@ -11,8 +11,9 @@ import numpy as np
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import EventSource
 from amiwarp.io.formats import open_recording
-from amiwarp.io.native_writer import Progress, RecordingWriter, copy_events
+from amiwarp.io.native_writer import RecordingWriter, copy_events
 from amiwarp.optics.camera import Camera
+from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism

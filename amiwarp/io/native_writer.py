@@ -22,6 +22,7 @@ from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name
 from amiwarp.io.output import NewFile
 from amiwarp.optics.camera import Camera
+from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 FORMAT = "amiwarp-recording"
 FORMAT_VERSION = 1
 
-Progress: TypeAlias = Callable[[int, int | None], None]
 """Called with the number of events done and of all, or None where that is not known."""
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -382,4 +382,4 @@ def copy_events(recording: Recording, writer: RecordingWriter, progress: Progres
         writer.append(block, truth_points=points, **marks)
         start = stop
         if progress is not None:
-            progress(start, len(source))
+            progress("writing events", start / len(source))

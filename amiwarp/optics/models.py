@@ -8,9 +8,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, cast
 
 import numpy as np
+import warp as wp
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import optics as kernels
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.optics import CircleParams, EllipseParams, ExactParams, RadialCircleParams, fit_harmonics
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.prism import (
     FlatSide,
     Prism,
@@ -72,11 +77,6 @@ class _OnDevice:
 
 
 def _run(kernel_name: str, model: _Model, xy: Any, theta: Any) -> Any:
-    import warp as wp
-
-    from amiwarp.kernels import optics as kernels
-    from amiwarp.kernels.launch import launch
-
     kernel = getattr(kernels, kernel_name)
     if isinstance(xy, wp.array):
         if not isinstance(theta, wp.array) or theta.device != xy.device or theta.dtype is not wp.float32:
@@ -107,8 +107,6 @@ def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def model_camera(model: _Model, device: Any) -> Any:
     """The camera's struct on ``device``, made once for each camera."""
-    from amiwarp.optics.device_camera import camera_params
-
     return camera_params(model.camera, str(device))
 
 
@@ -137,8 +135,6 @@ class CircleModel(_OnDevice):
         return cls(camera, prism.deflection, phase, prism.flat_side)
 
     def params(self, device: Any) -> Any:
-        from amiwarp.kernels.optics import CircleParams
-
         p = CircleParams()
         p.sine = math.sin(self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection)
         p.versine = 2.0 * math.sin(self.deflection / 2.0) ** 2
@@ -172,8 +168,6 @@ class RadialCircleModel(_OnDevice):
         return cls(camera, prism.deflection, phase, prism.index, prism.flat_side)
 
     def params(self, device: Any) -> Any:
-        from amiwarp.kernels.optics import RadialCircleParams
-
         p = RadialCircleParams()
         p.deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
         _set_phase(p, self.phase)
@@ -204,10 +198,6 @@ class ExactModel(_OnDevice):
         return cls(camera, prism, phase)
 
     def params(self, device: Any) -> Any:
-        import warp as wp
-
-        from amiwarp.kernels.optics import ExactParams
-
         p = ExactParams()
         p.sin_apex = math.sin(self.prism.apex)
         p.cos_apex = math.cos(self.prism.apex)
@@ -259,11 +249,6 @@ class EllipseModel(_OnDevice):
     @classmethod
     def from_model(cls, model: CircleModel | RadialCircleModel | ExactModel, device: Any = "cpu") -> EllipseModel:
         """Tables from any other model: least squares over 16 angles a pixel; NaN where a pixel has no ray."""
-        import warp as wp
-
-        from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.optics import fit_harmonics
-
         height, width = model.camera.height, model.camera.width
         table = wp.empty((height, width, 6), dtype=float, device=device)
         inputs = [replace(model, phase=0.0).params(device), model_camera(model, device)]
@@ -311,10 +296,6 @@ class EllipseModel(_OnDevice):
         return {}
 
     def params(self, device: Any) -> Any:
-        import warp as wp
-
-        from amiwarp.kernels.optics import EllipseParams
-
         if str(device) not in self._tables:
             p = EllipseParams()
             table = np.concatenate([self.offset, self.cosine, self.sine], axis=2)

@@ -13,6 +13,7 @@ import numpy as np
 from amiwarp.calib.parameters import size_name
 from amiwarp.calib.result import cost_surface
 from amiwarp.calib.thinning import thin
+from amiwarp.compensation.recordings import compensate_events
 from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io.output import write_text
@@ -275,8 +276,6 @@ def region_clouds(
     recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
 ) -> tuple[clouds.Cloud, clouds.Cloud]:
     """The same events of one turn before and after: those that end up in the region."""
-    from amiwarp.compensation.recordings import compensate_events
-
     source = recording.events
     encoder = calibration.encoder_for(recording.encoder, source.t_first, source.t_last)
     turn_us = round(60e6 / max(abs(encoder.rpm), 1e-3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,8 +133,6 @@ def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) ->
 
 
 def add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -> Any:
-    from fractions import Fraction
-
     rate = Fraction(fps).limit_denominator(1000)
     stream = container.add_stream("gif" if kind == "gif" else "libx264", rate=rate)
     stream.height, stream.width = shape

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +65,6 @@ STILL_US = 100_000
 LARGEST_MARGIN = 0.5
 """Of the image's width: by no more is the map grown."""
 
-Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import MetadataValue, Recording, Truth
+from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.progress import Progress
+from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.validation import instance, real, whole
@@ -23,7 +26,6 @@ from amiwarp.validation import instance, real, whole
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
 
-Progress = Callable[[float], None]
 """Called with the fraction that is done, 0 .. 1."""
 
 
@@ -189,13 +191,11 @@ class Simulation:
         Memory stays constant: a span is ``chunk_us``, or a default that depends on the device but changes no event.
         A point is NaN where its ray misses the image plane.
         """
-        from amiwarp.simulation.engine import Engine
-
         engine = Engine(self, chunk_us)
         for block in engine.run():
             yield block.to_host()
             if progress is not None:
-                progress(min(1.0, engine.now_us / self.duration_us))
+                progress("simulating", min(1.0, engine.now_us / self.duration_us))
 
     def log_view(self) -> NDArray[np.float32]:
         """The first picture as the camera sees it at t = 0 with no prism: log intensity, shape (height, width)."""
@@ -220,8 +220,6 @@ class Simulation:
 
     def write(self, path: str | Path, *, progress: Progress | None = None, overwrite: bool = False) -> None:
         """The whole recording to a file, in constant memory."""
-        from amiwarp.io import RecordingWriter
-
         with RecordingWriter(
             path,
             width=self.camera.width,

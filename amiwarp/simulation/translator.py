@@ -19,10 +19,11 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import TIME_LIMIT
 from amiwarp.io.files import errors_name, register_reader
 from amiwarp.optics.camera import Camera
+from amiwarp.progress import Progress
 from amiwarp.regular_file import check_regular
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear
-from amiwarp.simulation.simulator import Progress, Scene, SensorModel, Simulation
+from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 from amiwarp.validation import real, shown
 
 if TYPE_CHECKING:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.brightness.event_pairs import Sensor
+from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.thinning import thin
@@ -22,6 +21,7 @@ from amiwarp.io.output import check_output, make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import Reconstructed, draw_demo
+from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.export import save_picture
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.simulation.motion import PrismMotion
@@ -37,12 +37,11 @@ APEX, PHASE = math.radians(1.0), math.radians(126.0)
 """The truth."""
 NOMINAL_APEX = math.radians(1.2)
 """What the calibration is told, so that no box it searches is centred on the truth."""
-KNOWN_SENSOR = Sensor(SensorModel().latency_us, SensorModel().refractory_us)
+KNOWN_SENSOR = SensorTiming(SensorModel().latency_us, SensorModel().refractory_us)
 """What a data sheet would tell of the sensor."""
 MEASURED = 1_000_000
 """At most so many events, thinned evenly, measure blur."""
 
-Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is."""
 
 
@@ -90,23 +89,23 @@ class Outcome:
 
 def run_demo(demo: Demo, progress: Progress | None = None) -> Outcome:
     """Runs the whole main job into the folder ``demo.out``. Raises :class:`AmiwarpError` for an unusable file."""
-    tell = progress or (lambda what, share: None)
+    tell = progress or silent
     files = _files(demo.out)
     for path in files.values():
         check_output(path)
     began = time.perf_counter()
     made = simulation(demo)
-    made.write(files["recording"], progress=lambda share: tell("simulating", share))
+    made.write(files["recording"], progress=tell)
     simulated_s = time.perf_counter() - began
     recording = open_recording(files["recording"])
     found = calibrate(
         recording, seed=demo.seed, device=demo.device, photometric=PhotometricSettings(sensor=KNOWN_SENSOR),
-        progress=lambda stage, done, budget: tell(f"calibrating, {stage}", done / budget),
+        progress=tell,
     )  # fmt: skip
     found.save(files["calibration"])
     done = compensate(
         recording, found, files["compensated"], device=demo.device,
-        progress=lambda count, n: tell("compensating", count / n),
+        progress=tell,
     )  # fmt: skip
     tell("reconstructing", 0.0)
     picture = middle_turn(recording, found, demo.device)

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
+import warp as wp
+
+from amiwarp._version import __version__
 from amiwarp.kernels.cores import cpu_threads
 
 
@@ -20,16 +23,12 @@ def processor() -> str:
 
 def machine(device: str) -> str:
     """The GPU's name, or the processor's with the cores that may be used."""
-    import warp as wp
-
     there = wp.get_device(device)
     return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
     """Of amiwarp, Python and those of the packages that are installed."""
-    from amiwarp._version import __version__
-
     out = {"amiwarp": __version__, "python": platform.python_version()}
     for name in packages:
         try:

@@ -21,9 +21,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.output import check_output
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.scene import Look, Scene
+from amiwarp.viewer.serve import serve
+from amiwarp.viewer.values import SETTABLE
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -53,16 +57,11 @@ def serve_panel(
 async def _serve(
     make: Callable[[], Inspector], folder: Path, host: str, port: int, ready: Callable[[str], None]
 ) -> None:
-    from amiwarp.viewer.serve import serve
-    from amiwarp.viewer.values import SETTABLE
-
     token = secrets.token_urlsafe(16)
     await serve(partial(_tab, make, folder), settable=SETTABLE, host=host, port=port, token=token, ready=ready)
 
 
 def _tab(make: Callable[[], Inspector], folder: Path, server: Any) -> Callable[[], None]:
-    from amiwarp.viewer.panel import Panel
-
     return Panel(server, make(), folder).close
 
 
@@ -134,8 +133,6 @@ def save_screenshot(
     inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
 ) -> None:
     """Writes both clouds as PNG; ``size``: of the picture [px]."""
-    from amiwarp.io.output import check_output
-
     check_output(path)
     look = look or Look()
     scene = Scene(size)

@@ -8,6 +8,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import msgpack
+
 MOST_BYTES = 64 * 1024
 """Of a message. The page's own have up to some hundred; it cuts none into parts."""
 HEADER_BYTES = 12
@@ -135,8 +137,6 @@ class Gate:
 
 def _unpacked(message: bytes) -> Any:
     """Decode a message that came in one part."""
-    import msgpack  # type: ignore[import-untyped]
-
     begin, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
     if (begin, length) != (0, len(message) - HEADER_BYTES):
         raise ValueError("a part of a message")

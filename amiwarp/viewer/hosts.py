@@ -7,6 +7,8 @@ import ipaddress
 import socket
 from typing import TYPE_CHECKING
 
+from yarl import URL
+
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
@@ -50,8 +52,6 @@ def reachable(host: str) -> str:
 
 def address(host: str, port: int, token: str) -> str:
     """Return what to open in a browser."""
-    from yarl import URL
-
     return str(URL.build(scheme="http", host=reachable(host), port=port, path="/") % {"token": token})
 
 
@@ -77,8 +77,6 @@ class Names:
 
     def are_of(self, request: web.Request) -> bool:
         """Return whether the request is for this server, under a name it has or the address at which it arrived."""
-        from yarl import URL
-
         try:
             asked = plain(URL(f"http://{request.host}").host or "")
         except ValueError:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.errors import AmiwarpError
@@ -187,8 +188,6 @@ class Inspector:
     @cached_property
     def hot(self) -> NDArray[np.bool_]:
         """Hot and flickering pixels of the recording, shape (height, width)."""
-        from amiwarp.calib.bad_pixels import strange_pixels, stretch
-
         source, encoder = self.recording.events, self.encoder
         return strange_pixels(stretch(source, encoder), encoder, source.size)[0]
 

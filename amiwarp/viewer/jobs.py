@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.errors import AmiwarpError
+from amiwarp.progress import Progress
 from amiwarp.reconstruction.export import save_film
 
 if TYPE_CHECKING:
@@ -75,33 +76,33 @@ class Calibrating:
             with panel.state:
                 panel.state.busy = ""
 
-    def tell(self, stage: str, share: float) -> None:
+    def tell(self, what: str, share: float) -> None:
         """Shows how far it is."""
         if self.cancelled:
             return
         with self._panel.state:
-            self._panel.state.update({"busy": f"calibrating, {stage}", "progress": round(100 * min(share, 1.0))})
+            self._panel.state.update({"busy": what, "progress": round(100 * min(share, 1.0))})
 
 
-def _teller(job: Calibrating) -> Callable[[str, int, int], None]:
+def _teller(job: Calibrating) -> Progress:
     """What a calibration calls in its thread. NLopt never lets go of what it calls, so this knows the job weakly."""
     known, loop, told = weakref.ref(job), asyncio.get_running_loop(), -math.inf
 
-    def tell(stage: str, done: int, budget: int) -> None:
+    def tell(what: str, share: float) -> None:
         nonlocal told
         if not wanted():
             raise Cancelled
         if (now := loop.time()) >= told + PROGRESS_S:
             told = now
-            loop.call_soon_threadsafe(show, stage, done / max(budget, 1))
+            loop.call_soon_threadsafe(show, what, share)
 
     def wanted() -> bool:
         job = known()
         return job is not None and not job.cancelled
 
-    def show(stage: str, share: float) -> None:
+    def show(what: str, share: float) -> None:
         if (job := known()) is not None:
-            job.tell(stage, share)
+            job.tell(what, share)
 
     return tell
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.export import save_png
 from amiwarp.plotting.clouds import OFF_COLOUR, ON_COLOUR
 from amiwarp.validation import choice
 from amiwarp.viewer.choices import Axis, Colour, View
@@ -209,8 +210,6 @@ class Scene:
 
     def save(self, path: Path) -> None:
         """Writes the picture as PNG, beside and then renamed."""
-        from amiwarp.imaging.export import save_png
-
         save_png(path, self.picture())
 
     def turntable(self, frames: int) -> Any:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.solve import Stage
+from amiwarp.calib.solve import SearchStage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.calib.parameters import Space
+    from amiwarp.calib.parameters import ParameterSpace
 
     Vector = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ def _inverse(hessian: Vector) -> Vector:
     return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
 
 
-def determined(slopes: Slopes, space: Space, left: float) -> tuple[str, ...]:
+def determined(slopes: Slopes, space: ParameterSpace, left: float) -> tuple[str, ...]:
     """Names that the curvature determines; size, phase and rates always stay, of the others the worst goes first.
 
     A parameter is weak where its standard deviation is large, or its curvature, the others left to follow, is nothing
@@ -94,7 +94,7 @@ def iterate(
     high: Vector,
     tolerance: float,
     tell: Callable[[int, int], None],
-) -> Stage:
+) -> SearchStage:
     """Steps until they are shorter than ``tolerance`` [px] in every direction; a step that does not help is halved.
 
     The best point seen counts; the score is higher where it is better.
@@ -124,6 +124,6 @@ def iterate(
             break
     best = int(np.argmax(scores))
     seconds = time.perf_counter() - began
-    return Stage(
+    return SearchStage(
         GAUSS_NEWTON, points[best], scores[best], len(scores), seconds, ended, np.array(points), np.array(scores)
     )

@@ -11,7 +11,7 @@ from amiwarp.calib.photometric.acceptance import BESIDE_PX
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.calib.parameters import Space
+    from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.photometric.stage import Cost
 
 FEW_PAIRS = 50_000
@@ -37,7 +37,7 @@ def around_optimum(cost: Cost, best: NDArray[np.float64], final: float) -> list[
     return sorted(((place, at(place) - reference) for place in places), key=lambda found: found[1])
 
 
-def directions(space: Space, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def directions(space: ParameterSpace, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Unit vectors along the size and the phase, of those that are free."""
     if space.cartesian:
         x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)

@@ -8,21 +8,23 @@ For given parameters the map is a linear least-squares problem; the parameters m
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.brightness.event_pairs import EventTable, PairSet, Sensor, off_excess
+from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib.parameters import LATE, MOTION
 from amiwarp.calib.photometric.acceptance import FAR_PX, verdict
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, Slopes, determined, iterate
 from amiwarp.calib.photometric.minimum_check import around_optimum
 from amiwarp.calib.photometric.scene_tiles import choose_tiles, one_tile
-from amiwarp.calib.result import Photometric, StageSummary
+from amiwarp.calib.result import PhotometricSummary, StageSummary
 from amiwarp.calib.sharpness.objective import reach
-from amiwarp.calib.solve import LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
+from amiwarp.calib.sharpness.search import stage_share
+from amiwarp.calib.solve import LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import real, whole
 
@@ -30,10 +32,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.brightness.solver import Tiles
-    from amiwarp.calib.parameters import Space
-    from amiwarp.calib.sharpness.search import Progress, Search
+    from amiwarp.calib.parameters import ParameterSpace
+    from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.recording import Recording
+    from amiwarp.progress import Progress
 
 MARGIN_PX, MOVING_MARGIN_PX = 3, 8
 """By which the map of a tile is grown: the parameters may move events so far."""
@@ -71,7 +74,7 @@ class PhotometricSettings:
     """Conjugate gradients per evaluation; each starts from the last map."""
     density: float = 1.0
     """Nodes of the map per pixel."""
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: SensorTiming = field(default_factory=SensorTiming)
     """Known latency and refractory time; what is not known of them stays in the phase."""
 
     def check(self) -> None:
@@ -86,7 +89,7 @@ class PhotometricSettings:
 class _Gatherer:
     """Pairs whose two events both fall on one tile of the scene, at the first stage's answer."""
 
-    def __init__(self, recording: Recording, search: Search, tile_of: NDArray[np.int32], sensor: Sensor) -> None:
+    def __init__(self, recording: Recording, search: Search, tile_of: NDArray[np.int32], sensor: SensorTiming) -> None:
         from scipy import ndimage
 
         self.recording, self.search, self.sensor, self.tile_of = recording, search, sensor, tile_of
@@ -173,7 +176,7 @@ def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
 class Cost:
     """Robust residual as a function of the space's vector; the map is warm from call to call."""
 
-    def __init__(self, space: Space, brightness: BrightnessMap, steps: int) -> None:
+    def __init__(self, space: ParameterSpace, brightness: BrightnessMap, steps: int) -> None:
         self.space, self.brightness, self.steps = space, brightness, steps
         self.scale = FIRST_SCALE
         self.evaluations = 0
@@ -247,7 +250,7 @@ class Cost:
 
 def refine(
     recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
-) -> tuple[Photometric, StageSummary]:
+) -> tuple[PhotometricSummary, StageSummary]:
     """Runs the stage from the first stage's answer; ``linear``: which of ``off_ratio`` and ``leak`` are free.
 
     Raises :class:`AmiwarpError` where there are too few pairs.
@@ -273,12 +276,17 @@ def refine(
     v = space.to_vector({**space.start, **search.best})
     if held:
         cost.warm_up(v)
-    stage, result = _settle(cost, v, left, settings, progress)
+
+    def report(share: float) -> None:
+        if progress is not None:
+            progress(*stage_share(search.settings, "photometric", share))
+
+    stage, result = _settle(cost, v, left, settings, report)
     found = replace(result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held)
     return found, StageSummary.of("photometric", stage, space)
 
 
-def limits(space: Space, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def limits(space: ParameterSpace, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The box about the first stage's answer."""
     far = np.array([math.inf if n in LATE else FAR_MOVING_PX if n in MOTION else FAR_PX for n in space.names])
     low, high = space.bounds()
@@ -286,20 +294,20 @@ def limits(space: Space, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
 
 
 def _settle(
-    cost: Cost, v: NDArray[np.float64], left: float, settings: PhotometricSettings, progress: Progress | None
-) -> tuple[Stage, Photometric]:
+    cost: Cost, v: NDArray[np.float64], left: float, settings: PhotometricSettings, report: Callable[[float], None]
+) -> tuple[SearchStage, PhotometricSummary]:
     """Searches from the first stage's answer, and again from any place near the result that costs less.
 
     The map of few events follows a wrong answer so far that no step from there helps: that is no optimum.
     """
-    stage = _search(cost, v, v, settings, progress)
+    stage = _search(cost, v, v, settings, report)
     result, around = _conclude(cost, stage.x, v, left)
     for _ in range(RESTARTS):
         lower = [place for place, rise in around if rise < 0.0]
         if not lower:
             break
         cost.renew(lower[0])
-        stage = joined(stage, _search(cost, v, lower[0], settings, progress))
+        stage = joined(stage, _search(cost, v, lower[0], settings, report))
         result, around = _conclude(cost, stage.x, v, left)
     return stage, result
 
@@ -309,14 +317,13 @@ def _search(
     v: NDArray[np.float64],
     start: NDArray[np.float64],
     settings: PhotometricSettings,
-    progress: Progress | None,
-) -> Stage:
+    report: Callable[[float], None],
+) -> SearchStage:
     """One search from ``start``, in the box about the first stage's answer ``v``."""
     low, high = limits(cost.space, v)
 
     def tell(done: int, budget: int) -> None:
-        if progress is not None:
-            progress("photometric", done, budget)
+        report(done / budget)
 
     def score(at: NDArray[np.float64]) -> float:
         tell(cost.evaluations, 2 * settings.evaluations)
@@ -325,7 +332,7 @@ def _search(
     if settings.algorithm == GAUSS_NEWTON:
         return iterate(cost.settled, cost.slopes, start, low, high, settings.tolerance_px, tell)
 
-    def run(at: NDArray[np.float64], step: float) -> Stage:
+    def run(at: NDArray[np.float64], step: float) -> SearchStage:
         return maximise(
             score, settings.algorithm, low=low, high=high, start=at, evaluations=settings.evaluations,
             tolerance=settings.tolerance_px, step=step,
@@ -337,7 +344,7 @@ def _search(
     return joined(stage, run(stage.x, POLISH_STEP_PX))
 
 
-def joined(first: Stage, second: Stage) -> Stage:
+def joined(first: SearchStage, second: SearchStage) -> SearchStage:
     """Two runs as one; the answer is the second's, whose map was the better."""
     return replace(
         second,
@@ -353,7 +360,7 @@ def _conclude(
     best: NDArray[np.float64],
     v: NDArray[np.float64],
     left: float,
-) -> tuple[Photometric, list[tuple[NDArray[np.float64], float]]]:
+) -> tuple[PhotometricSummary, list[tuple[NDArray[np.float64], float]]]:
     """Final map at the optimum, covariance, and the verdict; ``left``: see :func:`check_pairs`.
 
     Returns the places around, and by how much each costs more, the least first.
@@ -373,7 +380,7 @@ def _conclude(
     rise = around[0][1] if around else math.inf
     ahead = float(np.linalg.norm(slopes.step()[near]))
     accepted, words = verdict(final, rise, float(np.linalg.norm((best - v)[near])), ahead)
-    found = Photometric(
+    found = PhotometricSummary(
         accepted=accepted,
         verdict=words,
         parameters=space.to_values(best),

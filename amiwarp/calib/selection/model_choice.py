@@ -11,21 +11,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib.result import Calibration, Ladder, Rung
+from amiwarp.calib.calibration import calibrate
+from amiwarp.calib.result import Calibration, ModelCandidate, ModelChoice
 from amiwarp.calib.selection import free_parameters
 from amiwarp.calib.selection.smaller_models import fit
 from amiwarp.calib.selection.trial import FACTOR, Trial, by_sharpness, in_pixels, make_trial
 from amiwarp.calib.sharpness.held_out import slope
 from amiwarp.calib.sharpness.objective import padding
-from amiwarp.calib.sharpness.search import Progress, Settings
+from amiwarp.calib.sharpness.search import Settings
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.models import MODELS, predicted_error
+from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
-    from amiwarp.calib.parameters import Space
+    from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.selection.trial import Vector
     from amiwarp.events.recording import Recording
 
@@ -45,8 +47,6 @@ def calibrate_auto(
     ``budget_px``: largest error of a model that counts as none [px rms]; None: a tenth of the blur that quantisation
     and timing leave anyway. Raises :class:`AmiwarpError` where the recording cannot determine the exact model.
     """
-    from amiwarp.calib.calibration import calibrate
-
     began = time.perf_counter()
     if budget_px is not None and not budget_px > 0.0:
         raise AmiwarpError(f"budget_px = {budget_px}; give an error above 0, as 0.03")
@@ -74,7 +74,7 @@ def calibrate_auto(
     chosen = expressed(trial, judged[pick], settings, device)
     whole = time.perf_counter() - began
     agreed = all(_agree(trial, j.rung) for j in judged[: pick + 1])
-    ladder = Ladder(
+    ladder = ModelChoice(
         budget_px=trial.budget_px,
         timing_px=trial.timing_px,
         agreed=agreed,
@@ -107,7 +107,7 @@ def _elsewhere(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
 class Judged:
     """A rung beside its best fit to the exact answer."""
 
-    rung: Rung
+    rung: ModelCandidate
     values: Mapping[str, float]
 
 
@@ -130,7 +130,7 @@ def judge_rungs(trial: Trial) -> tuple[Judged, ...]:
     return tuple(judged)
 
 
-def _refined(trial: Trial, space: Space, sharp: Vector) -> Vector:
+def _refined(trial: Trial, space: ParameterSpace, sharp: Vector) -> Vector:
     """Held-out sharpness of a smaller model, moved to its sharpest on the other turns from its fit to the exact one."""
     values, _ = fit(space, sharp, trial.places)
     v = space.to_vector(values)
@@ -147,7 +147,9 @@ def _as_ellipse(trial: Trial, top: Mapping[str, float]) -> tuple[dict[str, float
     return dict(trial.exact.parameters), predicted, trial.test.each(space, top, model)
 
 
-def _rung(trial: Trial, name: str, predicted: float, reference: Vector, held_out: Vector, *, found: bool) -> Rung:
+def _rung(
+    trial: Trial, name: str, predicted: float, reference: Vector, held_out: Vector, *, found: bool
+) -> ModelCandidate:
     mean, std, seen = trial.seen(reference - held_out)
     takes = predicted <= trial.budget_px and seen[0] <= trial.tells_px and not found
     verdict = _verdict(trial, name, predicted, seen)
@@ -157,7 +159,7 @@ def _rung(trial: Trial, name: str, predicted: float, reference: Vector, held_out
     if name == "exact" and any(trial.exact.parameters.get(n) for n in ("tilt_x", "tilt_y")):
         numbers = numbers.replace("2", "4")
     cost = 1e9 * min(half.fastest[name] for half in (trial.train, trial.test))
-    return Rung(name, numbers, predicted, float(held_out.mean()), mean, std, seen, cost, takes, verdict)
+    return ModelCandidate(name, numbers, predicted, float(held_out.mean()), mean, std, seen, cost, takes, verdict)
 
 
 def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float]) -> str:
@@ -177,7 +179,7 @@ def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float
     return f"over the budget; held-out turns {'agree' if seen[0] > budget / FACTOR else 'cannot tell'}"
 
 
-def _agree(trial: Trial, rung: Rung) -> bool:
+def _agree(trial: Trial, rung: ModelCandidate) -> bool:
     """Neither judge is surely on the other side of the budget."""
     low, high = rung.seen_px
     if rung.predicted_px <= trial.budget_px:
@@ -206,7 +208,9 @@ def expressed(trial: Trial, judged: Judged, settings: Settings, device: Any) -> 
     )  # fmt: skip
 
 
-def _sharpness(trial: Trial, space: Space, values: Mapping[str, float], settings: Settings, device: Any) -> float:
+def _sharpness(
+    trial: Trial, space: ParameterSpace, values: Mapping[str, float], settings: Settings, device: Any
+) -> float:
     """Of all events, on an image as large as the search's: beside it the number stands."""
     like = trial.rung("exact", trial.exact)
     largest = settings.bounds.get("apex", (0.0, 2.0 * trial.exact.prism.apex))[1]

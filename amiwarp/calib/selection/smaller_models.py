@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.calib.parameters import Space, make_space, size_name
+from amiwarp.calib.parameters import ParameterSpace, make_space, size_name
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -97,7 +97,7 @@ def encoder_noise(encoder: Encoder) -> float:
 
 def rung_space(
     model: str, exact: Calibration, free: tuple[str, ...], *, rad_per_us: float, duration_us: float
-) -> Space:
+) -> ParameterSpace:
     """The space of one rung about the exact answer, ``free`` beside size and phase."""
     found = exact.parameters
     prism = replace(exact.prism, apex=found["apex"], index=found.get("index", exact.prism.index))
@@ -111,7 +111,7 @@ def rung_space(
     )  # fmt: skip
 
 
-def fit(space: Space, target: NDArray[np.float64], places: Places) -> tuple[dict[str, float], float]:
+def fit(space: ParameterSpace, target: NDArray[np.float64], places: Places) -> tuple[dict[str, float], float]:
     """Parameters that bring a model closest to ``target`` [px], shape (n, 2), and the distance left [px rms].
 
     Size and phase are moved, so a constant lag is taken out.
@@ -131,7 +131,7 @@ def fit(space: Space, target: NDArray[np.float64], places: Places) -> tuple[dict
     return space.to_values(v), _rms(away(v))
 
 
-def apart(space: Space, v: NDArray[np.float64], places: Places) -> NDArray[np.float64]:
+def apart(space: ParameterSpace, v: NDArray[np.float64], places: Places) -> NDArray[np.float64]:
     """Directions that move events by a pixel each, those past size and phase by what these two cannot follow.
 
     Rows of vectors of the space, shape (n, n): the identity's first two, then each entry less the size and phase that

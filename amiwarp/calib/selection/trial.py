@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.calibration import moving_window
 from amiwarp.calib.parameters import LATE
 from amiwarp.calib.selection.smaller_models import QUANTISATION_PX, SHARE, Places, apart, rung_space, timing_blur
 from amiwarp.calib.sharpness.curvature import STEP_PX
 from amiwarp.calib.sharpness.held_out import Half, Quadratic, halves
 from amiwarp.calib.sharpness.search import Material, Settings
+from amiwarp.calib.thinning import thin
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.calib.parameters import Space
+    from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.result import Calibration
     from amiwarp.events.recording import Recording
 
@@ -49,7 +51,7 @@ class Trial:
     train: Half
     test: Half
     """The turns that are held out."""
-    space: Space
+    space: ParameterSpace
     start: Vector
     """The answer of sharpness in the space [px]."""
     directions: Vector
@@ -64,7 +66,7 @@ class Trial:
         """From where on held-out turns contradict a model that keeps the budget as predicted."""
         return max(FACTOR * self.budget_px, BIAS_PX)
 
-    def rung(self, model: str, exact: Calibration) -> Space:
+    def rung(self, model: str, exact: Calibration) -> ParameterSpace:
         return rung_space(model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us)
 
     def room(self, name: str) -> float:
@@ -112,9 +114,6 @@ def make_trial(
     budget_px: float | None,
 ) -> Trial:
     """Both halves of the events on the device, and the sharpness about the exact answer; ``names``: what to try."""
-    from amiwarp.calib.calibration import moving_window
-    from amiwarp.calib.thinning import thin
-
     events = thin(moving_window(recording, settings), settings.events)
     first, last = int(events.t[0]), int(events.t[-1])
     encoder = exact.encoder_for(recording.encoder, first, last)
@@ -149,7 +148,7 @@ def by_sharpness(exact: Calibration) -> Calibration:
     return replace(exact, parameters={**exact.parameters, **found})
 
 
-def _with_room(space: Space) -> Space:
+def _with_room(space: ParameterSpace) -> ParameterSpace:
     return replace(
         space,
         low={n: space.start[n] - ROOM[n] if n in ROOM else x for n, x in space.low.items()},
@@ -157,6 +156,6 @@ def _with_room(space: Space) -> Space:
     )
 
 
-def _room(space: Space, directions: Vector, name: str) -> float:
+def _room(space: ParameterSpace, directions: Vector, name: str) -> float:
     k = space.names.index(name)
     return ROOM[name] * space.pixels[name] / abs(float(directions[k, k])) if name in ROOM else math.inf

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.calib.sharpness.curvature import STEP_PX, differences
 from amiwarp.calib.sharpness.objective import padding
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from amiwarp.calib.parameters import Space
+    from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.sharpness.search import Material
     from amiwarp.events.events import Events
     from amiwarp.optics.models import Model
@@ -54,7 +55,7 @@ def halves(material: Material) -> tuple[Events, Events]:
 class Half:
     """Sharpness of one half of the events, in disjoint parts, under any model."""
 
-    def __init__(self, events: Events, material: Material, space: Space, device: Any) -> None:
+    def __init__(self, events: Events, material: Material, space: ParameterSpace, device: Any) -> None:
         """``space``: the largest."""
         slope = None if material.slope_of is None else material.slope_of(events.t)
         middle = space.middle_us if space.moving else None
@@ -67,10 +68,8 @@ class Half:
         self.fastest: dict[str, float] = {}
         """By kind of model, least time of an event's angle, displacement and vote [s]."""
 
-    def each(self, space: Space, values: Mapping[str, float], model: Model | None = None) -> Vector:
+    def each(self, space: ParameterSpace, values: Mapping[str, float], model: Model | None = None) -> Vector:
         """Sharpness of each part, shape (PARTS,); ``model``: that of the values, where it was built before."""
-        import warp as wp
-
         model = model or space.build(values)
         device = self._meter.device
         model.params(device)  # an ellipse's tables are made once for all events
@@ -88,7 +87,7 @@ class Half:
         return np.array(self._meter.results())
 
 
-def slope(half: Half, space: Space, v: Vector) -> Vector:
+def slope(half: Half, space: ParameterSpace, v: Vector) -> Vector:
     """Of the sharpness at a point of a space [1/px]."""
     steps = STEP_PX * np.eye(len(v))
     rise = [half.each(space, space.to_values(v + h)) - half.each(space, space.to_values(v - h)) for h in steps]
@@ -105,7 +104,7 @@ class Quadratic:
     """Of their mean, shape (n, n) [1/px²]."""
 
     @classmethod
-    def about(cls, half: Half, space: Space, v: Vector, directions: Vector) -> Quadratic:
+    def about(cls, half: Half, space: ParameterSpace, v: Vector, directions: Vector) -> Quadratic:
         """``directions``: rows of vectors that each move events by a pixel, shape (n, entries of the space)."""
         return cls(*differences(lambda shift: half.each(space, space.to_values(v + shift)), directions))
 

@@ -6,10 +6,12 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.calib.parameters import MOTION, build_model
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
+from amiwarp.imaging.tile_votes import TileVotes
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera_rotation import border
 
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from amiwarp.calib.parameters import Space
+    from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.imaging.device_events import DeviceEvents
     from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
@@ -34,7 +36,7 @@ class Objective:
 
     def __init__(
         self,
-        space: Space,
+        space: ParameterSpace,
         events: DeviceEvents,
         *,
         kind: Sharpness,
@@ -110,14 +112,10 @@ class _Captured:
     """Images by tiles, everything in one CUDA graph."""
 
     def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter, like: Model) -> None:
-        from amiwarp.imaging.tile_votes import TileVotes
-
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
         self._graph: Any = None
 
     def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
-        import warp as wp
-
         self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
         if self._graph is not None:
             wp.capture_launch(self._graph)
@@ -134,7 +132,7 @@ class _Captured:
         self._meter.launch()
 
 
-def padding(space: Space) -> int:
+def padding(space: ParameterSpace) -> int:
     """Border [px] that no event of the image can cross, at the largest size and any phase, or as far as it turns."""
     largest = {n: space.high[n] for n in space.names if n == space.size_name}
     # a search that goes as far as its bounds is lost anyway: twice the start's motion, and a little, is room enough
@@ -145,7 +143,7 @@ def padding(space: Space) -> int:
     return math.ceil(min(reach(space, {**space.start, **largest, **faster}) + room, most)) + 2
 
 
-def reach(space: Space, values: Mapping[str, float]) -> float:
+def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
     """How far events are moved at ``values``, at most [px], by the prism and by the camera's turning."""
     camera = space.camera
     kind = "exact" if space.model == "ellipse" else space.model

@@ -15,17 +15,18 @@ from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.sharpness.curvature import differences
 from amiwarp.calib.sharpness.objective import Objective
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Stage, check_algorithm, maximise
+from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import upload_events
 from amiwarp.optics.models import MODELS
+from amiwarp.progress import Progress
 from amiwarp.validation import choice, one_of, real, shown, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.calib.parameters import Space
+    from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events
     from amiwarp.imaging.device_events import DeviceEvents
@@ -43,7 +44,6 @@ LARGEST_FOLD = 1 << 20
 AUTO = "auto"
 STAGES = ("sharpness", "photometric")
 
-Progress = Callable[[str, int, int], None]
 """Called with the stage's name, evaluations done, and its budget."""
 
 
@@ -135,11 +135,18 @@ class Material:
         return Material(self.events[cut], self.encoder, self.slope_of, self.fold)
 
 
+def stage_share(settings: Settings, stage: str, share: float) -> tuple[str, float]:
+    """Return what a calibration is doing and its finished share, if each stage takes about as long as the others."""
+    names = [] if settings.global_algorithm is None else ["global"]
+    names += ["local", "photometric"][: len(settings.stages)]
+    return f"calibrating, {stage}", (names.index(stage) + min(share, 1.0)) / len(names)
+
+
 class Search:
     """One calibration under way: coarse and fine objective over the same space."""
 
     def __init__(
-        self, space: Space, material: Material, settings: Settings, device: Any, progress: Progress | None
+        self, space: ParameterSpace, material: Material, settings: Settings, device: Any, progress: Progress | None
     ) -> None:
         # the whole space is the photometric stage's
         self.whole = space
@@ -158,7 +165,7 @@ class Search:
         scale: float,
         smoothing: float,
         kind: Sharpness | None = None,
-        space: Space | None = None,
+        space: ParameterSpace | None = None,
         parts: int = 1,
     ) -> Objective:
         s = self.settings
@@ -183,7 +190,7 @@ class Search:
         self.stages.extend(StageSummary.of("local", run, self.space) for run in runs)
         self.best, self.score = self.space.to_values(best.x), best.score
 
-    def _coarse(self, material: Material, space: Space) -> Objective:
+    def _coarse(self, material: Material, space: ParameterSpace) -> Objective:
         step = max(1, len(material.events) // (self.settings.events // 3 + 1))
         return self._objective(material.every(step), 0.5, 4.0, space=space)
 
@@ -210,20 +217,20 @@ class Search:
             self.stages.append(StageSummary.of("local", stage, self.space))
         return start
 
-    def _run_local(self, start: NDArray[np.float64]) -> Stage:
+    def _run_local(self, start: NDArray[np.float64]) -> SearchStage:
         return self._maximise(
             self.fine, self.settings.local_algorithm, start, self.settings.local_evaluations, step=0.7
         )
 
     def _maximise(
         self, objective: Objective, algorithm: str, start: NDArray[np.float64], budget: int, step: float
-    ) -> Stage:
+    ) -> SearchStage:
         low, high = objective.space.bounds()
         name = "global" if algorithm.startswith("G") else "local"
 
         def score(v: NDArray[np.float64]) -> float:
             if self.progress is not None:
-                self.progress(name, objective.evaluations, budget)
+                self.progress(*stage_share(self.settings, name, objective.evaluations / budget))
             return objective(v)
 
         s = self.settings
@@ -264,7 +271,7 @@ class Search:
         return tuple(f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen it" for n in stuck)
 
 
-def distinct_optima(stage: Stage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
+def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
     """The best points of a stage that lie at least ``apart`` px from each better one."""
     chosen: list[NDArray[np.float64]] = []
     for k in np.argsort(-stage.scores, kind="stable"):

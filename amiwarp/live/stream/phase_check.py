@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from amiwarp.calib import calibrate
 from amiwarp.compensation.streams import held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TURN
@@ -127,8 +128,6 @@ class PhaseCheck:
             self._thread.join()
 
     def _look(self, events: Events, encoder: Encoder) -> None:
-        from amiwarp.calib import calibrate
-
         known = self._calibration
         phase = known.parameters["phase"]
         recording = Recording(MemoryEvents(events, known.camera.width, known.camera.height), known.camera, encoder,

@@ -17,6 +17,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.session import Session
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -92,8 +93,6 @@ def followed(source: Source, link: Link | None, ring: RecentEvents, say: Callabl
 
     Waits for the first turn. Raises :class:`AmiwarpError` where none comes in time, or what the source raised.
     """
-    from amiwarp.live.stream.session import Session
-
     stop, failed = threading.Event(), []
 
     def run() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,6 +16,7 @@ from amiwarp.calib.sharpness.search import STAGES
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
 from amiwarp.optics.models import MODELS
+from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import Row, Task, Timed, measure, near_front
 from amiwarp.studies.chart.truth import Known
 
@@ -131,7 +132,7 @@ def _mixed() -> Iterator[Setting]:
 
 
 def rows(
-    known: Known, device: str, *, repeats: int, quick: bool, seed: int, tell: Callable[[str, float], None]
+    known: Known, device: str, *, repeats: int, quick: bool, seed: int, tell: Progress
 ) -> tuple[list[Row], list[str]]:
     """All rows, and notes on settings that the calibration refuses on this recording."""
     ways = settings(known, quick=quick)
@@ -153,7 +154,7 @@ def rows(
         found: Calibration | AmiwarpError = t.result
         return None if isinstance(found, AmiwarpError) else t.row(model_error(found.model, known.model).rms)
 
-    timed = measure(tasks, repeats, lambda share: tell("calibrating", share), warm_up=False,
+    timed = measure(tasks, repeats, tell, "calibrating", warm_up=False,
                     again=lambda once: near_front([row(t) for t in once]))  # fmt: skip
     notes = []
     for t, way in zip(timed, ways, strict=True):

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,10 +16,13 @@ from amiwarp.calib.presets import Preset
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.device_events import TURNS
 from amiwarp.io.output import check_output, make_folder, write_text
+from amiwarp.progress import Progress, part, silent
+from amiwarp.simulation.simulator import SensorModel
 from amiwarp.studies.chart import calibration, compensation
 from amiwarp.studies.chart.drawing import draw
-from amiwarp.studies.chart.rows import Progress, Row, beaten_by, fastest_within, fronts, most_accurate_within
+from amiwarp.studies.chart.rows import Row, beaten_by, fastest_within, fronts, most_accurate_within
 from amiwarp.studies.chart.truth import Known
+from amiwarp.studies.demo import Demo, simulation
 from amiwarp.studies.machine import machine, versions
 
 if TYPE_CHECKING:
@@ -114,12 +117,9 @@ def _measured(row: Row) -> dict[str, float]:
 
 def simulated(
     picture: Path | None = None, *, seed: int = 0, device: str = "cpu", quick: bool = False,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Recording:  # fmt: skip
     """As that of ``amiwarp demo``, but 24 turns, in memory; ``picture`` None for the map of the earth."""
-    from amiwarp.simulation.simulator import SensorModel
-    from amiwarp.studies.demo import Demo, simulation
-
     width, height, seconds = QUICK if quick else USUAL
     made = simulation(Demo(Path(), picture, width, height, seconds, seed, device))
     if not quick:
@@ -148,7 +148,7 @@ def make(
     files = {"data": out / "chart.json", "table": out / "chart.csv"}
     for path in (*files.values(), *(path for chart in REPEATS for path in _drawn(chart, out).values())):
         check_output(path)
-    tell = progress or (lambda what, share: None)
+    tell = progress or silent
     repeats = dict.fromkeys(REPEATS, 1) if quick else REPEATS
     compensated, notes = compensation.rows(
         known,
@@ -156,11 +156,11 @@ def make(
         repeats=repeats["compensation"],
         quick=quick,
         folder=out,
-        tell=_part(tell, 0.0, 0.3),
+        tell=part(tell, 0.0, 0.3),
         libraries=libraries,
     )
     calibrated, more = calibration.rows(
-        known, device, repeats=repeats["calibration"], quick=quick, seed=seed, tell=_part(tell, 0.3, 0.97)
+        known, device, repeats=repeats["calibration"], quick=quick, seed=seed, tell=part(tell, 0.3, 0.97)
     )
     tell("drawing", 0.97)
     done = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), _about(known, device))
@@ -172,10 +172,6 @@ def make(
 
 def _drawn(chart: str, out: Path) -> dict[str, Path]:
     return {chart: out / f"{chart}.png", f"{chart} (SVG)": out / f"{chart}.svg"}
-
-
-def _part(tell: Progress, start: float, end: float) -> Progress:
-    return lambda what, share: tell(what, start + (end - start) * share)
 
 
 def _share_note(rows: Sequence[Row]) -> str:

@@ -11,13 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import warp as wp
 
 from amiwarp.calib.presets import simplified
+from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import TURNS, upload_events
 from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.io import open_recording, save_recording
+from amiwarp.io.output import scratch_folder
+from amiwarp.optics.models import MODELS, Model, wrap_angle
+from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import Row, Task, measure
 from amiwarp.studies.chart.truth import Known, exact_image, exact_places, raw_places, rms
 
@@ -74,8 +79,6 @@ class Uploads:
     """The recording's events on the device under different angles and shares, each uploaded once."""
 
     def __init__(self, known: Known, device: str) -> None:
-        import warp as wp
-
         self.known, self.device = known, device
         copies = 1 if wp.get_device(device).is_cpu else max(1, MANY // len(known.events))
         self.events = known.events if copies == 1 else _repeated(known, copies)
@@ -151,7 +154,7 @@ def rows(
     *,
     repeats: int,
     quick: bool,
-    tell: Callable[[str, float], None],
+    tell: Progress,
     folder: Path,
     libraries: Libraries | None = None,
 ) -> tuple[list[Row], list[str]]:
@@ -165,7 +168,7 @@ def rows(
     uploads, ways = Uploads(known, device), settings(quick=quick)
     others, notes = libraries(sample, uploads, device) if libraries is not None else ([], [])
     tasks = [*_image_tasks(ways, models, uploads, device), *(other.task for other in others)]
-    timed = measure(tasks, repeats, lambda share: tell("measuring images of events", share), rest_s=REST_S)
+    timed = measure(tasks, repeats, tell, "measuring images of events", rest_s=REST_S)
     out = []
     for t, way in zip(timed, ways, strict=False):
         places = _places(models[way.model], sample, way.angles, device)
@@ -181,8 +184,6 @@ def rows(
 
 
 def _image_tasks(ways: list[Setting], models: dict[str, Model], uploads: Uploads, device: str) -> Iterator[Task]:
-    import warp as wp
-
     camera = uploads.known.camera
     buffers = {}
     for vote in Vote:
@@ -204,10 +205,6 @@ def _image_tasks(ways: list[Setting], models: dict[str, Model], uploads: Uploads
 
 def _places(model: Model, sample: Sample, angles: int, device: str) -> NDArray[np.float64]:
     """By the functions that the votes call, on the same device, at the angles that the events have."""
-    import warp as wp
-
-    from amiwarp.optics.models import wrap_angle
-
     theta = wrap_angle(coarse(sample.theta, angles)).astype(np.float32)
     xy = wp.array(sample.xy.astype(np.float32), dtype=wp.vec2, device=device)
     return model.compensate_points(xy, wp.array(theta, dtype=float, device=device)).numpy().astype(np.float64)
@@ -235,13 +232,9 @@ def circle(sample: Sample) -> tuple[float, float]:
 
 
 def _file_rows(
-    sample: Sample, device: str, repeats: int, quick: bool, tell: Callable[[str, float], None], folder: Path
+    sample: Sample, device: str, repeats: int, quick: bool, tell: Progress, folder: Path
 ) -> tuple[list[Row], list[str]]:
     """Whole files by each model, reading and writing included; the error is that of the file that was written."""
-    from amiwarp.compensation.recordings import compensate
-    from amiwarp.io import open_recording, save_recording
-    from amiwarp.io.output import scratch_folder
-
     if missing := [name for name in ("h5py", "hdf5plugin") if find_spec(name) is None]:
         return [], [f"files: left out, {' and '.join(missing)} not installed"]
     known = sample.known
@@ -264,5 +257,5 @@ def _file_rows(
                       "mark": FILE, "settings": {"model": model, "device": device},
                       "default": model == "exact"}  # fmt: skip
             tasks.append(Task(partial(run, calibration), len(known.events), fields, error))
-        timed = measure(tasks, repeats, lambda share: tell("measuring files", share))
+        timed = measure(tasks, repeats, tell, "measuring files")
         return [t.row(t.result) for t in timed], []

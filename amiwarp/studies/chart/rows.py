@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-Progress = Callable[[str, float], None]
+from amiwarp.progress import Progress
+
 """Called with what is being done and the share of it that is."""
 
 ALIKE = 0.05
@@ -91,7 +92,8 @@ class Timed:
 def measure(
     tasks: Sequence[Task],
     repeats: int,
-    tell: Callable[[float], None],
+    tell: Progress,
+    what: str,
     *,
     warm_up: bool = True,
     limit_s: float = 180.0,
@@ -123,7 +125,7 @@ def measure(
             results[k] = task.keep(result) if turn == int(warm_up) else results[k]
             if turn >= int(warm_up):
                 times[k].append(took)
-            tell((turn * len(tasks) + k + 1) / (rounds * len(tasks)))
+            tell(what, (turn * len(tasks) + k + 1) / (rounds * len(tasks)))
     return _timed(tasks, times, results)
 
 

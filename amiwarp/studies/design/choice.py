@@ -12,9 +12,10 @@ from amiwarp.calib.selection.smaller_models import QUANTISATION_PX, SHARE
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
+from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 from amiwarp.studies.design.orbit import Orbit, orbit_of
-from amiwarp.studies.design.volume import Progress, Volume, filled, measure
+from amiwarp.studies.design.volume import Volume, filled, measure
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
@@ -177,12 +178,12 @@ def design(
     if not (apexes and rpms and apexes[0] > 0.0 and 0.0 < rpms[0] <= rpms[-1] < math.inf):
         raise AmiwarpError(f"apexes {apexes} rad or speeds {rpms} rpm: give at least one of each, all above 0")
     timing, limits, sensor = timing or Timing(), limits or Limits(), sensor or SensorModel()
-    tell = progress or (lambda what, share: None)
+    tell = progress or silent
     orbits = []
     for k, apex in enumerate(apexes):
         tell("fitting models", 0.5 * k / len(apexes))
         orbits.append(orbit_of(camera, replace(glass, apex=apex), device))
     template = Simulation(filled(scene, camera, replace(glass, apex=apexes[-1])), camera, glass, 1.0, sensor=sensor,
                           seed=seed, device=device)  # fmt: skip
-    volume = measure(template, apexes, rpms, lambda what, share: tell(what, 0.5 + 0.5 * share))
+    volume = measure(template, apexes, rpms, part(tell, 0.5, 1.0))
     return Design(camera, glass, tuple(orbits), tuple(rpms), volume, timing, limits)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,9 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.prism import Prism
+from amiwarp.progress import Progress
 from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.scenery import place_scene, seen_bearings
 from amiwarp.simulation.simulator import Scene, Simulation
 from amiwarp.studies.design.orbit import Orbit, orbit_radii
 
@@ -25,7 +27,6 @@ TILE, ACROSS_TILES, DOWN_TILES = 16, 12, 9
 NODES = 4
 """At most so many apexes are simulated; between them the yield is interpolated."""
 
-Progress = Callable[[str, float], None]
 """Called with what is being done and the share of it that is."""
 
 
@@ -67,8 +68,6 @@ def filled(scene: Scene, camera: Camera, prism: Prism) -> Scene:
 
     So every part of the image sees the same of it as the whole does.
     """
-    from amiwarp.simulation.scenery import place_scene, seen_bearings
-
     if scene.fov is not None:
         return scene
     whole = Simulation(scene, camera, prism, 1.0)

@@ -8,14 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from amiwarp.progress import Progress
 from amiwarp.studies.stability.cells import METHODS, Cell, Method, Store, Stored, identity, run_cell
 from amiwarp.studies.stability.conditions import AXES, Axis, Condition
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-Progress = Callable[[int, int], None]
-"""Called with cells done and their number, those of earlier runs included."""
 QUICK_METHODS = ("default", "paper", "sharpness")
 
 
@@ -65,7 +64,7 @@ def run(
             store.save(known[cell])
             done += 1
             if progress is not None:
-                progress(done, len(cells))
+                progress(f"{done:,} of {len(cells):,} cells", done / len(cells))
             if until is not None and until():
                 break
     finally:
