@@ -9,12 +9,12 @@ import pytest
 from conftest import TRUE_PRISM
 
 from amiwarp.calib import calibrate
-from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.photometric.acceptance import verdict
 from amiwarp.calib.prism_speed import turns_per_turn
 from amiwarp.calib.selection.trial import FARTHEST_PX, in_pixels
 from amiwarp.calib.sharpness.search import Settings
+from amiwarp.calib.single_model import prepare
 from amiwarp.cli.inputs import interval, number
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TURN, Encoder

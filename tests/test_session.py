@@ -29,10 +29,10 @@ from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
+from amiwarp.live.stream.opening import open_source
 from amiwarp.live.stream.packets import Packet, packet
 from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.session import Session, Status
-from amiwarp.live.stream.sources import open_source
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.calibration import prepare
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.sharpness.search import STAGES, Settings
+from amiwarp.calib.single_model import prepare
 from amiwarp.calib.solve import SearchStage
 from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness

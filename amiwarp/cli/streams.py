@@ -61,7 +61,7 @@ class SourceOptions:
     ] = 0.0
 
     def open(self, spec: str, say: Callable[[str], None]) -> Source:
-        from amiwarp.live.stream.sources import open_source
+        from amiwarp.live.stream.opening import open_source
 
         return open_source(spec, pace=None if self.fast else 1.0, wait_s=self.wait_for_source, say=say)
 

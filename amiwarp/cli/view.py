@@ -168,8 +168,8 @@ def inspector(
 @contextlib.contextmanager
 def _following(spec: str, controller: str | None) -> Iterator[Callable[[], Recording]]:
     """What a stream's last seconds are by now; waits for the first turn."""
+    from amiwarp.live.stream.opening import open_source
     from amiwarp.live.stream.recent_events import RecentEvents, followed
-    from amiwarp.live.stream.sources import open_source
 
     with SourceOptions(port=controller).link() as link:
         source = open_source(spec)

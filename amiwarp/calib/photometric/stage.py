@@ -23,8 +23,8 @@ from amiwarp.calib.photometric.minimum_check import around_optimum
 from amiwarp.calib.photometric.scene_tiles import choose_tiles, one_tile
 from amiwarp.calib.result import PhotometricSummary, StageSummary
 from amiwarp.calib.sharpness.objective import reach
-from amiwarp.calib.sharpness.search import stage_share
 from amiwarp.calib.solve import LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
+from amiwarp.calib.stage_share import stage_share
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import real, whole
 

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.result import Calibration, ModelCandidate, ModelChoice
 from amiwarp.calib.selection import free_parameters
 from amiwarp.calib.selection.smaller_models import fit
@@ -19,6 +18,7 @@ from amiwarp.calib.selection.trial import FACTOR, Trial, by_sharpness, in_pixels
 from amiwarp.calib.sharpness.held_out import slope
 from amiwarp.calib.sharpness.objective import padding
 from amiwarp.calib.sharpness.search import Settings
+from amiwarp.calib.single_model import calibrate_model
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
@@ -51,7 +51,7 @@ def calibrate_auto(
     if budget_px is not None and not budget_px > 0.0:
         raise AmiwarpError(f"budget_px = {budget_px}; give an error above 0, as 0.03")
     settings = replace(settings, model="exact")
-    first = calibrate(recording, settings, device=device, progress=progress)
+    first = calibrate_model(recording, settings, device=device, progress=progress)
     if not first.parameters["apex"]:
         return first  # without a prism all models are one
     names = free_parameters.candidates(recording, first) if settings.free is None else ()
@@ -60,7 +60,7 @@ def calibrate_auto(
     while more := free_parameters.wanted(parameters):
         again = free_parameters.freed_settings(first, settings, more)
         try:
-            exact = calibrate(recording, again, device=device, progress=progress)
+            exact = calibrate_model(recording, again, device=device, progress=progress)
         except AmiwarpError as error:
             parameters = free_parameters.refused(parameters, str(error))
             break

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.calibration import moving_window
 from amiwarp.calib.parameters import LATE
 from amiwarp.calib.selection.smaller_models import QUANTISATION_PX, SHARE, Places, apart, rung_space, timing_blur
 from amiwarp.calib.sharpness.curvature import STEP_PX
 from amiwarp.calib.sharpness.held_out import Half, Quadratic, halves
 from amiwarp.calib.sharpness.search import Material, Settings
+from amiwarp.calib.single_model import moving_window
 from amiwarp.calib.thinning import thin
 
 if TYPE_CHECKING:

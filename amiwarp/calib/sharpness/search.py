@@ -16,6 +16,7 @@ from amiwarp.calib.result import StageSummary
 from amiwarp.calib.sharpness.curvature import differences
 from amiwarp.calib.sharpness.objective import Objective
 from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
+from amiwarp.calib.stage_share import stage_share
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import upload_events
@@ -133,13 +134,6 @@ class Material:
 
     def _cut(self, cut: slice) -> Material:
         return Material(self.events[cut], self.encoder, self.slope_of, self.fold)
-
-
-def stage_share(settings: Settings, stage: str, share: float) -> tuple[str, float]:
-    """Return what a calibration is doing and its finished share, if each stage takes about as long as the others."""
-    names = [] if settings.global_algorithm is None else ["global"]
-    names += ["local", "photometric"][: len(settings.stages)]
-    return f"calibrating, {stage}", (names.index(stage) + min(share, 1.0)) / len(names)
 
 
 class Search:

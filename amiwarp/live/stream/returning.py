@@ -11,7 +11,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import packet
 from amiwarp.live.stream.sockets import Unreachable, accepting, connecting
-from amiwarp.live.stream.sources import HELLO_S, StreamSource, from_connection, open_source
+from amiwarp.live.stream.sources import HELLO_S, StreamSource, from_connection, open_stream
 
 if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Packet
@@ -20,6 +20,10 @@ LATE_US = 10_000
 """By which a returning sender's first event may be before the last one: as much as is put in order."""
 CLOCK_US = 2_000_000
 """Difference between the camera's and the host's time over a gap from which on it is said."""
+
+
+SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
+"""Kinds of sources whose sender can return."""
 
 
 class ReturningSource:
@@ -33,15 +37,13 @@ class ReturningSource:
 
     def __init__(self, spec: str, wait_s: float, say: Callable[[str], None]) -> None:
         kind = spec.partition(":")[0]
-        if kind not in ("tcp", "unix", "tcp-listen", "unix-listen"):
+        if kind not in SOCKETS:
             what = "give tcp:, unix:, tcp-listen: or unix-listen:, or leave it out"
             raise AmiwarpError(
                 f"{spec}: --wait-for-source applies to sockets only, a file or pipe does not return; {what}"
             )
         self._wait_s, self._say, self._listens = wait_s, say, kind.endswith("-listen")
-        source = open_source(spec)
-        assert isinstance(source, StreamSource)
-        self._source = source
+        source = self._source = open_stream(spec)
         self.name, self.size, self.camera, self.prism = spec, source.size, source.camera, source.prism
         self.has_encoder = source.has_encoder
         self.problem: str | None = None

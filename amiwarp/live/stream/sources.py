@@ -22,7 +22,6 @@ from amiwarp.live.stream.packets import (
     Hello,
     Message,
     Packet,
-    Source,
     Triggers,
     packet,
 )
@@ -36,44 +35,11 @@ HELLO_S = 10.0
 """How long a sender may take to say what it sends."""
 
 
-def open_source(
-    spec: str,
-    *,
-    pace: float | None = 1.0,
-    packet_us: int = 1000,
-    wait_s: float = 0.0,
-    say: Callable[[str], None] = lambda _: None,
-) -> Source:
-    """Open a source by its name.
-
-    FILE: a recording, ``pace`` times as fast as it was (None: as fast as it can be read), in packets of ``packet_us``.
-    ``-``, ``tcp:HOST:PORT``, ``unix:PATH``: a stream of packets (``docs/stream-format.md``); ``tcp-listen:HOST:PORT``,
-    ``unix-listen:PATH`` wait for its sender. ``dv`` or ``dv:SERIAL``, ``prophesee`` or ``prophesee:SERIAL``: a camera.
-    ``wait_s``: how long the sender of a socket is waited for when its stream broke off [s]; ``say`` then gets a
-    sentence.
-    Raises :class:`AmiwarpError` for a source that cannot be opened, or not waited for.
-    """
-    kind, _, rest = spec.partition(":")
-    if wait_s > 0.0:
-        from amiwarp.live.stream.returning import ReturningSource
-
-        return ReturningSource(spec, wait_s, say)
-    if spec == "-":
-        # past the buffer of sys.stdin, and without closing the descriptor at the end
-        return StreamSource("standard input", open(0, "rb", buffering=0, closefd=False))
-    if kind in ("tcp", "unix"):
-        return from_connection(spec, connect(spec))
-    if kind in ("tcp-listen", "unix-listen"):
-        return from_connection(spec, accept(spec.replace("-listen", "", 1)))
-    if kind == "dv":
-        from amiwarp.live.stream.cameras import DvSource
-
-        return DvSource(rest or None, packet_us=packet_us)
-    if kind == "prophesee":
-        from amiwarp.live.stream.cameras import PropheseeSource
-
-        return PropheseeSource(rest or None, packet_us=packet_us)
-    return FileSource(spec, pace=pace, packet_us=packet_us)
+def open_stream(spec: str) -> StreamSource:
+    """Connect to, or wait for, the sender of the stream at ``tcp:``, ``unix:``, ``tcp-listen:`` or ``unix-listen:``."""
+    kind = spec.partition(":")[0]
+    connection = accept(spec.replace("-listen", "", 1)) if kind.endswith("-listen") else connect(spec)
+    return from_connection(spec, connection)
 
 
 def from_connection(spec: str, connection: socket.socket, *, hello_s: float | None = None) -> StreamSource:

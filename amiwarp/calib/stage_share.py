@@ -1,0 +1,15 @@
+"""The finished share of a calibration."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from amiwarp.calib.sharpness.search import Settings
+
+
+def stage_share(settings: Settings, stage: str, share: float) -> tuple[str, float]:
+    """Return what a calibration is doing and its finished share, if each stage takes about as long as the others."""
+    names = [] if settings.global_algorithm is None else ["global"]
+    names += ["local", "photometric"][: len(settings.stages)]
+    return f"calibrating, {stage}", (names.index(stage) + min(share, 1.0)) / len(names)
