@@ -1,10 +1,22 @@
-"""The house rules that a machine can check: budgets of device code, lazy imports, and which way imports run."""
+"""House rules that a machine can check: budgets of device code, lazy imports, public names, no cycles of imports.
+
+Which room may import which is a contract of import-linter in ``pyproject.toml``.
+"""
 
 import ast
+import graphlib
+import importlib
+import inspect
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from types import FunctionType, ModuleType
+
+import pytest
+
+import amiwarp
 
 PACKAGE = Path(__file__).parents[1] / "amiwarp"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -25,45 +37,6 @@ HEAVY = (
     "trame",
     "aiohttp",
 )
-
-KERNELS_MAY_IMPORT = {"amiwarp.optics.camera", "amiwarp.errors", "amiwarp.kernels"}
-"""Kernels turn host objects to structs, so they know the camera; nothing of files, users or recordings."""
-
-ORDER = (
-    ("errors", "regular"),
-    ("values",),
-    ("prism",),
-    ("kernels", "camera", "multilevel"),
-    ("optics", "events", "encoder", "unwrapping", "turning", "machine"),
-    ("pictures", "motion", "clouds"),
-    ("io", "uploads", "link"),
-    ("iwe", "peers"),
-    (
-        "placing",
-        "gatherer",
-        "batches",
-        "compensate",
-        "compensator",
-        "iwe_files",
-        "sharpness",
-        "metrics",
-        "scenery",
-        "tiles",
-    ),
-    ("pairs",),
-    ("residuals",),
-    ("brightness",),
-    ("calib", "engine", "reconstruct"),
-    ("stream",),
-    ("picture_files",),
-    ("simulate",),
-    ("translate", "figures", "presets"),
-    ("stability", "design"),
-    ("chart", "viewer", "demo"),
-    ("cli",),
-    ("__main__",),
-)
-"""The way an event goes, first to last: a module imports from its own row or from an earlier one."""
 
 
 def name_of(path: Path) -> str:
@@ -151,37 +124,72 @@ def test_every_public_name_loads() -> None:
     subprocess.run([sys.executable, "-c", script], cwd=PACKAGE.parent, capture_output=True, text=True, check=True)
 
 
-def test_kernels_know_nothing_of_files_or_users() -> None:
-    wrong = [
-        f"{name_of(path)} imports {module}"
-        for path in MODULES
-        if name_of(path).startswith("amiwarp.kernels")
-        for module in imports_of(path)
-        if module.startswith("amiwarp") and ".".join(module.split(".")[:2]) not in KERNELS_MAY_IMPORT | {"amiwarp"}
-    ]
-    assert wrong == []
+def test_no_public_name_is_a_module() -> None:
+    assert sorted({path.stem for path in PACKAGE.iterdir()} & set(amiwarp.__all__)) == []
 
 
-def rank(module: str) -> int:
-    """Row of a module; one without a place is reported by the test below."""
-    part = module.split(".")[1]
-    return next((i for i, names in enumerate(ORDER) if part in names), len(ORDER))
-
-
-def inner_imports() -> Iterator[tuple[str, str]]:
-    """(importing module, imported module) inside the package, the front door excluded."""
-    known = {name_of(path) for path in MODULES}
+def test_a_module_can_be_imported_under_another_name() -> None:
     for path in MODULES:
-        for module in imports_of(path):
-            if name_of(path) != "amiwarp" and module in known and module != "amiwarp":
-                yield name_of(path), module
+        if name_of(path) != "amiwarp.__main__":
+            assert isinstance(importlib.import_module(name_of(path)), ModuleType)
+    import amiwarp.imaging.warped_image as images
+
+    assert images.iwe is amiwarp.iwe
 
 
-def test_every_module_has_its_place() -> None:
-    placed = {name for row in ORDER for name in row}
-    assert {name_of(path).split(".")[1] for path in MODULES if name_of(path) != "amiwarp"} - placed == set()
+def test_types_in_public_signatures_are_public() -> None:
+    """Of public functions, and of the fields, properties and methods of public classes."""
+    missing = {
+        f"{name} uses {used}"
+        for name in amiwarp.__all__
+        for used in _types_of(name)
+        if used not in amiwarp.__all__ and used in CLASSES
+    }
+    assert sorted(missing) == []
 
 
-def test_imports_run_one_way() -> None:
-    wrong = [f"{user} imports {used}" for user, used in inner_imports() if rank(used) > rank(user)]
-    assert wrong == []
+CLASSES = {
+    node.name
+    for path in MODULES
+    for node in ast.parse(path.read_text()).body
+    if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+}
+
+
+def _types_of(name: str) -> Iterator[str]:
+    public = getattr(amiwarp, name)
+    if not isinstance(public, type | FunctionType):
+        return
+    node = ast.parse(textwrap.dedent(inspect.getsource(public))).body[0]
+    inner = [node] if isinstance(node, ast.FunctionDef) else list(ast.iter_child_nodes(node))
+    for part in inner:
+        if isinstance(part, ast.FunctionDef) and (part is node or part.name == "__init__" or part.name[0] != "_"):
+            every = [*part.args.args, *part.args.kwonlyargs, part.args.vararg, part.args.kwarg]
+            yield from _names([part.returns, *(arg.annotation for arg in every if arg is not None)])
+        elif isinstance(part, ast.AnnAssign) and not ast.unparse(part.target).startswith("_"):
+            yield from _names([part.annotation])
+
+
+def _names(annotations: list[ast.expr | None]) -> Iterator[str]:
+    for annotation in annotations:
+        for node in ast.walk(annotation) if annotation is not None else ():
+            if isinstance(node, ast.Name):
+                yield node.id
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Modules of the package that a file imports at run time, at any depth."""
+    known = {name_of(other) for other in MODULES}
+    return {module for module in imports_of(path) if module in known} - {name_of(path), "amiwarp"}
+
+
+def test_no_modules_import_each_other() -> None:
+    """No cycle at run time, imports inside functions included; packages that only re-export names do not count."""
+    graph = {name_of(path): imported_modules(path) for path in MODULES if path.name != "__init__.py"}
+    order = graphlib.TopologicalSorter({name: used & set(graph) for name, used in graph.items()})
+    order.prepare()
+
+
+def test_a_cycle_would_be_seen() -> None:
+    with pytest.raises(graphlib.CycleError):
+        graphlib.TopologicalSorter({"a": {"b"}, "b": {"a"}}).prepare()

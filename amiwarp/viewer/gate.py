@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import msgpack
+import msgpack  # type: ignore[import-untyped]
 
 MOST_BYTES = 64 * 1024
 """Of a message. The page's own have up to some hundred; it cuts none into parts."""
