@@ -144,7 +144,7 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
         if scheduler is None:
             where = stack.enter_context(distributed.LocalCluster(
                 n_workers=cpu_threads(), threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=None,
-                silence_logs=logging.ERROR,
+                silence_logs=logging.CRITICAL,  # a worker that dies is reported by the executor
             ))  # fmt: skip
         try:
             client = stack.enter_context(distributed.Client(where, timeout=20))
