@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -222,8 +223,8 @@ def test_figures_are_written_with_a_page_for_each_axis(atlas: Atlas, tmp_path: P
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
     """The command has one axis with two small cameras."""
     axis = Axis("width", "width", (48, 64), "px", (("height", 48), ("turns", 1.0)))
-    monkeypatch.setattr(amiwarp.stability, "AXES", (axis,))
-    monkeypatch.setattr(amiwarp.stability, "quick_axes", lambda: (replace(axis, values=(48,)),))
+    monkeypatch.setattr(amiwarp.studies.stability, "AXES", (axis,))
+    monkeypatch.setattr(amiwarp.studies.stability, "quick_axes", lambda: (replace(axis, values=(48,)),))
     return axis
 
 
@@ -258,3 +259,8 @@ def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:
     assert "no cells of this version" in fails("--redraw", *words)
     (tmp_path / "file").write_text("")
     assert "cannot be made a folder" in fails("--out", tmp_path / "file" / "deeper", "--device", "cpu")
+
+
+def test_command_names_the_extra_that_is_missing(tiny: Axis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "pip install 'amiwarp[cluster]'" in fails("--quick", "--out", tmp_path, "--device", "cpu")

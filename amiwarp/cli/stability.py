@@ -138,7 +138,10 @@ def _run(
 @contextlib.contextmanager
 def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
     """Of the scheduler's workers, or of one process a core here. Raises :class:`AmiwarpError` where it is not there."""
-    distributed: Any = importlib.import_module("distributed")  # loaded only here, and without types
+    try:
+        distributed: Any = importlib.import_module("distributed")  # loaded only here, and without types
+    except ModuleNotFoundError as error:
+        raise AmiwarpError("the atlas runs on Dask, which is not installed; pip install 'amiwarp[cluster]'") from error
     with contextlib.ExitStack() as stack:
         where: Any = scheduler
         if scheduler is None:
