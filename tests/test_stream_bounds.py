@@ -166,7 +166,7 @@ class Flood(Made):
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions whose queues are small."""
-    monkeypatch.setattr("amiwarp.live.stream.session.Beside", partial(BackgroundWorker, MOST))
+    monkeypatch.setattr("amiwarp.live.stream.session.BackgroundWorker", partial(BackgroundWorker, MOST))
     monkeypatch.setattr("amiwarp.live.stream.session.PacketQueue", partial(PacketQueue, most_bytes=MOST))
 
 

@@ -107,7 +107,8 @@ class Panel:
         except ValueError:
             self.say(f"{text!r} is no number; give one such as 1.5", "error")
             return
-        name, value = ("length_ms", value * float(self.state.turn_ms)) if name == "turns" else (name, value)
+        if name == "turns":
+            name, value = "length_ms", value * float(self.state.turn_ms)
         self.state[name] = round(value, 4)
         if name in NAMES:
             self.moved(name)

@@ -154,7 +154,7 @@ def rows(
         found: Calibration | AmiwarpError = t.result
         return None if isinstance(found, AmiwarpError) else t.row(model_error(found.model, known.model).rms)
 
-    timed = measure(tasks, repeats, tell, "calibrating", warm_up=False,
+    timed = measure(tasks, repeats, partial(tell, "calibrating"), warm_up=False,
                     again=lambda once: near_front([row(t) for t in once]))  # fmt: skip
     notes = []
     for t, way in zip(timed, ways, strict=True):

@@ -168,7 +168,7 @@ def rows(
     uploads, ways = Uploads(known, device), settings(quick=quick)
     others, notes = libraries(sample, uploads, device) if libraries is not None else ([], [])
     tasks = [*_image_tasks(ways, models, uploads, device), *(other.task for other in others)]
-    timed = measure(tasks, repeats, tell, "measuring images of events", rest_s=REST_S)
+    timed = measure(tasks, repeats, partial(tell, "measuring images of events"), rest_s=REST_S)
     out = []
     for t, way in zip(timed, ways, strict=False):
         places = _places(models[way.model], sample, way.angles, device)
@@ -257,5 +257,5 @@ def _file_rows(
                       "mark": FILE, "settings": {"model": model, "device": device},
                       "default": model == "exact"}  # fmt: skip
             tasks.append(Task(partial(run, calibration), len(known.events), fields, error))
-        timed = measure(tasks, repeats, tell, "measuring files")
+        timed = measure(tasks, repeats, partial(tell, "measuring files"))
         return [t.row(t.result) for t in timed], []

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from amiwarp.progress import Progress
 
 """Called with what is being done and the share of it that is."""
 
@@ -92,8 +91,7 @@ class Timed:
 def measure(
     tasks: Sequence[Task],
     repeats: int,
-    tell: Progress,
-    what: str,
+    tell: Callable[[float], None],
     *,
     warm_up: bool = True,
     limit_s: float = 180.0,
@@ -125,7 +123,7 @@ def measure(
             results[k] = task.keep(result) if turn == int(warm_up) else results[k]
             if turn >= int(warm_up):
                 times[k].append(took)
-            tell(what, (turn * len(tasks) + k + 1) / (rounds * len(tasks)))
+            tell((turn * len(tasks) + k + 1) / (rounds * len(tasks)))
     return _timed(tasks, times, results)
 
 
