@@ -4,7 +4,7 @@
 
 Methods take turns, pass by pass, so that whatever else the machine does meets them alike. The first pass, which
 compiles, is told apart. Where all cases run at full size this writes benchmarks/results/speed_cpu.json or
-speed_cuda.json, and the tables of docs/performance.md from these (``python -m benchmarks.report`` does that alone).
+speed_cuda.json, and the tables of benchmarks/results/speed.md from these (``python -m benchmarks.report`` does that alone).
 Exit status 1 where an answer is wrong; the row is named.
 """
 

@@ -4,7 +4,7 @@
 
 A 320 × 240 camera (60°) behind a prism (apex 1.8°) looks at PyVista's map of the earth, stands still or turns, its gaze
 going round a circle. Each window of 33 ms is simulated at the speed that the last one led to, the motor lagging behind.
-What ``ok`` means and how edges are counted is in docs/adaptive.md. Exit status 1 where something is not ok.
+What ``ok`` means and how edges are counted is in docs/explanation/adaptive-speed.md. Exit status 1 where something is not ok.
 """
 
 from __future__ import annotations

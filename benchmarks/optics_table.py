@@ -1,4 +1,4 @@
-"""Prints the tables of docs/optics.md: what each model costs in pixels, and what float32 costs the exact one.
+"""Prints the tables of docs/explanation/optics.md: what each model costs in pixels, and what float32 costs the exact one.
 
     python benchmarks/optics_table.py
 

@@ -1,4 +1,4 @@
-"""Tables of docs/performance.md from the JSON files of the runs.
+"""Tables of benchmarks/results/speed.md from the JSON files of the runs.
 
     python -m benchmarks.report [--check]
 
@@ -19,7 +19,7 @@ from typing import Any
 from benchmarks.cases import AIMS, IMAGE, MOVED, PREPARED, Aim
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "performance.md"
+PAGE = ROOT / "benchmarks" / "results" / "speed.md"
 FILES = {kind: ROOT / "benchmarks" / "results" / f"speed_{kind}.json" for kind in ("cpu", "cuda")}
 BEGIN, END = "<!-- speed: from here on by python -m benchmarks.report -->", "<!-- speed: to here -->"
 IMAGES = (IMAGE, PREPARED)

@@ -26,7 +26,7 @@ from amiwarp.optics.models import (
 )
 from amiwarp.optics.prism import FlatSide, Prism
 
-ATOL = 1e-3  # px, the promise; docs/optics.md has what was measured
+ATOL = 1e-3  # px, the promise; docs/explanation/optics.md has what was measured
 SIDES = list(FlatSide)
 BARREL = RadialTangential(-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0)
 TURN = np.arange(36) * (2.0 * np.pi / 36)
