@@ -325,7 +325,7 @@ def test_blosc_parameters_that_would_crash_are_noticed(tmp_path):
 
 
 def test_example_of_the_documentation(tmp_path, monkeypatch):
-    text = (Path(__file__).parents[1] / "docs" / "recording-format.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[1] / "docs" / "reference" / "recording-format.md").read_text(encoding="utf-8")
     code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len(code) == 1
     monkeypatch.chdir(tmp_path)

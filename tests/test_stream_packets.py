@@ -172,7 +172,7 @@ def test_room_is_never_more_than_the_packet():
 
 
 def test_the_sender_of_the_documentation_is_understood():
-    text = (Path(__file__).parents[1] / "docs" / "stream-format.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[1] / "docs" / "reference" / "stream-format.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict[str, object] = {}
     exec(compile(code, "stream-format.md", "exec"), names)
