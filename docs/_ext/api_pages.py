@@ -1,0 +1,132 @@
+"""Write the pages of the Python reference: one per room of the package, one per public name.
+
+The names are those of ``amiwarp.__all__``. The imports of the package's front door tell in which room each one lives.
+The pages are written before Sphinx reads its sources, to ``reference/api``, which is not under version control.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from docutils import nodes
+from generated_files import heading, write_pages
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.errors import ExtensionError
+
+import amiwarp
+
+INDEX = """
+The public names of ``import amiwarp``, by the part of the package that they belong to. Angles are in radians, times in
+microseconds and places in pixels unless a name says otherwise.
+
+"""
+
+
+def homes() -> dict[str, str]:
+    """Return the module that each public name is imported from, as the front door states it."""
+    front = Path(amiwarp.__file__)
+    stub = front.with_suffix(".pyi")
+    found = {}
+    for node in ast.walk(ast.parse((stub if stub.exists() else front).read_text())):
+        if isinstance(node, ast.ImportFrom):
+            module = f"amiwarp.{node.module}" if node.level else str(node.module)
+            found.update({alias.asname or alias.name: module for alias in node.names})
+    names = [name for name in amiwarp.__all__ if not name.startswith("_")]
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise ExtensionError(f"no import in amiwarp's front door for {', '.join(missing)}")
+    return {name: found[name] for name in names}
+
+
+def rooms(order: list[str]) -> dict[str, list[str]]:
+    """Return the public names by room; the rooms are in ``order``, then by name."""
+    out: dict[str, list[str]] = {}
+    for name, module in sorted(homes().items(), key=lambda item: item[0].lower()):
+        out.setdefault(module.split(".")[1] if "." in module else "", []).append(name)
+    return {room: out[room] for room in sorted(out, key=lambda r: (order.index(r) if r in order else len(order), r))}
+
+
+def summary(thing: Any) -> str:
+    """Return the first sentence of the documentation of ``thing``, or nothing."""
+    if not (inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, ModuleType)):
+        return ""
+    text = " ".join((inspect.getdoc(thing) or "").split("\n\n")[0].split())
+    return re.split(r"(?<=[.:]) (?=[A-Z])", text)[0].rstrip(":")
+
+
+def directive(thing: Any) -> str:
+    """Return the autodoc directive that documents ``thing``."""
+    if inspect.isclass(thing):
+        return "autoexception" if issubclass(thing, BaseException) else "autoclass"
+    return "autofunction" if inspect.isroutine(thing) else "autodata"
+
+
+def name_page(name: str) -> str:
+    """Return the page of one public name."""
+    thing = getattr(amiwarp, name)
+    return (
+        heading(name)
+        + f".. currentmodule:: amiwarp\n\n.. {directive(thing)}:: {name}\n\n"
+        + f".. minigallery:: amiwarp.{name}\n   :add-heading: Tutorials\n   :heading-level: -\n"
+    )
+
+
+def room_page(room: str, names: list[str]) -> str:
+    """Return the page of one room: what it is for, and a table of its names."""
+    module = importlib.import_module(f"amiwarp.{room}") if room else amiwarp
+    rows = "".join(f"   * - :py:obj:`~amiwarp.{name}`\n     - {summary(getattr(amiwarp, name))}\n" for name in names)
+    table = f".. list-table::\n   :class: names\n   :widths: 25 75\n\n{rows}\n"
+    toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   amiwarp.{name}\n" for name in names)
+    return heading(room or "amiwarp") + f"{summary(module)}\n\n{table}{toctree}"
+
+
+def index_page(found: dict[str, list[str]]) -> str:
+    """Return the page that lists the rooms and their names."""
+    rows = ""
+    for room, names in found.items():
+        links = ", ".join(f":py:obj:`~amiwarp.{name}`" for name in names)
+        rows += f"   * - :doc:`{room or 'amiwarp'}`\n     - {links}\n"
+    table = f".. list-table::\n   :class: names\n   :widths: 20 80\n\n{rows}\n"
+    toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   {room or 'amiwarp'}\n" for room in found)
+    return heading("Python") + INDEX + table + toctree
+
+
+def write(app: Sphinx, config: Any) -> None:
+    """Write all pages."""
+    found = rooms(config.api_rooms)
+    pages = {"index.rst": index_page(found)}
+    for room, names in found.items():
+        pages[f"{room or 'amiwarp'}.rst"] = room_page(room, names)
+        pages.update({f"amiwarp.{name}.rst": name_page(name) for name in names})
+    write_pages(Path(app.srcdir) / "reference" / "api", pages)
+
+
+def link_by_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, contnode: Any) -> nodes.reference | None:
+    """Link ``amiwarp.room.module.Name`` and ``Name`` to the public ``amiwarp.Name``, its members included."""
+    if node.get("refdomain") != "py":
+        return None
+    parts = node["reftarget"].split(".")
+    start = next((i for i, part in enumerate(parts) if part in homes()), None)
+    if start is None or (start > 0 and parts[0] != "amiwarp"):
+        return None
+    target = ".".join(["amiwarp", *parts[start:]])
+    if target == node["reftarget"]:
+        return None
+    domain = env.domains["py"]
+    return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, contnode)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the generator."""
+    app.add_config_value("api_rooms", [], "env")
+    app.connect("config-inited", write)
+    app.connect("missing-reference", link_by_name)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
