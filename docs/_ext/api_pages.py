@@ -7,6 +7,7 @@ The pages are written before Sphinx reads its sources, to ``reference/api``, whi
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import inspect
 import re
@@ -20,6 +21,7 @@ from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.errors import ExtensionError
+from sphinx.pycode import ModuleAnalyzer
 
 import amiwarp
 
@@ -30,6 +32,11 @@ microseconds and places in pixels unless a name says otherwise.
 """
 
 
+COMMON = "common"
+COMMON_ABOUT = "What all parts of the package use."
+
+
+@functools.cache
 def homes() -> dict[str, str]:
     """Return the module that each public name is imported from, as the front door states it."""
     front = Path(amiwarp.__file__)
@@ -46,46 +53,79 @@ def homes() -> dict[str, str]:
     return {name: found[name] for name in names}
 
 
+def room_of(module: str) -> str:
+    """Return the room of a module, or :data:`COMMON` if it lies in none."""
+    below = module.split(".")[1:2]
+    package = below and importlib.import_module(f"amiwarp.{below[0]}")
+    return below[0] if package and hasattr(package, "__path__") else COMMON
+
+
 def rooms(order: list[str]) -> dict[str, list[str]]:
-    """Return the public names by room; the rooms are in ``order``, then by name."""
+    """Return the public names by room; the rooms are in ``order``, then by name, those in no room last."""
     out: dict[str, list[str]] = {}
     for name, module in sorted(homes().items(), key=lambda item: item[0].lower()):
-        out.setdefault(module.split(".")[1] if "." in module else "", []).append(name)
-    return {room: out[room] for room in sorted(out, key=lambda r: (order.index(r) if r in order else len(order), r))}
+        out.setdefault(room_of(module), []).append(name)
+    known = {room: i for i, room in enumerate(order)}
+    return {room: out[room] for room in sorted(out, key=lambda r: (r == COMMON, known.get(r, len(order)), r))}
 
 
-def summary(thing: Any) -> str:
-    """Return the first sentence of the documentation of ``thing``, or nothing."""
-    if not (inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, ModuleType)):
-        return ""
-    text = " ".join((inspect.getdoc(thing) or "").split("\n\n")[0].split())
-    return re.split(r"(?<=[.:]) (?=[A-Z])", text)[0].rstrip(":")
+def alias(name: str) -> tuple[str, str]:
+    """Return what a public name that is neither class nor function stands for, and its documentation."""
+    module = importlib.import_module(homes()[name])
+    analyzer = ModuleAnalyzer.for_module(module.__name__)
+    analyzer.analyze()
+    doc = " ".join(analyzer.attr_docs.get(("", name), [])).strip()
+    for node in ast.parse(Path(str(module.__file__)).read_text()).body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+            return ast.unparse(node.value), doc  # type: ignore[attr-defined]
+    return "", doc
 
 
-def directive(thing: Any) -> str:
-    """Return the autodoc directive that documents ``thing``."""
+def documented(thing: Any) -> bool:
+    """Return whether ``thing`` carries a documentation of its own."""
+    return inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, ModuleType)
+
+
+def summary(name: str) -> str:
+    """Return the first sentence of the documentation of a public name."""
+    thing = getattr(amiwarp, name)
+    return first_sentence((inspect.getdoc(thing) or "") if documented(thing) else alias(name)[1])
+
+
+def first_sentence(text: str) -> str:
+    """Return the first sentence of a docstring."""
+    line = " ".join(text.split("\n\n")[0].split())
+    return re.split(r"(?<=[.:]) (?=[A-Z])", line)[0].rstrip(":")
+
+
+def directive(name: str) -> str:
+    """Return the directive that documents a public name."""
+    thing = getattr(amiwarp, name)
     if inspect.isclass(thing):
-        return "autoexception" if issubclass(thing, BaseException) else "autoclass"
-    return "autofunction" if inspect.isroutine(thing) else "autodata"
+        return f".. {'autoexception' if issubclass(thing, BaseException) else 'autoclass'}:: {name}\n\n"
+    if documented(thing):
+        return f".. autofunction:: {name}\n\n"
+    meaning, doc = alias(name)
+    return f".. py:type:: {name}\n   :canonical: {meaning}\n\n   {doc}\n\n"
 
 
 def name_page(name: str) -> str:
     """Return the page of one public name."""
-    thing = getattr(amiwarp, name)
     return (
         heading(name)
-        + f".. currentmodule:: amiwarp\n\n.. {directive(thing)}:: {name}\n\n"
+        + f".. currentmodule:: amiwarp\n\n{directive(name)}"
         + f".. minigallery:: amiwarp.{name}\n   :add-heading: Tutorials\n   :heading-level: -\n"
     )
 
 
 def room_page(room: str, names: list[str]) -> str:
     """Return the page of one room: what it is for, and a table of its names."""
-    module = importlib.import_module(f"amiwarp.{room}") if room else amiwarp
-    rows = "".join(f"   * - :py:obj:`~amiwarp.{name}`\n     - {summary(getattr(amiwarp, name))}\n" for name in names)
+    about = COMMON_ABOUT if room == COMMON else first_sentence(importlib.import_module(f"amiwarp.{room}").__doc__ or "")
+    rows = "".join(f"   * - :py:obj:`~amiwarp.{name}`\n     - {summary(name)}\n" for name in names)
     table = f".. list-table::\n   :class: names\n   :widths: 25 75\n\n{rows}\n"
     toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   amiwarp.{name}\n" for name in names)
-    return heading(room or "amiwarp") + f"{summary(module)}\n\n{table}{toctree}"
+    return heading(room) + f"{about}\n\n{table}{toctree}"
 
 
 def index_page(found: dict[str, list[str]]) -> str:
@@ -93,9 +133,9 @@ def index_page(found: dict[str, list[str]]) -> str:
     rows = ""
     for room, names in found.items():
         links = ", ".join(f":py:obj:`~amiwarp.{name}`" for name in names)
-        rows += f"   * - :doc:`{room or 'amiwarp'}`\n     - {links}\n"
+        rows += f"   * - :doc:`{room}`\n     - {links}\n"
     table = f".. list-table::\n   :class: names\n   :widths: 20 80\n\n{rows}\n"
-    toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   {room or 'amiwarp'}\n" for room in found)
+    toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   {room}\n" for room in found)
     return heading("Python") + INDEX + table + toctree
 
 
@@ -104,7 +144,7 @@ def write(app: Sphinx, config: Any) -> None:
     found = rooms(config.api_rooms)
     pages = {"index.rst": index_page(found)}
     for room, names in found.items():
-        pages[f"{room or 'amiwarp'}.rst"] = room_page(room, names)
+        pages[f"{room}.rst"] = room_page(room, names)
         pages.update({f"amiwarp.{name}.rst": name_page(name) for name in names})
     write_pages(Path(app.srcdir) / "reference" / "api", pages)
 

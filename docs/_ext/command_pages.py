@@ -30,15 +30,19 @@ def plain(markup: str | None) -> str:
 
 
 def paragraphs(text: str) -> str:
-    """Return the paragraphs of a help text, each on one line, as reStructuredText."""
-    return "\n\n".join(escape(" ".join(part.split())) for part in text.split("\n\n"))
+    """Return the paragraphs of a help text, each on one line, as reStructuredText; options are set as code."""
+    joined = "\n\n".join(escape(" ".join(part.split())) for part in text.split("\n\n"))
+    return re.sub(r"(?<![\w-])(--[a-z][a-z-]*)", r"``\1``", joined)
+
+
+def argument_name(one: Any) -> str:
+    """Return the name of an argument in capitals."""
+    return str(one.name).upper()
 
 
 def parameter(one: Any, ctx: Any) -> str:
     """Return the description of an argument or an option: its name, its help, its default and its limits."""
     names, text = one.get_help_record(ctx)
-    if one.param_type_name == "argument":
-        names = str(one.metavar or one.name).strip("[]<>").upper()
     match = re.fullmatch(r"(.*?)\s*\[([^\[\]]*|\w+\[[^\]]*\])\]", text, re.S)
     notes = ""
     if match and re.search(r"default:|required|<|>", match[2]):
@@ -46,14 +50,15 @@ def parameter(one: Any, ctx: Any) -> str:
     body = paragraphs(plain(text)) or " "
     extra = f"\n\n   *{escape(notes)}*" if notes else ""
     if one.param_type_name == "argument":
-        return f"``{names}``\n   {body}{extra}\n\n"
-    return f".. option:: {names}\n\n   {body}{extra}\n\n"
+        return f"``{argument_name(one)}``\n   {body}{extra}\n\n"
+    return f".. option:: {names.replace(' range>', '>')}\n\n   {body}{extra}\n\n"
 
 
 def usage(command: Any, ctx: Any) -> str:
     """Return the line that shows how the command is called."""
-    pieces = " ".join(piece for piece in command.collect_usage_pieces(ctx))
-    return f"{ctx.command_path} {pieces}"
+    arguments = [one for one in command.params if one.param_type_name == "argument"]
+    pieces = [argument_name(one) if one.required else f"[{argument_name(one)}]" for one in arguments]
+    return " ".join([ctx.command_path, *pieces, "[OPTIONS]"])
 
 
 def command_page(name: str, command: Any, parent: Any) -> str:

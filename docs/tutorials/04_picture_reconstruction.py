@@ -2,16 +2,18 @@
 A picture from events
 =====================
 
-Events tell where the brightness changes, not how bright a pixel is. Behind a rotating prism every pixel sees a small
-circle of the scene in each turn, so the changes connect neighbouring places in all directions. From one turn amiwarp
-solves for the log intensity of the whole picture, without a neural network. This tutorial reconstructs a picture and
-compares it with the original.
+Events tell where the brightness changes, not how bright a pixel is. Behind a
+rotating prism every pixel sees a small circle of the scene in each turn, so the
+changes connect neighbouring places in all directions. From one turn amiwarp solves
+for the log intensity of the whole picture, without a neural network. This tutorial
+reconstructs a picture and compares it with the original.
 
 The recording
 -------------
 
-:class:`amiwarp.Simulation` describes a recording before it is made. Its :meth:`~amiwarp.Simulation.log_view` is the
-ground truth: the log intensity that the camera would see without the prism.
+:class:`amiwarp.Simulation` describes a recording before it is made. Its
+:meth:`~amiwarp.Simulation.log_view` is the ground truth: the log intensity that the
+camera would see without the prism.
 """
 
 import math
@@ -24,27 +26,33 @@ import amiwarp
 
 camera = amiwarp.Camera.from_fov(320, 240, math.radians(60))
 prism = amiwarp.Prism(math.radians(1.5))
-simulation = amiwarp.Simulation(amiwarp.Scene.from_picture(mapfile), camera, prism, duration_s=0.2, seed=0)
+scene = amiwarp.Scene.from_picture(mapfile)
+simulation = amiwarp.Simulation(scene, camera, prism, duration_s=0.2, seed=0)
 recording = simulation.run()
 original = simulation.log_view()
-print(f"{len(recording.events):,} events in {0.2 * 720 / 60:.1f} turns of the prism")
+print(
+    f"{len(recording.events):,} events in {0.2 * 720 / 60:.1f} turns of the prism"
+)
 
 # %%
 # One turn, and less
 # ------------------
 #
-# Here the true model is known, so no calibration is needed. For a recording of yours give the result of
-# :func:`amiwarp.calibrate` instead. The window starts after 50 ms, because the first event of a pixel has no earlier
-# one to be compared with.
+# Here the true model is known, so no calibration is needed. For a recording of
+# yours give the result of :func:`amiwarp.calibrate` instead. The window starts
+# after 50 ms, because the first event of a pixel has no earlier one to be compared
+# with.
 
 model = amiwarp.truth_model(camera, recording.truth, prism.flat_side)
-pictures = {
-    turns: amiwarp.reconstruct(recording, model=model, start_us=50_000, turns=turns) for turns in (0.25, 0.5, 1.0)
-}
+pictures = {}
+for turns in (0.25, 0.5, 1.0):
+    pictures[turns] = amiwarp.reconstruct(
+        recording, model=model, start_us=50_000, turns=turns
+    )
 
 
 def fitted(picture):
-    """Scale the picture to the original: events determine neither the gain nor the offset."""
+    """Fit gain and offset to the original: events determine neither."""
     gain, offset = np.polyfit(picture.log.ravel(), original.ravel(), 1)
     return gain * picture.log + offset
 
@@ -67,25 +75,27 @@ plt.show()
 # The correlation of the log intensities needs no scale.
 
 for turns, picture in pictures.items():
-    correlation = np.corrcoef(picture.log.ravel(), original.ravel())[0, 1]
-    print(f"{turns:4g} turns: {picture.pairs:9,} event pairs, correlation {correlation:.3f}, {picture.seconds:.1f} s")
+    value = np.corrcoef(picture.log.ravel(), original.ravel())[0, 1]
+    print(f"{turns:4g} turns: {picture.pairs:7,} pairs, correlation {value:.3f}")
 
 # %%
 # Where events determine the picture
 # ----------------------------------
 #
-# Regions without texture give no events. There the picture is filled smoothly from around, and
-# :attr:`amiwarp.Picture.known` is false. With ``fill="none"`` these pixels are NaN.
+# Regions without texture give no events. There the picture is filled smoothly from
+# around, and :attr:`amiwarp.Picture.known` is false. With ``fill="none"`` these
+# pixels are NaN.
 
 known = pictures[1.0].known
 error = np.abs(fitted(pictures[1.0]) - original)
 figure, axes = plt.subplots(1, 2)
 axes[0].imshow(known)
-axes[0].set_title(f"determined by events: {known.mean():.0%} of the pixels")
+axes[0].set_title(f"determined by events: {known.mean():.0%}")
 drawn = axes[1].imshow(error, cmap="cividis", vmax=np.percentile(error, 99))
 axes[1].set_title("error of one turn (log intensity)")
 figure.colorbar(drawn, ax=axes[1], shrink=0.85)
 for ax in axes:
     ax.set(xticks=[], yticks=[])
 plt.show()
-print(f"median error {np.median(error[known]):.3f} where events determine it, {np.median(error[~known]):.3f} elsewhere")
+print(f"median error {np.median(error[known]):.3f} where events determine it")
+print(f"             {np.median(error[~known]):.3f} elsewhere")
