@@ -1,4 +1,4 @@
-"""What makes the pages of the documentation site: references, tables of measurements, links, the check for the network."""
+"""What makes the pages of the site: references, tables of measurements, links, and the check for the network."""
 
 from pathlib import Path
 from types import ModuleType
@@ -29,6 +29,8 @@ def test_every_public_name_has_a_page(extension: Any) -> None:
         name for name in amiwarp.__all__ if name != "__version__"
     )
     assert list(found)[:2] == ["viewer", "calib"]
+    pages = [api.page_of(name).lower() for name in api.homes()]
+    assert len(set(pages)) == len(pages)
     assert "autoclass:: Camera" in api.name_page("Camera")
     assert "autofunction:: calibrate" in api.name_page("calibrate")
     assert "autoexception:: AmiwarpError" in api.name_page("AmiwarpError")

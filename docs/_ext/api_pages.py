@@ -82,6 +82,12 @@ def alias(name: str) -> tuple[str, str]:
     return "", doc
 
 
+def page_of(name: str) -> str:
+    """Return the name of the page of a public name; no two differ in case only, as some file systems cannot."""
+    twin = any(name != other and name.lower() == other.lower() for other in homes())
+    return f"amiwarp.{name}" + ("-function" if twin and name.islower() else "")
+
+
 def documented(thing: Any) -> bool:
     """Return whether ``thing`` carries a documentation of its own."""
     return inspect.isclass(thing) or inspect.isroutine(thing) or isinstance(thing, ModuleType)
@@ -124,7 +130,7 @@ def room_page(room: str, names: list[str]) -> str:
     about = COMMON_ABOUT if room == COMMON else first_sentence(importlib.import_module(f"amiwarp.{room}").__doc__ or "")
     rows = "".join(f"   * - :py:obj:`~amiwarp.{name}`\n     - {summary(name)}\n" for name in names)
     table = f".. list-table::\n   :class: names\n   :widths: 25 75\n\n{rows}\n"
-    toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   amiwarp.{name}\n" for name in names)
+    toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   {page_of(name)}\n" for name in names)
     return heading(room) + f"{about}\n\n{table}{toctree}"
 
 
@@ -145,7 +151,7 @@ def write(app: Sphinx, config: Any) -> None:
     pages = {"index.rst": index_page(found)}
     for room, names in found.items():
         pages[f"{room}.rst"] = room_page(room, names)
-        pages.update({f"amiwarp.{name}.rst": name_page(name) for name in names})
+        pages.update({f"{page_of(name)}.rst": name_page(name) for name in names})
     write_pages(Path(app.srcdir) / "reference" / "api", pages)
 
 
