@@ -65,7 +65,7 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "remove_config_comments": True,
     "show_memory": False,
-    "min_reported_time": 0,
+    "min_reported_time": 3600,
     "plot_gallery": True,
     "write_computation_times": False,  # its pages load scripts from the network
     "image_srcset": ["2x"],
