@@ -35,6 +35,7 @@ myst_heading_anchors = 4
 smartquotes = False  # options begin with two hyphens
 napoleon_google_docstring = False
 napoleon_use_rtype = False
+napoleon_use_ivar = True  # the members are documented too
 autodoc_default_options = {"members": True, "undoc-members": True, "member-order": "bysource"}
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"

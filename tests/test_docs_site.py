@@ -55,6 +55,15 @@ def test_a_command_page_has_every_option(extension: Any) -> None:
     assert "*default: 0; 0<=x<=2147483647*" in page
 
 
+def test_help_is_shown_unchanged(extension: Any) -> None:
+    import docutils.core
+
+    text = "tcp:HOST:PORT, http://example.org, NAME_0.png, *, `x` | c:\\x ..."
+    tree = docutils.core.publish_doctree(extension("generated_files").escape(text))
+    assert tree.astext() == text
+    assert [node.tagname for node in tree.findall()] == ["document", "paragraph", "#text"]
+
+
 def test_resources_from_the_network_are_seen(extension: Any, tmp_path: Path) -> None:
     (tmp_path / "good.html").write_text(
         '<a href="https://example.org/">a link</a><img src="picture.png"><link href="_static/a.css" rel="stylesheet">'

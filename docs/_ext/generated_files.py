@@ -13,7 +13,8 @@ def heading(text: str, line: str = "=") -> str:
 
 def escape(text: str) -> str:
     """Return ``text`` such that reStructuredText shows it unchanged."""
-    return re.sub(r"([\\*`|_])", r"\\\1", text)
+    marked = re.sub(r"([\\*`|_])", r"\\\1", text)
+    return re.sub(r":(?=\S)", r"\\:", marked)  # else what looks like an address becomes a link
 
 
 def write_page(path: Path, text: str) -> None:
