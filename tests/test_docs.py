@@ -1,4 +1,4 @@
-"""The documentation's links lead somewhere, headings included."""
+"""The documentation's links lead somewhere, headings included, and its index names every page."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = ROOT / "docs"
+MADE = [ROOT / line[1:] for line in (ROOT / ".gitignore").read_text().split() if line.startswith("/docs/")]
+"""What the build of the site writes next to the sources."""
+SOURCES = [
+    page for page in sorted(DOCS.rglob("*.md")) if not any(page == made or made in page.parents for made in MADE)
+]
+PAGES = [*sorted(ROOT.glob("*.md")), *SOURCES, *sorted((ROOT / "benchmarks" / "results").glob("*.md"))]
 
 
 def anchors(page: Path) -> set[str]:
@@ -26,7 +32,16 @@ def broken(page: Path) -> list[str]:
     return out
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def unnamed(index: str, names: list[str]) -> list[str]:
+    """Pages that no table of contents of ``index`` names; * stands for any name in a folder, as for Sphinx."""
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", index, re.S)
+    lines = [line.strip() for tree in trees for line in tree.splitlines() if line.strip() and not line.startswith(":")]
+    entries = [re.sub(r".*<(.*)>$", r"\1", line) for line in lines]
+    patterns = [re.compile(re.escape(entry).replace(r"\*", "[^/]*")) for entry in entries]
+    return [name for name in names if not any(pattern.fullmatch(name) for pattern in patterns)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere(page: Path) -> None:
     assert broken(page) == []
 
@@ -38,5 +53,17 @@ def test_a_broken_link_is_seen(tmp_path: Path) -> None:
 
 
 def test_the_index_names_every_page() -> None:
-    index = (ROOT / "docs" / "index.md").read_text()
-    assert [page.name for page in PAGES if page.name != "index.md" and page.name not in index] == []
+    names = [page.relative_to(DOCS).with_suffix("").as_posix() for page in SOURCES if page != DOCS / "index.md"]
+    assert unnamed((DOCS / "index.md").read_text(), [*names, "changelog"]) == []
+    assert len(names) >= 10
+
+
+def test_a_page_that_is_not_named_is_seen() -> None:
+    index = "a\n```{toctree}\n:glob:\n\none\nTwo <two>\nhow-to/*\n```\nthree\n"
+    assert unnamed(index, ["one", "two", "three", "how-to/four", "how-to/deep/five"]) == ["three", "how-to/deep/five"]
+
+
+def test_what_the_site_makes_is_not_checked_as_a_source() -> None:
+    assert DOCS / "_build" in MADE
+    assert DOCS / "changelog.md" in MADE
+    assert all("_build" not in page.parts and page.name != "changelog.md" for page in SOURCES)

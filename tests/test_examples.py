@@ -1,4 +1,4 @@
-"""Each example runs, and the README's program is one of them."""
+"""Each example runs, and the README's program is one of them. The tutorials run when the documentation is built."""
 
 import re
 import runpy
@@ -8,10 +8,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 
 
 def test_there_are_examples() -> None:
-    assert len(EXAMPLES) >= 4
+    assert len(EXAMPLES) >= 3
+    assert len(TUTORIALS) >= 5
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)

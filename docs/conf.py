@@ -1,0 +1,85 @@
+"""Settings of the documentation: ``sphinx-build -W --keep-going docs docs/_build/html``."""
+
+import os
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE / "_ext"))
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import amiwarp  # noqa: E402
+
+project = "amiwarp"
+author = "the amiwarp authors"
+project_copyright = author
+version = release = amiwarp.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "api_pages",
+    "command_pages",
+    "offline",
+    "repository_pages",
+    "results_table",
+]
+exclude_patterns = ["_build", "tutorials", "gallery/backreferences", "**/*.ipynb"]
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4
+
+smartquotes = False  # options begin with two hyphens
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True  # the members are documented too
+autodoc_default_options = {"members": True, "undoc-members": True, "member-order": "bysource"}
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 88
+python_display_short_literal_types = True
+toc_object_entries_show_parents = "hide"
+
+api_rooms = [
+    "optics", "events", "io", "imaging", "simulation", "calib", "compensation", "reconstruction", "live", "plotting",
+    "studies", "viewer",
+]  # fmt: skip
+
+repository_pages = {
+    "changelog": "CHANGELOG.md",
+    "contributing": "CONTRIBUTING.md",
+    "reference/measurements/*": "benchmarks/results/*.md",
+}
+repository_aliases = {"README.md": "index"}
+
+sphinx_gallery_conf = {
+    "examples_dirs": "tutorials",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"[\\/]\d\d_",
+    "within_subsection_order": "FileNameSortKey",
+    "backreferences_dir": "gallery/backreferences",
+    "doc_module": ("amiwarp",),
+    "abort_on_example_error": True,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "min_reported_time": 3600,
+    "plot_gallery": True,
+    "write_computation_times": False,  # its pages load scripts from the network
+    "image_srcset": ["2x"],
+    "reset_modules": ("matplotlib", "tutorial_style.reset"),
+}
+
+html_theme = "furo"
+html_title = "amiwarp"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_show_copyright = False
+html_math_renderer = "mathml"
+pygments_style = "friendly"
+html_theme_options = {"footer_icons": [], "top_of_page_buttons": []}

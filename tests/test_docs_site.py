@@ -1,0 +1,130 @@
+"""What makes the pages of the site: references, tables of measurements, links, and the check for the network."""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+import amiwarp
+
+ROOT = Path(__file__).parents[1]
+
+pytest.importorskip("sphinx", reason="needs the extra docs")
+
+
+@pytest.fixture
+def extension(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A function that imports one of the site's extensions."""
+    import importlib
+
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    return importlib.import_module
+
+
+def test_every_public_name_has_a_page(extension: Any) -> None:
+    api: ModuleType = extension("api_pages")
+    found = api.rooms(["viewer", "calib"])
+    assert sorted(name for names in found.values() for name in names) == sorted(
+        name for name in amiwarp.__all__ if name != "__version__"
+    )
+    assert list(found)[:2] == ["viewer", "calib"]
+    pages = [api.page_of(name).lower() for name in api.homes()]
+    assert len(set(pages)) == len(pages)
+    assert "autoclass:: Camera" in api.name_page("Camera")
+    assert "autofunction:: calibrate" in api.name_page("calibrate")
+    assert "autoexception:: AmiwarpError" in api.name_page("AmiwarpError")
+
+
+def test_the_summary_is_the_first_sentence(extension: Any) -> None:
+    assert extension("api_pages").first_sentence("Do this\nnow. And that.\n\nMore.") == "Do this now."
+
+
+def test_a_command_page_has_every_option(extension: Any) -> None:
+    commands = extension("command_pages")
+    group = commands.typer.main.get_command(commands.application)
+    parent = commands.typer.Context(group, info_name="amiwarp")
+    assert {"demo", "calibrate", "live"} <= set(group.commands)
+    for name, command in group.commands.items():
+        page = commands.command_page(name, command, parent)
+        options = [option for one in command.params for option in one.opts if option.startswith("--")]
+        assert [option for option in options if f"{option}" not in page and option != "--help"] == []
+    page = commands.command_page("calibrate", group.commands["calibrate"], parent)
+    assert "amiwarp calibrate RECORDING [OUT] [OPTIONS]" in page
+    assert ".. option:: --seed <int>" in page
+    assert "*default: 0; 0<=x<=2147483647*" in page
+
+
+def test_help_is_shown_unchanged(extension: Any) -> None:
+    import docutils.core
+
+    text = "tcp:HOST:PORT, http://example.org, NAME_0.png, *, `x` | c:\\x ..."
+    tree = docutils.core.publish_doctree(extension("generated_files").escape(text))
+    assert tree.astext() == text
+    assert [node.tagname for node in tree.findall()] == ["document", "paragraph", "#text"]
+
+
+def test_resources_from_the_network_are_seen(extension: Any, tmp_path: Path) -> None:
+    (tmp_path / "good.html").write_text(
+        '<a href="https://example.org/">a link</a><img src="picture.png"><link href="_static/a.css" rel="stylesheet">'
+    )
+    bad = {
+        "a.html": '<script async src="https://example.org/a.js"></script>',
+        "b.html": "<img alt='x' src='//example.org/a.png'>",
+        "c.html": '<link rel="stylesheet" href="http://example.org/a.css">',
+        "d.css": "@font-face { src: url(https://example.org/a.woff2) }",
+        "e.css": '@import "https://example.org/e.css";',
+    }
+    for name, text in bad.items():
+        (tmp_path / name).write_text(text)
+    found = extension("offline").remote_resources(tmp_path)
+    assert [one.partition(":")[0] for one in found] == list(bad)
+
+
+def test_links_lead_to_the_pages_of_the_site(extension: Any, tmp_path: Path) -> None:
+    pages = extension("repository_pages")
+    docs = tmp_path / "docs"
+    for name in ("docs/index.md", "docs/how-to/gpu.md", "results/speed.md", "results/speed.json", "README.md"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("x")
+    shown = pages.shown_files(docs, {"reference/*": "results/*.md"})
+    assert shown == {"reference/speed": tmp_path / "results" / "speed.md"}
+
+    def rewrite(text: str, page: str) -> str:
+        return str(pages.rewrite(text, page, docs, shown, {"README.md": "index"}))
+
+    text = "[a](../../results/speed.md#fast) [b](../../results) [c](../../README.md) [d](https://e.org/) [e](#here)"
+    assert rewrite(text, "how-to/gpu") == (
+        "[a](../reference/speed.md#fast) b [c](../index.md) [d](https://e.org/) [e](#here)"
+    )
+    assert rewrite("[a](../docs/how-to/gpu.md) [b](speed.json) [c](none.md)", "reference/speed") == (
+        "[a](../how-to/gpu.md) [b](../../results/speed.json) [c](none.md)"
+    )
+    assert rewrite("![picture](../README.md)", "reference/speed") == "![picture](../index.md)"
+
+
+def test_a_column_is_scaled_and_formatted(extension: Any) -> None:
+    results = extension("results_table")
+    column = results.Column.parse("Mev/s | rate.cpu | *1e-6 .1f")
+    assert column.text([{"rate": {"cpu": 12_340_000.0}}]) == ("12.3", True)
+    assert column.text([{"rate": {}}]) == ("–", False)
+    assert results.Column.parse("Name | name").text([{"name": "exact"}]) == ("exact", False)
+    assert results.Column.parse("Ok | ok").text([{"ok": True}]) == ("yes", False)
+    assert results.Column.parse("First | list.1").text([{"list": [1.5, 2.5]}]) == ("2.5", True)
+    with pytest.raises(results.ResultsError, match="expected 'heading"):
+        results.Column.parse("only a heading")
+
+
+def test_rows_are_selected_and_summarised(extension: Any) -> None:
+    results = extension("results_table")
+    data = {"motions": {"still": [{"rpm": 60, "e": 1.0}, {"rpm": 60, "e": 3.0}], "fast": [{"rpm": 90, "e": 5.0}]}}
+    rows = list(results.rows_at(data, "motions.*"))
+    assert [row["key"] for row in rows] == ["still", "still", "fast"]
+    groups = results.group(rows, ["key"])
+    median, count = (results.Column.parse(line) for line in ("E | median e | .2f", "n | count"))
+    assert [(median.text(same)[0], count.text(same)[0]) for same in groups] == [("2.00", "2"), ("5.00", "1")]
+    assert results.select(rows, "key = fast; rpm = 90") == [{"key": "fast", "rpm": 90, "e": 5.0}]
+    with pytest.raises(results.ResultsError, match="no row is left"):
+        results.select(rows, "key = slow")
+    with pytest.raises(results.ResultsError, match="no 'none' in the file"):
+        list(results.rows_at(data, "none"))
