@@ -53,6 +53,9 @@ from .optics.models import ExactModel as ExactModel
 from .optics.models import Model as Model
 from .optics.models import ModelError as ModelError
 from .optics.models import RadialCircleModel as RadialCircleModel
+from .optics.models import apex_from_deflection as apex_from_deflection
+from .optics.models import deflection_from_apex as deflection_from_apex
+from .optics.models import predicted_error as predicted_error
 from .optics.prism import FlatSide as FlatSide
 from .optics.prism import NominalPrism as NominalPrism
 from .optics.prism import Prism as Prism
