@@ -170,9 +170,28 @@ def link_by_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, contnod
     return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, contnode)
 
 
+class AttributeText:
+    """Keep the text of attributes as it is written: Napoleon takes the words before a colon for a type."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, list[str]] = {}
+
+    def keep(self, app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+        """Store the text, before Napoleon."""
+        if what in ("attribute", "data", "property"):
+            self.kept[name] = list(lines)
+
+    def restore(self, app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+        """Put the text back, after Napoleon."""
+        lines[:] = self.kept.pop(name, lines)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the generator."""
     app.add_config_value("api_rooms", [], "env")
     app.connect("config-inited", write)
     app.connect("missing-reference", link_by_name)
+    text = AttributeText()
+    app.connect("autodoc-process-docstring", text.keep, priority=400)
+    app.connect("autodoc-process-docstring", text.restore, priority=600)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
