@@ -1,0 +1,1 @@
+"""Worlds: three-dimensional scenes that a simulated camera moves through."""

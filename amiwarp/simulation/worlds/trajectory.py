@@ -1,0 +1,259 @@
+"""Trajectories: position and orientation of a camera or a body over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.output import write_text
+from amiwarp.regular_file import check_regular
+from amiwarp.validation import array, real
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+LARGEST_SPEED = 1e3
+"""Largest speed of a body or camera [m/s]: more is a jump."""
+LARGEST_TURN_RATE = 1e3
+"""Largest angular velocity of a body or camera [rad/s]: more is a jump."""
+COLUMNS = 8
+"""Columns of a table of poses: t, x, y, z, qx, qy, qz, qw."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses over time, interpolated smoothly, and constant before the first and after the last.
+
+    With three or more poses the position follows a cubic spline and the orientation a spline with continuous angular
+    acceleration; with two poses both are linear. Raises :class:`AmiwarpError` for tables of other shapes, times that do
+    not rise, and jumps.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> path = amiwarp.Trajectory([0.0, 1.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0, 1], [0, 0, 0, 1]])
+    >>> rotation, position = path.poses(np.array([0.25]))
+    >>> position.tolist()
+    [[0.25, 0.0, 0.0]]
+    """
+
+    t: ArrayLike
+    """Times [s] from the start of the recording, rising, shape ``(n,)``."""
+    position: ArrayLike
+    """Positions in the world [m], shape ``(n, 3)``."""
+    rotation: ArrayLike
+    """Orientations as unit quaternions (x, y, z, w), from the camera's or body's frame to the world's, ``(n, 4)``."""
+
+    def __post_init__(self) -> None:
+        t = array(self.t, "trajectory's times").astype(np.float64)
+        position = array(self.position, "trajectory's positions").astype(np.float64)
+        rotation = array(self.rotation, "trajectory's orientations").astype(np.float64)
+        if t.ndim != 1 or not t.size or position.shape != (t.size, 3) or rotation.shape != (t.size, 4):
+            raise AmiwarpError(
+                f"trajectory has times {t.shape}, positions {position.shape}, orientations {rotation.shape}; "
+                "give shapes (n,), (n, 3) and (n, 4)"
+            )
+        if not all(np.isfinite(values).all() for values in (t, position, rotation)):
+            raise AmiwarpError("trajectory holds values that are not finite; drop these poses")
+        if not (np.diff(t) > 0).all():
+            raise AmiwarpError("trajectory's times do not rise; sort the poses and drop doubles")
+        length = np.linalg.norm(rotation, axis=1, keepdims=True)
+        if not (np.abs(length - 1.0) < 0.01).all():
+            raise AmiwarpError(
+                f"trajectory has a quaternion of length {float(length.min()):.3g}; give unit quaternions"
+            )
+        for name, values in (("t", t), ("position", position), ("rotation", rotation / length)):
+            object.__setattr__(self, name, values)
+        self._check_jumps()
+        object.__setattr__(self, "_place", None)
+
+    def _check_jumps(self) -> None:
+        from scipy.spatial.transform import Rotation
+
+        t, position = self._table()
+        if t.size < 2:
+            return
+        step = np.diff(t)
+        speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
+        orientation = Rotation.from_quat(self.rotation)
+        rate = (orientation[:-1].inv() * orientation[1:]).magnitude() / step
+        for what, found, limit, unit in (
+            ("moves", speed, LARGEST_SPEED, "m/s"), ("turns", rate, LARGEST_TURN_RATE, "rad/s")
+        ):  # fmt: skip
+            if found.max() > limit:
+                at = float(t[int(np.argmax(found))])
+                raise AmiwarpError(
+                    f"trajectory {what} at {found.max():.3g} {unit} after {at:.6g} s, over {limit:g}: it jumps; "
+                    "split it, or check the units of its times (s) and positions (m)"
+                )
+
+    def _table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return np.asarray(self.t, np.float64), np.asarray(self.position, np.float64)
+
+    @property
+    def moves(self) -> bool:
+        """Whether any two poses differ."""
+        position, rotation = np.asarray(self.position), np.asarray(self.rotation)
+        return bool((position != position[0]).any() or (rotation != rotation[0]).any())
+
+    def poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return orientations and positions at times.
+
+        Parameters
+        ----------
+        t : array_like
+            Times [s], shape ``(k,)``.
+
+        Returns
+        -------
+        rotation : ndarray
+            Matrices from the camera's or body's frame to the world's, shape ``(k, 3, 3)``.
+        position : ndarray
+            Positions in the world [m], shape ``(k, 3)``.
+        """
+        from scipy.interpolate import CubicSpline
+        from scipy.spatial.transform import Rotation, RotationSpline, Slerp
+
+        at, position = self._table()
+        orientation = Rotation.from_quat(self.rotation)
+        inside = np.clip(np.atleast_1d(np.asarray(t, np.float64)), at[0], at[-1])
+        if at.size == 1:
+            ones = np.ones(inside.size)
+            return np.repeat(orientation.as_matrix(), inside.size, axis=0), ones[:, None] * position
+        if at.size == 2:
+            along = (inside - at[0]) / (at[1] - at[0])
+            between = position[0] + along[:, None] * (position[1] - position[0])
+            return Slerp(at, orientation)(inside).as_matrix(), between
+        if self._place is None:  # splines are made once
+            object.__setattr__(self, "_place", (RotationSpline(at, orientation), CubicSpline(at, position)))
+        turn, place = self._place
+        return turn(inside).as_matrix(), np.asarray(place(inside))
+
+    @classmethod
+    def still(
+        cls, position: ArrayLike, *, look_at: ArrayLike | None = None, rotation: ArrayLike = (0, 0, 0, 1)
+    ) -> Trajectory:
+        """Return a trajectory that never moves.
+
+        Parameters
+        ----------
+        position : array_like
+            Position [m], shape ``(3,)``.
+        look_at : array_like, optional
+            Point [m] that the camera's axis goes through, shape ``(3,)``; then ``rotation`` is not used.
+        rotation : array_like
+            Unit quaternion (x, y, z, w).
+
+        Returns
+        -------
+        Trajectory
+            One pose, for all times.
+        """
+        quaternion = rotation if look_at is None else looking_at(position, look_at).as_quat()
+        return cls([0.0], [position], [quaternion])
+
+    @classmethod
+    def from_function(
+        cls, pose: Callable[[float], tuple[Rotation, ArrayLike]], duration_s: float, *, rate_hz: float = 100.0
+    ) -> Trajectory:
+        """Sample a function of time.
+
+        Parameters
+        ----------
+        pose : callable
+            Returns orientation (``scipy.spatial.transform.Rotation``) and position [m] at a time [s].
+        duration_s : float
+            Length of the trajectory [s].
+        rate_hz : float
+            Samples per second.
+
+        Returns
+        -------
+        Trajectory
+            The sampled trajectory.
+        """
+        duration_s = real(duration_s, "duration_s", 1e-6, 1e6, " s")
+        t = np.linspace(0.0, duration_s, max(2, round(duration_s * real(rate_hz, "rate_hz", 1e-3, 1e6)) + 1))
+        poses = [pose(float(at)) for at in t]
+        return cls(t, [place for _, place in poses], [turn.as_quat() for turn, _ in poses])
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Trajectory:
+        """Read poses from a text file: TUM (spaces) or CSV (commas), eight columns, ``#`` for comments.
+
+        Parameters
+        ----------
+        path : str or Path
+            File with the columns t [s], x, y, z [m], qx, qy, qz, qw; a CSV may begin with a header line.
+
+        Returns
+        -------
+        Trajectory
+            The poses, their times counted from the first.
+
+        Raises
+        ------
+        AmiwarpError
+            If the file is no such table.
+        """
+        path = Path(path)
+        check_regular(path)
+        rows = []
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+            words = line.split("#")[0].replace(",", " ").split()
+            if not words or (number == 1 and words[0].lower() in ("t", "time", "timestamp", "t_s")):
+                continue
+            try:
+                rows.append([float(word) for word in words])
+            except ValueError as error:
+                raise AmiwarpError(
+                    f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw"
+                ) from error
+            if len(rows[-1]) != COLUMNS:
+                raise AmiwarpError(
+                    f"{path}: line {number} has {len(rows[-1])} numbers; expected 8: t x y z qx qy qz qw"
+                )
+        if not rows:
+            raise AmiwarpError(f"{path}: holds no poses; expected lines of t x y z qx qy qz qw")
+        table = np.array(rows)
+        try:
+            return cls(table[:, 0] - table[0, 0], table[:, 1:4], table[:, 4:])
+        except AmiwarpError as error:
+            raise AmiwarpError(f"{path}: {error}") from error
+
+    def save_tum(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the poses as a TUM file: lines of t x y z qx qy qz qw, separated by spaces.
+
+        Parameters
+        ----------
+        path : str or Path
+            File to write.
+        overwrite : bool
+            Whether to replace an existing file.
+        """
+        table = np.column_stack([self.t, self.position, self.rotation])
+        lines = [" ".join(repr(float(value)) for value in row) for row in table]
+        write_text(Path(path), "# t x y z qx qy qz qw\n" + "\n".join(lines) + "\n", overwrite=overwrite)
+
+
+def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Rotation:
+    """Return the orientation of a camera at ``position`` [m] that looks at ``target`` [m], its top towards ``up``."""
+    from scipy.spatial.transform import Rotation
+
+    forward = np.asarray(target, np.float64) - np.asarray(position, np.float64)
+    distance = float(np.linalg.norm(forward))
+    if not distance > 0.0:
+        raise AmiwarpError("the camera looks at its own position; give another target")
+    forward /= distance
+    right: Any = np.cross(forward, np.asarray(up, np.float64))
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    return Rotation.from_matrix(np.column_stack([right, down, forward]))
