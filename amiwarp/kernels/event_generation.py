@@ -173,13 +173,12 @@ def reconverge():
     """Bring a warp back together: after an event its lanes would else run apart to the end of the chunk."""
 
 
-@wp.kernel
-def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, start: int, pixels: wp.array(dtype=Pixel)):
-    """Every pixel's own thresholds and noise; its reference is the level, less what has leaked by then."""
-    i = start + wp.tid()
+@wp.func
+def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
+    """A pixel with its own thresholds and noise; its reference is the level, less what has leaked by then."""
     rng = wp.rand_init(seed, i)
     p = Pixel()
-    p.level = see(view, steps.at[steps.margin], local_ray(view, i))
+    p.level = level
     p.on = sensor.on * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
     p.off = sensor.off * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
     p.noise = sensor.noise
@@ -193,7 +192,14 @@ def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, star
     p.last_stamp = wp.int64(-1)
     p.next_noise = waiting(p.noise, wp.randf(rng))
     p.rng = rng
-    pixels[i] = p
+    return p
+
+
+@wp.kernel
+def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, start: int, pixels: wp.array(dtype=Pixel)):
+    """Every pixel at the start of the recording."""
+    i = start + wp.tid()
+    pixels[i] = new_pixel(sensor, seed, i, see(view, steps.at[steps.margin], local_ray(view, i)))
 
 
 @wp.func

@@ -1,0 +1,69 @@
+"""Device side of worlds: pixels that look into a world through the prism at every step, some rays at a time."""
+
+import warp as wp
+
+from amiwarp.kernels.camera import CameraParams, pixel_to_ray
+from amiwarp.kernels.event_generation import Pixel, SensorParams, Sink, advance, new_pixel, on_next_clock, reconverge
+from amiwarp.kernels.optics import ExactParams, trace
+from amiwarp.kernels.sight import Steps
+from amiwarp.kernels.world import Pose, World, radiance
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class RayView:
+    """Camera, prism and pose for every instant of a chunk."""
+
+    camera: CameraParams
+    prism: ExactParams
+    poses: wp.array(dtype=Pose)  # the camera's at each instant
+    offsets: wp.array(dtype=wp.vec2)  # of a pixel's rays from its centre [px]
+    cone: float  # angular width of a ray [rad]
+    dark: float  # added to the luminance before the logarithm
+
+
+@wp.func
+def see_world(world: World, view: RayView, steps: Steps, k: int, i: int) -> float:
+    """Log intensity that a pixel sees through the prism at instant ``k``."""
+    row = i / view.camera.width
+    col = i - row * view.camera.width
+    w = steps.at[k].azimuth
+    pose = view.poses[k]
+    total = float(0.0)
+    for j in range(view.offsets.shape[0]):
+        xy = wp.vec2(float(col), float(row)) + view.offsets[j]
+        ray = trace(view.prism, pixel_to_ray(view.camera, xy), w, view.prism.flat_to_scene)
+        total += radiance(world, k, pose.position, pose.rotation * wp.normalize(ray), view.cone)
+    return wp.log(total / float(view.offsets.shape[0]) + view.dark)
+
+
+@wp.kernel
+def start_world_pixels(
+    world: World, view: RayView, steps: Steps, sensor: SensorParams, seed: int, start: int,
+    pixels: wp.array(dtype=Pixel),
+):  # fmt: skip
+    """Every pixel at the start of the recording."""
+    i = start + wp.tid()
+    pixels[i] = new_pixel(sensor, seed, i, see_world(world, view, steps, steps.margin, i))
+
+
+@wp.kernel
+def run_world_pixels(
+    world: World,
+    view: RayView,
+    steps: Steps,
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+    start: int,
+    sink: Sink,
+):
+    """Walk through the steps of a chunk, as :func:`amiwarp.kernels.event_generation.run_pixels` does."""
+    i = start + wp.tid()
+    p = pixels[i]
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        p = advance(p, sensor, sink, i, t0, steps, see_world(world, view, steps, steps.margin + k + 1, i))
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = on_next_clock(p, t0)
