@@ -16,8 +16,13 @@ wp.set_module_options({"enable_backward": False})
 TICKS = wp.constant(16)  # per microsecond
 HALF_TICKS = wp.constant(8)
 TICK_BITS = wp.constant(4)
-LOW_BITS = wp.constant(20)  # of a key: lag (19), polarity; before them the pixel, in as few bits as it needs; the time
-LOW_MASK = wp.constant((1 << 20) - 1)
+LOW_BITS = wp.constant(22)  # of a key: lag (19), cause (2), polarity; before them the pixel, in as few bits as it needs
+LOW_MASK = wp.constant((1 << 22) - 1)
+SIGNAL = wp.constant(0)  # causes of an event
+SHOT_NOISE = wp.constant(1)
+LEAK = wp.constant(2)
+HOT_PIXEL = wp.constant(3)
+LEAK_SHARE = wp.constant(1.5)  # a rise of less than so many drifts is a leak: at least two thirds of it is drift
 LARGEST_LAG = wp.constant((1 << 19) - 1)
 LAG_ZERO = wp.constant(16)  # ticks added to the lag: rounding a stamp may make it slightly negative
 NEVER = wp.constant(wp.int64(-(1 << 60)))
@@ -76,7 +81,9 @@ class Block:
     y: wp.array(dtype=wp.uint16)
     t: wp.array(dtype=wp.int64)
     p: wp.array(dtype=wp.uint8)
+    cause: wp.array(dtype=wp.uint8)
     points: wp.array(dtype=wp.vec2)
+    ticks: wp.array(dtype=int)  # of the crossing, from the first instant of the table
 
 
 @wp.func
@@ -98,13 +105,13 @@ def waiting(rate: float, uniform: float) -> wp.int64:
 
 
 @wp.func
-def write(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64, on: int):
-    """Append the key of an event that happened at tick ``t`` and is stamped ``stamp`` [us]."""
+def write(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64, kind: int):
+    """Append the key of an event at tick ``t``, stamped ``stamp`` [us]; ``kind``: twice its cause, and 1 for ON."""
     lag = wp.clamp(int(stamp * wp.int64(TICKS) - t) + LAG_ZERO, 0, LARGEST_LAG)
     segment = (index / sink.run) % sink.keys.shape[0]
     place = wp.atomic_add(sink.count, segment, 0, 1)
     if place < sink.keys.shape[1]:
-        low = wp.int64(index) << wp.int64(LOW_BITS) | wp.int64((LARGEST_LAG - lag) << 1 | on)
+        low = wp.int64(index) << wp.int64(LOW_BITS) | wp.int64((LARGEST_LAG - lag) << 3 | kind)
         sink.keys[segment, place] = stamp << wp.int64(shift) | low
 
 
@@ -116,6 +123,14 @@ def latency(s: SensorParams, rng: wp.uint32):
         four = wp.randf(rng) + wp.randf(rng) + wp.randf(rng) + wp.randf(rng)
         late = wp.max(late + s.jitter * 1.7320508 * (four - 2.0), 0.0)
     return late, rng
+
+
+@wp.func
+def cause(p: Pixel, s: SensorParams, slope: float, noise: bool) -> int:
+    """Why a pixel fires while its level, less the leaking reference, rises by ``slope`` in a step."""
+    if noise:
+        return wp.where(p.noise > s.noise, HOT_PIXEL, SHOT_NOISE)
+    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * s.leak * p.on, LEAK, SIGNAL)
 
 
 @wp.func
@@ -135,7 +150,7 @@ def fire(
         late, rng = latency(s, rng)
         stamp = (t + wp.int64(late) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
         p.last_stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
-        write(sink, steps.shift, index, t, p.last_stamp, on)
+        write(sink, steps.shift, index, t, p.last_stamp, 2 * cause(p, s, slope, noise) + on)
         p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
         if noise or p.next_noise < p.blind_until:
             p.next_noise = wp.max(t, p.blind_until) + waiting(p.noise, wp.randf(rng))
@@ -277,8 +292,10 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
     block.y[i] = wp.uint16(row)
     block.t[i] = t + origin
     block.p[i] = wp.uint8(low & 1)
-    lag = LARGEST_LAG - (low >> 1) - LAG_ZERO
+    block.cause[i] = wp.uint8((low >> 1) & 3)
+    lag = LARGEST_LAG - (low >> 3) - LAG_ZERO
     at = int(t) * TICKS - lag + steps.margin * steps.ticks
+    block.ticks[i] = at
     k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
     angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
     ray = pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))

@@ -96,25 +96,36 @@ def meets_sphere(origin: wp.vec3, direction: wp.vec3, centre: wp.vec3, radius: f
 
 
 @wp.func
+def nearer(hit: Hit, q: wp.MeshQueryRay, first_face: int, mover: int, direction: wp.vec3) -> Hit:
+    """The hit, or that of a query which met something nearer; ``direction`` is in the frame of the mesh."""
+    if q.result:
+        hit.distance = q.t
+        hit.face = first_face + q.face
+        hit.u = q.u
+        hit.v = q.v
+        hit.mover = mover
+        hit.normal = facing(q.normal, direction)
+    return hit
+
+
+@wp.func
 def cast(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: float) -> Hit:
     """Nearest surface within ``far`` [m] along a direction of length one."""
     hit = Hit()
-    hit.distance, hit.face, hit.mover = far, -1, -1
+    hit.distance = far
+    hit.face = -1
+    hit.mover = -1
     if world.still != wp.uint64(0):
-        q = wp.mesh_query_ray(world.still, origin, direction, far)
-        if q.result:
-            hit.distance, hit.face, hit.u, hit.v = q.t, q.face, q.u, q.v
-            hit.normal = facing(q.normal, direction)
+        hit = nearer(hit, wp.mesh_query_ray(world.still, origin, direction, far), 0, -1, direction)
     for m in range(world.movers.shape[0]):
         mover = world.movers[m]
         pose = world.poses[instant, m]
         o = wp.transpose(pose.rotation) * (origin - pose.position)
         d = wp.transpose(pose.rotation) * direction
         if meets_sphere(o, d, mover.centre, mover.radius):
-            q = wp.mesh_query_ray(mover.mesh, o, d, hit.distance)
-            if q.result:
-                hit.distance, hit.face, hit.mover, hit.u, hit.v = q.t, mover.first_face + q.face, m, q.u, q.v
-                hit.normal = pose.rotation * facing(q.normal, d)
+            hit = nearer(hit, wp.mesh_query_ray(mover.mesh, o, d, hit.distance), mover.first_face, m, d)
+    if hit.mover >= 0:
+        hit.normal = world.poses[instant, hit.mover].rotation * hit.normal
     return hit
 
 

@@ -18,7 +18,7 @@ class RayView:
     camera: CameraParams
     prism: ExactParams
     poses: wp.array(dtype=Pose)  # the camera's at each instant
-    offsets: wp.array(dtype=wp.vec2)  # of a pixel's rays from its centre [px]
+    aperture: wp.array(dtype=wp.vec3)  # of a pixel's rays: x and y from its centre [px], and the weight
     cone: float  # angular width of a ray [rad]
     dark: float  # added to the luminance before the logarithm
 
@@ -31,11 +31,12 @@ def see_world(world: World, view: RayView, steps: Steps, k: int, i: int) -> floa
     w = steps.at[k].azimuth
     pose = view.poses[k]
     total = float(0.0)
-    for j in range(view.offsets.shape[0]):
-        xy = wp.vec2(float(col), float(row)) + view.offsets[j]
+    for j in range(view.aperture.shape[0]):
+        a = view.aperture[j]
+        xy = wp.vec2(float(col) + a[0], float(row) + a[1])
         ray = trace(view.prism, pixel_to_ray(view.camera, xy), w, view.prism.flat_to_scene)
-        total += radiance(world, k, pose.position, pose.rotation * wp.normalize(ray), view.cone)
-    return wp.log(total / float(view.offsets.shape[0]) + view.dark)
+        total += a[2] * radiance(world, k, pose.position, pose.rotation * wp.normalize(ray), view.cone)
+    return wp.log(total + view.dark)
 
 
 @wp.kernel

@@ -13,10 +13,14 @@ from numpy.typing import NDArray
 from amiwarp.events.events import Events
 from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import launch as launching
-from amiwarp.kernels import sight
+from amiwarp.kernels import sight, world_events
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
-from amiwarp.simulation.scenery import MapRing, place_scene, step_us
+from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
+from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.map_ring import WorldMapRing
+from amiwarp.simulation.worlds.sight import SeenSurfaces, WorldSight, interval_limit_us, largest_speed
+from amiwarp.simulation.worlds.world_scene import WorldScene
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import SensorModel, Simulation
@@ -49,6 +53,8 @@ class DeviceBlock:
     arrays: Any
     """The struct :class:`amiwarp.kernels.event_generation.Block`."""
     count: int
+    seen: SeenSurfaces | None = None
+    """What the events saw of a world."""
 
     def to_host(self) -> tuple[Events, NDArray[np.float32]]:
         """Events and their points without the prism, shape (n, 2)."""
@@ -65,22 +71,29 @@ class Engine:
         self._simulation = simulation
         self._device = wp.get_device(simulation.device)
         self._pixels = simulation.camera.width * simulation.camera.height
-        self._step = step_us(simulation)
+        scene = simulation.scene
+        self._sight: WorldSight | None = None
+        self._maps: MapRing | WorldMapRing | None = None
+        if isinstance(scene, WorldScene):
+            world = DeviceWorld(scene.world, self._device)
+            self._step = step_us(simulation, largest_speed(world, simulation, scene), interval_limit_us(scene))
+            self._sight = WorldSight(simulation, scene, world)
+            if not scene.rays(self._device.is_cpu):
+                self._maps = WorldMapRing(simulation, scene, world, seen_bearings(simulation))
+        else:
+            self._step = step_us(simulation)
+            self._maps = MapRing(simulation, place_scene(simulation))
         self._chunk_steps = self._steps_per_chunk(chunk_us)
         self._margin = int(kernels.LARGEST_LAG) // (int(kernels.TICKS) * self._step) + 2
-        placement = place_scene(simulation)
-        self._maps = MapRing(simulation, placement)
         self._axis = axis_rotation(*simulation.motion.tilt)
-        self._to_texel = placement.to_texel()
-        turns = bool(simulation.camera_motion.largest_rates.any())
-        self._orientation = simulation.camera_motion.orientation(simulation.duration_s) if turns else None
         self._sensor = sensor_params(simulation.sensor, self._step)
         self._view = sight.View()
         self._view.camera = camera_params(simulation.camera, str(self._device))
         self._view.prism = ExactModel(simulation.camera, simulation.prism, 0.0, simulation.motion.tilt).params(
             self._device
         )
-        self._view.width, self._view.height = placement.width, placement.height
+        if self._maps is not None:
+            self._view.width, self._view.height = self._maps.placement.width, self._maps.placement.height
         self._state = wp.empty(self._pixels, dtype=kernels.Pixel, device=self._device)
         self._buffer = KeyBuffer(self._pixels, self._device)
         self._nothing: wp.array = wp.empty(0, dtype=wp.int64, device=self._device)
@@ -89,15 +102,17 @@ class Engine:
 
     def _steps_per_chunk(self, chunk_us: int | None) -> int:
         longest = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
-        interval = self._simulation.scene.frames.interval_us
+        scene = self._simulation.scene
+        interval = None if isinstance(scene, WorldScene) else scene.frames.interval_us
         if interval is not None:
             longest = min(longest, int(FRAMES_PER_CHUNK * interval))
         return max(1, longest // self._step)
 
     def prepare(self) -> None:
         """Read the first pictures and load the kernels, which else happens in the first span."""
-        launching.load(kernels.run_pixels, self._device)
-        self._maps.cover(0, self._chunk_steps * self._step)
+        launching.load(kernels.run_pixels if self._maps is not None else world_events.run_world_pixels, self._device)
+        if self._maps is not None:
+            self._maps.cover(0, self._chunk_steps * self._step)
 
     def run(self) -> Iterator[DeviceBlock]:
         """Blocks of successive spans."""
@@ -118,20 +133,13 @@ class Engine:
         simulation, margin = self._simulation, self._margin
         t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
         angle = simulation.motion.phase + simulation.motion.angle(t)
-        times, slots = self._maps.cover(first * self._step, (first + count) * self._step)
-        self._view.maps = self._maps.maps
-        before = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
-        after = np.minimum(before + 1, len(times) - 1)
-        weight = np.clip((t - times[before]) / np.maximum(times[after] - times[before], 1.0), 0.0, 1.0)
-        weight[before == after] = 0.0  # one look-up is enough
-        to_texel = self._to_texel @ self._axis
-        if self._orientation is not None:
-            to_texel = self._to_texel @ self._orientation(np.maximum(t, 0.0) * 1e-6) @ self._axis
         steps = sight.Steps()
         table: NDArray[Any] = np.zeros(len(t), cast("Any", sight.Step).numpy_dtype())
         table["azimuth"] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        table["to_texel"] = to_texel
-        table["before"], table["after"], table["weight"] = slots[before], slots[after], weight
+        if self._maps is not None:
+            self._fill_maps(self._maps, table, t, first, count)
+        if self._sight is not None:
+            self._sight.set_instants(t, self._view)
         steps.at = wp.array(table, dtype=sight.Step, device=self._device)
         if self._device.is_cpu:
             steps.ahead = wp.array(instants_ahead(table[margin + 1 :]), dtype=sight.Instants, device=self._device)
@@ -142,16 +150,41 @@ class Engine:
         steps.margin, steps.count, steps.ticks = margin, count, self._step * int(kernels.TICKS)
         return steps
 
+    def _fill_maps(
+        self, maps: MapRing | WorldMapRing, table: NDArray[Any], t: NDArray[np.float64], first: int, count: int
+    ) -> None:
+        """Fill in the maps before and after each instant, and the way onto them."""
+        times, slots = maps.cover(first * self._step, (first + count) * self._step)
+        self._view.maps = maps.maps
+        before = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
+        after = np.minimum(before + 1, len(times) - 1)
+        weight = np.clip((t - times[before]) / np.maximum(times[after] - times[before], 1.0), 0.0, 1.0)
+        weight[before == after] = 0.0  # one look-up is enough
+        orientation = maps.orientations(t)
+        to_texel = maps.placement.to_texel()
+        table["to_texel"] = to_texel @ self._axis if orientation is None else to_texel @ orientation @ self._axis
+        table["before"], table["after"], table["weight"] = slots[before], slots[after], weight
+
     def _upload(self, values: NDArray[np.float64]) -> wp.array:
         return wp.array(values.astype(np.float32), dtype=float, device=self._device)
 
     def _start(self, steps: Any) -> None:
-        inputs = [self._view, steps, self._sensor, self._simulation.seed, 0, self._state]
-        wp.launch(kernels.start_pixels, dim=self._pixels, inputs=inputs, device=self._device)
+        inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, self._state]
+        kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
+        wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
+
+    def _views(self) -> list[Any]:
+        """First inputs of the kernels that walk through the steps."""
+        return [self._view] if self._maps is not None or self._sight is None else self._sight.inputs()
+
+    def _kernel(self) -> Any:
+        if self._maps is None:
+            return world_events.run_world_pixels
+        return kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
 
     def _gather(self, steps: Any, count: int) -> wp.array:
         """Walk through the steps; the keys of the chunk's events, sorted, those before its end."""
-        keys = self._buffer.run([self._view, steps, self._sensor, self._state], self._carry)
+        keys = self._buffer.run(self._kernel(), [*self._views(), steps, self._sensor, self._state], self._carry)
         limit = min(count * self._step, self._simulation.duration_us - self.now_us)
         total = len(keys) // 2
         if not total:  # an empty array has no slices
@@ -180,11 +213,12 @@ class Engine:
     def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
         n = len(keys)
         block = kernels.Block()
-        for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8), ("points", wp.vec2)):
+        for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8),
+                            ("cause", wp.uint8), ("points", wp.vec2), ("ticks", int)):  # fmt: skip
             setattr(block, name, wp.empty(n, dtype=dtype, device=self._device))
         inputs = [self._view, steps, keys, first * self._step]
         launching.launch(kernels.unpack, n, inputs, [block], device=self._device)
-        return DeviceBlock(block, n)
+        return DeviceBlock(block, n, None if self._sight is None else self._sight.look(self._view, steps, block, n))
 
 
 class KeyBuffer:
@@ -203,7 +237,7 @@ class KeyBuffer:
         self._capacity = capacity
         self._sink.keys = wp.empty((self._segments, capacity), dtype=wp.int64, device=self._device)
 
-    def run(self, inputs: list[Any], carry: wp.array) -> wp.array:
+    def run(self, kernel: Any, inputs: list[Any], carry: wp.array) -> wp.array:
         """Run the pixels, whose state is the last of ``inputs``; the keys of their events and ``carry``, unsorted.
 
         As many places again lie behind them, which the sorting on CUDA needs.
@@ -212,7 +246,7 @@ class KeyBuffer:
         before = wp.clone(state)
         while True:
             self._sink.count.zero_()
-            self._launch(inputs)
+            self._launch(kernel, inputs)
             counts = self._sink.count.numpy()[:, 0]
             if counts.max() <= self._capacity:
                 return self._pack(counts, carry)
@@ -235,8 +269,7 @@ class KeyBuffer:
             wp.copy(keys, carry, dest_offset=int(ends[-1]))
         return keys
 
-    def _launch(self, inputs: list[Any]) -> None:
-        kernel = kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
+    def _launch(self, kernel: Any, inputs: list[Any]) -> None:
 
         def run(start: int, stop: int) -> None:
             wp.launch(kernel, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)

@@ -44,15 +44,18 @@ class Motion:
     """Largest motion per angle of the camera about each of its axes [px/rad], shape (3,)."""
 
 
-def step_us(simulation: Simulation) -> int:
-    """Length of a step [us] in which nothing moves more than half a pixel."""
+def step_us(simulation: Simulation, world_speed: float = 0.0, longest: float = math.inf) -> int:
+    """Length of a step [us] in which nothing moves more than half a pixel.
+
+    ``world_speed``: of a world in the image [px/s]; ``longest``: what its lamps allow [us].
+    """
     motion = image_motion(simulation)
     rates = simulation.camera_motion.largest_rates
-    speed = motion.prism * simulation.motion.largest_speed + float(motion.camera @ rates)
-    step = min(float(LONGEST_STEP), 1e6 * LARGEST_MOTION / max(speed, 1e-9))
-    interval = simulation.scene.frames.interval_us
-    if interval is not None:
-        step = min(step, interval / STEPS_PER_FRAME)
+    speed = motion.prism * simulation.motion.largest_speed + float(motion.camera @ rates) + world_speed
+    step = min(float(LONGEST_STEP), longest, 1e6 * LARGEST_MOTION / max(speed, 1e-9))
+    frames = getattr(simulation.scene, "frames", None)
+    if frames is not None and frames.interval_us is not None:
+        step = min(step, frames.interval_us / STEPS_PER_FRAME)
     if step < 1.0:
         raise AmiwarpError(f"the image moves at {speed:.3g} px/s, over half a pixel a microsecond; slow it down")
     return int(step)
@@ -138,7 +141,9 @@ class MapRing:
     def __init__(self, simulation: Simulation, placement: Placement) -> None:
         focal = max(simulation.camera.fx, simulation.camera.fy)
         self._blur = simulation.scene.blur * math.sqrt(placement.pitch[0] * placement.pitch[1]) / focal
-        self._placement = placement
+        self.placement = self._placement = placement
+        turns = bool(simulation.camera_motion.largest_rates.any())
+        self._orientation = simulation.camera_motion.orientation(simulation.duration_s) if turns else None
         self._frames = simulation.scene.frames.read()
         self._device = simulation.device
         self._texels = placement.width * placement.height
@@ -162,6 +167,10 @@ class MapRing:
             self._free.append(self._held.pop(0)[1])
         times, slots = zip(*self._held, strict=True)
         return np.array(times, np.float64), np.array(slots, np.int32)
+
+    def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Matrices (n, 3, 3) from the camera's frame to the picture's at times [us]; None if the camera rests."""
+        return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
 
     def _slot(self) -> int:
         if not self._free:

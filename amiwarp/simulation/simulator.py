@@ -21,6 +21,7 @@ from amiwarp.progress import Progress
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import linear_luminance, read_picture
+from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.validation import instance, real, whole
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ class Scene:
 class Simulation:
     """All that determines a recording; equal values give equal events, bit for bit, on one kind of device."""
 
-    scene: Scene
+    scene: Scene | WorldScene
     camera: Camera
     prism: Prism
     """The true prism."""
@@ -147,8 +148,10 @@ class Simulation:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        kinds = {"scene": Scene, "camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
+        kinds = {"camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
                  "camera_motion": CameraMotion, "encoder_model": EncoderModel}  # fmt: skip
+        if not isinstance(self.scene, WorldScene):
+            instance(self.scene, Scene, "simulation's scene")
         for name, kind in kinds.items():
             instance(getattr(self, name), kind, f"simulation's {name}")
         real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
@@ -236,7 +239,7 @@ class Simulation:
 
 
 def simulate(
-    scene: Scene | str | Path | NDArray[Any],
+    scene: Scene | WorldScene | str | Path | NDArray[Any],
     camera: Camera,
     prism: Prism,
     *,
@@ -256,7 +259,7 @@ def simulate(
     Raises :class:`AmiwarpError` where a value makes no sense or the camera turns away from the picture.
     """
     return Simulation(
-        scene if isinstance(scene, Scene) else Scene.from_picture(scene),
+        scene if isinstance(scene, Scene | WorldScene) else Scene.from_picture(scene),
         camera,
         prism,
         duration_s,

@@ -1,0 +1,103 @@
+"""Views of a world: luminance, depth, normals and instances, without the prism."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.kernels import world as kernels
+from amiwarp.kernels import world_view
+from amiwarp.kernels.launch import launch
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.device_camera import camera_params
+from amiwarp.simulation.worlds.device_world import DeviceWorld
+
+SMALLEST_LAUNCH = 1 << 10
+"""Rays that are worth a thread on a CPU."""
+ROTATED_GRID = [(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375)]
+"""Places of four samples from a pixel's centre [px]: fixed, so that sampling fires no events."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceView:
+    """What stands at each pixel of a camera, without the prism."""
+
+    depth: NDArray[np.float32]
+    """Depth along the camera's axis [m], shape (height, width); infinite for the sky."""
+    normal: NDArray[np.float32]
+    """Unit normals in the world's frame, towards the camera, shape (height, width, 3); zero for the sky."""
+    instance: NDArray[np.int32]
+    """Instance numbers, shape (height, width): 0 is the sky, i + 1 is ``World.instances[i]``."""
+    mover: NDArray[np.int32]
+    """Number of the moving body, as in ``World.moving``, shape (height, width); -1 for what rests."""
+    place: NDArray[np.float32]
+    """Place in the world [m], shape (height, width, 3)."""
+
+
+def device_pose(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Any:
+    """Return a pose for the kernels from a matrix (3, 3) and a position [m]."""
+    pose = kernels.Pose()
+    pose.rotation = wp.mat33(*np.asarray(rotation).ravel().tolist())
+    pose.position = wp.vec3(*np.asarray(position).tolist())
+    return pose
+
+
+def surfaces_at(
+    world: DeviceWorld, camera: Camera, rotation: NDArray[np.float64], position: NDArray[np.float64], instant: int = 0
+) -> SurfaceView:
+    """Return what stands at each pixel of a camera; ``instant`` is a row of :meth:`DeviceWorld.set_instants`."""
+    n, device = camera.width * camera.height, world.device
+    out = world_view.Surfaces()
+    for name, dtype in (("depth", float), ("normal", wp.vec3), ("instance", int), ("mover", int), ("place", wp.vec3)):
+        setattr(out, name, wp.empty(n, dtype=dtype, device=device))
+    inputs = [world.params, instant, camera_params(camera, str(device)), device_pose(rotation, position)]
+    launch(world_view.find_surfaces, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
+    size = (camera.height, camera.width)
+    return SurfaceView(
+        out.depth.numpy().reshape(size),
+        out.normal.numpy().reshape(*size, 3),
+        out.instance.numpy().reshape(size),
+        out.mover.numpy().reshape(size),
+        out.place.numpy().reshape(*size, 3),
+    )
+
+
+def sample_grid(samples: int, device: Any) -> wp.array:
+    """Return the places of a pixel's samples from its centre [px]."""
+    centres = (np.arange(math.isqrt(samples)) + 0.5) / math.isqrt(samples) - 0.5
+    places = ROTATED_GRID if samples == 4 else [(x, y) for y in centres for x in centres]
+    return wp.array(np.array(places, np.float32), dtype=wp.vec2, device=device)
+
+
+class MapRenderer:
+    """Renders maps of a world on a plane at distance 1 before the camera, as bilinear pieces of log intensity."""
+
+    def __init__(self, world: DeviceWorld, frame: Any, *, blur: float, dark: float, samples: int) -> None:
+        """``frame``: a :class:`amiwarp.kernels.world_view.MapFrame` without a pose; ``blur``: sigma [texels]."""
+        self._world, self._frame, self._dark = world, frame, dark
+        frame.offsets = sample_grid(samples, world.device)
+        n = frame.width * frame.height
+        self._light, self._half = (wp.empty(n, dtype=float, device=world.device) for _ in range(2))
+        reach = max(1, math.ceil(3.0 * blur))
+        along = np.arange(-reach, reach + 1)
+        weights = np.exp(-0.5 * (along / max(blur, 1e-6)) ** 2)
+        self._weights = wp.array((weights / weights.sum()).astype(np.float32), dtype=float, device=world.device)
+
+    def render(self, pose: Any, instant: int, out: wp.array, first: int) -> None:
+        """Render one map into ``out`` from place ``first`` on."""
+        f, device = self._frame, self._world.device
+        f.pose, f.instant = pose, instant
+        n = f.width * f.height
+        launch(
+            world_view.render_map, n, [self._world.params, f], [self._light], device=device, smallest=SMALLEST_LAUNCH
+        )
+        for across, source, target in ((0, self._light, self._half), (1, self._half, self._light)):
+            inputs = [source, self._weights, f.width, f.height, across]
+            launch(world_view.blur_lines, n, inputs, [target], device=device)
+        inputs = [self._light, f.width, f.height, self._dark, first]
+        launch(world_view.log_pieces, n, inputs, [out], device=device)
