@@ -68,3 +68,10 @@ def run_world_pixels(
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = on_next_clock(p, t0)
+
+
+@wp.kernel
+def see_pixels(world: World, view: RayView, steps: Steps, k: int, start: int, out: wp.array(dtype=float)):
+    """Luminance that each pixel sees through the prism at instant ``k``."""
+    i = start + wp.tid()
+    out[i] = wp.exp(see_world(world, view, steps, k, i)) - view.dark

@@ -109,12 +109,10 @@ def instance_of(world: World, face: int) -> int:
 
 
 @wp.kernel
-def find_surfaces(world: World, instant: int, camera: CameraParams, pose: Pose, start: int, out: Surfaces):
-    """Depth, normal, instance and place at each pixel's centre, with no prism."""
+def find_surfaces(world: World, instant: int, rays: wp.array(dtype=wp.vec3), pose: Pose, start: int, out: Surfaces):
+    """What unit rays in the camera's frame meet; NaN for a ray that is none."""
     i = start + wp.tid()
-    row = i / camera.width
-    col = i - row * camera.width
-    ray = wp.normalize(pixel_to_ray(camera, wp.vec2(float(col), float(row))))
+    ray = rays[i]
     direction = pose.rotation * ray
     hit = cast(world, instant, pose.position, direction, FAR)
     out.depth[i] = wp.where(hit.face < 0, wp.inf, hit.distance * ray[2])

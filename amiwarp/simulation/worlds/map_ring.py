@@ -28,6 +28,8 @@ SMALLEST_COSINE = 0.25
 LONGEST_S = 0.5
 """Between two maps of a world in which anything moves [s]."""
 SAMPLES = 4
+TEXEL_VARIANCE = 1.0 / 12.0 + 1.0 / 6.0
+"""Blur by a texel's own area, and by bilinear look-up [texels squared]."""
 
 
 class WorldMapRing:
@@ -49,7 +51,7 @@ class WorldMapRing:
         p, frame = self.placement, world_view.MapFrame()
         frame.left, frame.top, (frame.pitch_x, frame.pitch_y) = p.left, p.top, p.pitch
         frame.width, frame.height, frame.cone = p.width, p.height, 1.0 / (TEXELS_PER_PIXEL * focal)
-        self._renderer = MapRenderer(self._world, frame, blur=scene.blur * TEXELS_PER_PIXEL, dark=DARK,
+        self._renderer = MapRenderer(self._world, frame, blur=map_blur(scene.blur), dark=DARK,
                                      samples=scene.samples or SAMPLES)  # fmt: skip
         self._texels = p.width * p.height
         self._held: list[tuple[float, int, NDArray[np.float64]]] = []  # time [us], slot, orientation
@@ -150,6 +152,11 @@ class WorldMapRing:
             self._free.extend(range(slots, 2 * slots or 1))
             self.maps = grown
         return self._free.pop()
+
+
+def map_blur(blur: float) -> float:
+    """Return the blur [texels] that leaves a total of ``blur`` [px], with that of the texels and of the look-up."""
+    return math.sqrt(max((blur * TEXELS_PER_PIXEL) ** 2 - TEXEL_VARIANCE, 0.0))
 
 
 def _placement(bearings: NDArray[np.float64], focal: float, margin: float) -> Placement:

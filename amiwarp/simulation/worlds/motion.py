@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.renderer import surfaces_at
+from amiwarp.simulation.worlds.renderer import pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.scene import Body
 from amiwarp.simulation.worlds.trajectory import Trajectory
 
@@ -55,7 +55,7 @@ def parallax_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t
         PROBE, max(1, round(camera.height * scale)), camera.fx * scale, camera.fy * scale,
         (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5,
     )  # fmt: skip
-    seen = surfaces_at(world, small, before[0][0], before[1][0], instant)
+    seen = surfaces_at(world, pixel_rays(small), before[0][0], before[1][0], instant)
     near = seen.place[np.isfinite(seen.depth)].astype(np.float64) - before[1][0]
     if not len(near):
         return 0.0

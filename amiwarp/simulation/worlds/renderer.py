@@ -14,7 +14,6 @@ from amiwarp.kernels import world as kernels
 from amiwarp.kernels import world_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.device_camera import camera_params
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 
 SMALLEST_LAUNCH = 1 << 10
@@ -25,18 +24,18 @@ ROTATED_GRID = [(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.37
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """What stands at each pixel of a camera, without the prism."""
+    """What rays meet."""
 
     depth: NDArray[np.float32]
-    """Depth along the camera's axis [m], shape (height, width); infinite for the sky."""
+    """Depth along the camera's axis [m], shape (n,); infinite for the sky."""
     normal: NDArray[np.float32]
-    """Unit normals in the world's frame, towards the camera, shape (height, width, 3); zero for the sky."""
+    """Unit normals in the world's frame, towards the camera, shape (n, 3); zero for the sky."""
     instance: NDArray[np.int32]
-    """Instance numbers, shape (height, width): 0 is the sky, i + 1 is ``World.instances[i]``."""
+    """Instance numbers, shape (n,): 0 is the sky, i + 1 is ``World.instances[i]``."""
     mover: NDArray[np.int32]
-    """Number of the moving body, as in ``World.moving``, shape (height, width); -1 for what rests."""
+    """Number of the moving body, as in ``World.moving``, shape (n,); -1 for what rests."""
     place: NDArray[np.float32]
-    """Place in the world [m], shape (height, width, 3)."""
+    """Place in the world [m], shape (n, 3)."""
 
 
 def device_pose(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Any:
@@ -48,23 +47,30 @@ def device_pose(rotation: NDArray[np.float64], position: NDArray[np.float64]) ->
 
 
 def surfaces_at(
-    world: DeviceWorld, camera: Camera, rotation: NDArray[np.float64], position: NDArray[np.float64], instant: int = 0
+    world: DeviceWorld,
+    rays: NDArray[Any],
+    rotation: NDArray[np.float64],
+    position: NDArray[np.float64],
+    instant: int = 0,
 ) -> SurfaceView:
-    """Return what stands at each pixel of a camera; ``instant`` is a row of :meth:`DeviceWorld.set_instants`."""
-    n, device = camera.width * camera.height, world.device
+    """Return what rays meet.
+
+    ``rays``: in the camera's frame, shape (n, 3); ``instant``: a row of :meth:`DeviceWorld.set_instants`.
+    """
+    n, device = len(rays), world.device
     out = world_view.Surfaces()
     for name, dtype in (("depth", float), ("normal", wp.vec3), ("instance", int), ("mover", int), ("place", wp.vec3)):
         setattr(out, name, wp.empty(n, dtype=dtype, device=device))
-    inputs = [world.params, instant, camera_params(camera, str(device)), device_pose(rotation, position)]
+    unit = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    inputs = [world.params, instant, wp.array(unit, dtype=wp.vec3, device=device), device_pose(rotation, position)]
     launch(world_view.find_surfaces, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
-    size = (camera.height, camera.width)
-    return SurfaceView(
-        out.depth.numpy().reshape(size),
-        out.normal.numpy().reshape(*size, 3),
-        out.instance.numpy().reshape(size),
-        out.mover.numpy().reshape(size),
-        out.place.numpy().reshape(*size, 3),
-    )
+    return SurfaceView(*(getattr(out, name).numpy() for name in ("depth", "normal", "instance", "mover", "place")))
+
+
+def pixel_rays(camera: Camera) -> NDArray[np.float64]:
+    """Return the unit rays of all pixels, row by row, shape (n, 3)."""
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return camera.pixels_to_rays(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64))
 
 
 def sample_grid(samples: int, device: Any) -> wp.array:

@@ -1,0 +1,166 @@
+"""Ground truth of a world at an instant: depth, normals, instances, optical flow, and what the sensor sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import sight, world_events
+from amiwarp.kernels.launch import launch
+from amiwarp.optics.models import ExactModel, wrap_angle
+from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.renderer import SMALLEST_LAUNCH, SurfaceView, pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.sight import WorldSight
+from amiwarp.simulation.worlds.world_scene import WorldScene
+
+if TYPE_CHECKING:
+    from amiwarp.simulation.simulator import Simulation
+
+ANGLE = 1e-3
+"""Small angle over which the image plane is taken for flat [rad]."""
+MOMENT_S = 1e-4
+"""Half of the time over which flow is a difference quotient [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTruth:
+    """Ground truth at an instant, for each pixel of the camera.
+
+    Depth, normals and instances are those that the pixel would see without the prism.
+    """
+
+    t_us: int
+    """Time from the start of the recording [us]."""
+    depth: NDArray[np.float32]
+    """Depth along the camera's axis [m], shape (height, width); infinite for the sky."""
+    normal: NDArray[np.float32]
+    """Unit normals in the world's frame, towards the camera, shape (height, width, 3)."""
+    instance: NDArray[np.uint16]
+    """Instance numbers, shape (height, width): 0 is the sky, i + 1 is ``World.instances[i]``."""
+    flow: NDArray[np.float32]
+    """Optical flow without the prism [px/s], shape (height, width, 2); NaN where a point leaves the image plane."""
+    flow_with_prism: NDArray[np.float32]
+    """Optical flow of what the pixel sees through the turning prism [px/s], shape (height, width, 2)."""
+    intensity: NDArray[np.float32]
+    """Linear luminance without the prism, shape (height, width)."""
+    intensity_with_prism: NDArray[np.float32]
+    """Linear luminance through the prism, shape (height, width)."""
+    rotation: NDArray[np.float64]
+    """Orientation of the camera in the world, shape (3, 3)."""
+    position: NDArray[np.float64]
+    """Position of the camera in the world [m], shape (3,)."""
+    joints: dict[str, NDArray[np.float64]]
+    """Positions of the world's joints [m], shape (3,) each."""
+
+
+class TruthRenderer:
+    """Renders the ground truth of a simulated world at any instant."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        if not isinstance(simulation.scene, WorldScene):
+            raise AmiwarpError("the scene is a picture at infinity; depth and flow belong to worlds: give a WorldScene")
+        self._simulation, self._scene = simulation, simulation.scene
+        self._world = DeviceWorld(self._scene.world, simulation.device)
+        self._sight = WorldSight(simulation, self._scene, self._world)
+        self._rays = pixel_rays(simulation.camera)
+
+    def at(self, t_us: int) -> FrameTruth:
+        """Return the ground truth at a time [us] from the start of the recording."""
+        t = t_us * 1e-6
+        scene, camera, motion = self._scene, self._simulation.camera, self._simulation.motion
+        (rotation,), (position,) = scene.trajectory.poses([t])
+        self._world.set_instants(np.array([t]))
+        model = ExactModel(camera, self._simulation.prism, motion.phase, motion.tilt)
+        pixels = camera.rays_to_pixels(self._rays)
+        theta = np.full(len(pixels), wrap_angle(motion.angle(t_us)))
+        bare = surfaces_at(self._world, self._rays, rotation, position)
+        places = moved_points(model.compensate_points, pixels, theta)
+        through = surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
+        speed = self._flow(through, places, t)
+        size = (camera.height, camera.width)
+        return FrameTruth(
+            t_us,
+            bare.depth.reshape(size),
+            bare.normal.reshape(*size, 3),
+            bare.instance.reshape(size).astype(np.uint16),
+            self._flow(bare, pixels, t).astype(np.float32).reshape(*size, 2),
+            self._prism_flow(model, places, speed, theta, t_us).astype(np.float32).reshape(*size, 2),
+            self._intensity(t_us, prism=False).reshape(size),
+            self._intensity(t_us, prism=True).reshape(size),
+            rotation,
+            position,
+            {name: path.poses([t])[1][0] for name, path in scene.world.joints.items()},
+        )
+
+    def _flow(self, seen: SurfaceView, pixels: NDArray[np.float64], t: float) -> NDArray[np.float64]:
+        """Speeds in the image [px/s] of the points that pixels see, shape (n, 2)."""
+        rays = [self._ray_at(seen, pixels, t, t + h) for h in (-MOMENT_S, MOMENT_S)]
+        change = (rays[1] - rays[0]) / (2.0 * MOMENT_S)
+        middle = (rays[0] + rays[1]) / 2.0
+        rate = np.linalg.norm(change, axis=1, keepdims=True)
+        aside = ANGLE * change / np.maximum(rate, 1e-12)
+        camera = self._simulation.camera
+        ends = [camera.rays_to_pixels(middle + sign * aside).astype(np.float64) for sign in (-1.0, 1.0)]
+        return np.asarray((ends[1] - ends[0]) / (2.0 * ANGLE) * rate)
+
+    def _ray_at(self, seen: SurfaceView, pixels: NDArray[np.float64], t: float, later: float) -> NDArray[np.float64]:
+        """Unit rays in the camera's frame at ``later`` [s] to the points that pixels see at ``t``."""
+        (r0, r1), (p0, p1) = self._scene.trajectory.poses([t, later])
+        rays = self._simulation.camera.pixels_to_rays(pixels).astype(np.float64)
+        distance = seen.depth.astype(np.float64) / rays[:, 2]
+        sky = ~np.isfinite(distance)
+        points = p0 + np.where(sky, 1.0, distance)[:, None] * (rays @ r0.T)
+        for k, body in enumerate(self._world.movers):
+            on = (seen.mover == k) & ~sky
+            if body.trajectory is not None and on.any():
+                (b0, b1), (q0, q1) = body.trajectory.poses([t, later])
+                points[on] = (points[on] - q0) @ b0 @ b1.T + q1
+        directions = np.where(sky[:, None], points - p0, points - p1) @ r1  # the sky is at infinity
+        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+    def _prism_flow(
+        self,
+        model: ExactModel,
+        places: NDArray[np.float64],
+        speed: NDArray[np.float64],
+        theta: NDArray[np.float64],
+        t_us: int,
+    ) -> NDArray[np.float64]:
+        """Speeds [px/s] at which pixels see points move that move by ``speed`` at ``places`` without the prism."""
+        size = np.linalg.norm(speed, axis=1, keepdims=True)
+        aside = speed / np.maximum(size, 1e-9)
+        along = [moved_points(model.deflect_points, places + sign * aside, theta) for sign in (-1.0, 1.0)]
+        turned = [moved_points(model.deflect_points, places, theta + sign * ANGLE) for sign in (-10.0, 10.0)]
+        (before, after) = self._simulation.motion.angle([t_us - 50.0, t_us + 50.0])
+        rate = (after - before) / 1e-4
+        return np.asarray((along[1] - along[0]) / 2.0 * size + (turned[1] - turned[0]) / (20.0 * ANGLE) * rate)
+
+    def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
+        """Luminance of all pixels."""
+        simulation, device = self._simulation, self._world.device
+        given = simulation.prism if prism else replace(simulation.prism, apex=0.0)
+        view = sight.View()
+        view.prism = ExactModel(simulation.camera, given, 0.0, simulation.motion.tilt).params(device)
+        self._sight.set_instants(np.array([float(t_us)]), view)
+        angle = simulation.motion.phase + float(simulation.motion.angle(t_us))
+        table: NDArray[Any] = np.zeros(1, sight.Step.numpy_dtype())
+        table["azimuth"] = (math.cos(angle), math.sin(angle))
+        steps = sight.Steps()
+        steps.at = wp.array(table, dtype=sight.Step, device=device)
+        out = wp.empty(len(self._rays), dtype=float, device=device)
+        inputs = [*self._sight.inputs(), steps, 0]
+        launch(world_events.see_pixels, len(out), inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
+        return np.asarray(out.numpy())
+
+
+def moved_points(move: Callable[..., Any], xy: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (n, 2) [px] moved by a model's method at prism angles (n,) [rad]."""
+    points = wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu")
+    return np.asarray(move(points, wp.array(theta.astype(np.float32), dtype=float, device="cpu")).numpy(), np.float64)
