@@ -73,7 +73,7 @@ def test_window_model_and_axis(files: Path, tmp_path: Path) -> None:
     [
         (["--screenshot", "out.jpg"], "written as .png"),
         (["--screenshot", "nowhere/out.png"], "nowhere"),
-        (["--screenshot", "out.png", "--window", "5:2"], "--window '5:2' is no span of time"),
+        (["--screenshot", "out.png", "--window", "5:2"], "--window '5:2' is not a time span"),
         (["--screenshot", "out.png", "--window", "50:60"], "take another window"),
         (["--screenshot", "out.png", "--model", "sphere"], "choose among circle, exact, radial, ellipse"),
         (["--screenshot", "out.png", "--size", "9x9"], "--size"),
