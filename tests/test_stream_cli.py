@@ -291,7 +291,7 @@ def test_packets_go_through_pipes(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (["live", "still.h5", "--calibration", "c.json"], "still.h5: gives no encoder samples"),
+        (["live", "still.h5", "--calibration", "c.json"], "still.h5: contains no encoder samples"),
         (["record", "still.h5", "o.h5"], "give the controller's --port"),
         (["live", "recording.h5", "--calibration", "c.json", "--adaptive"], "give the controller's --port"),
         (["live", "nowhere.h5", "--calibration", "c.json"], "nowhere.h5"),

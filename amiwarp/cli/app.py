@@ -73,7 +73,9 @@ app = typer.Typer(
 
 
 @app.callback(invoke_without_command=True)
-def _version(ctx: typer.Context, version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
+def _version(
+    ctx: typer.Context, version: bool = typer.Option(False, "--version", help="Print the version and exit.")
+) -> None:
     if version:
         import amiwarp
 

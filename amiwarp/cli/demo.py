@@ -24,7 +24,9 @@ def run(
     out: Annotated[
         Path, typer.Option(help="Folder for the recording, calibration, picture and figure."), OUTPUT_FOLDER
     ] = OWN_FOLDER,
-    picture: Annotated[Path | None, typer.Option(help="Picture to use as the scene. Default: a map of the earth.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture to use as the scene. Default: a map of the earth.")
+    ] = None,
     size: Annotated[str, typer.Option(help="Size of the camera's image (px).", metavar="WIDTHxHEIGHT")] = "640x480",
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.5,
     common: Common,

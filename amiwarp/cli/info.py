@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 EXAMPLE = "amiwarp info recording.h5"
 
 
-def run(
-    file: Annotated[Path, typer.Argument(help="Recording in any supported format.")], *, common: Common
-) -> None:
+def run(file: Annotated[Path, typer.Argument(help="Recording in any supported format.")], *, common: Common) -> None:
     """Show a recording's format, events, encoder, camera, prism, ground truth and repairs.
 
     The file is read once, in blocks.

@@ -158,7 +158,9 @@ def interval(text: str, unit: str, name: str) -> tuple[float, float]:
     """
     low, colon, high = text.partition(":")
     if not colon:
-        raise AmiwarpError(f"{name}: {text!r} has no colon; write LOW:HIGH, for example 0:{FORMS[unit][1].partition(' ')[0]}")
+        raise AmiwarpError(
+            f"{name}: {text!r} has no colon; write LOW:HIGH, for example 0:{FORMS[unit][1].partition(' ')[0]}"
+        )
     shared = "" if _suffix(low, unit) else _suffix(high, unit)
     return number(low.strip() + shared, unit, name), number(high, unit, name)
 

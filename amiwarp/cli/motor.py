@@ -34,7 +34,9 @@ class Action(enum.StrEnum):
 
 
 def run(
-    action: Annotated[Action, typer.Argument(help="status: print the status; set: turn at --rpm; stop: stop the motor.")],
+    action: Annotated[
+        Action, typer.Argument(help="status: print the status; set: turn at --rpm; stop: stop the motor.")
+    ],
     *,
     port: Annotated[
         str | None,
@@ -48,7 +50,8 @@ def run(
         float, typer.Option(min=0.001, help="Largest change of the speed (turns/min per second).")
     ] = 500.0,
     limit_rpm: Annotated[
-        float, typer.Option(min=0.0, help="Largest speed accepted (turns/min): what the prism, mount and bearing can bear.")
+        float,
+        typer.Option(min=0.0, help="Largest speed accepted (turns/min): what the prism, mount and bearing can bear."),
     ] = LIMIT_RPM,
     common: Common,
 ) -> None:

@@ -19,7 +19,9 @@ EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
 
 def run(
-    source: Annotated[str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")],
+    source: Annotated[
+        str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")
+    ],
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     stream: SourceOptions,
@@ -50,5 +52,9 @@ def run(
             status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
     data = {"file": str(out), **summary(status, opened), "messages": list(line.messages)}
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
-    report(common, data, [text, *([f"{status.late:,} events arrived too late to be sorted by time"] if status.late else [])])
+    report(
+        common,
+        data,
+        [text, *([f"{status.late:,} events arrived too late to be sorted by time"] if status.late else [])],
+    )
     check_whole(opened, status)

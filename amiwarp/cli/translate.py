@@ -17,7 +17,9 @@ EXAMPLE = "amiwarp translate video.mp4 recording.h5 --apex-deg 1 --rpm 720"
 
 
 def run(
-    source: Annotated[Path, typer.Argument(help="Video, folder of pictures (with times.csv: file, t_us) or .npy stack.")],
+    source: Annotated[
+        Path, typer.Argument(help="Video, folder of pictures (with times.csv: file, t_us) or .npy stack.")
+    ],
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     fps: Annotated[
@@ -26,7 +28,9 @@ def run(
             help="Pictures per second. Needed for a stack or a folder without times.csv; overrides the rate of a video."
         ),
     ] = None,
-    duration: Annotated[float | None, typer.Option(help="Length of the recording (s). Default: length of the pictures.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of the recording (s). Default: length of the pictures.")
+    ] = None,
     rig: RigOptions,
     sensor: SensorOptions,
     encoder: EncoderModelOptions,
