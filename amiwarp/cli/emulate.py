@@ -102,8 +102,8 @@ class PlaybackOptions:
     camera: Annotated[
         str | None,
         typer.Option(
-            help="Address of an emulated camera that serves the recording's events: tcp:HOST:PORT or unix:PATH. Playing "
-            "starts when the first client connects.",
+            help="Address of an emulated camera that serves the recording's events: tcp:HOST:PORT or unix:PATH. "
+            "Playing starts when the first client connects.",
             metavar="ADDRESS",
             rich_help_panel=_PLAYBACK,
         ),

@@ -58,7 +58,7 @@ class SourceOptions:
         float,
         typer.Option(
             min=0.0,
-            help="Longest wait for the sender to return after a socket's stream breaks off (s). Default: do not wait.",
+            help="Longest wait for the sender to return after a socket's stream breaks off (s); 0: do not wait.",
             rich_help_panel=_SOURCE,
         ),
     ] = 0.0

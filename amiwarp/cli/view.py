@@ -215,7 +215,7 @@ def run(
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
-    """Show events in x, y and prism angle, as recorded and as compensated, and adjust the prism's parameters by hand."""
+    """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
     from amiwarp.viewer.app import export_folder
     from amiwarp.viewer.scene import check_display
 
