@@ -60,9 +60,10 @@ class LimitOptions:
     """Options for the limits that a choice must meet."""
 
     tolerance_px: Annotated[
-        float, typer.Option(
+        float,
+        typer.Option(
             help="Largest standard deviation across an edge after compensation (px).", rich_help_panel=_LIMITS
-        )
+        ),
     ] = 0.5
     window_ms: Annotated[
         float,
@@ -103,9 +104,7 @@ class FaultOptions:
     encoder_deg: Annotated[
         float, typer.Option(help="Standard deviation of the encoder's angle (deg).", rich_help_panel=_FAULTS)
     ] = 0.1
-    contrast: Annotated[
-        float, typer.Option(help="Contrast threshold (log intensity).", rich_help_panel=_FAULTS)
-    ] = 0.25
+    contrast: Annotated[float, typer.Option(help="Contrast threshold (log intensity).", rich_help_panel=_FAULTS)] = 0.25
 
     def timing(self) -> Timing:
         """Return the errors of event times and encoder angles."""

@@ -47,7 +47,8 @@ class RigOptions:
     nominal_apex_deg: Annotated[
         float | None,
         typer.Option(
-            help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.", rich_help_panel=_PRISM
+            help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.",
+            rich_help_panel=_PRISM,
         ),
     ] = None
     index: Annotated[float, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = 1.5168
@@ -67,7 +68,8 @@ class RigOptions:
         float, typer.Option(help="Azimuth of the prism at encoder angle 0 (deg).", rich_help_panel=_PRISM)
     ] = 0.0
     tilt_deg: Annotated[
-        str, typer.Option(
+        str,
+        typer.Option(
             help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).",
             metavar="X,Y",
             rich_help_panel=_PRISM,
@@ -124,7 +126,8 @@ class SensorOptions:
     """Options for the sensor's imperfections. Defaults are those of ``amiwarp.SensorModel``."""
 
     ideal: Annotated[
-        bool, typer.Option("--ideal", help="Simulate a sensor without noise, mismatch and latency.", rich_help_panel=_SENSOR)
+        bool,
+        typer.Option("--ideal", help="Simulate a sensor without noise, mismatch and latency.", rich_help_panel=_SENSOR),
     ] = False
     contrast_on: Annotated[float | None, _sensor("ON threshold: rise of log intensity.")] = None
     contrast_off: Annotated[float | None, _sensor("OFF threshold: fall of log intensity.")] = None
@@ -156,9 +159,13 @@ class EncoderModelOptions:
     counts_per_turn: Annotated[int | None, _encoder("Counts per turn; 0: no rounding to counts.")] = None
     rate_hz: Annotated[float | None, _encoder("Sample rate (Hz).")] = None
     jitter_us: Annotated[float | None, _encoder("Standard deviation of the sample times (us).")] = None
-    clock_offset_us: Annotated[float | None, _encoder("Encoder clock minus camera clock (us); stored in the ground truth only.")] = None
+    clock_offset_us: Annotated[
+        float | None, _encoder("Encoder clock minus camera clock (us); stored in the ground truth only.")
+    ] = None
     dropouts_hz: Annotated[float | None, _encoder("Rate of drop-outs (1/s).")] = None
-    dropout_us: Annotated[float | None, _encoder("Length of a drop-out, during which all samples are lost (us).")] = None
+    dropout_us: Annotated[float | None, _encoder("Length of a drop-out, during which all samples are lost (us).")] = (
+        None
+    )
 
     def build(self) -> EncoderModel:
         """Return the encoder model."""
