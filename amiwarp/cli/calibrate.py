@@ -100,7 +100,7 @@ class SearchOptions:
         int | None,
         typer.Option(
             min=0,
-            help="Number of angle bins per turn; events of one pixel in the same bin are joined. Default: 0, no joining.",
+            help="Number of angle bins per turn; events of one pixel in the same bin are joined. Default: 0 (off).",
             rich_help_panel=_SEARCH,
         ),
     ] = None

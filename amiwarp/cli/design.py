@@ -78,7 +78,8 @@ class LimitOptions:
     budget_px: Annotated[
         float | None,
         typer.Option(
-            help="Largest error of the prism model (px rms). Default: a tenth of the blur from pixels, clock and encoder.",
+            help="Largest error of the prism model (px rms). Default: a tenth of the blur from pixels, clock and "
+            "encoder.",
             rich_help_panel=_LIMITS,
         ),
     ] = None

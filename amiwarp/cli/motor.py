@@ -15,7 +15,6 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import FAULTS, STATES
 
-
 EXAMPLE = "amiwarp motor set --port /dev/ttyACM0 --rpm 720"
 LIMIT_RPM = 3000.0
 """Default of ``--limit-rpm`` [turns/min]."""
