@@ -47,7 +47,7 @@ def run(
     methods: Annotated[
         list[str] | None,
         typer.Option(
-            help="Method to run in addition to 'default' and 'paper'. Can be repeated. Default: all methods.",
+            help="Method to run in addition to 'default' and 'paper'. Can be repeated. Default: all, with --quick three.",
             metavar="NAME",
         ),
     ] = None,
@@ -177,9 +177,9 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
                                "run the same command again to continue") from error  # fmt: skip
 
 
-def _prepare(device: str, here: bool) -> None:
+def _prepare(device: str, local: bool) -> None:
     """Prepare a worker: silence Warp; a local worker leaves Ctrl-C to its parent process."""
-    if here:
+    if local:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     choose_device(device)
 
