@@ -18,7 +18,7 @@ from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 
 NASTY = "a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
-"""A name that sets a terminal's title, turns it red, breaks the line and turns the direction of writing round."""
+"""File name that sets the terminal's title and colour, breaks the line and reverses the direction of text."""
 SHOWN = r"a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
 
 

@@ -47,7 +47,8 @@ def run(
     methods: Annotated[
         list[str] | None,
         typer.Option(
-            help="Method to run in addition to 'default' and 'paper'. Can be repeated. Default: all, with --quick three.",
+            help="Method to run in addition to 'default' and 'paper'. Can be repeated. "
+            "Default: all methods, with --quick three.",
             metavar="NAME",
         ),
     ] = None,
