@@ -220,7 +220,7 @@ def test_emulate_and_motor_as_commands(tmp_path: Path) -> None:
                     break
             assert (done.returncode, done.stderr) == (0, "")
             assert "set to 720 rpm" in done.stdout
-            assert f"it goes on turning; to end that: amiwarp motor stop --port {path}" in done.stdout
+            assert f"the motor keeps turning; to stop it: amiwarp motor stop --port {path}" in done.stdout
             emulator.send_signal(signal.SIGINT)
             assert emulator.wait(LONG_S) == 0
         finally:

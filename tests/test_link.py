@@ -571,8 +571,8 @@ def test_the_command_sets_shows_and_stops(path: Path, monkeypatch: pytest.Monkey
         (("set", "--rpm", 3001), "--rpm 3001 is beyond the limit of 3000 rpm"),
         (("set", "--rpm", -200, "--limit-rpm", 100), "--rpm -200 is beyond the limit of 100 rpm"),
         (("set", "--rpm", "nan"), "--rpm nan is beyond"),
-        (("set",), "needs it"),
-        (("stop", "--rpm", 5), "nothing else takes it"),
+        (("set",), "needs --rpm"),
+        (("stop", "--rpm", 5), "stop do not accept it"),
     ],
 )
 def test_a_speed_beyond_the_limit_is_refused_before_the_port_is_opened(args: tuple[object, ...], says: str) -> None:

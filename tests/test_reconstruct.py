@@ -321,7 +321,7 @@ def test_command_refuses(recording: Recording, tmp_path: Path) -> None:
     for out, more, said in (
         ("p.bmp", [], "ends in .bmp"),
         ("none/p.png", [], "does not exist"),
-        ("p.png", ["--fps", "20"], "--fps goes with a video"),
+        ("p.png", ["--fps", "20"], "--fps applies to a video"),
         ("v.mp4", ["--mask", "m.png"], "--mask"),
         ("p.png", ["--start", "9"], "no events in"),
         ("p.png", ["--bits", "12"], "12 bits"),

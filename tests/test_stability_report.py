@@ -254,8 +254,8 @@ def test_command_runs_goes_on_and_redraws(tiny: Axis, tmp_path: Path) -> None:
 
 def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:
     words = ("--out", tmp_path, "--device", "cpu")
-    assert "no axis 'colour' is here; choose among width" in fails("--axes", "colour", *words)
-    assert "no method 'magic' is here; choose among default, paper" in fails("--methods", "magic", *words)
+    assert "unknown axis 'colour'; choose among width" in fails("--axes", "colour", *words)
+    assert "unknown method 'magic'; choose among default, paper" in fails("--methods", "magic", *words)
     assert "no cells of this version" in fails("--redraw", *words)
     (tmp_path / "file").write_text("")
     assert "cannot be made a folder" in fails("--out", tmp_path / "file" / "deeper", "--device", "cpu")

@@ -102,7 +102,7 @@ def test_a_stream_that_breaks_off_is_a_failure_with_whole_files(
     assert done.exit_code == 1
     (line,) = done.stderr.splitlines()
     assert f"{address}: the stream broke off: ended " in line
-    assert f"the {N:,} events until then were kept" in line
+    assert f"the {N:,} events received until then are kept" in line
     assert "--wait-for-source" in line
     assert len(sent(out)) == json.loads(done.stdout)["events"] == N
     assert json.loads(done.stdout)["broke_off"] in line
