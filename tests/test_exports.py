@@ -32,8 +32,8 @@ PNG = (".png",)
         ("a\u202eb.png", r"holds '\\u202e'"),
         ("\ud800.png", "holds"),
         ("x" * 300, "300 characters"),
-        ("x.h5", "ends in .png"),
-        ("x.json", "ends in .png"),
+        ("x.h5", "must end in .png"),
+        ("x.json", "must end in .png"),
     ],
     ids=ascii,
 )

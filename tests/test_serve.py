@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.gate import Check, number
+from amiwarp.viewer.message_filter import Check, number
 from amiwarp.viewer.serve import Session, serve
 
 pytest.importorskip("trame_vuetify")

@@ -31,8 +31,8 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.frames import MOST_IN_FLIGHT
-from amiwarp.viewer.gate import MOST_BYTES, Gate
-from amiwarp.viewer.hosts import Names, address, is_local, reachable, warning
+from amiwarp.viewer.message_filter import MOST_BYTES, MessageFilter
+from amiwarp.viewer.hosts import HostNames, address, is_local, reachable, warning
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.serve import serve
 from amiwarp.viewer.values import SETTABLE
@@ -421,7 +421,7 @@ def test_others_can_reach_it_and_that_is_said(host: str) -> None:
     text = warning(host)
     assert text is not None
     assert host in text
-    assert "everybody in the network" in text
+    assert "everybody on the network" in text
     assert not is_local(host)
 
 
@@ -432,7 +432,7 @@ def test_this_machine_alone_needs_no_warning(host: str) -> None:
 
 @pytest.mark.parametrize(
     ("host", "says"),
-    [("192.0.2.1", "no address of this machine"), ("no.such.host.invalid", "no known name"), ("  ", "host is empty")],
+    [("192.0.2.1", "not an address of this machine"), ("no.such.host.invalid", "unknown name"), ("  ", "host is empty")],
 )
 def test_a_host_that_is_not_here_is_one_error(host: str, says: str) -> None:
     with pytest.raises(AmiwarpError, match=says) as error:
@@ -449,10 +449,10 @@ def test_an_occupied_port_is_one_error() -> None:
 
 
 def test_names_of_a_host_that_others_reach() -> None:
-    names = Names("0.0.0.0")
+    names = HostNames("0.0.0.0")
     assert sockets.gethostname().lower() in names.known
     assert "0.0.0.0" not in names.known
-    assert sockets.gethostname().lower() not in Names("127.0.0.1").known - {"localhost"}
+    assert sockets.gethostname().lower() not in HostNames("127.0.0.1").known - {"localhost"}
 
 
 # slow and absent pages, many of them
@@ -488,7 +488,7 @@ def test_for_a_page_that_takes_nothing_nothing_more_is_drawn(
                 (("wslink.hello", {"secret": "wslink-secret"}), ("viewport.image.push.observer.add", view))
             ):
                 message = packed({"id": "rpc:1" if number else "system:0", "method": method, "args": args})
-                assert Gate(server, SETTABLE).passes(message)
+                assert MessageFilter(server, SETTABLE).passes(message)
                 await connection.send(True, aiohttp.WSMessage(aiohttp.WSMsgType.BINARY, message, None))
             panel.play()
             application.InvokeEvent("StartInteractionEvent")

@@ -433,7 +433,7 @@ def test_exports_go_to_one_folder_under_new_plain_names(page: Any, tabs: Tabs, t
         ("picture", str(outside), "holds '/'"),
         ("picture", "../outside.png", "holds '/'"),
         ("save", "..", "is not the name of an ordinary file"),
-        ("save", "c.h5", "such a file ends in .json"),
+        ("save", "c.h5", "the name must end in .json"),
     ):
         page.locator("#out").fill(given)
         page.locator(f"#do-{name}").click()
@@ -448,7 +448,7 @@ def test_exports_go_to_one_folder_under_new_plain_names(page: Any, tabs: Tabs, t
     with Image.open(io.BytesIO(written)) as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     page.locator("#do-picture").click()
-    message(page, "exists, and a page replaces nothing")
+    message(page, "exists, and the page never replaces a file")
     assert (tabs.folder / "seen.png").read_bytes() == written
     page.locator("#out").fill("")
     for expected in ("discs.png", "discs.2.png"):

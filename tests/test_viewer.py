@@ -95,14 +95,14 @@ def test_every_source_finds_a_moment(million: MemoryEvents, tmp_path: Path) -> N
     sources = [open_recording(tmp_path / name).events for name in ("events.txt", "events.h5")] + [hidden]
     for moment in (-5, int(some.t[0]), 3_456, int(some.t[-1]), 10_000_000):
         assert {source.find(moment) for source in sources} == {int(np.searchsorted(some.t, moment))}
-    runs = [read_span(source, 1000, 5000, most=640).events for source in (*sources, MemoryEvents(some, 4, 4))]
+    runs = [read_span(source, 1000, 5000, most_events=640).events for source in (*sources, MemoryEvents(some, 4, 4))]
     assert len(runs[0]) == 640
     assert all(np.array_equal(run.t, runs[0].t) for run in runs)
 
 
 def test_a_long_window_is_thinned_evenly_and_its_true_count_is_told(million: MemoryEvents) -> None:
     source = Counted(million)
-    span = read_span(source, 200_000, 1_000_000, most=64_000)  # type: ignore[arg-type]
+    span = read_span(source, 200_000, 1_000_000, most_events=64_000)  # type: ignore[arg-type]
     t = million.slice(0, len(million)).t
     inside = t[(t >= 200_000) & (t < 1_200_000)]
     assert span.count == len(inside)
@@ -111,7 +111,7 @@ def test_a_long_window_is_thinned_evenly_and_its_true_count_is_told(million: Mem
     assert (np.diff(span.events.t) >= 0).all()
     shares = np.histogram(span.events.t, 8, (200_000, 1_200_000))[0] / np.histogram(inside, 8, (200_000, 1_200_000))[0]
     assert shares.max() < 1.3 * shares.min()
-    whole = read_span(million, 200_000, 10_000, most=64_000)
+    whole = read_span(million, 200_000, 10_000, most_events=64_000)
     assert np.array_equal(whole.events.t, t[(t >= 200_000) & (t < 210_000)])
 
 

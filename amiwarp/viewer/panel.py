@@ -27,7 +27,7 @@ from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.exports import export_path
 from amiwarp.viewer.frames import room
-from amiwarp.viewer.gate import finite
+from amiwarp.viewer.message_filter import finite
 from amiwarp.viewer.inspector import Selection
 from amiwarp.viewer.jobs import Calibrating, Playing
 from amiwarp.viewer.layout import KEYS, NAMES, UNITS, build

@@ -19,7 +19,7 @@ from weakref import WeakSet
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.frames import Frames
-from amiwarp.viewer.gate import MOST_BYTES, Check, Gate
+from amiwarp.viewer.message_filter import MOST_BYTES, Check, Gate
 from amiwarp.viewer.hosts import ANYWHERE, Names, address, cannot_serve, plain
 
 if TYPE_CHECKING:
