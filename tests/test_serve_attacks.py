@@ -31,9 +31,9 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.frames import MOST_IN_FLIGHT
-from amiwarp.viewer.message_filter import MOST_BYTES, MessageFilter
 from amiwarp.viewer.hosts import HostNames, address, is_local, reachable, warning
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.message_filter import MOST_BYTES, MessageFilter
 from amiwarp.viewer.serve import serve
 from amiwarp.viewer.values import SETTABLE
 
@@ -241,7 +241,7 @@ def test_all_that_the_page_may_set_leaves_it_alive(
             for _ in range(7):  # plays and stops at once
                 await page.call("trame.trigger", "key", [" "], {})
             await page.call("trame.trigger", "key", [" "], {})
-            await until_async(lambda: not build.panels[0].playing.runs)
+            await until_async(lambda: not build.panels[0].playback.runs)
             for name, value in first.items():
                 if name in SETTABLE and SETTABLE[name](value):
                     await page.call("trame.state.update", [{"key": name, "value": value}])
@@ -432,7 +432,11 @@ def test_this_machine_alone_needs_no_warning(host: str) -> None:
 
 @pytest.mark.parametrize(
     ("host", "says"),
-    [("192.0.2.1", "not an address of this machine"), ("no.such.host.invalid", "unknown name"), ("  ", "host is empty")],
+    [
+        ("192.0.2.1", "not an address of this machine"),
+        ("no.such.host.invalid", "unknown name"),
+        ("  ", "host is empty"),
+    ],
 )
 def test_a_host_that_is_not_here_is_one_error(host: str, says: str) -> None:
     with pytest.raises(AmiwarpError, match=says) as error:
@@ -496,7 +500,7 @@ def test_for_a_page_that_takes_nothing_nothing_more_is_drawn(
             drawn.clear()
             for number in range(200):
                 panel.state.dark = bool(number % 2)
-                panel.ask("look")
+                panel.request("look")
                 application.InvokeEvent("UpdateEvent")
                 await asyncio.sleep(0.01)
                 waiting.append(monitor.pending)

@@ -148,7 +148,7 @@ def page(kept: tuple[Any, Any, dict[str, Any]], tabs: Tabs, nothing_fails: None)
     page, panel, first = kept
 
     async def anew() -> str:
-        panel.calibrating.cancel()
+        panel.calibration_job.cancel()
         panel.discard()
         with panel.state:
             panel.state.update({**first, "trame__title": panel.state.trame__title})
@@ -355,7 +355,7 @@ def endless(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
         try:
             while True:
                 calibrate(*args, **kwargs)
-        except jobs.Cancelled:
+        except jobs.JobCancelled:
             ended.set()
             raise
 
@@ -683,7 +683,7 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     until(lambda: field(page, "start_ms") > shown + 8.0 and source(page, "image-before") != picture)
     page.locator("#do-play").click()
     page.locator("#do-play").filter(has_text=re.compile("follow", re.I)).wait_for()
-    until(lambda: not tabs.panels[-1].playing.runs)
+    until(lambda: not tabs.panels[-1].playback.runs)
     times = len(asked)
     start, counts = field(page, "start_ms"), page.locator("#events").inner_text()
     enter(page, "apex", APEX_DEG)

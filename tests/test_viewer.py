@@ -26,8 +26,9 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.colouring import colours_of, residual
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection
-from amiwarp.viewer.scene import Look, Scene, colours_of, residual
+from amiwarp.viewer.scene import Look, Scene
 from amiwarp.viewer.timeline import event_rate, read_span
 
 TRUE = Prism(math.radians(1.0))
@@ -136,7 +137,7 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
     inspector.set(replace(true_knobs(recording), model=model, clock_offset=300.0))
     inspector.open(*inspector.first_window())
     shown = inspector.show()
-    encoder = inspector.set_encoder
+    encoder = inspector.adjusted_encoder
     events = recording.events.between(shown.span.start_us, shown.span.start_us + shown.span.length_us)
     assert shown.span.count == shown.selected == len(events)
     expected = compensate_events(shown.events, inspector.model, encoder)
@@ -149,7 +150,7 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
 
 
 def test_points_are_thinned_evenly(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "DRAWN", 1000)
+    monkeypatch.setattr(viewer, "MOST_POINTS", 1000)
     shown = inspector.show()
     assert len(shown.events) == len(shown.after) == 1000
     parts = np.histogram(shown.events.t, 4, (shown.span.start_us, shown.span.start_us + shown.span.length_us))[0]
@@ -246,9 +247,9 @@ def test_an_encoder_s_own_clock_offset_counts_once(recording: Recording) -> None
     for each in (inspector, punctual):
         each.open(*punctual.first_window())
     np.testing.assert_allclose(inspector.show().after, punctual.show().after, atol=0.01)
-    assert inspector.set_encoder.clock_offset_us == 0.0
+    assert inspector.adjusted_encoder.clock_offset_us == 0.0
     found = calibration_of(recording, clock_offset=700.0)
-    assert Inspector(late, found).set_encoder.clock_offset_us == 700.0
+    assert Inspector(late, found).adjusted_encoder.clock_offset_us == 700.0
 
 
 def test_what_was_set_by_hand_can_be_saved_and_opened(
@@ -343,7 +344,7 @@ def test_the_model_s_orbit_is_drawn_in_front(scene: Scene, inspector: Inspector)
     scene.look_from(view, look)
     before = scene.picture()
     theta, xy = inspector.orbit(80.0, 60.0)
-    scene.mark([(0, scene.box.places(xy, np.degrees(theta)), "#009e73")])
+    scene.mark([(0, scene.box.positions(xy, np.degrees(theta)), "#009e73")])
     after = scene.picture()
     green = (np.abs(after.astype(int) - [0, 158, 115]).max(axis=2) < 12).sum()
     assert green > 20

@@ -83,4 +83,3 @@ class PictureThrottle:
             self._push(self._animated_view, ignore_animation=True)
             drawing_s = loop.time() - start_s
             self._next = loop.call_later(max(FRAME_S - drawing_s, PAUSE_S), self._animate)
-

@@ -103,4 +103,3 @@ def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
     if error.errno in (errno.EACCES, errno.EPERM):
         return AmiwarpError(f"--port {port}: permission denied; give a port above 1023, or 0 for a free one")
     return AmiwarpError(f"--host {host!r} --port {port}: cannot listen: {error.strerror or error}; give others")
-

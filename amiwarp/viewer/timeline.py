@@ -75,7 +75,6 @@ def event_rate(source: EventSource) -> tuple[NDArray[np.int64], NDArray[np.float
     start_s, n, (first, last) = time.perf_counter(), 1, (source.t_first, source.t_last + 1)
     index = {0.0: 0, 1.0: len(source)}
     while n < min(RATE_POINTS, last - first) and time.perf_counter() - start_s < RATE_SECONDS / 3:
-
         n *= 2
         for k in range(1, n, 2):
             index[k / n] = source.find(first + (last - first) * k // n)

@@ -11,8 +11,8 @@ import numpy as np
 
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.message_filter import Check, flag, list_of, number, one_of, text
 from amiwarp.viewer.layout import NAMES, SPEEDS
+from amiwarp.viewer.message_filter import Check, flag, list_of, number, one_of, text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
