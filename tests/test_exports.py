@@ -1,4 +1,4 @@
-"""The names that a page may give to files: plain ones, in one folder, of nothing that exists."""
+"""Names of exported files: plain file names in one folder that never replace an existing file."""
 
 import os
 from pathlib import Path

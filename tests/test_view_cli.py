@@ -1,4 +1,4 @@
-"""``amiwarp view`` on the command line: pictures without a window, and what is said of bad input."""
+"""``amiwarp view`` on the command line: pictures without a window, and error messages for bad input."""
 
 import asyncio
 import json
@@ -29,7 +29,7 @@ from amiwarp.viewer.inspector import Inspector
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> Path:
-    """A recording, and its calibration by the truth."""
+    """Return the folder of a recording and of its calibration with the true parameters."""
     folder = tmp_path_factory.mktemp("view")
     camera, prism = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(1.0))
     recording = simulate(texture, camera, prism, duration_s=0.2, seed=1, nominal_prism=Prism(math.radians(1.3)))
@@ -122,7 +122,7 @@ def test_a_window_opens_only_where_there_is_a_display(monkeypatch: pytest.Monkey
 
 
 def test_what_others_can_reach_is_said(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exports go to the recording's folder, or to another."""
+    """Also: exports go to the recording's folder, or to the given one."""
     folders: list[Path] = []
 
     def serve_panel(make: object, folder: Path, *, host: str, port: int, ready: Callable[[str], None]) -> None:
@@ -165,7 +165,7 @@ def test_exports_of_a_notebook_s_page_have_a_folder_too(files: Path, tmp_path: P
 
 
 def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The browser is one that writes down how it was called, asks for the page and closes."""
+    """A script stands in for the browser: it fetches the page, saves it and ends."""
     browser = tmp_path / BROWSERS[0]
     browser.write_text(
         f"#!{sys.executable}\n"
@@ -184,7 +184,7 @@ def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkey
 
 
 def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its display is one that fetches the page."""
+    """A list stands in for the notebook's display: it collects the page's address."""
     pages: list[bytes] = []
     shown = types.ModuleType("IPython.display")
     vars(shown).update(IFrame=lambda url, width, height: url, display=pages.append)

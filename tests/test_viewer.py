@@ -1,4 +1,4 @@
-"""What the inspector shows, and how its clouds are drawn; without a browser."""
+"""The inspector's values and the drawing of its clouds, without a browser."""
 
 import math
 from collections.abc import Iterator
@@ -64,7 +64,7 @@ def calibration_of(recording: Recording, **parameters: float) -> Calibration:
 
 
 class Counted:
-    """A source that counts the events that were read."""
+    """Event source that counts the events read from it."""
 
     def __init__(self, source: MemoryEvents) -> None:
         self.source, self.read, self.find = source, 0, source.find
@@ -141,10 +141,13 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
     events = recording.events.between(shown.span.start_us, shown.span.start_us + shown.span.length_us)
     assert shown.span.count == shown.selected == len(events)
     expected = compensate_events(shown.events, inspector.model, encoder)
-    np.testing.assert_allclose(shown.after, expected, atol=2e-3)  # the knob's offset is linear in the angle
+    np.testing.assert_allclose(shown.after, expected, atol=2e-3)  # the clock offset is applied linearly
     image = iwe(events, *recording.events.size, model=inspector.model, encoder=encoder)
     raw = iwe(events, *recording.events.size)
-    for ours, plain in ((shown.image_after, image), (shown.image_before, raw)):  # but for the dither of the votes
+    for ours, plain in (
+        (shown.image_after, image),
+        (shown.image_before, raw),
+    ):  # dithered votes
         ours, plain = (gaussian_filter(each, 2.0)[6:-6, 6:-6] for each in (ours, plain))
         assert np.abs(ours - plain).max() < 0.05 * plain.max()
 
@@ -281,7 +284,7 @@ def test_what_cannot_be_shown_is_said(inspector: Inspector, recording: Recording
     with pytest.raises(AmiwarpError, match="none of them selected"):
         inspector.open(*inspector.first_window(), Selection(region=(5, 5, 5, 9)))
     assert inspector.selection == Selection()
-    assert inspector.show().region == (0, 0, *recording.events.size)  # as before
+    assert inspector.show().region == (0, 0, *recording.events.size)  # unchanged
     other = replace(calibration_of(recording), camera=Camera.from_fov(64, 48, 1.0))
     with pytest.raises(AmiwarpError, match="64x48 pixels, the events are of 160x120"):
         Inspector(recording, other)
@@ -318,7 +321,7 @@ LOOKS = {
 
 
 def away(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean difference of two pictures, single pixels smoothed: renderers differ in which one a point takes."""
+    """Return the mean difference of two smoothed pictures, because renderers round a point's pixel differently."""
     return float(
         np.abs(gaussian_filter(a.astype(float), (2, 2, 0)) - gaussian_filter(b.astype(float), (2, 2, 0))).mean()
     )
@@ -326,7 +329,7 @@ def away(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", LOOKS)
 def test_pictures_are_as_they_were(scene: Scene, inspector: Inspector, recording: Recording, name: str) -> None:
-    """Beside the committed ones; every other of these differs by much more."""
+    """Each picture is close to its committed reference and far from the other references."""
     inspector.set(true_knobs(recording))
     look, view = LOOKS[name]
     scene.show(inspector.show(), look)
@@ -360,7 +363,7 @@ def test_an_event_is_picked_where_it_is_seen(scene: Scene, inspector: Inspector)
     k = scene.pick(0.25, 0.5)
     assert k is not None
     x, y = shown.before[k]
-    assert (x, y) == pytest.approx((80.0, 60.0), abs=6.0)  # the image's middle is that of the left half
+    assert (x, y) == pytest.approx((80.0, 60.0), abs=6.0)  # the left half shows the whole image
     right = scene.pick(0.75, 0.5)
     assert right is not None
     assert tuple(shown.after[right]) == pytest.approx((80.0, 60.0), abs=6.0)

@@ -90,8 +90,10 @@ def open_window(make_inspector: Callable[[], Inspector], folder: Path, ready: Ca
     """
 
     async def serve_and_show() -> None:
-        address: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        serving = asyncio.create_task(_serve(make_inspector, folder, LOCALHOST, 0, address.set_result))
+        address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        serving: asyncio.Future[Any] = asyncio.create_task(
+            _serve(make_inspector, folder, LOCALHOST, 0, address.set_result)
+        )
         await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
         if serving.done():
             serving.result()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from amiwarp.viewer.scene import Look
 
 NEAR_PX = 3.0
-"""Diameter of the neighbourhood whose centre is compared with an event [px]: two standard deviations of its weights."""
+"""Size of the neighbourhood whose centre is compared with an event: two standard deviations [px]."""
 
 
 def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:

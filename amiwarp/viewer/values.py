@@ -17,7 +17,7 @@ from amiwarp.viewer.message_filter import Check, flag, list_of, number, one_of, 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.viewer.inspector import Inspector, Shown
+    from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 
 JPEG_QUALITY = 90
 _pixels = number(0, 65536)
@@ -63,7 +63,7 @@ def source_state(inspector: Inspector) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def event_text(shown: Shown, k: int) -> str:
+def event_text(shown: DisplayedWindow, k: int) -> str:
     """Return the description of point ``k``: pixel, time, angle, polarity and compensated position."""
     e, (x, y) = shown.events, shown.after[k]
     return (
