@@ -144,10 +144,8 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
     np.testing.assert_allclose(shown.after, expected, atol=2e-3)  # the clock offset is applied linearly
     image = iwe(events, *recording.events.size, model=inspector.model, encoder=encoder)
     raw = iwe(events, *recording.events.size)
-    for ours, plain in (
-        (shown.image_after, image),
-        (shown.image_before, raw),
-    ):  # dithered votes
+    # the inspector dithers its votes: compare smoothed images
+    for ours, plain in ((shown.image_after, image), (shown.image_before, raw)):
         ours, plain = (gaussian_filter(each, 2.0)[6:-6, 6:-6] for each in (ours, plain))
         assert np.abs(ours - plain).max() < 0.05 * plain.max()
 
