@@ -56,13 +56,13 @@ def _measured(args: argparse.Namespace) -> Charts:
     said: set[str] = set()
     began = time.perf_counter()
 
-    def tell(what: str, share: float) -> None:
+    def show_progress(what: str, share: float) -> None:
         step = f"{what}: {10 * int(10 * share)} %"
         if step not in said:
             said.add(step)
             print(f"{time.perf_counter() - began:6.0f} s  {step}", file=sys.stderr, flush=True)
 
-    tell("simulating", 0.0)
+    show_progress("simulating", 0.0)
     recording = simulated(args.picture, seed=args.seed, device=args.device, quick=args.quick)
     args.out.mkdir(parents=True, exist_ok=True)
     with own_folder(args.out):
@@ -73,9 +73,9 @@ def _measured(args: argparse.Namespace) -> Charts:
             seed=args.seed,
             quick=args.quick,
             libraries=library_tasks,
-            progress=tell,
+            progress=show_progress,
         )
-    tell("done", 1.0)
+    show_progress("done", 1.0)
     return charts
 
 
