@@ -1,7 +1,7 @@
-"""The charts of speed against error, without the command line's packages: for a machine that has only a GPU.
+"""Charts of speed against error, on a machine without the packages of amiwarp's command line.
 
 python -m benchmarks.chart PICTURE --out FOLDER [--device cuda:0] [--budget-px 0.3] [--quick]
-python -m benchmarks.chart --from chart.json --out FOLDER      draws what was measured elsewhere
+python -m benchmarks.chart --from chart.json --out FOLDER      draws the results of an earlier run
 """
 
 from __future__ import annotations
