@@ -42,7 +42,7 @@ FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1
 """Nominal over true apex angle, so that no search range is centred on the truth."""
 NEAR = 0.05
-"""If a model's true error differs from the budget by less than this share, either pick is acceptable."""
+"""If a model's true error differs from the budget by less than this share, a pick on either side is plausible."""
 LEAST_RIGHT, MOST_OVER, MOST_REFUSED = 0.95, 1.1, 0.05
 TURNS_PER_S = 12.0
 
