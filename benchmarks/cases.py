@@ -149,7 +149,7 @@ class Aim:
     Rates such as ``Gev/s`` and ``x faster`` are minima. ``s``, ``x time`` and ``MiB`` (peak memory of the process) are
     maxima.
     """
-    beside: str | None = None
+    compared_with: str | None = None
     """Name of the case to compare with, pass by pass of the same run."""
 
 
@@ -172,17 +172,18 @@ CIRCLE, EXACT = "amiwarp circle bilinear", "amiwarp exact bilinear"
 AIMS = (
     Aim("bilinear image, one pass, from device memory", "cuda", CIRCLE,
         dict(zip(EVENT_SCENES, (80.0, 75.0, 50.0), strict=True)), "Gev/s"),
-    Aim("the same beside four float atomics", "cuda", CIRCLE, _everywhere(3.3), "x faster", "Warp, four float atomics"),
-    Aim("the same beside PyTorch", "cuda", CIRCLE, _everywhere(10.0), "x faster", "PyTorch"),
+    Aim("the same, compared with four float atomics", "cuda", CIRCLE, _everywhere(3.3), "x faster",
+        "Warp, four float atomics"),
+    Aim("the same, compared with PyTorch", "cuda", CIRCLE, _everywhere(10.0), "x faster", "PyTorch"),
     Aim("bilinear votes of prepared events", "cuda", "amiwarp circle bilinear, prepared",
         _everywhere(300.0, EVENT_SCENES[:2]), "Gvotes/s"),
     Aim("nearest votes of prepared events", "cuda", "amiwarp circle nearest, prepared",
         _everywhere(600.0, EVENT_SCENES[:2]), "Gvotes/s"),
     Aim("exact model over circle, time", "cuda", EXACT, _everywhere(1.1), "x time", CIRCLE),
     *_whole("cuda", (0.05, 0.25, 0.05), 100.0),
-    Aim("bilinear image beside Numba", "cpu", CIRCLE, _everywhere(1.5), "x faster", "Numba"),
-    Aim("the same beside NumPy", "cpu", CIRCLE, _everywhere(12.0), "x faster", "NumPy"),
-    Aim("the same beside PyTorch", "cpu", CIRCLE, _everywhere(12.0), "x faster", "PyTorch"),
+    Aim("bilinear image, compared with Numba", "cpu", CIRCLE, _everywhere(1.5), "x faster", "Numba"),
+    Aim("the same, compared with NumPy", "cpu", CIRCLE, _everywhere(12.0), "x faster", "NumPy"),
+    Aim("the same, compared with PyTorch", "cpu", CIRCLE, _everywhere(12.0), "x faster", "PyTorch"),
     Aim("exact model over circle, time", "cpu", EXACT, _everywhere(1.5), "x time", CIRCLE),
     *_whole("cpu", (2.0, 6.0, 2.0), 40.0),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""How wrong each model of the prism is, before anything is recorded: pixels against the exact trace."""
+"""Predict the error of each optical model without a recording, compared with the exact model [px]."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Your own arrays and encoder counts into a recording that every command of amiwarp reads."""
+"""Save your own arrays and encoder counts as a recording that every command of amiwarp reads."""
 
 import math
 
@@ -15,7 +15,7 @@ events = amiwarp.Events.from_arrays(
     p=rng.integers(0, 2, n),  # 1 is ON
 )
 
-# A counter of 4096 per turn at 720 rpm, read out each millisecond, with an index pulse each turn.
+# An encoder with 4096 counts per turn at 720 rpm, read every millisecond, with an index pulse every turn.
 t = np.arange(-1000, 1_002_000, 1000)
 count = np.round(t * 1e-6 * 12.0 * 4096).astype(int)
 encoder = amiwarp.Encoder.from_counts(t, count, counts_per_turn=4096, index_t_us=np.arange(0, 12) * 1_000_000 // 12)
@@ -28,4 +28,4 @@ amiwarp.save_recording("mine.h5", amiwarp.Recording(source, camera, encoder, pri
 opened = amiwarp.open_recording("mine.h5")
 assert opened.encoder is not None
 slip = math.degrees(float(np.abs(opened.encoder.slip()).max()))
-print(f"{len(opened.events)} events, {opened.encoder.rpm:.1f} rpm, index slips by at most {slip:.2f} deg")
+print(f"{len(opened.events)} events, {opened.encoder.rpm:.1f} rpm, index slip at most {slip:.2f} deg")
