@@ -113,10 +113,10 @@ def line(row: dict[str, Any]) -> str:
         return f"{start} skipped: {row['skipped']}"
     low, high = row["quartiles_s"]
     rate = f"{row['rate_per_s'] / 1e6:10.1f} M{row['unit']}/s" if row["unit"] else f"{row['events']:13,} ev"
-    told = ", ".join(f"{k} {v:.4g}" for k, v in (row["errors"] | row["also"]).items())
+    results = ", ".join(f"{k} {v:.4g}" for k, v in (row["errors"] | row["also"]).items())
     bad = f"  WRONG: {'; '.join(row['wrong'])}" if row["wrong"] else ""
     note = f"  ({row['note']})" if row["note"] else ""
-    return f"{start} {rate} {row['median_s'] * 1e3:9.3f} ms [{low * 1e3:.3f}, {high * 1e3:.3f}]  {told}{note}{bad}"
+    return f"{start} {rate} {row['median_s'] * 1e3:9.3f} ms [{low * 1e3:.3f}, {high * 1e3:.3f}]  {results}{note}{bad}"
 
 
 def versions() -> dict[str, str]:

@@ -189,8 +189,8 @@ def run(
     edges, model, meter = Edges(made), ExactModel(CAMERA, prism, PHASE), CoverageMeter(CAMERA.width, CAMERA.height)
     step = step_us(made)
     length = WINDOW_US // step * step
-    start, told = 0, rpm
-    driven.drive(length, told)
+    start, target_rpm = 0, rpm
+    driven.drive(length, target_rpm)
     for events, points in made.blocks(chunk_us=WINDOW_US):
         end = start + length
         if end > made.duration_us:
@@ -203,9 +203,9 @@ def run(
         share = edges.seen(events.t, points, start, end)
         yield Window(0.5e-6 * (start + end), end * 1e-6, length * 1e-6, driven.rpm, len(events), share, coverage.share)
         if controller is not None:
-            told = controller.update(start, end, coverage, len(events) / length) or told
+            target_rpm = controller.update(start, end, coverage, len(events) / length) or target_rpm
         start = end
-        driven.drive(end + length, told)
+        driven.drive(end + length, target_rpm)
 
 
 Row = dict[str, Any]
@@ -236,7 +236,7 @@ def judge(row: Row, usual: Row) -> None:
     row["ok"] = row["share"] >= needed and row["fewer_events"] > 0.0
 
 
-def told(row: Row) -> None:
+def print_row(row: Row) -> None:
     fewer = f"  {100 * row['fewer_events']:5.1f} % fewer  {'ok' if row['ok'] else 'NOT ok'}" if "ok" in row else ""
     print(f"  {row['name']:15} {row['rpm']:5.0f} rpm  {row['mev_s']:6.3f} Mev/s  {100 * row['share']:7.3f} % "
           f"± {100 * row['share_error']:.3f}, 5th {100 * row['share_p5']:7.3f} %{fewer}", flush=True)  # fmt: skip
@@ -251,7 +251,7 @@ def one_motion(name: str, prism: Prism, speeds: tuple[float, ...]) -> list[Row]:
     for rpm in speeds:
         windows = list(run(motion, SETTLED_S + seconds + SPARE_S, rpm, prism=prism))
         rows.append(summary(f"{rpm:g} rpm", windows, SETTLED_S, SETTLED_S + seconds))
-        told(rows[-1])
+        print_row(rows[-1])
     usual = rows[speeds.index(USUAL)]
     for band_name, band in BANDS.items():
         controller = SpeedController(
@@ -260,7 +260,7 @@ def one_motion(name: str, prism: Prism, speeds: tuple[float, ...]) -> list[Row]:
         windows = list(run(motion, ADAPTED_S + seconds + SPARE_S, START_RPM, controller, prism))
         rows.append(summary(band_name, windows, ADAPTED_S, ADAPTED_S + seconds))
         judge(rows[-1], usual)
-        told(rows[-1])
+        print_row(rows[-1])
     return rows
 
 
@@ -278,7 +278,7 @@ def changing() -> tuple[list[Row], dict[str, Any]]:
         rows.append(summary(name, windows, SETTLED_S, float(ends[-1])))
         if controller is not None:
             judge(rows[-1], rows[0])
-        told(rows[-1])
+        print_row(rows[-1])
         course[name] = {
             "t_s": [round(w.t_s, 4) for w in windows],
             "rpm": [round(w.rpm, 1) for w in windows],

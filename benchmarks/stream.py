@@ -48,7 +48,7 @@ PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Pri
 MODELS: dict[str, Model] = {
     "exact": ExactModel.from_prism(CAMERA, PRISM, 0.3), "circle": CircleModel.from_prism(CAMERA, PRISM, 0.3),
 }  # fmt: skip
-ASKED_MEV_S = {"cpu": 50.0, "cuda": 500.0}
+TARGET_MEV_S = {"cpu": 50.0, "cuda": 500.0}
 MOST_MS, LATENCY_MEV_S, MOST_ERROR_PX, MOST_GROWTH_MIB = 5.0, 10.0, 0.01, 16.0
 HOUR_S, HOUR_MEV_S = 3600.0, 0.5
 REPEATS = 9
@@ -127,17 +127,17 @@ class Check:
 
 def rate(device: str, pool: Events, model: Model, together: int) -> dict[str, Any]:
     kind = "cuda" if "cuda" in device else "cpu"
-    asked, packets = ASKED_MEV_S[kind], 20_000 if kind == "cuda" else 2000
-    stream = Stream(pool, asked)
+    target, packets = TARGET_MEV_S[kind], 20_000 if kind == "cuda" else 2000
+    stream = Stream(pool, target)
     ahead = [stream.packet(k) for k in range(packets)]  # a sensor's driver would make these
-    passes = [one_pass(device, pool, model, ahead, together, asked) for _ in range(REPEATS + 1)][1:]
+    passes = [one_pass(device, pool, model, ahead, together, target) for _ in range(REPEATS + 1)][1:]
     mev_s = [found["mev_s"] for found in passes]
     quartiles = np.percentile(mev_s, [25, 50, 75]).tolist()
     error, voted = max(found["error_px"] for found in passes), passes[-1]["voted"]
     whole = all(found["packets"] == packets for found in passes)
-    return {"together": together, "mev_s": quartiles[1], "quartiles": [quartiles[0], quartiles[2]], "asked": asked,
+    return {"together": together, "mev_s": quartiles[1], "quartiles": [quartiles[0], quartiles[2]], "asked": target,
             "packets": packets, "error_px": error, "voted": voted,
-            "ok": whole and quartiles[1] >= asked and error <= MOST_ERROR_PX}  # fmt: skip
+            "ok": whole and quartiles[1] >= target and error <= MOST_ERROR_PX}  # fmt: skip
 
 
 def one_pass(

@@ -523,8 +523,8 @@ def test_keys(page: Any) -> None:
 
     page.keyboard.press("?")
     page.locator("#help").wait_for()
-    told = [row.locator("td").all_inner_texts() for row in page.locator("#help tr").all()]
-    assert told == [["space" if key == " " else key, words] for key, _, words in KEYS]
+    shown = [row.locator("td").all_inner_texts() for row in page.locator("#help tr").all()]
+    assert shown == [["space" if key == " " else key, words] for key, _, words in KEYS]
     page.keyboard.press("?")
     page.locator("#help").wait_for(state="hidden")
 

@@ -131,7 +131,7 @@ def view(
     Parameters
     ----------
     recording : Recording
-        Events to look at, with the encoder, the camera and the prism as far as they are known.
+        Events to show. Encoder, camera and prism may be missing.
     calibration : Calibration or None
         Parameters of the prism at the start. Without it, the page starts with the nominal prism.
     device : str or warp.Device

@@ -1,4 +1,4 @@
-"""Clicks on the event clouds, told apart from drags that rotate the view."""
+"""Detection of clicks on the event clouds, as opposed to drags that rotate the view."""
 
 from __future__ import annotations
 
