@@ -58,7 +58,6 @@ class Panel:
         self._tasks: set[asyncio.Task[None]] = set()
         self._shown: DisplayedWindow | None = None
         self._picked: int | None = None
-
         self._error_source = ""
         self._threads = ThreadPoolExecutor(2, "amiwarp-tab")  # calibration or film; curve or picture
         self.state.update(initial_state(inspector))
