@@ -132,7 +132,7 @@ def test_a_page_in_the_network_prints_a_warning(files: Path, tmp_path: Path, mon
     monkeypatch.setattr(viewer_app, "serve_panel", serve_panel)
     code, said, error = view(files / "recording.h5", "--web", "--host", "0.0.0.0", "--out-dir", tmp_path)
     assert code == 0
-    assert "everybody in the network" in error
+    assert "everybody on the network" in error
     assert "control the inspector" in error
     assert said.startswith("recording.h5: http://")
     assert view(files / "recording.h5", "--web")[2] == ""
@@ -142,10 +142,10 @@ def test_a_page_in_the_network_prints_a_warning(files: Path, tmp_path: Path, mon
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (["--host", "192.0.2.1"], "is no address of this machine"),
+        (["--host", "192.0.2.1"], "is not an address of this machine"),
         (["--port", "{port}"], "is in use"),
-        (["--out-dir", "none"], "is no folder"),
-        (["--out-dir", "{file}"], "is no folder"),
+        (["--out-dir", "none"], "is not a folder"),
+        (["--out-dir", "{file}"], "is not a folder"),
     ],
 )
 def test_a_page_that_cannot_be_served_is_reported_in_one_line(files: Path, args: list[str], says: str) -> None:
