@@ -51,6 +51,6 @@ class Sharpness(enum.StrEnum):
     LAPLACIAN = "laplacian"
     """Mean squared Laplacian over mean."""
     PAPER_J = "paper_j"
-    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)); see ``docs/explanation/calibration.md`` for where it fails."""
+    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)). It fails as ``docs/explanation/calibration.md`` shows."""
     ENTROPY = "entropy"
     """Minus the entropy of the distribution of votes over pixels [nat]."""

@@ -58,7 +58,7 @@ class DeviceEvents:
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:
-        """Return the same events split over ``parts`` images, or, if ``per_polarity``, over ``parts`` pairs of images."""
+        """Return the same events split over ``parts`` images, or over ``parts`` pairs (OFF, ON) of images."""
         a, e = self.arrays, EventArrays()
         e.x, e.y, e.turn, e.azimuths, e.time, e.weight = a.x, a.y, a.turn, a.azimuths, a.time, a.weight
         e.layer = wp.empty_like(a.layer)

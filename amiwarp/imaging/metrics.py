@@ -155,7 +155,7 @@ def _edge_probability(across: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def contrast(image: NDArray[np.float32]) -> float:
-    """Return the variance over mean of an IWE (height, width): 1 for events at random pixels, higher for sharper ones."""
+    """Return the variance over mean of an IWE: 1 for events at random pixels, higher for sharper images."""
     return sharpness(image, Sharpness.VARIANCE)
 
 
@@ -234,7 +234,7 @@ class PictureQuality:
     Infinite if there is no error.
     """
     gain: float
-    """Log intensity of the truth per unit of the picture: the ON threshold, for a picture in units of that threshold."""
+    """Log intensity of the truth per unit of the picture. For a picture in units of the ON threshold: that threshold."""
     offset: float
     """Log intensity of the truth where the picture is 0."""
 

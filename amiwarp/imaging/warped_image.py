@@ -71,7 +71,7 @@ class CanvasShape:
     parts: int = 1
     """Number of disjoint subsets of the events with separate images; event k belongs to subset ``k % parts``."""
     dither: bool = False
-    """Put each event at a pseudo-random place in its pixel instead of the centre, so that the pixel grid adds no sharpness."""
+    """Put each event at a pseudo-random place in its pixel: at the centres, the pixel grid would add sharpness."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vote", choice(Vote, self.vote, "vote"))
