@@ -224,7 +224,7 @@ class EventTable:
         inputs = [fired, self.tile_of.flatten(), at_least, base]
         launch(kernels.mark_quiet, self.arrays.pixels, inputs, [flag], device=self.device)
 
-    def leave_out_hot(self) -> NDArray[np.int32]:
+    def exclude_hot_pixels(self) -> NDArray[np.int32]:
         """Marks pixels that fire far more than the busiest of those around them -1 in ``tile_of``.
 
         Returns how many events each pixel fired, shape (height, width).
