@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.known import dilated, known_nodes
+from amiwarp.reconstruction.result import Picture
 from amiwarp.reconstruction.window import busiest_square, map_tile, off_excess_by_counts
 from amiwarp.validation import choice
 
@@ -55,62 +55,6 @@ NOISE_DISTANCE = 2
 """Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
 STILL_WINDOW_US = 100_000
 """Default length of a window if the prism does not turn [us]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """Picture of the scene over a time window, without the prism.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> picture = amiwarp.Picture(
-    ...     log=np.array([[0.0, 2.0]], np.float32), known=np.array([[True, True]]), start_us=0, length_us=1000, pairs=2,
-    ...     off_excess=0.0, smoothness=0.02, residual=0.1, hot=0, seconds=0.0, unknowns=np.zeros(2, np.float32))
-    >>> picture.intensity(0.5).round(2)
-    array([[1.  , 2.72]], dtype=float32)
-    """
-
-    log: NDArray[np.float32]
-    """Log intensity in units of the ON threshold, median 0, shape (height, width); NaN where it is not filled.
-
-    Events determine it up to one constant per connected region of :attr:`known`; the fill joins the regions.
-    """
-    known: NDArray[np.bool_]
-    """Whether events determine the pixel, shape (height, width)."""
-    start_us: int
-    """Start of the window [us]."""
-    length_us: int
-    """Length of the window [us]."""
-    pairs: int
-    """Number of equations from pairs of two events."""
-    off_excess: float
-    """Assumed OFF threshold over ON threshold, minus 1."""
-    smoothness: float
-    """Weight of the smoothness prior, chosen by held-out equations."""
-    residual: float
-    """Median absolute residual of the equations [ON thresholds]. Near 1, the optical model or the motion is wrong."""
-    hot: int
-    """Number of hot pixels that were excluded."""
-    seconds: float
-    """Computing time [s]."""
-    unknowns: NDArray[np.float32] = field(repr=False)
-    """Flattened map with its margin and the sensor unknowns, from which the next window can start, shape (n,)."""
-
-    def intensity(self, contrast: float = 0.25) -> NDArray[np.float32]:
-        """Return relative linear intensity, 1 at the median.
-
-        Parameters
-        ----------
-        contrast : float, optional
-            ON threshold [log intensity].
-
-        Returns
-        -------
-        ndarray
-            Intensity, float32, shape ``(height, width)``; NaN where the picture is not filled.
-        """
-        return np.exp(np.float32(contrast) * self.log)
 
 
 class Reconstruction:
@@ -252,17 +196,7 @@ class Reconstruction:
             self._smoothness = self._choose(count, pairs, start_us, length_us, off)
         left, top, tiles = self._tile(start_us, length_us)
         solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
-        if last is not None:
-            unknowns = last.unknowns.copy()
-            unknowns[tiles.nodes :] = solver.unknowns[tiles.nodes :]
-            solver.unknowns = unknowns
-        for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
-            solver.solve(scale, steps=STEPS)
-        typical = solver.residuals.median(pair_count)
-        covered = known_nodes(solver)
-        if covered.any():
-            solver.keep(dilated(covered, NOISE_DISTANCE)[None])
-        solver.solve(SCALES[-1], steps=STEPS)
+        residual, covered = _solve(solver, pair_count, last)
         cut = np.s_[top : top + height, left : left + width]
         unknowns = solver.unknowns
         log, known = unknowns[: tiles.nodes].reshape(tiles.rows, tiles.columns)[cut], covered[cut]
@@ -271,8 +205,9 @@ class Reconstruction:
             log = np.where(known, log, np.float32(np.nan))
         hot = int((table.tile_of.numpy() < 0).sum())
         return Picture(
-            log.astype(np.float32), known, start_us, length_us, pair_count, off, self._smoothness,
-            typical, hot, time.perf_counter() - began, unknowns,
+            log=log.astype(np.float32), known=known, start_us=start_us, length_us=length_us, pairs=pair_count,
+            off_excess=off, smoothness=self._smoothness, residual=residual, hot=hot,
+            seconds=time.perf_counter() - began, unknowns=unknowns,
         )  # fmt: skip
 
     def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
@@ -372,6 +307,23 @@ class Reconstruction:
         return map_tile(self.model, self.camera_rotation.about(start_us + length_us // 2), length_us)
 
 
+def _solve(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tuple[float, NDArray[np.bool_]]:
+    """Solve for the map, from that of the window before if given; return the median residual and the known nodes."""
+    nodes = solver.tiles.nodes
+    if last is not None:
+        unknowns = last.unknowns.copy()
+        unknowns[nodes:] = solver.unknowns[nodes:]
+        solver.unknowns = unknowns
+    for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
+        solver.solve(scale, steps=STEPS)
+    residual = solver.residuals.median(pair_count)
+    covered = known_nodes(solver)
+    if covered.any():
+        solver.keep(dilated(covered, NOISE_DISTANCE)[None])
+    solver.solve(SCALES[-1], steps=STEPS)
+    return residual, covered
+
+
 def reconstruct(
     recording: Recording,
     calibration: Calibration | None = None,
@@ -436,3 +388,6 @@ def reconstruct(
         recording, calibration, model=model, encoder=encoder, camera_rotation=camera_rotation, fill=fill, device=device
     )
     return work.window(*work.span(start_us, length_us, turns))
+
+
+__all__ = ["Picture", "Reconstruction", "reconstruct"]
