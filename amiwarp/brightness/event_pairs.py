@@ -209,8 +209,8 @@ class EventTable:
           start, the brightness is anywhere within one threshold of the reference, so on average the first event finds
           it one threshold further. After the last event, it stays within one threshold. Without the pairs at the start,
           every edge that enters would look lower than when it leaves, and the map would slope.
-        - Silence: ``quiet`` gives the increasing boundaries of time spans [us], and a number n. A span of a pixel is used if
-          the pixel fires in none of the n spans around it. Silence is information: along the pixel's path, the
+        - Silence: ``quiet`` gives the increasing boundaries of time spans [us], and a number n. Used are runs of at
+          least n successive spans in which a pixel does not fire. Silence is information: along the pixel's path, the
           brightness changed by no more than about one threshold.
         """
         self.sort()

@@ -185,7 +185,7 @@ class BrightnessMap:
         return self._new_geometry(), self._new_geometry()
 
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float) -> Any:
-        """Return the slope of the residuals for a fixed map, on the device: a difference quotient of two parameter sets.
+        """Return the slope of the residuals for a fixed map: a difference quotient of two parameter sets.
 
         ``plus`` and ``minus``: arguments of :meth:`place`, ``width`` apart. The positions of the pairs do not change.
         """
