@@ -67,7 +67,7 @@ class PacketCopier:
         self._allocate(64)
 
     def _allocate(self, rows: int) -> None:
-        """Allocate the table of packets for so many rows."""
+        """Allocate the table of packets with ``rows`` rows."""
         table, found = (
             wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
             wp.zeros(rows * FOUND, dtype=int, device="cpu"),

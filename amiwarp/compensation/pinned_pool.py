@@ -30,7 +30,7 @@ class PinnedPool:
         self._allocated = dict.fromkeys(self._free, 0)
 
     def fill(self, counts: dict[Any, int]) -> None:
-        """Allocate so many arrays of each type now."""
+        """Allocate arrays now; ``counts``: number of arrays for each type."""
         for dtype, count in counts.items():
             self._free[dtype] += [self._allocate(dtype) for _ in range(count)]
 
@@ -45,7 +45,7 @@ class PinnedPool:
             view = np.empty(n, dtype)
             return wp.array(view, dtype=wp.dtype_from_numpy(dtype), device="cpu", copy=False), view
         array = free.pop() if free else self._allocate(dtype)
-        # From a buffer, not a slice: views of this view then refer to it, and none to what lies below it.
+        # Not a slice: NumPy makes a slice of a slice refer to the base, and the pool would miss that it is in use.
         view = np.frombuffer(memoryview(array.numpy()), dtype, n)
         weakref.finalize(view, free.append, array).atexit = False
         return array, view

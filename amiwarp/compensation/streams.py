@@ -264,10 +264,10 @@ class Compensator:
         in_flight = self._pipeline.submit(staged, unknown)
         return in_flight, None if self.encoder.knows(first, last) else self.encoder.guessed(in_flight.t)
 
-    def _finish(self, in_flight: BatchInFlight, guessed: NDArray[np.bool_] | None) -> Compensated:
+    def _finish(self, in_flight: BatchInFlight, extrapolated: NDArray[np.bool_] | None) -> Compensated:
         x, y, flags = self._pipeline.finish(in_flight)
-        if guessed is not None:
-            flags[guessed] |= EXTRAPOLATED
+        if extrapolated is not None:
+            flags[extrapolated] |= EXTRAPOLATED
         flags[: in_flight.unknown] = OUTSIDE | NO_ANGLE
         return Compensated(Events(x, y, in_flight.t, in_flight.p), flags, in_flight.arrived_us)
 

@@ -234,7 +234,7 @@ class PictureQuality:
     Infinite if there is no error.
     """
     gain: float
-    """Log intensity of the truth per unit of the picture. For a picture in units of the ON threshold: that threshold."""
+    """Log intensity of the truth per unit of the picture. If that unit is the ON threshold: the threshold."""
     offset: float
     """Log intensity of the truth where the picture is 0."""
 

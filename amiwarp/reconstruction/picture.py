@@ -148,8 +148,10 @@ class Reconstruction:
         """
         first, last = self.recording.events.t_first, self.recording.events.t_last
         if turns is not None:
-            if length_us is not None or self.turn_us is None:
-                raise AmiwarpError("turns: the prism does not turn, or a length is given too; give only a length")
+            if length_us is not None:
+                raise AmiwarpError("turns is given, and a length is given too; give one of them")
+            if self.turn_us is None:
+                raise AmiwarpError("turns is given, but the prism does not turn; give a length")
             length_us = round(turns * self.turn_us)
         start = first if start_us is None else start_us
         length = length_us or round(self.turn_us or STILL_WINDOW_US)

@@ -301,7 +301,7 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
             if not container.streams.video:
                 raise AmiwarpError(f"{path} contains no video stream; give a video")
             stream = container.streams.video[0]
-            own = float(stream.average_rate or stream.guessed_rate or 0.0)
+            native_fps = float(stream.average_rate or stream.guessed_rate or 0.0)
             length = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) * 1e-6
             size = (stream.width, stream.height)
     except AmiwarpError:
@@ -310,7 +310,7 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
         raise AmiwarpError(f"{path} cannot be read as a video ({error}); give a file that FFmpeg can read") from error
     if size[0] * size[1] > MOST_PIXELS:
         raise AmiwarpError(f"{path}: is {size[0]}x{size[1]}, over {MOST_PIXELS} pixels; make it smaller")
-    if own <= 0.0 or min(size) < 2:
+    if native_fps <= 0.0 or min(size) < 2:
         raise AmiwarpError(f"{path} has no frame rate or no picture size; convert it to a common format")
-    stretch = own / fps if fps else 1.0
-    return VideoFile(path, size, own, length * 1e6 * stretch, stretch)
+    stretch = native_fps / fps if fps else 1.0
+    return VideoFile(path, size, native_fps, length * 1e6 * stretch, stretch)
