@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.compensation.recordings import PIECE, Mover, compensate, inside_image
+from amiwarp.compensation.recordings import PIECE, BlockCompensator, compensate, inside_image
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
@@ -110,7 +110,7 @@ class Bare:
     def piece(self, start: int) -> Events:
         return Events(**self.read(start, COLUMNS))
 
-    def compensate(self, out: Path, mover: Mover) -> None:
+    def compensate(self, out: Path, mover: BlockCompensator) -> None:
         out.mkdir()
 
         def job(start: int) -> dict[str, Any]:
@@ -186,8 +186,8 @@ def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any]:
     return Events(events.x, events.y, events.t + piece * int(events.t[-1] - events.t[0]), events.p), inside
 
 
-def stages_alone(recording: Any, mover: Mover, folder: Path) -> dict[str, float]:
-    """Return the rate of each stage without the others, on all cores [million events/s]."""
+def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[str, float]:
+    """Million events a second of each stage, over all cores, the others left out."""
     reads = list(recording.events.pieces(PIECE))[: ALONE // PIECE]
     count = min(len(reads) * PIECE, len(recording.events))
     held = [read() for read in reads[:8]]
@@ -230,7 +230,7 @@ def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> di
     encoder = Encoder.constant_speed(RPM, 0, int(bare.piece(bare.count - 1).t[0])) if bare else recording.encoder
     first, last = (0, int(encoder.t[-1])) if bare else (recording.events.t_first, recording.events.t_last)
     began = time.perf_counter()
-    mover = Mover(calibration.model, encoder, first, last, device)
+    mover = BlockCompensator(calibration.model, encoder, first, last, device)
     mover(bare.piece(0) if bare else recording.events.slice(0, PIECE))
     result["compile_s"] = time.perf_counter() - began
     for _ in range(repeats):

@@ -40,7 +40,7 @@ from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_png
-from amiwarp.imaging.metrics import RANGE, picture_quality
+from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
@@ -157,7 +157,7 @@ def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, di
     for area, where in (("textured", spread > TEXTURED**2), ("all", np.ones(truth.shape, np.bool_))):
         quality = picture_quality(log, truth, where)
         fitted = (quality.gain * log + quality.offset).astype(np.float64)
-        span = float(np.ptp(np.percentile(truth, RANGE)))
+        span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))
         _, similar = structural_similarity(truth.astype(np.float64), fitted, data_range=span, full=True)
         out[area] = {
             "correlation": quality.correlation, "psnr_db": quality.psnr_db, "ssim": float(similar[where].mean()),

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-
 """Called with what is being done and the share of it that is."""
 
 ALIKE = 0.05
