@@ -22,10 +22,10 @@ from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, EncoderStream
 from amiwarp.events.events import Events
-from amiwarp.live.link.emulator import MOST_OUT, Controller, Fault
-from amiwarp.live.link.news import News
-from amiwarp.live.link.rotors import MOST_PIECES, Motor, Played
+from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, Fault
+from amiwarp.live.link.rotors import MOST_SEGMENTS, Motor, Played
 from amiwarp.live.link.terminal import RETRY_S, PseudoTerminal
+from amiwarp.live.link.updates import LinkUpdate
 from amiwarp.live.stream import phase_check as watch_module
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream import speed_control as speed_module
@@ -291,10 +291,10 @@ def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest
     class Sending:
         polls = 0
 
-        def poll(self) -> News:
+        def poll(self) -> LinkUpdate:
             self.polls += 1
             t = np.arange(100 * self.polls, 100 * (self.polls + 1), dtype=np.int64)
-            return News(t, t * 1e-5, t[:1], (), False, ())
+            return LinkUpdate(t_us=t, angle=t * 1e-5, index_t_us=t[:1], sync=(), restarted=False, messages=())
 
         def clock(self) -> None:
             return None
@@ -319,13 +319,13 @@ def test_a_motor_remembers_a_bounded_past() -> None:
     motor = Motor(720.0)
     for k in range(5000):
         motor.set_speed(700.0 + k % 40, 500.0, 1000 * k)
-    assert len(motor._pieces) <= MOST_PIECES + 2
+    assert len(motor._segments) <= MOST_SEGMENTS + 2
     assert motor.target_rpm(5_000_000) == 700.0 + 4999 % 40
 
 
 def test_an_emulator_that_was_suspended_sends_a_bounded_rest() -> None:
     controller = Controller(Motor(720.0))
-    assert len(controller.advance(1_000_000_000)) < MOST_OUT + 1000
+    assert len(controller.advance(1_000_000_000)) < MOST_OUT_BYTES + 1000
 
 
 def test_an_emulated_port_comes_back_after_a_lack_of_descriptors(

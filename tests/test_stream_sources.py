@@ -22,10 +22,10 @@ from amiwarp.live.stream import cameras, sockets, sources
 from amiwarp.live.stream.opening import open_source
 from amiwarp.live.stream.packets import (
     HEADER,
-    Decoder,
     End,
     Hello,
     Packet,
+    PacketDecoder,
     encode_compensated,
     encode_encoder,
     encode_end,
@@ -284,7 +284,7 @@ def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path, monkeypat
         slow, quick, gone = (sockets.connect(sink.address) for _ in range(3))
         sink.tick()
         gone.close()
-        decoder, seen = Decoder("quick"), []
+        decoder, seen = PacketDecoder("quick"), []
         quick.setblocking(False)
         for k in range(300):
             sink.send(encode_events(make(1000, start=10_000 * k)))
@@ -307,7 +307,7 @@ def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path, monkeypat
     slow.close()
     quick.close()
     assert [type(message) for message in seen] == [Hello, *[Events] * 300, End]
-    got = list(Decoder("slow").feed(data))
+    got = list(PacketDecoder("slow").feed(data))
     assert isinstance(got[0], Hello)
     assert isinstance(got[-1], End)
     starts = [int(message.t[0]) // 10_000 for message in got[1:-1]]

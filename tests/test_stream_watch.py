@@ -26,7 +26,7 @@ from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.live.stream.forward import Forward
 from amiwarp.live.stream.opening import open_source
-from amiwarp.live.stream.packets import Angles, Decoder, Packet
+from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
 from amiwarp.live.stream.sources import FileSource
@@ -257,8 +257,8 @@ def test_what_is_handed_on_is_what_came(recording: Recording) -> None:
     forward.append_encoder(np.array([1, 2]), np.array([0.5, 0.6]))
     forward.tick()
     assert sent.pop() == b""
-    first, second = [message for data in sent for message in Decoder("here").feed(data)]
+    first, second = [message for data in sent for message in PacketDecoder("here").feed(data)]
     assert isinstance(first, Events)
     np.testing.assert_array_equal(first.t, events.t)
-    assert isinstance(second, Angles)
+    assert isinstance(second, EncoderSamples)
     np.testing.assert_array_equal(second.angle, [0.5, 0.6])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.live.link.clocks import FEWEST, Clock, from_pulses
+from amiwarp.live.link.clocks import FEWEST_PAIRS, ClockMap, fit_to_pulses
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -42,7 +42,7 @@ class CameraClock:
         self._trigger: deque[tuple[int, int]] = deque(maxlen=UNPAIRED)  # camera's time, host's
         self._pairs: deque[tuple[int, int]] = deque(maxlen=PULSES)
         self._ahead: deque[int] = deque(maxlen=ARRIVALS)
-        self._found: Clock | None = None
+        self._found: ClockMap | None = None
 
     @property
     def pulses(self) -> int:
@@ -79,12 +79,12 @@ class CameraClock:
         """The camera's events up to ``t_last`` arrived at ``host_us``."""
         self._ahead.append(host_us - t_last)
 
-    def clock(self, host: Clock | None) -> Clock | None:
+    def clock(self, host: ClockMap | None) -> ClockMap | None:
         """The camera's clock beside the controller's, by pulses; without, by ``host``: the controller's beside it.
 
         By the host it is off by the shortest way of the camera's packets, which nothing tells. None while unknown.
         """
-        if self._found is not None or host is None or len(self._ahead) < FEWEST:
+        if self._found is not None or host is None or len(self._ahead) < FEWEST_PAIRS:
             return self._found
         ahead = np.array(self._ahead)
         shortest = int(ahead.min())
@@ -115,9 +115,9 @@ class CameraClock:
         last_t, last_s = max(pairs.values()), max(pairs)
         self._trigger = deque(list(self._trigger)[last_t + 1 :], UNPAIRED)
         self._sync = deque(list(self._sync)[last_s + 1 :], UNPAIRED)
-        if len(self._pairs) >= FEWEST:
+        if len(self._pairs) >= FEWEST_PAIRS:
             own, other = np.array(self._pairs).T
-            self._found = from_pulses(own, other)
+            self._found = fit_to_pulses(own, other)
 
 
 def _first_meeting(trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -130,12 +130,12 @@ def _first_meeting(trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArr
     intervals = np.concatenate([np.diff(trigger[:, 0]), np.diff(sync[:, 0]), [2 * APART_US]])
     reach, best = int(intervals.min()) // 2, np.zeros(apart.shape, np.bool_)
     delays = trigger[:, 1] - trigger[:, 0], sync[:, 1] - sync[:, 0]
-    if any(np.count_nonzero(some <= some.min() + reach) < FEWEST for some in delays):
+    if any(np.count_nonzero(some <= some.min() + reach) < FEWEST_PAIRS for some in delays):
         return best
     away = np.abs(apart - (delays[1].min() - delays[0].min()))
     nearest = reach
     for i, j in np.argwhere(away <= reach):
         meet = np.abs(apart - apart[i, j]) <= ALIKE_US
-        if meet.any(axis=0).sum() >= FEWEST and away[i, j] <= nearest:
+        if meet.any(axis=0).sum() >= FEWEST_PAIRS and away[i, j] <= nearest:
             best, nearest = meet, int(away[i, j])
     return best

@@ -120,7 +120,7 @@ class Triggers:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Angles:
+class EncoderSamples:
     """Encoder samples: times [us], angles unwrapped [rad]."""
 
     t: NDArray[np.int64]
@@ -132,7 +132,7 @@ class End:
     """The stream ends as it should."""
 
 
-Message: TypeAlias = Hello | Events | Compensated | Triggers | Angles | End
+Message: TypeAlias = Hello | Events | Compensated | Triggers | EncoderSamples | End
 
 
 def encode_hello(width: int, height: int, camera: Camera | None = None, prism: NominalPrism | None = None) -> bytes:
@@ -183,7 +183,7 @@ def _packed(kind: int, count: int, payload: bytes) -> bytes:
     return HEADER.pack(MAGIC, VERSION, kind, 0, count, len(payload), zlib.crc32(payload)) + payload
 
 
-class Decoder:
+class PacketDecoder:
     """Bytes as they come to messages; never holds more than one packet.
 
     Raises :class:`AmiwarpError`, naming ``where`` and the byte at which the packet begins, for a stream that is none:
@@ -265,7 +265,7 @@ class Decoder:
         if kind == TRIGGERS:
             return Triggers(t)
         if kind == ENCODER:
-            return Angles(t, columns[1].astype(np.float64, copy=False))
+            return EncoderSamples(t, columns[1].astype(np.float64, copy=False))
         _, x, y, p, *flags = columns
         place = np.float32 if flags else np.uint16
         events = Events(x.astype(place, copy=False), y.astype(place, copy=False), t, p)
@@ -287,7 +287,7 @@ class Decoder:
         return AmiwarpError(f"{self._where}: packet at byte {self._at}: {what}; see docs/stream-format.md")
 
 
-class Sorter:
+class EventSorter:
     """Puts events in order across packets: each comes out once, and none is earlier than those that came out before.
 
     As long as all come in order, they pass at once and untouched. From an event on that is earlier than those of a

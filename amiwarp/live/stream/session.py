@@ -21,7 +21,7 @@ from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.clocking import CameraClock, clock_offset
-from amiwarp.live.stream.packets import NO_TIMES, Sorter
+from amiwarp.live.stream.packets import NO_TIMES, EventSorter
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from amiwarp.calib.result import Calibration
     from amiwarp.events.events import Events
     from amiwarp.io.live_writer import LiveWriter
-    from amiwarp.live.link.clocks import Clock
+    from amiwarp.live.link.clocks import ClockMap
     from amiwarp.live.link.link import Link
-    from amiwarp.live.link.news import News
+    from amiwarp.live.link.updates import LinkUpdate
     from amiwarp.live.stream.packets import Packet, Source
     from amiwarp.live.stream.speed_control import SpeedKeeper
 
@@ -78,7 +78,7 @@ class Status:
     sharpness: float | None = None
     """Of the last image, over :data:`IMAGE_US`."""
     rpm: float | None = None
-    clock: Clock | None = None
+    clock: ClockMap | None = None
     """The camera's beside the controller's, where there is a link."""
     coverage: float | None = None
     """Share of the edges that the last window saw, where the speed is adaptive."""
@@ -129,12 +129,12 @@ class Session:
         self._out = None if out is None else (out, BackgroundWorker())
         self._stop = threading.Event()
         self._queue = PacketQueue(queue_events, policy)
-        self._sorter, self._camera_clock = Sorter(), CameraClock()
+        self._sorter, self._camera_clock = EventSorter(), CameraClock()
         # a source's own samples are on the events' clock already, as its file says; what was calibrated says it better
         own = clock_offset(source, link)
         known = {} if calibration is None else calibration.parameters
         self.encoder = EncoderStream(known.get("clock_offset", own) - own)
-        self._held: deque[News] = deque()
+        self._held: deque[LinkUpdate] = deque()
         self._held_samples, self._told_held = 0, False
         self._hasty = False
         self._compensator: Compensator | None = None

@@ -16,8 +16,8 @@ from amiwarp.events.events import Events
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import (
-    Angles,
-    Decoder,
+    EncoderSamples,
+    PacketDecoder,
     End,
     Hello,
     Message,
@@ -126,7 +126,7 @@ class StreamSource:
     def __init__(self, name: str, file: Any, *, hello_s: float | None = None) -> None:
         self.name, self._file = name, file
         self._hello_s = HELLO_S if hello_s is None else hello_s
-        self._decoder = Decoder(name)
+        self._decoder = PacketDecoder(name)
         self._ended = False
         self.problem: str | None = None
         """How the stream ended, where it did not end as it should: one line."""
@@ -186,7 +186,7 @@ class StreamSource:
     def _end(self, problem: str) -> None:
         self._ended, self.problem = True, problem
 
-    def _packet(self, message: Events | Compensated | Triggers | Angles) -> Packet:
+    def _packet(self, message: Events | Compensated | Triggers | EncoderSamples) -> Packet:
         now = monotonic_us()
         if isinstance(message, Compensated):
             raise AmiwarpError(f"{self.name}: sends compensated events; give the stream of a sensor")
@@ -195,7 +195,7 @@ class StreamSource:
             raise AmiwarpError(f"{self.name}: {given}; correct its sender")
         if isinstance(message, Triggers):
             return packet(now, triggers=message.t)
-        if isinstance(message, Angles):
+        if isinstance(message, EncoderSamples):
             if not (np.abs(message.angle) <= LARGEST_RAD).all():
                 what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
                 raise AmiwarpError(f"{self.name}: {what}; correct its sender")
