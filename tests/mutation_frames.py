@@ -160,7 +160,8 @@ def frames(rng: random.Random) -> list[bytes]:
         speed = rng.choice([720.0, 0.0, math.nan, math.inf, -math.inf, 1e-45, 3e38])
         message: Message = rng.choice(
             [Samples((t,), (signed,)), Samples((t,) * 3, (signed,) * 3), Index(t, signed), Sync(t, number()),
-             ControllerStatus(t, rng.randrange(256), rng.randrange(1 << 16), speed, 720.0, rng.choice([4096, 4096, 0, number()])),
+             ControllerStatus(t, rng.randrange(256), rng.randrange(1 << 16), speed, 720.0,
+                              rng.choice([4096, 4096, 0, number()])),
              Pong(rng.choice([1, 2, 3, 4, number()]), t), Answer(rng.randrange(1 << 16), rng.randrange(256)),
              Ping(number()), SetSpeed(speed, speed)]
         )  # fmt: skip
@@ -237,7 +238,7 @@ def read_stream(data: bytes) -> int:
         source = StreamSource("the stream", file)
         count = sum(1 for _ in source.packets())
     for _ in decoder.feed(data):
-        assert len(decoder.room()) < 1 << 23
+        assert len(decoder.free_buffer()) < 1 << 23
     return count
 
 

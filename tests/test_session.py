@@ -30,7 +30,7 @@ from amiwarp.live.stream import sources
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
 from amiwarp.live.stream.opening import open_source
-from amiwarp.live.stream.packets import Packet, packet
+from amiwarp.live.stream.packets import Packet, make_packet
 from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.session import Session, Status
 from amiwarp.optics.camera import Camera
@@ -250,7 +250,7 @@ def packets_of(recording: Recording, size: int = 500) -> list[Packet]:
     out = []
     for events in recording.events.blocks(count=size):
         until = int(np.searchsorted(encoder.t, events.t[-1])) + 2
-        out.append(packet(0, events, encoder_t=encoder.t[sent:until], encoder_angle=encoder.angle[sent:until]))
+        out.append(make_packet(0, events, encoder_t=encoder.t[sent:until], encoder_angle=encoder.angle[sent:until]))
         sent = until
     return out
 
@@ -269,8 +269,8 @@ def test_packets_out_of_order_come_out_sorted_and_once() -> None:
     rng = np.random.default_rng(0)
     order = np.argsort(np.arange(len(given)) + rng.uniform(0, 1.6, len(given)))  # late by a packet or two
     shuffled = [given[k] for k in order]
-    samples = [packet(0, encoder_t=p.encoder_t, encoder_angle=p.encoder_angle) for p in given]
-    out, status = through(Made(samples + [packet(0, p.events) for p in shuffled]))
+    samples = [make_packet(0, encoder_t=p.encoder_t, encoder_angle=p.encoder_angle) for p in given]
+    out, status = through(Made(samples + [make_packet(0, p.events) for p in shuffled]))
     found = Events.concatenate([p.events for p in out])
     assert (found.t[1:] >= found.t[:-1]).all()
     assert len(found) == 20_000
@@ -353,7 +353,7 @@ class Whole(Made):
 def test_samples_that_wait_in_the_queue_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each packet's come after it; a sink was slow for longer than one waits for the encoder."""
     given = packets_of(points(100_000, 0.5))
-    apart = [packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)]
+    apart = [make_packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)]
     now_us = 0
     out: list[Compensated] = []
     monkeypatch.setattr(session_module, "monotonic_us", lambda: now_us)

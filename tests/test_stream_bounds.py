@@ -32,7 +32,7 @@ from amiwarp.live.stream import speed_control as speed_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import EmulatedCamera
-from amiwarp.live.stream.packets import Packet, encode_hello, packet
+from amiwarp.live.stream.packets import Packet, encode_hello, make_packet
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
@@ -50,17 +50,17 @@ LONG_S = 120.0
 def samples(k: int, n: int = 500) -> Packet:
     """The k-th packet of encoder samples alone."""
     t = np.arange(k * n, (k + 1) * n, dtype=np.int64)
-    return packet(0, encoder_t=t, encoder_angle=t * 1e-5)
+    return make_packet(0, encoder_t=t, encoder_angle=t * 1e-5)
 
 
 def pulses(k: int, n: int = 500) -> Packet:
     """The k-th packet of triggers alone."""
-    return packet(0, triggers=np.arange(k * n, (k + 1) * n, dtype=np.int64))
+    return make_packet(0, triggers=np.arange(k * n, (k + 1) * n, dtype=np.int64))
 
 
 def single(k: int) -> Packet:
     """The k-th packet of one event."""
-    return packet(0, events(1, k))
+    return make_packet(0, events(1, k))
 
 
 def events(n: int, t: int) -> Events:
@@ -122,7 +122,7 @@ def test_dropped_events_leave_their_samples_in_order() -> None:
     queue = PacketQueue(10, Policy.DROP_OLDEST)
     for k in range(100):
         queue.put(samples(k, 3))
-        queue.put(packet(0, events(10, k), triggers=np.array([k])))
+        queue.put(make_packet(0, events(10, k), triggers=np.array([k])))
     assert queue.dropped == 990
     queue.close()
     got: list[Packet] = []
@@ -302,7 +302,7 @@ def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest
     class Silent(Flood):
         def packets(self) -> Iterator[Packet]:
             while controller.polls < 50:
-                yield packet(0)
+                yield make_packet(0)
 
     controller = Sending()
     session = Session(Silent(samples, 0), link=controller, say=said.append)  # type: ignore[arg-type]

@@ -125,7 +125,8 @@ def test_a_controller_that_always_begins_anew_is_bounded() -> None:
     sequence = 0
     for k in range(1000):
         messages = [
-            ControllerStatus(k, 1, 0, 720.0, 720.0, 4096), Samples((k + 10,), (0,)), Sync(k + 11, k), Samples((k + 20,), (9000,)),
+            ControllerStatus(k, 1, 0, 720.0, 720.0, 4096), Samples((k + 10,), (0,)), Sync(k + 11, k),
+            Samples((k + 20,), (9000,)),
         ]  # fmt: skip
         for message in messages:
             follower.feed(encode(message, sequence), 1000 * k)

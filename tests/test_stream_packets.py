@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.live.stream.event_sorter import EventSorter
 from amiwarp.live.stream.packets import (
     ENCODER,
     HEADER,
@@ -22,7 +23,6 @@ from amiwarp.live.stream.packets import (
     Compensated,
     EncoderSamples,
     End,
-    EventSorter,
     Hello,
     PacketDecoder,
     Triggers,
@@ -90,7 +90,7 @@ def test_all_kinds_come_back_from_pieces_of_any_size(cuts):
     edges = [0, *sorted(cuts), len(data)]
     for start, stop in itertools.pairwise(edges):
         got += decoder.feed(data[start:stop])
-    assert decoder.within is None
+    assert decoder.unfinished_at is None
     for one, other in zip(got, messages, strict=True):
         assert_same(one, other)
 
@@ -129,7 +129,7 @@ def packet(kind: int, count: int, payload: bytes, *, magic: bytes = MAGIC, versi
     [
         (packet(4, 1, bytes(8), magic=b"AMIX"), "begins with b'AMIX'"),
         (packet(4, 1, bytes(8), version=2), "of version 2, not 1"),
-        (packet(4, 1, bytes(8), wrong=1), "check of its 8 bytes"),
+        (packet(4, 1, bytes(8), wrong=1), "checksum of its 8 bytes"),
         (packet(4, 2, bytes(8)), "2 rows in 8 bytes"),
         (packet(4, MOST + 1, bytes(8 * MOST + 8)), f"{MOST + 1} rows"),
         (HEADER.pack(MAGIC, 1, 99, 0, 0, 1 << 31, 0), "2147483648 bytes"),
@@ -161,15 +161,15 @@ def test_kinds_that_are_unknown_are_passed_over():
 def test_an_end_within_a_packet_is_told():
     decoder = PacketDecoder("here")
     assert list(decoder.feed(encode_end() + encode_triggers(np.arange(5))[:-1])) == [End()]
-    assert decoder.within == HEADER.size
+    assert decoder.unfinished_at == HEADER.size
 
 
 def test_room_is_never_more_than_the_packet():
     decoder, data = PacketDecoder("here"), encode_encoder(np.arange(MOST), np.zeros(MOST))
-    assert len(decoder.room()) == HEADER.size
-    decoder.room()[:] = data[: HEADER.size]
-    assert decoder.filled(HEADER.size) is None
-    assert len(decoder.room()) == len(data) - HEADER.size
+    assert len(decoder.free_buffer()) == HEADER.size
+    decoder.free_buffer()[:] = data[: HEADER.size]
+    assert decoder.commit(HEADER.size) is None
+    assert len(decoder.free_buffer()) == len(data) - HEADER.size
     assert HEADER.unpack_from(data)[2] == ENCODER
 
 
@@ -237,7 +237,7 @@ def test_after_a_second_without_disorder_all_passes_at_once_again():
     most=st.integers(1, 60),
 )
 def test_every_event_comes_out_once_in_order(times, most):
-    sorter = EventSorter(most=most)
+    sorter = EventSorter(most_events=most)
     got = []
     for part in times:
         got.append(sorter.put(at(*part)))

@@ -366,7 +366,7 @@ def test_empty_packets_come_each_50_ms_of_silence(monkeypatch):
         packets = list(itertools.islice(source.packets(), 5))
         source.close()
     assert [packet.arrived_us for packet in packets] == [70_050_100, 70_100_200, 70_150_300, 70_200_400, 70_250_500]
-    assert all(packet.bare for packet in packets)
+    assert all(packet.empty for packet in packets)
 
 
 def test_addresses_that_are_none(tmp_path):

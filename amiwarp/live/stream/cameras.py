@@ -17,7 +17,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.packets import Packet, packet
+from amiwarp.live.stream.packets import Packet, make_packet
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,12 +87,12 @@ class DvSource(_CameraSource):
                 running = self._camera.isRunning()
                 store, triggers = self._camera.getNextEventBatch(), self._triggers()
             if store is not None or triggers.size:
-                yield packet(monotonic_us(), _dv_events(store), triggers)
+                yield make_packet(monotonic_us(), _dv_events(store), triggers)
                 given = time.monotonic()
             elif not running:
                 raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
             elif time.monotonic() - given >= IDLE_S:
-                yield packet(monotonic_us())
+                yield make_packet(monotonic_us())
                 given = time.monotonic()
             else:
                 time.sleep(POLL_S)
@@ -152,7 +152,7 @@ class PropheseeSource(_CameraSource):
             if events is None:
                 raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
             now = monotonic_us()
-            yield packet(now, _events(events["x"], events["y"], events["t"], events["p"]), triggers)
+            yield make_packet(now, _events(events["x"], events["y"], events["t"], events["p"]), triggers)
 
     def close(self) -> None:
         """See :meth:`Source.close`."""

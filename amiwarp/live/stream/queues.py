@@ -69,7 +69,7 @@ class PacketQueue:
                 packet = self._thinned(packet)
             while self.policy is Policy.DROP_OLDEST and self._held and not self._fits(packet):
                 self._drop_oldest()
-            if packet.bare:  # a source's sign of life: nothing to consume
+            if packet.empty:  # a source's sign of life: nothing to consume
                 return
             self._changed.wait_for(lambda: not self._packets or self._fits(packet) or self._closed)
             self._packets.append(packet)
@@ -110,8 +110,8 @@ class PacketQueue:
         self._held -= len(packet.events)
         self.dropped += len(packet.events)
         rest = replace(packet, events=Events.empty())
-        self.held_bytes -= packet.held_bytes - (0 if rest.bare else rest.held_bytes)
-        if rest.bare:
+        self.held_bytes -= packet.held_bytes - (0 if rest.empty else rest.held_bytes)
+        if rest.empty:
             del self._packets[self._spent]
         else:
             self._packets[self._spent] = rest

@@ -21,7 +21,8 @@ from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.clocking import CameraClock, clock_offset
-from amiwarp.live.stream.packets import NO_TIMES, EventSorter
+from amiwarp.live.stream.event_sorter import EventSorter
+from amiwarp.live.stream.packets import NO_TIMES
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.queues import PacketQueue

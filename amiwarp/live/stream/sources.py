@@ -17,13 +17,13 @@ from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import (
     EncoderSamples,
-    PacketDecoder,
     End,
     Hello,
     Message,
     Packet,
+    PacketDecoder,
     Triggers,
-    packet,
+    make_packet,
 )
 from amiwarp.live.stream.sockets import Unreachable, accept, connect, ready
 
@@ -39,10 +39,10 @@ def open_stream(spec: str) -> StreamSource:
     """Connect to, or wait for, the sender of the stream at ``tcp:``, ``unix:``, ``tcp-listen:`` or ``unix-listen:``."""
     kind = spec.partition(":")[0]
     connection = accept(spec.replace("-listen", "", 1)) if kind.endswith("-listen") else connect(spec)
-    return from_connection(spec, connection)
+    return open_connection(spec, connection)
 
 
-def from_connection(spec: str, connection: socket.socket, *, hello_s: float | None = None) -> StreamSource:
+def open_connection(spec: str, connection: socket.socket, *, hello_s: float | None = None) -> StreamSource:
     """Read the stream that comes over a connection, which the source closes."""
     with connection:
         connection.settimeout(None)
@@ -108,13 +108,13 @@ class FileSource:
         while (left := (due - self._clock()) * 1e-6) > 0.0:
             self._sleep(min(left, IDLE_S))
             if left > IDLE_S:
-                yield packet(self._clock())
+                yield make_packet(self._clock())
 
     def _packet(self, arrived_us: int, events: Events, end_us: int) -> Packet:
         start = self._sampled
         self._sampled = max(start, min(int(np.searchsorted(self._encoder_t, end_us)) + 1, len(self._encoder_t)))
         which = slice(start, self._sampled)
-        return packet(arrived_us, events, encoder_t=self._encoder_t[which], encoder_angle=self._encoder_angle[which])
+        return make_packet(arrived_us, events, encoder_t=self._encoder_t[which], encoder_angle=self._encoder_angle[which])
 
 
 class StreamSource:
@@ -149,7 +149,7 @@ class StreamSource:
                 yield self._packet(message)
                 given = time.monotonic()
             elif time.monotonic() - given >= IDLE_S:
-                yield packet(monotonic_us())
+                yield make_packet(monotonic_us())
                 given = time.monotonic()
 
     def close(self) -> None:
@@ -171,15 +171,15 @@ class StreamSource:
         if not ready(self._file, timeout_s):
             return None
         try:
-            count = self._file.readinto(self._decoder.room())
+            count = self._file.readinto(self._decoder.free_buffer())
         except OSError as error:
             self._end(f"ended after an error: {error.strerror or error}")
             return None
         if not count:
-            begun = self._decoder.within
-            self._end("ended without an end packet" if begun is None else f"ended within the packet at byte {begun}")
+            offset = self._decoder.unfinished_at
+            self._end("ended without an end packet" if offset is None else f"ended within the packet at byte {offset}")
             return None
-        message = self._decoder.filled(count)
+        message = self._decoder.commit(count)
         self._ended |= isinstance(message, End)
         return message
 
@@ -194,14 +194,14 @@ class StreamSource:
             given = f"times of {message.t.min()} .. {message.t.max()} us, not in +-{LAST_US}"
             raise AmiwarpError(f"{self.name}: {given}; correct its sender")
         if isinstance(message, Triggers):
-            return packet(now, triggers=message.t)
+            return make_packet(now, triggers=message.t)
         if isinstance(message, EncoderSamples):
             if not (np.abs(message.angle) <= LARGEST_RAD).all():
                 what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
                 raise AmiwarpError(f"{self.name}: {what}; correct its sender")
-            return packet(now, encoder_t=message.t, encoder_angle=message.angle)
+            return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
         width, height = self.size
         if len(message) and (message.x.max() >= width or message.y.max() >= height or message.p.max() > 1):
             what = f"an event outside the {width}x{height} frame, or of a polarity that is neither 0 nor 1"
             raise AmiwarpError(f"{self.name}: {what}; correct its sender")
-        return packet(now, message)
+        return make_packet(now, message)
