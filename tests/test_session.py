@@ -353,7 +353,9 @@ class Whole(Made):
 def test_samples_that_wait_in_the_queue_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each packet's come after it; a sink was slow for longer than one waits for the encoder."""
     given = packets_of(points(100_000, 0.5))
-    apart = [make_packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)]
+    apart = [
+        make_packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)
+    ]
     now_us = 0
     out: list[Compensated] = []
     monkeypatch.setattr(session_module, "monotonic_us", lambda: now_us)

@@ -38,7 +38,7 @@ from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.sockets import MOST_CLIENTS, PIECE, REST_S, PipeSink, SocketSink
+from amiwarp.live.stream.sockets import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
 from amiwarp.live.stream.speed_control import SpeedKeeper
 
 MOST = 1 << 20
@@ -375,7 +375,7 @@ def test_a_client_that_reads_nothing_is_bounded(tmp_path: Path) -> None:
         client.connect(f"{tmp_path}/s")
         for _ in range(20_000):
             sink.send(bytes(40))
-            assert sink.waiting <= most + 40 + PIECE
+            assert sink.waiting <= most + 40 + PACKET_OVERHEAD
         assert sink.clients == 1
         assert sink.lost > 1000
         sink._clients[0].waiting.clear()  # no parting
@@ -468,11 +468,11 @@ def test_a_pipe_whose_reader_takes_nothing_can_be_ended() -> None:
         stop.set()
         thread.join(LONG_S)
         assert not thread.is_alive()
-        assert "its reader takes nothing any more" in str(raised[0])
+        assert "its reader accepts no more data" in str(raised[0])
 
 
 def test_descriptors_above_a_thousand_can_be_waited_for() -> None:
-    from amiwarp.live.stream.sockets import ready
+    from amiwarp.live.stream.connections import ready
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     ours, theirs = socket.socketpair()

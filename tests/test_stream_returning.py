@@ -24,10 +24,10 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import open_recording
+from amiwarp.live.stream.connections import close_listener, listen
 from amiwarp.live.stream.opening import open_source
 from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
 from amiwarp.live.stream.recent_events import RecentEvents, followed
-from amiwarp.live.stream.sockets import listen, shut
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -75,7 +75,7 @@ def sender(path: Path, *streams: bytes | Callable[[], bytes]) -> Iterator[str]:
     finally:
         server.shutdown(socket.SHUT_RDWR)
         thread.join(LONG_S)
-        shut(server)
+        close_listener(server)
 
 
 @pytest.fixture(scope="module")
@@ -281,7 +281,7 @@ def test_a_flood_without_events_can_be_ended(tmp_path: Path, number: int, kind: 
             finally:
                 process.kill()
     finally:
-        shut(server)
+        close_listener(server)
         thread.join(LONG_S)
     assert (process.returncode, error.splitlines()[1:]) == (0, []), error
     assert json.loads(said)["events"] == 0

@@ -40,7 +40,9 @@ class EmulatedCamera:
     ) -> None:
         encoder, events = recording.encoder, recording.events
         if encoder is None or not len(events):
-            raise AmiwarpError(f"{recording.name}: has no {'events' if encoder else 'encoder'}; give a recording with both")
+            raise AmiwarpError(
+                f"{recording.name}: has no {'events' if encoder else 'encoder'}; give a recording with both"
+            )
         self._events, self._rotor, self._controller, self._now_us = events, rotor, controller, now_us
         self._origin = round(int(encoder.t[0]) - encoder.clock_offset_us)
         """Time on the events' clock at which the rotor begins [us]."""

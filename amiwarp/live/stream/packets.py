@@ -294,4 +294,6 @@ class PacketDecoder:
         return Hello(width, height, camera, prism)
 
     def _error(self, what: str) -> AmiwarpError:
-        return AmiwarpError(f"{self._where}: packet at byte {self._offset}: {what}; see docs/reference/stream-format.md")
+        return AmiwarpError(
+            f"{self._where}: packet at byte {self._offset}: {what}; see docs/reference/stream-format.md"
+        )

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.stream.connections import Unreachable, iter_accepted, iter_connected
 from amiwarp.live.stream.packets import make_packet
-from amiwarp.live.stream.sockets import Unreachable, accepting, connecting
 from amiwarp.live.stream.sources import HELLO_S, StreamSource, open_connection, open_stream
 
 if TYPE_CHECKING:
@@ -104,8 +104,8 @@ class ReturningSource:
 
     def _wait(self, until: float) -> Iterator[Packet]:
         """Yield empty packets until the sender returns (:attr:`problem` is then None) or the time is over."""
-        place = self.name.replace("-listen", "", 1)
-        attempts = (accepting if self._listens else connecting)(place)
+        address = self.name.replace("-listen", "", 1)
+        attempts = (iter_accepted if self._listens else iter_connected)(address)
         try:
             for connection in attempts:
                 if connection is not None:
