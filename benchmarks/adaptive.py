@@ -359,7 +359,7 @@ def _course(ax: Any, course: dict[str, Any], what: str, label: str) -> None:
 
 
 def measure_ms(events: int = 300_000, repeats: int = 50) -> tuple[float, float]:
-    """Time for a window's coverage and for what is foretold of it, median [ms]: points of a 640 × 480 image, each seen
+    """Time for a window's coverage and for the prediction from it, median [ms]: points of a 640 × 480 image, each seen
     again and again."""
     rng = np.random.default_rng(0)
     meter, orbit = CoverageMeter(640, 480), prism_orbit(ExactModel(CAMERA, PRISM, PHASE))

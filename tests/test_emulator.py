@@ -16,7 +16,7 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulator import MOST_RPM, Controller, Fault
+from amiwarp.live.link.emulator import MOST_RPM, Controller, EmulatedFault
 from amiwarp.live.link.protocol import (
     Answer,
     ControllerStatus,
@@ -134,7 +134,7 @@ def test_counts_pulses_and_status_are_those_of_the_rotor(rpm: float) -> None:
 
 
 def test_steps_of_any_size_send_the_same() -> None:
-    a, b = (sent(Controller(Motor(500.0), faults=[Fault("slip", 0.5)]), S, step) for step in (1000, 250_000))
+    a, b = (sent(Controller(Motor(500.0), faults=[EmulatedFault("slip", 0.5)]), S, step) for step in (1000, 250_000))
     np.testing.assert_array_equal(counted(a), counted(b))
     assert [m for m in a if isinstance(m, Index)] == [m for m in b if isinstance(m, Index)]
 
@@ -173,14 +173,14 @@ def test_a_host_that_is_silent_is_told_of_and_stops_nothing() -> None:
 
 
 def test_faults_are_written_as_name_and_time() -> None:
-    assert Fault.parse("slip@5") == Fault("slip", 5.0)
-    assert Fault.parse("unplug@1.5+0.25") == Fault("unplug", 1.5, 0.25)
-    assert Fault.parse("stall@3").duration_s == 2.0
+    assert EmulatedFault.parse("slip@5") == EmulatedFault("slip", 5.0)
+    assert EmulatedFault.parse("unplug@1.5+0.25") == EmulatedFault("unplug", 1.5, 0.25)
+    assert EmulatedFault.parse("stall@3").duration_s == 2.0
     for text, says in (("melt@3", "garbage, truncate"), ("slip", "NAME@SECONDS"), ("reset@1+2", "happens at once")):
         with pytest.raises(AmiwarpError, match=says):
-            Fault.parse(text)
+            EmulatedFault.parse(text)
     with pytest.raises(AmiwarpError, match="reverse"):
-        Controller(Played(Encoder.constant_speed(300.0, 0, S)), faults=[Fault("reverse", 1.0, 1.0)])
+        Controller(Played(Encoder.constant_speed(300.0, 0, S)), faults=[EmulatedFault("reverse", 1.0, 1.0)])
 
 
 def test_nothing_is_left_of_a_pseudo_terminal(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.live.link import following, updates
 from amiwarp.live.link import link as link_module
 from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, Fault
+from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault
 from amiwarp.live.link.following import Follower
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.port import open_port, usb_id
@@ -43,7 +43,7 @@ class Line:
 
     def __init__(self, *faults: str, follower: Follower | None = None, **settings: float) -> None:
         self.motor = Motor(RPM)
-        self.controller = Controller(self.motor, faults=[Fault.parse(f) for f in faults], **settings)  # type: ignore[arg-type]
+        self.controller = Controller(self.motor, faults=[EmulatedFault.parse(f) for f in faults], **settings)  # type: ignore[arg-type]
         self.follower = follower or Follower("port")
         self.follower.opened(HOST)
         self.now, self.arrived = 0, 0
@@ -126,8 +126,8 @@ def test_after_a_fault_angles_are_right_and_it_was_said(fault: str, says: str) -
     assert len(news.t_us) == line.arrived
     assert (np.diff(news.t_us) > 0).all()
     name = fault.partition("@")[0]
-    begin = Fault.parse(fault).start_s * S
-    end = begin + Fault.parse(fault).duration_s * S + 90_000  # a turn: until the next index
+    begin = EmulatedFault.parse(fault).start_s * S
+    end = begin + EmulatedFault.parse(fault).duration_s * S + 90_000  # a turn: until the next index
     away = np.abs(line.away(news))
     world = line.controller.time_at(news.t_us)
     assert away[(world < begin) | (world > end)].max() < TOLERANCE
@@ -363,7 +363,7 @@ class Live:
     ) -> None:  # fmt: skip
         self.motor = Motor(rpm)
         self.controller = Controller(
-            self.motor, faults=[Fault.parse(f) for f in faults], drift_ppm=drift_ppm, sample_hz=sample_hz
+            self.motor, faults=[EmulatedFault.parse(f) for f in faults], drift_ppm=drift_ppm, sample_hz=sample_hz
         )
         self.terminal = PseudoTerminal(self.controller, path, now_us=now_us)
 

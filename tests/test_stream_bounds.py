@@ -22,7 +22,7 @@ from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, EncoderStream
 from amiwarp.events.events import Events
-from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, Fault
+from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, EmulatedFault
 from amiwarp.live.link.rotors import MOST_SEGMENTS, Motor, Played
 from amiwarp.live.link.terminal import RETRY_S, PseudoTerminal
 from amiwarp.live.link.updates import LinkUpdate
@@ -166,7 +166,7 @@ class Flood(Made):
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions whose queues are small."""
-    monkeypatch.setattr("amiwarp.live.stream.session.Beside", partial(BackgroundWorker, MOST))
+    monkeypatch.setattr("amiwarp.live.stream.consumers.BackgroundWorker", partial(BackgroundWorker, MOST))
     monkeypatch.setattr("amiwarp.live.stream.session.PacketQueue", partial(PacketQueue, most_bytes=MOST))
 
 
@@ -181,7 +181,7 @@ def test_a_session_bounds_encoder_samples_without_events() -> None:
     for _ in range(50):  # it stays there
         time.sleep(0.002)
         assert session._queue.held_bytes <= MOST
-        assert session._raw[0][1].held_bytes <= MOST
+        assert session._consumers.raw[0].worker.held_bytes <= MOST
     assert source.given * samples(0).held_bytes < 2.1 * MOST
     taker.go.set()
     thread.join(LONG_S)
@@ -285,7 +285,7 @@ def test_a_window_that_never_ends_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A controller that sends without end while the camera sends nothing."""
-    monkeypatch.setattr("amiwarp.live.stream.session.MOST_HELD", 1000)
+    monkeypatch.setattr("amiwarp.live.stream.encoder_feed.MOST_WAITING", 1000)
     said: list[str] = []
 
     class Sending:
@@ -308,8 +308,9 @@ def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest
     session = Session(Silent(samples, 0), link=controller, say=said.append)  # type: ignore[arg-type]
     session.run(threading.Event(), lambda _: None)
     assert controller.polls >= 50
-    assert session._held_samples == sum(len(news.t_us) + len(news.index_t_us) for news in session._held)
-    assert 900 <= session._held_samples <= 1000
+    feed = session._feed
+    assert feed._waiting_samples == sum(len(update.t_us) + len(update.index_t_us) for update in feed._waiting)
+    assert 900 <= feed._waiting_samples <= 1000
     assert [message for message in said if "clock is not known" in message] == said
     assert len(said) == 1
 
@@ -340,7 +341,7 @@ def test_an_emulated_port_comes_back_after_a_lack_of_descriptors(
             raise OSError(24, "Too many open files")
         return openpty()
 
-    controller = Controller(Motor(720.0), faults=[Fault.parse("unplug@0.1+0.1")])
+    controller = Controller(Motor(720.0), faults=[EmulatedFault.parse("unplug@0.1+0.1")])
     with PseudoTerminal(controller, tmp_path / "prism", now_us=World().step):
         monkeypatch.setattr(os, "openpty", exhausted)
         reached(lambda: len(failed) == 3)

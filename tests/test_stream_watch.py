@@ -61,7 +61,7 @@ def streamed(recording: Recording) -> EncoderStream:
 def looked(watch: PhaseCheck, encoder: EncoderStream, until_s: float = 120.0) -> float:
     """What the watch finds, which it is asked again and again as by a session."""
     end = time.monotonic() + until_s
-    while (found := watch.look(encoder)) is None:
+    while (found := watch.update(encoder)) is None:
         assert time.monotonic() < end
         time.sleep(0.01)
     return math.degrees(found)
@@ -93,17 +93,17 @@ def test_a_watch_tells_a_phase_that_is_far_off(recording: Recording) -> None:
     watch = PhaseCheck(known(recording, 12.0), 0.0, said.append)
     watch.put(recording.events.slice(0, len(recording.events)))
     assert looked(watch, streamed(recording)) == pytest.approx(12.0, abs=BIAS_DEG)
-    assert "calibrate anew" in said[0]
+    assert "calibrate again" in said[0]
     watch.close()
 
 
 def test_a_watch_says_nothing_of_too_little(recording: Recording) -> None:
     watch = PhaseCheck(known(recording, 0.0), 0.0, print)
-    assert not watch.begin(streamed(recording))
+    assert not watch.start_check(streamed(recording))
     watch.put(recording.events.slice(0, 1000))
-    assert not watch.begin(streamed(recording))
-    assert not watch.begin(EncoderStream())
-    assert watch.look(streamed(recording)) is None
+    assert not watch.start_check(streamed(recording))
+    assert not watch.start_check(EncoderStream())
+    assert watch.update(streamed(recording)) is None
 
 
 def kept(recording: Recording, *, most_mev_s: float, fail: bool = False) -> tuple[list[float], list[str]]:

@@ -66,7 +66,7 @@ STOP_RAMP = 2000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class EmulatedFault:
     """One of :data:`LASTING_FAULTS` or :data:`INSTANT_FAULTS`, scheduled at an emulation time."""
 
     name: str
@@ -77,7 +77,7 @@ class Fault:
     """Duration [s]; 0 for instant faults."""
 
     @classmethod
-    def parse(cls, text: str) -> Fault:
+    def parse(cls, text: str) -> EmulatedFault:
         """Parse ``NAME@SECONDS`` or ``NAME@SECONDS+DURATION``. Raises :class:`AmiwarpError` for anything else."""
         match = re.fullmatch(r"([a-z-]+)@(\d+(?:\.\d*)?)(?:\+(\d+(?:\.\d*)?))?", text)
         if match is None or match[1] not in (*LASTING_FAULTS, *INSTANT_FAULTS):
@@ -86,6 +86,10 @@ class Fault:
         if match[1] in INSTANT_FAULTS and match[3]:
             raise AmiwarpError(f"fault {text!r}: {match[1]} happens at once and has no duration; omit it")
         return cls(match[1], float(match[2]), float(match[3] or LASTING_FAULTS.get(match[1], 0.0)))
+
+
+# Name under which the command imports this type.
+Fault = EmulatedFault
 
 
 class Controller:
@@ -105,7 +109,7 @@ class Controller:
         clock_start: int = 0,
         sync_hz: float = 10.0,
         start_us: int = 0,
-        faults: Iterable[Fault] = (),
+        faults: Iterable[EmulatedFault] = (),
         seed: int = 0,
     ) -> None:
         faults = tuple(faults)
@@ -309,7 +313,7 @@ class Controller:
         return frame
 
 
-def _edges_of(fault: Fault, start_us: int) -> list[tuple[int, bool]]:
+def _edges_of(fault: EmulatedFault, start_us: int) -> list[tuple[int, bool]]:
     """Return the times [us] at which a fault begins (True) and, if it lasts, ends (False)."""
     first = start_us + round(fault.start_s * 1e6)
     ends = [(first + round(fault.duration_s * 1e6), False)] if fault.name in LASTING_FAULTS else []

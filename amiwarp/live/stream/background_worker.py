@@ -9,7 +9,7 @@ from collections.abc import Callable
 from amiwarp.compensation.streams import OVERHEAD
 
 QUEUE_BYTES = 1 << 27
-"""Memory bound of the queue before the compensator, and of each consumer's queue [bytes]: about eight million events."""
+"""Memory bound of the queue before the compensator, and of each consumer's queue [bytes]: about 8 million events."""
 LAST_JOB_S = 5.0
 """Longest wait for the running job when the others are dropped [s]."""
 
