@@ -62,7 +62,7 @@ class Connection:
     losses: LossReporter = field(default_factory=LossReporter)
     received_bytes: int = 0
     unusable: bool = False
-    """Whether the user was told that the data cannot be used."""
+    """Whether a message already said that the data cannot be used."""
     ping_answered: bool = False
     unread: bool = True
     """Whether no time of the controller has arrived yet."""
@@ -122,7 +122,7 @@ class Epoch:
         self.pulses: deque[int] = deque(maxlen=updates.MOST_PULSES)
         """Times of index pulses that wait for the next sample [us]."""
         self.given_us: int | None = None
-        """Time of the latest sample that was handed out [us]."""
+        """Time of the latest sample given out [us]."""
         self.stall = StallDetector()
         self.faults = 0
         """Fault bits of the latest status."""

@@ -17,7 +17,7 @@ from amiwarp.live.link.updates import LinkUpdate, UpdateQueue
 LATE_US = 100_000
 """Step backwards of the controller's clock beyond which it counts as reset [us]."""
 AHEAD_US = 2_000_000
-"""Sudden advance of the controller's clock over the host's beyond which it counts as set anew [us]."""
+"""Sudden advance of the controller's clock over the host's beyond which the clock counts as changed [us]."""
 SILENT_US = 1_800_000_000
 """Silence after which the number of wraps of the controller's clock is unknown [us]."""
 FASTEST = 200.0
@@ -143,6 +143,7 @@ class Follower:
         self._convert(t, count, pulse=False)
 
     def _continues(self, suspect: tuple[int, int], raw_t: int, raw_count: int) -> bool:
+        """Return whether a text line plausibly continues an implausible one."""
         step = (raw_t - suspect[0]) % WRAP
         return 0 < step < AHEAD_US and abs(raw_count - suspect[1]) <= self._largest_step(step)
 
@@ -245,14 +246,14 @@ class Follower:
         self._release()
 
     def _release(self) -> None:
-        """Hand out the samples that waited for the first index pulse."""
+        """Give out the samples that waited for the first index pulse."""
         waiting, self._epoch.unreferenced = self._epoch.unreferenced or (), None
         for t, count in waiting:
             assert self._epoch.angles is not None
             self._give(t, self._epoch.angles.angle(count))
 
     def _give(self, t: int, angle: float) -> None:
-        """Hand out a sample with the index pulses before it; drop it if it is out of order."""
+        """Give out a sample with the index pulses before it; drop it if it is out of order."""
         epoch = self._epoch
         if epoch.given_us is not None and t <= epoch.given_us:
             self._connection.losses.out_of_order += 1

@@ -93,7 +93,7 @@ class Consumers:
             served.worker.end()
 
     def abandon(self) -> None:
-        """Drop what waits, so that the caller can close the consumers at once."""
+        """Drop the waiting data, so that the caller can close the consumers at once."""
         for served in self._all():
             served.worker.abandon()
 

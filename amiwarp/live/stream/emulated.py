@@ -102,7 +102,7 @@ class EmulatedCamera:
         self.done.set()
 
     def _pause(self, seconds: float) -> bool:
-        """Wait, then send the new triggers and what waits; return True if the camera was closed."""
+        """Wait, then send the new triggers and the waiting packets; return True if the camera was closed."""
         if self._ended.wait(seconds):
             return True
         # Select pulses by time, not by number: after a reset the controller numbers them from 0 again.

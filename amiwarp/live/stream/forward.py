@@ -29,5 +29,5 @@ class Forward:
         self._sink.send(encode_encoder(t_us, angle))
 
     def tick(self) -> None:
-        """Let the sink continue to send what waits."""
+        """Let the sink continue to send the waiting packets."""
         self._sink.tick()

@@ -20,8 +20,8 @@ def open_source(
 ) -> Source:
     """Open a source by its name.
 
-    A file name replays a recording at ``pace`` times its speed (None: as fast as possible), in packets of ``packet_us``
-    [us]. ``-``, ``tcp:HOST:PORT`` and ``unix:PATH`` read a stream (``docs/reference/stream-format.md``);
+    The name of a file replays a recording at ``pace`` times its speed (None: as fast as possible), in packets of
+    ``packet_us`` [us]. ``-``, ``tcp:HOST:PORT`` and ``unix:PATH`` read a stream (``docs/reference/stream-format.md``);
     ``tcp-listen:HOST:PORT`` and ``unix-listen:PATH`` wait for its sender to connect. ``dv``, ``dv:SERIAL``,
     ``prophesee`` and ``prophesee:SERIAL`` open a camera. ``wait_s``: how long to wait for the sender of a socket to
     return after its stream broke off [s]; ``say`` then gets messages.

@@ -22,7 +22,7 @@ THIN_FROM = 0.5
 
 
 class PacketQueue:
-    """Queue of at most ``most_events`` events and ``most_bytes`` bytes.
+    """Bounded queue of packets: at most ``most_events`` events and ``most_bytes`` bytes.
 
     The policy applies to events only: triggers and encoder samples are never dropped. If these alone fill the memory,
     the source waits under every policy. A single packet larger than the bounds passes alone.

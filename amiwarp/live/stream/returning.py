@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 LATE_US = 10_000
 """Largest step backwards of the event time when a sender returns [us]: events within it are sorted."""
 CLOCK_US = 2_000_000
-"""Difference between the camera's and the host's duration of a gap above which the user is told [us]."""
+"""Difference between the camera's and the host's duration of a gap above which a message warns the user [us]."""
 
 
 SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")

@@ -97,8 +97,8 @@ class Session:
         """Process the source until it ends or ``stop`` is set, and then everything received by then.
 
         ``on_status`` gets the status every ``every_s`` [s] and at the end. Raises the error of the source or of a
-        consumer, after everything received before it was processed. KeyboardInterrupt ends the session at once: what
-        still waits is dropped.
+        consumer, after everything received before it was processed. KeyboardInterrupt ends the session at once and
+        drops all waiting data.
         """
         reader = threading.Thread(target=self._read, args=(stop,), name="amiwarp-source", daemon=True)
         self._stop = stop
@@ -146,7 +146,7 @@ class Session:
         self._consumers.end()
 
     def _abandon(self) -> None:
-        """Drop what waits for the consumers, so that the caller can finish their files at once."""
+        """Drop the data that wait for the consumers, so that the caller can finish their files at once."""
         self._hasty = True
         self._consumers.abandon()
 

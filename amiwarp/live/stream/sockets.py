@@ -126,7 +126,7 @@ class SocketSink:
         self._push()
 
     def tick(self) -> None:
-        """Continue to send what waits, and accept new clients."""
+        """Continue to send the waiting packets, and accept new clients."""
         self.send(b"")
 
     def close(self) -> None:
