@@ -161,7 +161,7 @@ def test_live_is_offline_compensation_of_what_was_recorded(tmp_path: Path) -> No
 @TURNING
 @pytest.mark.parametrize(
     ("fault", "said"),
-    [("unplug@1.5+0.3", "back"), ("reset@1.6", "anew"), ("clock-jump@1.6", "anew"), ("slip@1.6", "slip"),
+    [("unplug@1.5+0.3", "back"), ("reset@1.6", "restart"), ("clock-jump@1.6", "restart"), ("slip@1.6", "slip"),
      ("crc@1.5+0.3", "frames"), ("drop@1.5+0.3", "frames"), ("stall@1.5+0.2", "slip"),
      ("missed-index@1.4+0.4", "index")],
 )  # fmt: skip
