@@ -265,7 +265,7 @@ class FrameDecoder:
             self._held.clear()  # a header line, or the rest of a first line
             self._whole = True
         else:
-            self._hold(byte)  # a line feed inside a frame
+            self._hold(byte)  # a line feed at the start of a frame or inside it
 
 
 def _checked(held: bytes) -> bytes | None:
