@@ -37,7 +37,8 @@ from amiwarp.events.encoder import Encoder, EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import Packet
-from amiwarp.live.stream.session import IMAGE_US, Session, Status
+from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.status import IMAGE_US, SessionStatus
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import CircleModel, ExactModel, Model
 from amiwarp.optics.prism import Prism
@@ -215,7 +216,7 @@ def hour(device: str, pool: Events) -> dict[str, Any]:
     values = {"apex": PRISM.apex, "phase": 0.3}
     known = Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 0.0, 0.0, (), 0, 0.0)
 
-    def note(status: Status) -> None:
+    def note(status: SessionStatus) -> None:
         with open("/proc/self/statm") as statm:
             sizes.append((status.events, int(statm.read().split()[1]) * resource.getpagesize() / 2**20))
 

@@ -31,8 +31,8 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
+from amiwarp.live.stream.connections import close_listener, listen
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
-from amiwarp.live.stream.sockets import listen, shut
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -62,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.PARTING_S = 120.0; "
+PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.DRAIN_S = 120.0; "
 """Code placed before a command that serves packets: at the end it waits longer for slow receivers."""
 
 
@@ -163,7 +163,7 @@ def test_a_killed_recording_holds_what_came_before_its_last_moment(folder: Path,
         finally:
             process.kill()
             process.communicate()
-            shut(server)
+            close_listener(server)
     assert not out.exists()
     found = times(part)
     assert len(found) >= 200_000
@@ -233,7 +233,7 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
         finally:
             emulator.kill()
             relay.join(LONG_S)
-            shut(server)
+            close_listener(server)
     data = json.loads(said)
     assert data["events"] == data["compensated"] == SENT
     assert data["dropped"] == data["late"] == 0
