@@ -19,7 +19,7 @@ from amiwarp.cli.streams import stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.link.emulator import Controller, Fault
+from amiwarp.live.link.emulator import Controller, EmulatedFault
 from amiwarp.live.link.rotors import Motor, Played
 from amiwarp.live.link.terminal import PseudoTerminal
 
@@ -83,7 +83,7 @@ class ControllerOptions:
             rotor,
             counts_per_turn=self.counts_per_turn,
             drift_ppm=self.drift_ppm,
-            faults=[Fault.parse(text) for text in self.fault or ()],
+            faults=[EmulatedFault.parse(text) for text in self.fault or ()],
             seed=seed,
         )
 

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from amiwarp.compensation.streams import Compensated
     from amiwarp.live.link.link import Link
     from amiwarp.live.stream.packets import Source
-    from amiwarp.live.stream.session import Raw, Session, Status
+    from amiwarp.live.stream.consumers import RawConsumer
+    from amiwarp.live.stream.session import Session
+    from amiwarp.live.stream.status import SessionStatus
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
     from amiwarp.live.stream.speed_control import SpeedKeeper
     from amiwarp.optics.models import Model
@@ -201,7 +203,7 @@ class _Receivers:
         def sink(address: str | None) -> SocketSink | PipeSink | None:
             return None if address is None else _open_sink(address, found, resources, stop=stop, say=say)
 
-        self.raw: list[Raw] = []
+        self.raw: list[RawConsumer] = []
         if options.record is not None:
             writer = _writer(options.record, source, found, compensated=False, offset_us=offset_us)
             self.raw.append(resources.enter_context(writer))
@@ -232,10 +234,10 @@ def _session(
     )  # fmt: skip
 
 
-def _follow(session: Session, stop: threading.Event, line: StatusLine, receivers: _Receivers) -> Status:
+def _follow(session: Session, stop: threading.Event, line: StatusLine, receivers: _Receivers) -> SessionStatus:
     """Run the session to its end with its status on ``line``."""
 
-    def update(status: Status) -> None:
+    def update(status: SessionStatus) -> None:
         line.update(status)
         if receivers.sink is not None:
             receivers.sink.tick()

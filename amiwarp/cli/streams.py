@@ -21,7 +21,7 @@ from amiwarp.live.link.link import Link
 
 if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Source
-    from amiwarp.live.stream.session import Status
+    from amiwarp.live.stream.status import SessionStatus
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
 
 _SOURCE = "Source"
@@ -123,7 +123,7 @@ class StatusLine:
         else:
             say(message)
 
-    def update(self, status: Status) -> None:
+    def update(self, status: SessionStatus) -> None:
         """Show ``status``, and request the end of the session once ``seconds`` have passed."""
         if self._seconds is not None and status.seconds >= self._seconds:
             self._stop.set()
@@ -137,7 +137,7 @@ class StatusLine:
                 self.say(f"{sink.lost:,} packets were not sent: a receiver is too slow")
 
 
-def describe(s: Status) -> str:
+def describe(s: SessionStatus) -> str:
     """Return the text of the status line."""
     parts = [f"{s.seconds:.1f} s", f"{s.events:,} events", f"{s.rate_mev_s:.2f} Mev/s"]
     if s.done:
@@ -161,7 +161,7 @@ def check_angles(source: Source, link: Link | None) -> None:
         raise AmiwarpError(f"{source.name}: contains no encoder samples; give the controller's --port")
 
 
-def check_whole(source: Source, status: Status) -> None:
+def check_whole(source: Source, status: SessionStatus) -> None:
     """Raise :class:`AmiwarpError` if the stream broke off. To be called after the files are complete."""
     problem = getattr(source, "problem", None)
     if problem is None:
@@ -172,7 +172,7 @@ def check_whole(source: Source, status: Status) -> None:
     raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
 
 
-def summary(s: Status, source: Source) -> dict[str, Any]:
+def summary(s: SessionStatus, source: Source) -> dict[str, Any]:
     """Return the counts of a session for ``--json``."""
     return {
         "seconds": s.seconds, "events": s.events, "mev_per_s": s.events / max(s.seconds, 1e-9) / 1e6,

@@ -88,10 +88,6 @@ class EmulatedFault:
         return cls(match[1], float(match[2]), float(match[3] or LASTING_FAULTS.get(match[1], 0.0)))
 
 
-# Name under which the command imports this type.
-Fault = EmulatedFault
-
-
 class Controller:
     """Emulates a controller's firmware, see ``docs/reference/link-protocol.md``. The caller supplies the time [us].
 

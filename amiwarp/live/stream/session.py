@@ -37,10 +37,6 @@ QUEUE_EVENTS = 1 << 23
 STEP_BYTES = 1 << 22
 """Memory of the packets processed at once, before controller and stop event are checked again [bytes]."""
 
-# Names under which the commands import these types.
-Status = SessionStatus
-Raw = RawConsumer
-
 
 class Session:
     """Processes a source until it ends or is stopped. The caller opens and closes all that it is given.
