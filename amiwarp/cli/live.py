@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from amiwarp.calib import Calibration
     from amiwarp.compensation.streams import Compensated
     from amiwarp.live.link.link import Link
-    from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.consumers import RawConsumer
+    from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session import Session
-    from amiwarp.live.stream.status import SessionStatus
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
     from amiwarp.live.stream.speed_control import SpeedKeeper
+    from amiwarp.live.stream.status import SessionStatus
     from amiwarp.optics.models import Model
 
 EXAMPLE = "amiwarp live dv --port find --calibration calibration.json --out compensated.h5"

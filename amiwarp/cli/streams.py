@@ -21,8 +21,8 @@ from amiwarp.live.link.link import Link
 
 if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Source
-    from amiwarp.live.stream.status import SessionStatus
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.status import SessionStatus
 
 _SOURCE = "Source"
 
