@@ -13,6 +13,7 @@ from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholePa
 from amiwarp.kernels.encoder import THETA_U16_RAD
 from amiwarp.kernels.native import load_uint32
 from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams, displace
+from amiwarp.kernels.shared_memory import add_to_word, get_word, set_word, wait_for_block, window
 from amiwarp.kernels.votes import Canvas, dither_offset
 
 # Fast math is on: these sums need not equal those of a CPU bit for bit.
@@ -142,58 +143,6 @@ def pack_events(
         out.slope[i] = slope[k]
     if time.shape[0] > 0:
         out.time[i] = time[k]
-
-
-# Shared memory is used by address: the address is looked up once, while an array's name would be looked up per vote.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __shared__ int words[3 * 61 * 64];
-    unsigned address = (unsigned)__cvta_generic_to_shared(words);
-    asm volatile("" : "+r"(address));  // keeps the compiler from looking it up repeatedly
-    return (int)address;
-#endif
-    return 0;
-""")
-def window() -> int:
-    """Return the address of the block's windows in shared memory; 0 on a CPU."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("bar.sync 0;" ::: "memory");
-#endif
-""")
-def wait_for_block():
-    """Wait until all threads of the block arrive here."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.u32 [%0], %1;" :: "r"(address), "r"(value) : "memory");
-#endif
-""")
-def set_word(address: int, value: int):
-    """Store a word in shared memory."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("red.shared.add.u32 [%0], %1;" :: "r"(address), "r"(value));
-#endif
-""")
-def add_to_word(address: int, value: int):
-    """Add to a word in shared memory, atomically."""
-
-
-@wp.func_native("""
-    int value = 0;
-#if defined(__CUDA_ARCH__)
-    asm volatile("ld.shared.u32 %0, [%1];" : "=r"(value) : "r"(address) : "memory");
-#endif
-    return value;
-""")
-def get_word(address: int) -> int:
-    """Load a word from shared memory."""
 
 
 @wp.func
