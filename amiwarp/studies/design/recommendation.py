@@ -27,7 +27,7 @@ def reasons(design: Design) -> list[str]:
         return _refusals(design)
     kept = sum(not c.misses for c in design.choices)
     lines = [
-        f"events: {rate(chosen.events_per_s)}, the fewest of the {kept} choices, out of {len(design.choices)}, "
+        f"events: {rate(chosen.events_per_s)}, the fewest of the {kept} choices of {len(design.choices)} "
         "that keep all limits" + _dearer(design, chosen),
         f"edges: a quarter turn displaces edges of every direction by at least {chosen.orbit.swing:.2f} px "
         f"across themselves (required: {LEAST_SWING:g} px)" + _smaller(design, chosen),
@@ -91,12 +91,12 @@ def _refusals(design: Design) -> list[str]:
         "is allowed; try a faster prism, or a longer --window-ms",
         "blur": f"the smallest blur is {least:.3f} px, and the tolerance is {limits.tolerance_px:g} px; "
         + (
-            f"pixels alone cause {QUANTISATION_PX:.2f} px, so only a larger --tolerance-px helps"
+            f"pixels alone leave {QUANTISATION_PX:.2f} px, so only a larger --tolerance-px helps"
             if limits.tolerance_px <= QUANTISATION_PX
             else "try a better clock or encoder, a slower prism, or a larger --tolerance-px"
         ),
         "bandwidth": f"the lowest event rate is {rate(fewest)}, and the limit is {rate(limits.bandwidth or math.inf)}; "
-        "try a higher contrast threshold, or a slower prism",
+        "try a higher threshold, or a slower prism",
     }
     lines = []
     for name, text in advice.items():
