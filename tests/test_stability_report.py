@@ -222,8 +222,8 @@ def test_figures_are_written_with_a_page_for_each_axis(atlas: Atlas, tmp_path: P
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
     """The command has one axis with two small cameras."""
     axis = Axis("width", "width", (48, 64), "px", (("height", 48), ("turns", 1.0)))
-    monkeypatch.setattr(amiwarp.stability, "AXES", (axis,))
-    monkeypatch.setattr(amiwarp.stability, "quick_axes", lambda: (replace(axis, values=(48,)),))
+    monkeypatch.setattr(amiwarp.studies.stability, "AXES", (axis,))
+    monkeypatch.setattr(amiwarp.studies.stability, "quick_axes", lambda: (replace(axis, values=(48,)),))
     return axis
 
 

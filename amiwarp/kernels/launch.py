@@ -25,7 +25,7 @@ def pool() -> ThreadPoolExecutor:
 @cache
 def beside() -> ThreadPoolExecutor:
     """Return the shared background worker: a pool of one thread, which keeps the order of its jobs."""
-    return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-beside")
+    return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-background")
 
 
 def load(kernel: Any, device: Any) -> None:

@@ -32,7 +32,7 @@ class CircleParams:
 
     sine: float  # of the deflection; positive if the flat face looks to the scene
     versine: float  # 1 - cosine
-    phase: float
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
 
@@ -42,20 +42,20 @@ class RadialCircleParams:
     """Radial circle model: the deflection grows with the angle from the axis."""
 
     deflection: float  # on the axis [rad]; negative if the flat face looks to the camera
-    phase: float
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
-    index: float
+    index: float  # refractive index
 
 
 @wp.struct
 class ExactParams:
     """Exact model: refraction at both faces."""
 
-    sin_apex: float
+    sin_apex: float  # of the apex angle
     cos_apex: float
-    index2: float  # n squared
-    phase: float
+    index2: float  # square of the refractive index
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
     flat_to_scene: int  # 1 if the flat face looks to the scene, else 0
@@ -67,7 +67,7 @@ class ExactParams:
 class EllipseParams:
     """Ellipse model: a table of displacements per pixel."""
 
-    phase: float
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
     table: wp.array3d(dtype=float)  # per pixel [px]: offset (x, y), factor of cos (x, y), factor of sin (x, y)

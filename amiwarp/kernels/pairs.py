@@ -67,7 +67,7 @@ def fill_keys(
     key: wp.array(dtype=int),
     order: wp.array(dtype=int),
 ):
-    """Write the keys of the marked events without gaps.
+    """Write the keys of the marked events contiguously.
 
     ``first`` is the index of the first event of each span.
     """
@@ -271,7 +271,7 @@ def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: 
 
 @wp.kernel
 def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs):
-    """Copy the marked pairs without gaps."""
+    """Copy the marked pairs contiguously."""
     i = start + wp.tid()
     if flag[i] == 0:
         return

@@ -99,7 +99,7 @@ class Choice:
 
     @property
     def error_px(self) -> float:
-        """Blur across an edge, with the model's error; half of its square lies across the edge [px]."""
+        """Standard deviation across an edge, model error included; half of the square of that error counts [px]."""
         return math.hypot(self.blur_px, self.orbit.errors[self.model] / math.sqrt(2.0))
 
     @property
