@@ -91,6 +91,7 @@ class Choice:
     """Names of the violated limits, out of :data:`LIMITS`."""
 
     LIMITS: ClassVar[tuple[str, ...]] = ("edges", "window", "blur", "bandwidth")
+    """Names of all limits."""
 
     @property
     def blur_px(self) -> float:

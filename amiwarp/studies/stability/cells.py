@@ -56,7 +56,9 @@ class Method:
     """Calibration method. Without settings it is the paper's method."""
 
     name: str
+    """Name for people."""
     settings: Settings | None
+    """Settings of the calibration; None for the paper's method."""
 
     @property
     def model(self) -> str:
@@ -131,7 +133,9 @@ class Cell:
     """Condition and seed."""
 
     condition: Condition
+    """Condition of the recording."""
     seed: int
+    """Seed of the recording and of the search."""
 
     @property
     def name(self) -> str:
@@ -144,6 +148,7 @@ class Stored:
     """Known results of a cell."""
 
     cell: Cell
+    """Cell."""
     events: int = 0
     """Number of events of the recording."""
     results: dict[str, Result] = field(default_factory=dict)

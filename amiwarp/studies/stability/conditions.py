@@ -299,6 +299,7 @@ class Axis:
 
 
 def _scene_values(*kinds: SceneKind) -> tuple[str, ...]:
+    """Return the names of kinds of scenes."""
     return tuple(kind.value for kind in kinds)
 
 

@@ -25,7 +25,9 @@ class Rate:
     """Number of cases out of a total."""
 
     count: int
+    """Number of cases."""
     total: int
+    """Total number of recordings."""
 
     @property
     def share(self) -> float:
