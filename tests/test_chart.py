@@ -31,6 +31,7 @@ from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.models import MODELS, ExactModel, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.plotting import figures
+from amiwarp.progress import silent
 from amiwarp.studies.chart import Charts, calibration, compensation
 from amiwarp.studies.chart.rows import (
     Row,
@@ -237,7 +238,7 @@ def test_what_cannot_reach_the_front_is_not_repeated() -> None:
     ran: list[str] = []
     tasks = [Task(lambda name=name: ran.append(name), 1) for name in "abc"]
     timed = measure(
-        tasks, 3, lambda share: None, warm_up=False, again=lambda once: [t.task is not tasks[1] for t in once]
+        tasks, 3, silent, "measuring", warm_up=False, again=lambda once: [t.task is not tasks[1] for t in once]
     )
     assert "".join(ran) == "abcacac"
     assert [len(t.times) for t in timed] == [3, 1, 3]
@@ -247,13 +248,18 @@ def test_tasks_take_turns() -> None:
     order: list[str] = []
     shares: list[float] = []
     tasks = [Task(lambda name=name: order.append(name), 1, keep=lambda _: len(order)) for name in "ab"]
-    timed = measure(tasks, 2, shares.append)
+
+    def progress(what: str, share: float) -> None:
+        assert what == "measuring"
+        shares.append(share)
+
+    timed = measure(tasks, 2, progress, "measuring")
     assert "".join(order) == "ababab"
     assert [len(t.times) for t in timed] == [2, 2]
     assert [t.result for t in timed] == [3, 4]  # of the first round on the clock
     assert shares == [(k + 1) / 6 for k in range(6)]
     order.clear()
-    assert [len(t.times) for t in measure(tasks, 9, shares.append, warm_up=False, limit_s=0.0)] == [1, 1]
+    assert [len(t.times) for t in measure(tasks, 9, progress, "measuring", warm_up=False, limit_s=0.0)] == [1, 1]
 
 
 def test_quick_chart_writes_everything(charted: tuple[Path, dict[str, Any]]) -> None:
@@ -399,7 +405,7 @@ def test_chart_refuses_what_makes_no_sense(charted: tuple[Path, dict[str, Any]],
     assert "give one of them" in fails("chart", file, "--budget-px", "1", "--budget-ms", "1")
     assert "give one of them" in fails("chart", file, "--picture", "x.png")
     save_recording(tmp_path / "plain.h5", replace(open_recording(file), truth=None))
-    assert "carries no truth" in fails("chart", tmp_path / "plain.h5", "--out", tmp_path / "out")
+    assert "has no ground truth" in fails("chart", tmp_path / "plain.h5", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
