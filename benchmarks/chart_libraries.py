@@ -11,16 +11,13 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.imaging.choices import Vote
-from amiwarp.studies.chart.compensation import IMAGE, LibraryTask, Sample, Uploads, circle
+from amiwarp.studies.chart.compensation import IMAGE, ErrorSample, LibraryTask, Uploads, circle
 from amiwarp.studies.chart.rows import Task
 from benchmarks import libraries
 
 
-def library_tasks(sample: Sample, uploads: Uploads, device: str) -> tuple[list[LibraryTask], list[str]]:
-    """Return a task for every installed library, and a note for every missing one.
-
-    All tasks use the circle that fits the events best.
-    """
+def library_tasks(sample: ErrorSample, uploads: Uploads, device: str) -> tuple[list[LibraryTask], list[str]]:
+    """Make a task for every installed library, with the circle that fits the events best, and notes on the others."""
     known = sample.known
     camera, radius, turned = known.camera, *circle(sample)
 
