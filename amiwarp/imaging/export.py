@@ -17,6 +17,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Layers
+from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.warped_image import PIECE, CanvasShape, Votes
 from amiwarp.io.output import NewFile, allocate, check_output
 from amiwarp.validation import choice
@@ -30,8 +31,6 @@ PERCENTILE = 99.5
 """Percentile of the non-empty pixels that is shown as white."""
 GAMMA = 0.5
 """Display gamma. Counts span decades; their square root keeps weak edges visible next to strong ones."""
-OFF_COLOUR, ON_COLOUR = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)
-"""Red, green and blue of OFF (blue) and ON (orange), 0 .. 1. All common kinds of colour vision can tell them apart."""
 MOST_WINDOWS = 100_000
 """Largest number of time windows."""
 
@@ -57,7 +56,7 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
         shown = 0.5 + 0.5 * np.sign(image) * tone(np.abs(image))
     else:
         bright = tone(image)
-        shown = bright[0][..., None] * np.array(OFF_COLOUR) + bright[1][..., None] * np.array(ON_COLOUR)
+        shown = bright[0][..., None] * np.array(OFF_ON_BLACK) + bright[1][..., None] * np.array(ON_ON_BLACK)
     return np.asarray(np.rint(np.clip(shown, 0.0, 1.0) * 255.0), np.uint8)
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.plotting.palette import OFF_COLOUR, ON_COLOUR
+from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +34,7 @@ _CAMERA = ((2.75, -2.75, 1.55), (0.0, 0.0, -0.03), (0.0, 0.0, 1.0))
 """Position, focal point and upward direction of the camera."""
 
 
-__all__ = ["HALF", "MISSING", "OFF_COLOUR", "ON_COLOUR", "Cloud", "draw_plain", "render"]
+__all__ = ["HALF", "MISSING", "Cloud", "draw_plain", "render"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def render(clouds: Sequence[Cloud]) -> list[NDArray[np.uint8]] | None:
 
 def draw_plain(axes: Any, cloud: Cloud) -> None:
     """Draw a cloud on three-dimensional Matplotlib axes."""
-    colours = np.array([OFF_COLOUR, ON_COLOUR])[cloud.on.astype(np.intp)]
+    colours = np.where(cloud.on, ON_COLOUR, OFF_COLOUR)
     axes.scatter(*cloud.xyz.T, s=1.6, c=colours, linewidths=0, alpha=0.7, depthshade=False)
     axes.set_box_aspect(HALF, zoom=1.1)
     axes.set(xlim=(-HALF[0], HALF[0]), ylim=(-HALF[1], HALF[1]), zlim=(-HALF[2], HALF[2]))

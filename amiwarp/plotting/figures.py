@@ -15,10 +15,10 @@ from amiwarp.calib.result import cost_surface
 from amiwarp.calib.thinning import thin
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.imaging.export import PERCENTILE, save_png
+from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io.output import write_text
 from amiwarp.plotting import clouds
-from amiwarp.plotting.palette import BLACK, ORANGE, VERMILION
 from amiwarp.reconstruction.choices import Tone
 from amiwarp.reconstruction.export import limits, tones
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.plotting.clouds import OFF_COLOUR, ON_COLOUR
+from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.viewer.choices import Axis, Colour
 
 if TYPE_CHECKING:

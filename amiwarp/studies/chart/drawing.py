@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from amiwarp.imaging.device_events import TURNS
+from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.plotting import figures
-from amiwarp.plotting.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.studies.chart.rows import Row, beaten_by, fronts, told_apart
 
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 11.0, 4.4, 0.85, 0.3, 0.3

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.imaging.palette import BLUE, GREEN, ORANGE, VERMILION
 from amiwarp.plotting import figures
-from amiwarp.plotting.palette import BLUE, GREEN, ORANGE, VERMILION
 from amiwarp.studies.design.choice import LEAST_SWING
 from amiwarp.studies.design.recommendation import degrees, headline
 

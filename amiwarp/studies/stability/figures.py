@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
 from amiwarp.io.output import NewFile
 from amiwarp.plotting.figures import save
-from amiwarp.plotting.palette import BLACK, BLUE, PINK, SKY_BLUE
 from amiwarp.studies.stability.cells import LIMIT_PX, Outcome
 from amiwarp.studies.stability.conditions import Axis
 from amiwarp.studies.stability.points import AxisPoint, axis_label, value_label
