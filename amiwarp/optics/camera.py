@@ -22,7 +22,7 @@ LEAST_FOV = 1e-9
 """Least field of view [rad]. :data:`LARGEST_FOCAL` sets the limit in practice."""
 
 Rows = TypeVar("Rows")
-"""A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3, shape (n,). Results are of the same kind."""
+"""A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3. Results are of the same kind."""
 
 
 @dataclass(frozen=True, slots=True)
