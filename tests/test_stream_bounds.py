@@ -20,7 +20,8 @@ from test_session import KNOWN, MODEL, Made, points, world
 
 from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.live.link.emulator import MOST_OUT, Controller, Fault
 from amiwarp.live.link.news import News

@@ -19,7 +19,8 @@ from amiwarp.events.recording import Recording
 
 if TYPE_CHECKING:
     from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder, EncoderStream
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.encoder_stream import EncoderStream
 
 REACH = math.radians(20.0)
 """A phase further off is not sought: then the answer lies at the edge, and is further off than anyone bears anyway."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator, held_bytes
-from amiwarp.events.encoder import EncoderStream
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape
