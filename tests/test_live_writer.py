@@ -21,7 +21,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import CHUNK
-from amiwarp.io.live_writer import WASTE, LiveWriter
+from amiwarp.io.live_writer import MAX_WASTE_BYTES, LiveWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
@@ -87,7 +87,7 @@ def test_everything_comes_back(tmp_path, flush_s):
             np.testing.assert_array_equal(got[name][()], expected[name][()], strict=True)
             assert got[name].dtype == expected[name].dtype
     wasted = os.path.getsize(path) - os.path.getsize(tmp_path / "b.h5")
-    assert wasted < (WASTE if flush_s == 0.0 else 500_000)
+    assert wasted < (MAX_WASTE_BYTES if flush_s == 0.0 else 500_000)
 
 
 def test_index_pulses_may_come_before_the_samples_about_them(tmp_path):
@@ -225,7 +225,7 @@ def test_a_full_disk_keeps_all_that_came_before(tmp_path, limit, flush_s):
         assert os.listdir(tmp_path) == []
         return
     assert said.strip() == (
-        f"{path}: File too large after {count} events; it holds these; make room, or write to another disk"
+        f"{path}: File too large after {count} events, which the file holds; make room, or write to another disk"
     )
     assert os.listdir(tmp_path) == ["a.h5"]
     recording = open_recording(path)
