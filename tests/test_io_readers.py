@@ -74,7 +74,7 @@ def test_real_text_has_its_camera(data_dir):
 @pytest.mark.parametrize("keep", [True, False])
 def test_every_format_reads_back(tmp_path, monkeypatch, name, keep):
     if not keep:
-        monkeypatch.setattr(scan, "KEEP", 0)
+        monkeypatch.setattr(scan, "KEEP_EVENTS", 0)
     recording = open_recording(write_sample(tmp_path, name, EVENTS))
     assert recording.events.size == SIZE
     assert recording.metadata["format"] == WRITERS[name][0]

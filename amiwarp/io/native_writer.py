@@ -267,9 +267,8 @@ class RecordingWriter:
             self._columns = dtypes
             self._t_offset = int(events.t[0])
         elif dtypes != self._columns:
-            raise AmiwarpError(
-                f"events come with {describe_columns(dtypes)}, those before with {describe_columns(self._columns)}"
-            )
+            given = f"events come with {describe_columns(dtypes)}"
+            raise AmiwarpError(f"{given}, those before with {describe_columns(self._columns)}; give the same arrays")
         return columns
 
     def _index(self, t: NDArray[np.int64]) -> None:
