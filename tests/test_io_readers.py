@@ -256,7 +256,7 @@ def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch):
         ({"t": np.full(5, 2**63, np.uint64)}, "beyond int64"),
         ({"t": np.array([None] * 5)}, "pickle"),
         ({"x": np.zeros(0, int), "y": np.zeros(0, int), "t": np.zeros(0, int), "p": np.zeros(0, int)}, "no events"),
-        ({"width": 0}, "size of 0x9"),
+        ({"width": 0}, "size 0x9"),
     ],
 )
 def test_npz_refuses(tmp_path, arrays, message):

@@ -156,7 +156,7 @@ class LiveWriter:
             return
         self._finish(tidy=True)
         if error is not None:
-            error.add_note(f"{self.path}: holds the {len(self)} events up to then")
+            error.add_note(f"{self.path}: holds the {len(self)} events before the error")
 
     def append(self, events: Events, *, inside: ArrayLike | None = None, extrapolated: ArrayLike | None = None) -> None:
         """Append events. Compensated ones need the flags ``inside`` and may have ``extrapolated``, shape ``(n,)``."""

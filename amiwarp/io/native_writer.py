@@ -224,7 +224,7 @@ class RecordingWriter:
             for events, inside, columns, encoded in made:
                 with errors_name(self.path, lambda: f"after {len(self)} events"):
                     if self._written % CHUNK:
-                        raise AmiwarpError("a piece before the last does not hold whole chunks")
+                        raise AmiwarpError("a piece before the last ends within a chunk; give whole chunks")
                     check_events(events, *self._size, where=str(self.path), first_index=len(self), allow_nan=True,
                                  after_t=self._t_last)  # fmt: skip
                     self._index(events.t)
