@@ -221,7 +221,7 @@ def test_a_full_disk_keeps_all_that_came_before(tmp_path, limit, flush_s):
     count, _, said = done.stdout.partition(" ")
     assert done.stderr == ""
     if limit < 10_000:
-        assert said.strip() == f"{path}: cannot be begun: File too large; choose another place"
+        assert said.strip() == f"{path}: cannot be created: File too large; choose another place"
         assert os.listdir(tmp_path) == []
         return
     assert said.strip() == (

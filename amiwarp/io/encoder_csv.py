@@ -42,7 +42,9 @@ def read_encoder_csv(
             line = lines[int(late[0]) + 1]
             raise AmiwarpError(f"{path}: line {line}: t_us is not later than in the line before; sort and deduplicate")
         try:
-            encoder = _encoder(path, columns, t, counts_per_turn, counter_bits, direction)
+            encoder = _encoder(
+                path, columns, t, counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
+            )
         except UnwrapError as error:
             raise AmiwarpError(f"{path}: line {lines[error.sample]}: {error.problem}") from error
         if "index" not in columns:
@@ -60,10 +62,12 @@ def _encoder(
     path: Path,
     columns: dict[str, NDArray[np.float64]],
     t: NDArray[np.int64],
+    *,
     counts_per_turn: int | None,
     counter_bits: int | None,
     direction: int,
 ) -> Encoder:
+    """Return the encoder of the log's columns."""
     if "count" in columns:
         if counts_per_turn is None:
             raise AmiwarpError(f"{path}: holds counts; give counts_per_turn")

@@ -67,9 +67,9 @@ def parse_json(text: bytes) -> Any:
     except RecursionError as error:
         raise AmiwarpError("the JSON nests too deeply") from error
     except UnicodeDecodeError as error:
-        raise AmiwarpError(f"byte {error.start} is no UTF-8") from error
+        raise AmiwarpError(f"byte {error.start} is not UTF-8") from error
     except ValueError as error:
-        raise AmiwarpError(f"is no JSON: {error}") from error
+        raise AmiwarpError(f"is not JSON: {error}") from error
 
 
 def _refuse(word: str) -> NoReturn:

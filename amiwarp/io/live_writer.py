@@ -118,7 +118,7 @@ class LiveWriter:
             raise AmiwarpError(f"{self.part}: {what}; rename or delete it") from error
         except OSError as error:
             self.part.unlink(missing_ok=True)
-            raise AmiwarpError(f"{self.path}: cannot be begun: {error.strerror}; choose another place") from error
+            raise AmiwarpError(f"{self.path}: cannot be created: {error.strerror}; choose another place") from error
         try:
             with errors_name(self.path, lambda: "making the file"):
                 self._file = h5py.File(self.part, "w", libver=("v110", "v110"))

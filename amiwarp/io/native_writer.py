@@ -220,8 +220,8 @@ class RecordingWriter:
         if self._file is None or len(self):
             raise AmiwarpError(f"{self.path}: fill outside the writer's with block or after other events")
         self._t_offset = t_first
-        with contextlib.closing(in_order(partial(self._made, piece) for piece in pieces)) as made:
-            for events, inside, columns, encoded in made:
+        with contextlib.closing(in_order(partial(self._compute, piece) for piece in pieces)) as computed:
+            for events, inside, columns, encoded in computed:
                 with errors_name(self.path, lambda: f"after {len(self)} events"):
                     if self._written % CHUNK:
                         raise AmiwarpError("a piece before the last ends within a chunk; give whole chunks")
@@ -232,7 +232,7 @@ class RecordingWriter:
                     self._written += len(events)
                 done(events, inside)
 
-    def _made(self, piece: Callable[[], FlaggedEvents]) -> tuple[Events, NDArray[np.uint8], Columns, list[bytes]]:
+    def _compute(self, piece: Callable[[], FlaggedEvents]) -> tuple[Events, NDArray[np.uint8], Columns, list[bytes]]:
         """Compute and encode a piece. Runs in a thread."""
         events, inside = piece()
         columns = {"events/x": events.x, "events/y": events.y, "events/t": events.t - self._t_offset}
@@ -290,9 +290,9 @@ class RecordingWriter:
         if not whole:
             return
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
-        begun = {name: column[:whole] for name, column in joined.items()}
-        with contextlib.closing(in_order(partial(encode, part) for part in chunks_of(begun))) as encoded:
-            self._store(begun, encoded)
+        complete = {name: column[:whole] for name, column in joined.items()}
+        with contextlib.closing(in_order(partial(encode, part) for part in chunks_of(complete))) as encoded:
+            self._store(complete, encoded)
         self._written += whole
         self._pending_count -= whole
         self._pending = [{name: column[whole:] for name, column in joined.items()}] if self._pending_count else []

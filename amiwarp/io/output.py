@@ -92,7 +92,7 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
     except (OSError, RuntimeError) as error:  # a loop of links
         raise AmiwarpError(f"{path}: cannot be written: {_reason(error)}; give another name") from error
     if mode is not None and not stat.S_ISREG(mode):
-        what = KINDS.get(stat.S_IFMT(mode), "no regular file")
+        what = KINDS.get(stat.S_IFMT(mode), "not a regular file")
         raise AmiwarpError(f"{path}: is {what}; give the name of a file")
     if not target.parent.is_dir():
         raise AmiwarpError(f"{path}: its folder {target.parent} does not exist; make it first")

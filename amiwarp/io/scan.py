@@ -59,7 +59,7 @@ class PassCounts:
     notes: dict[str, int] = field(default_factory=dict)
     """Other findings of the format's reader, by name."""
 
-    def place(self) -> str:
+    def position(self) -> str:
         """Return the current position of the pass, for messages."""
         return f"after {self.count} events (t = {self.t_last} us)" if self.count else "before the first event"
 
@@ -87,43 +87,43 @@ class FileEvents:
         self.size_is_known = size is not None
         """Whether the file stores the sensor size. Otherwise the smallest known sensor with all events is taken."""
         self._kept: list[Events] | None = []
-        self._tally = PassCounts()
-        for block in self._pass(self._tally):
+        self._counts = PassCounts()
+        for block in self._pass(self._counts):
             if self._kept is not None:
                 self._kept.append(block)
-                self._kept = self._kept if self._tally.count <= KEEP_EVENTS else None
+                self._kept = self._kept if self._counts.count <= KEEP_EVENTS else None
         self._check_counts()
-        self._size = size or smallest_sensor(self._tally.x_max, self._tally.y_max)
+        self._size = size or smallest_sensor(self._counts.x_max, self._counts.y_max)
         register_reader(self, self.path)
 
     def _check_counts(self) -> None:
         """Raise :class:`AmiwarpError` for too many faulty events, and for none at all."""
-        tally = self._tally
-        for bad, what in ((tally.outside, f"lie outside the frame {self._size}"), (tally.late, "are out of order")):
-            if bad * 100 > tally.count + tally.outside:
-                total = tally.count + tally.outside
+        counts = self._counts
+        for bad, what in ((counts.outside, f"lie outside the frame {self._size}"), (counts.late, "are out of order")):
+            if bad * 100 > counts.count + counts.outside:
+                total = counts.count + counts.outside
                 raise AmiwarpError(f"{self.path}: {bad} of {total} events {what}; the file is damaged or mislabelled")
-        if not tally.count:
+        if not counts.count:
             raise AmiwarpError(f"{self.path}: holds no events; give another recording")
 
     @property
     def repairs(self) -> dict[str, int]:
         """Number of repairs and other findings by name, without zeros."""
-        counts = {"repaired_time_events": self._tally.late, "dropped_outside_events": self._tally.outside}
-        return {name: count for name, count in {**counts, **self._tally.notes}.items() if count}
+        repairs = {"repaired_time_events": self._counts.late, "dropped_outside_events": self._counts.outside}
+        return {name: count for name, count in {**repairs, **self._counts.notes}.items() if count}
 
     def __len__(self) -> int:
-        return self._tally.count
+        return self._counts.count
 
     @property
     def t_first(self) -> int:
         """Time of the first event [us]."""
-        return self._tally.t_first
+        return self._counts.t_first
 
     @property
     def t_last(self) -> int:
         """Time of the last event [us]."""
-        return self._tally.t_last
+        return self._counts.t_last
 
     @property
     def size(self) -> tuple[int, int]:
@@ -169,30 +169,30 @@ class FileEvents:
     def _all(self) -> Iterator[Events]:
         return iter(self._kept) if self._kept is not None else self._pass(PassCounts())
 
-    def _pass(self, tally: PassCounts) -> Iterator[Events]:
-        with errors_name(self.path, tally.place):
-            for packet in self._packets(tally.notes):
+    def _pass(self, counts: PassCounts) -> Iterator[Events]:
+        with errors_name(self.path, counts.position):
+            for packet in self._packets(counts.notes):
                 # Large packets are cut, so that copies stay small even if one packet holds the whole file.
                 for start in range(0, len(packet[2]), DEFAULT_BLOCK):
                     x, y, t, p = (array[start : start + DEFAULT_BLOCK] for array in packet)
-                    block = self._repair(x, y, t, p, tally)
+                    block = self._repair(x, y, t, p, counts)
                     if len(block):
                         yield block
 
-    def _repair(self, x: NDArray[Any], y: NDArray[Any], t: NDArray[Any], p: NDArray[Any], tally: PassCounts) -> Events:
+    def _repair(self, x: NDArray[Any], y: NDArray[Any], t: NDArray[Any], p: NDArray[Any], counts: PassCounts) -> Events:
         # Sensor coordinates are uint16. Larger values would wrap around.
         width, height = self._size or (LARGEST_SIZE, LARGEST_SIZE)
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         if not inside.all():
-            tally.outside += int(inside.size - np.count_nonzero(inside))
+            counts.outside += int(inside.size - np.count_nonzero(inside))
             x, y, t, p = x[inside], y[inside], t[inside], p[inside]
         if not t.size:
             return Events.empty()
         times = as_times(t)
-        floor = tally.t_last if tally.count else int(times[0])
+        floor = counts.t_last if counts.count else int(times[0])
         ordered = np.maximum(np.maximum.accumulate(times), floor)
-        tally.late += int(np.count_nonzero(ordered != times))
-        tally.t_first = tally.t_first if tally.count else int(ordered[0])
-        tally.t_last, tally.count = int(ordered[-1]), tally.count + ordered.size
-        tally.x_max, tally.y_max = max(tally.x_max, int(x.max())), max(tally.y_max, int(y.max()))
+        counts.late += int(np.count_nonzero(ordered != times))
+        counts.t_first = counts.t_first if counts.count else int(ordered[0])
+        counts.t_last, counts.count = int(ordered[-1]), counts.count + ordered.size
+        counts.x_max, counts.y_max = max(counts.x_max, int(x.max())), max(counts.y_max, int(y.max()))
         return Events(x.astype(np.uint16), y.astype(np.uint16), ordered, (p > 0).astype(np.uint8))
