@@ -10,7 +10,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import LARGEST_INTEGER
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import CAMERA_NUMBERS, Camera
 from amiwarp.optics.lens import DISTORTIONS, Distortion
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.validation import array, instance, one_of, real, shown, whole
@@ -40,8 +40,7 @@ def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[A
 
 def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[float]]:
     """Return the attributes of a camera."""
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    attributes: dict[str, int | float | str | list[float]] = {name: getattr(camera, name) for name in names}
+    attributes: dict[str, int | float | str | list[float]] = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
     attributes["distortion_model"] = "none"
     for name, kind in DISTORTIONS.items():
         if isinstance(camera.distortion, kind):

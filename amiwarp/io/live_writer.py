@@ -92,10 +92,10 @@ class LiveWriter:
         self._small: dict[str, _GrowingDataset] = {}
         self._pending: list[Columns] = []
         self._pending_count = 0
-        self._written = 0
-        self._stored = 0
-        self._flushed_at = 0.0
-        self._reserved = 0
+        self._written = 0  # events in full chunks
+        self._stored = 0  # events in the file, those of the last chunk included
+        self._flushed_at = 0.0  # [s], monotonic
+        self._reserved = 0  # [bytes]
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
@@ -123,7 +123,7 @@ class LiveWriter:
             with errors_name(self.path, lambda: "making the file"):
                 self._file = h5py.File(self.part, "w", libver=("v110", "v110"))
                 self._reserve()
-                self._make()
+                self._create_datasets()
                 self._file.swmr_mode = True
         except BaseException:
             self._close()
@@ -132,11 +132,11 @@ class LiveWriter:
         self._flushed_at = time.monotonic()
         return self
 
-    def _make(self) -> None:
+    def _create_datasets(self) -> None:
         """Create all datasets. In single-writer mode none can be added later."""
-        file, place = self._file, np.float32 if self._compensated else np.uint16
+        file, coordinate = self._file, np.float32 if self._compensated else np.uint16
         write_header(file, self._size, self._camera, self._prism, self._metadata)
-        dtypes = {"x": place, "y": place, "p": np.uint8, "t": np.int64}
+        dtypes = {"x": coordinate, "y": coordinate, "p": np.uint8, "t": np.int64}
         if self._compensated:
             dtypes |= {"inside": np.uint8, "extrapolated": np.uint8}
         self._columns = {

@@ -21,6 +21,9 @@ LARGEST_FOCAL = 1e6
 LEAST_FOV = 1e-9
 """Least field of view [rad]. :data:`LARGEST_FOCAL` sets the limit in practice."""
 
+CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
+"""Names of a camera's fields without the distortion, as files and streams use them."""
+
 Rows = TypeVar("Rows")
 """A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3. Results are of the same kind."""
 

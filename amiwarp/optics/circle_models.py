@@ -15,12 +15,17 @@ from amiwarp.validation import choice, instance, real
 
 @dataclass(frozen=True)
 class CircleModel(PointDisplacement):
-    """Circle model: rotates every bearing vector by one constant angle about z × w(θ).
+    """Circle model: rotates every bearing vector by one constant angle.
 
     Raises
     ------
     AmiwarpError
         If the deflection is not at least 0 and below pi/2, or another field has an unusable value.
+
+    Notes
+    -----
+    The rotation axis is z × w, with z the optical axis and w = (cos φ, sin φ) the direction of the prism's tilt at
+    φ = θ + θ_b. See ``docs/explanation/optics.md``.
 
     Examples
     --------
