@@ -126,7 +126,7 @@ class Encoder:
     ) -> Encoder:
         """Create an encoder from counts.
 
-        The counter may run on, restart each turn, or wrap at its width.
+        The counter may keep counting, restart each turn, or wrap at its width.
 
         Parameters
         ----------

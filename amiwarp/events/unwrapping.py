@@ -128,7 +128,7 @@ class _Samples:
 def unwrap_counts(
     t: NDArray[np.int64], count: NDArray[np.float64], counts_per_turn: int, counter_bits: int | None = None
 ) -> NDArray[np.float64]:
-    """Return the unwrapped counts of a counter that runs on, restarts each turn, or wraps at its width.
+    """Return unwrapped counts. The counter may keep counting, restart each turn, or wrap at its width.
 
     ``counter_bits`` is that width, 0 for a counter that restarts each turn, or None to find it from the samples.
     Raises :class:`UnwrapError` for samples that do not determine the rotation.
@@ -151,7 +151,7 @@ def unwrap_counts(
 
 
 def unwrap_angles(t: NDArray[np.int64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unwrapped angles [rad] from angles that run on, or wrap at one turn or at a whole number of turns.
+    """Return unwrapped angles [rad]. The angles may be unwrapped already, or wrap at a whole number of turns.
 
     Raises :class:`UnwrapError` for samples that do not determine the rotation.
     """

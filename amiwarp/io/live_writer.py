@@ -39,7 +39,7 @@ SMALL_CHUNK = 4096
 """Elements per chunk of the small datasets. They are not compressed, so that they grow in place."""
 
 END_ADDRESS_OFFSET = 28
-"""Offset of the end-of-file address in the superblock of an HDF5 file [bytes]. Later bytes were reserved, not used."""
+"""Offset of the end-of-file address in an HDF5 file's header [bytes]. Bytes after that address are unused."""
 
 FINISH_BYTES = 1 << 19
 """Bytes that are reserved to finish a file in addition to its data: for HDF5's structures and partial chunks."""
