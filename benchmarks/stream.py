@@ -33,7 +33,8 @@ import warp as wp
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, Compensator
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import Packet

@@ -11,7 +11,8 @@ import pytest
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.optics.camera import Camera

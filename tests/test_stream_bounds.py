@@ -20,7 +20,8 @@ from test_session import KNOWN, MODEL, Made, points, world
 
 from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, EmulatedFault
 from amiwarp.live.link.rotors import MOST_SEGMENTS, Motor, Played

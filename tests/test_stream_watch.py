@@ -18,7 +18,7 @@ import pytest
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.streams import Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import EncoderStream
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.io import save_recording

@@ -17,7 +17,7 @@ from amiwarp.events.events import Events, check_sensor
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events.encoder import EncoderStream
+    from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.optics.models import Model
 
 OUTSIDE, EXTRAPOLATED, NO_ANGLE = 1, 2, 4

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from amiwarp.events.encoder import EncoderStream
+    from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.live.link.clocks import ClockMap
     from amiwarp.live.link.link import Link
     from amiwarp.live.link.updates import LinkUpdate

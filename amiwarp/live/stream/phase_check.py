@@ -19,7 +19,8 @@ from amiwarp.events.recording import Recording
 
 if TYPE_CHECKING:
     from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder, EncoderStream
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.encoder_stream import EncoderStream
 
 SEARCH_RAD = math.radians(20.0)
 """Range of the search around the calibrated phase [rad]. A phase beyond it is found at its edge and reported anyway."""

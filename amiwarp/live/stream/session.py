@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.compensation.streams import Compensated, Compensator
-from amiwarp.events.encoder import EncoderStream
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.clocking import clock_offset
 from amiwarp.live.stream.consumers import Consumers, RawConsumer

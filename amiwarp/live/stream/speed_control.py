@@ -16,7 +16,7 @@ from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_p
 
 if TYPE_CHECKING:
     from amiwarp.compensation.streams import Compensated
-    from amiwarp.events.encoder import EncoderStream
+    from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.optics.models import Model
 
 WINDOW_US, MOST_WINDOWS = 33_333, 10
