@@ -1,7 +1,7 @@
 """Event cameras behind a rotating wedge prism (AMI-EV): calibration, motion compensation and simulation.
 
-Every public name is listed in ``__init__.pyi``. Names are loaded on first use, so that ``import amiwarp`` takes
-milliseconds.
+All public names are listed in ``__init__.pyi``. Their modules are loaded on first use, so that ``import amiwarp`` takes
+milliseconds only.
 """
 
 import lazy_loader

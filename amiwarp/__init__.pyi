@@ -20,7 +20,7 @@ from .compensation.streams import Compensated as Compensated
 from .compensation.streams import Compensator as Compensator
 from .errors import AmiwarpError as AmiwarpError
 from .events.encoder import Encoder as Encoder
-from .events.encoder import EncoderStream as EncoderStream
+from .events.encoder_stream import EncoderStream as EncoderStream
 from .events.events import Events as Events
 from .events.events import EventSource as EventSource
 from .events.events import MemoryEvents as MemoryEvents

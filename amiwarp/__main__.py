@@ -1,4 +1,4 @@
-"""``python -m amiwarp`` and the ``amiwarp`` command."""
+"""Entry point of ``python -m amiwarp`` and of the ``amiwarp`` command."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import sys
 from amiwarp.cli import INTERRUPTED, STOPPED, fail
 
 ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""Signals that end a command as Ctrl-C does."""
+"""Signals that end a command in the same way as Ctrl-C."""
 
 
 def main() -> None:
     """Run the command line and end the process.
 
-    After an interrupt it ends without Python's own clearing up: a compiled library that was interrupted while it was
-    loading may crash there. All that a command holds is given back before.
+    After an interrupt the process ends without Python's own clean-up, in which a compiled library may crash if it was
+    interrupted while loading. Commands release their resources before.
     """
     try:
         _main()
@@ -31,15 +31,15 @@ def main() -> None:
 
 
 def _main() -> None:
-    """Load the command line, which takes a moment, and run it."""
+    """Load the command line, which takes some time, and run it."""
     try:
         for number in ENDING:
-            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores the terminal's end, and so do we then
+            if signal.getsignal(number) is signal.SIG_DFL:  # a signal that nohup ignores stays ignored
                 signal.signal(number, signal.default_int_handler)
         from amiwarp.cli import app
 
         app.main()
-    except KeyboardInterrupt:  # while it is loaded, before a command began, or after it ended
+    except KeyboardInterrupt:  # during loading, or before or after a command
         fail(INTERRUPTED, STOPPED)
 
 

@@ -1,3 +1,3 @@
-"""The version of amiwarp."""
+"""Version of amiwarp."""
 
 __version__ = "0.1.0"

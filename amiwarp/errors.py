@@ -1,18 +1,27 @@
-"""The one exception that bad input raises: its text names what was given, what was expected and the remedy."""
+"""The exception for bad input. Its message says what was given, what was expected and what to do."""
 
 
 class AmiwarpError(ValueError):
-    """Bad input: a file, field or value that cannot be used. The message is one line for the user."""
+    """Error for bad input: a file, field or value that cannot be used. The message is one line.
+
+    Examples
+    --------
+    >>> try:
+    ...     amiwarp.Prism(apex=2.0)
+    ... except amiwarp.AmiwarpError as error:
+    ...     print(error)
+    prism apex = 2.0 is not a finite number in 0 .. 0.523599 rad, 0 .. 30 deg; is it given in degrees?
+    """
 
     def __init__(self, message: str) -> None:
-        """Keep the message, :func:`printable`: it may quote a damaged file, or a forged one."""
+        """Keep the message in printable form, because it may quote a damaged or malicious file."""
         super().__init__(printable(message))
 
 
 def printable(text: str) -> str:
-    """Return text as one line that a terminal shows and does not obey.
+    """Return text as one line without control characters.
 
-    Names of files, cameras and streams, and texts in files, may hold escape sequences, newlines, marks that turn the
-    direction of writing round, or bytes that are no UTF-8. All of these come out escaped, as in ``\\x1b``.
+    Names of files, cameras and streams, and text in files, may contain escape sequences of terminals, newlines, marks
+    that reverse the direction of writing, or bytes that are not UTF-8. All of these are escaped, as in ``\\x1b``.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

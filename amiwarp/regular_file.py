@@ -1,4 +1,4 @@
-"""The one check that an input is a regular file: a pipe or a device would block its reader, or never end."""
+"""Check that an input is a regular file. A pipe or a device could block its reader, or never end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ KINDS = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
-"""File types that are refused, and their names in a message."""
+"""Names of the file types that are refused, for messages."""
 
 
 def check_regular(path: Path) -> None:
@@ -33,4 +33,4 @@ def check_regular(path: Path) -> None:
         what = getattr(error, "strerror", None) or error
         raise AmiwarpError(f"{path}: cannot be opened: {what}; give another file") from error
     if kind != stat.S_IFREG:
-        raise AmiwarpError(f"{path}: is {KINDS.get(kind, 'no regular file')}; give a file")
+        raise AmiwarpError(f"{path}: is {KINDS.get(kind, 'not a regular file')}; give a file")

@@ -1,4 +1,7 @@
-"""Checks of single values at the public door: each returns the value in its plain type, or says what was expected."""
+"""Checks of single values given by users.
+
+Each check returns the value in its plain type, or raises :class:`AmiwarpError` that says what was expected.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,13 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 Choice = TypeVar("Choice", bound=enum.StrEnum)
+"""An enumeration of names."""
+
 Kind = TypeVar("Kind")
+"""Any class."""
 
 UNUSABLE = (TypeError, ValueError, OverflowError, RecursionError)
-"""What Python and NumPy raise for a value of a foreign kind."""
+"""Exceptions of Python and NumPy for values of unexpected types."""
 
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = _short.maxlong = 80
@@ -26,20 +32,20 @@ _short.maxlevel = 2
 
 
 def shown(value: object) -> str:
-    """Return a value as at most a line of text, for a message."""
+    """Return a short text of a value on one line, for messages."""
     try:
         return " ".join(_short.repr(value).split())
-    except Exception:  # a foreign class may raise anything, and a number of 5000 digits does
+    except Exception:  # other classes may raise anything; an integer of 5000 digits raises too
         return f"a value of type {type(value).__name__}"
 
 
 def choice(kind: type[Choice], value: object, what: str) -> Choice:
-    """Return the member of ``kind`` that ``value`` is or names; :class:`AmiwarpError` lists the choices."""
+    """Return the member of ``kind`` that ``value`` is or names. Raises :class:`AmiwarpError` with the choices."""
     return kind(one_of(value, [member.value for member in kind], what))
 
 
 def one_of(value: object, names: Iterable[str], what: str) -> str:
-    """Return ``value`` if it is among ``names``; :class:`AmiwarpError` lists them."""
+    """Return ``value`` if it is one of ``names``. Raises :class:`AmiwarpError` with the names."""
     names = list(names)
     if not isinstance(value, str) or value not in names:
         raise AmiwarpError(f"{what} is {shown(value)}; choose among {', '.join(names)}")
@@ -47,7 +53,7 @@ def one_of(value: object, names: Iterable[str], what: str) -> str:
 
 
 def instance(value: object, kind: type[Kind], what: str) -> Kind:
-    """Return ``value`` if it is a ``kind``. Raises :class:`AmiwarpError`."""
+    """Return ``value`` if it is an instance of ``kind``. Raises :class:`AmiwarpError`."""
     if not isinstance(value, kind):
         raise AmiwarpError(f"{what} is {shown(value)}; expected a {kind.__name__}")
     return value
@@ -56,7 +62,8 @@ def instance(value: object, kind: type[Kind], what: str) -> Kind:
 def real(value: object, what: str, low: float = -math.inf, high: float = math.inf, hint: str = "") -> float:
     """Return a finite number within ``low`` .. ``high``, both included, as float.
 
-    Takes Python's and NumPy's numbers, no text and no truth value. Raises :class:`AmiwarpError`, ending in ``hint``.
+    Accepts numbers of Python and NumPy, but neither text nor truth values. Raises :class:`AmiwarpError`, whose message
+    ends in ``hint``.
     """
     plain = _scalar(value)
     number = math.nan
@@ -73,7 +80,8 @@ def real(value: object, what: str, low: float = -math.inf, high: float = math.in
 def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
     """Return a whole number within ``low`` .. ``high``, both included, as int.
 
-    Takes Python's and NumPy's integers, no floats and no truth value. Raises :class:`AmiwarpError`, ending in ``hint``.
+    Accepts integers of Python and NumPy, but neither floats nor truth values. Raises :class:`AmiwarpError`, whose
+    message ends in ``hint``.
     """
     plain = _scalar(value)
     if isinstance(plain, bool) or not isinstance(plain, numbers.Integral) or not low <= int(plain) <= high:
@@ -82,7 +90,7 @@ def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
 
 
 def vector(value: object, count: int, what: str, check: Callable[[object, str], float]) -> tuple[float, ...]:
-    """Return ``count`` numbers, each passed through ``check``. Raises :class:`AmiwarpError`."""
+    """Return a sequence of ``count`` numbers, each checked by ``check``. Raises :class:`AmiwarpError`."""
     axes = value.ndim if isinstance(value, np.ndarray) else 1
     if not isinstance(value, list | tuple | np.ndarray) or axes != 1 or len(value) != count:
         raise AmiwarpError(f"{what} is {shown(value)}; expected {count} numbers")
@@ -90,9 +98,9 @@ def vector(value: object, count: int, what: str, check: Callable[[object, str], 
 
 
 def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
-    """Return an array of numbers, as it is given where it is one already. Raises :class:`AmiwarpError`.
+    """Return an array of numbers, without a copy if ``value`` is one. Raises :class:`AmiwarpError`.
 
-    ``kinds``: NumPy's letters of the kinds of numbers that are taken; ``b``, truth values, only where listed.
+    ``kinds`` are the accepted kinds of types, as in NumPy's ``dtype.kind``. Add ``b`` to accept truth values.
     """
     try:
         found = np.asarray(value)
@@ -106,12 +114,12 @@ def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
 
 
 def _scalar(value: object) -> Any:
-    """An array without axes as the number it holds, anything else as it is."""
+    """Return the number in an array without axes, or any other value unchanged."""
     return value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
 
 
 def _range(what: str, low: float, high: float) -> str:
-    """Words for a range whose ends may be infinite."""
+    """Describe a range whose limits may be infinite."""
     if math.isinf(low) and math.isinf(high):
         return what
     if math.isinf(high):
@@ -120,4 +128,5 @@ def _range(what: str, low: float, high: float) -> str:
 
 
 def _plain(number: float) -> str:
+    """Format a limit of a range."""
     return str(number) if isinstance(number, int) else f"{number:.6g}"

@@ -1,1 +1,1 @@
-"""Speed and accuracy, measured together: run with ``python -m benchmarks.NAME``."""
+"""Benchmarks of speed and accuracy, measured in the same runs: ``python -m benchmarks.NAME``."""

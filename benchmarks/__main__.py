@@ -1,11 +1,11 @@
-"""Speed, with the error of the very run that was timed, beside other libraries: one command.
+"""Speed of amiwarp and of other libraries, with the error of each timed run.
 
     python -m benchmarks [--device cuda:0] [--only NAME …] [--events N] [--repeats R] [--picture FILE] [--out FILE.json]
 
-Methods take turns, pass by pass, so that whatever else the machine does meets them alike. The first pass, which
-compiles, is told apart. Where all cases run at full size this writes benchmarks/results/speed_cpu.json or
-speed_cuda.json, and the tables of benchmarks/results/speed.md from these (``python -m benchmarks.report`` does that alone).
-Exit status 1 where an answer is wrong; the row is named.
+The methods alternate, one pass each, so that other load on the machine affects all of them equally. The first pass
+includes compilation and is reported separately. A run of all cases at full size writes
+benchmarks/results/speed_cpu.json or speed_cuda.json, and updates the tables of benchmarks/results/speed.md from both
+(``python -m benchmarks.report`` does only the latter). The exit status is 1 if a result is wrong; the row is printed.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from benchmarks.libraries import Missing
 
 ROOT = Path(__file__).parents[1]
 LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy")
-REST_S = 0.02  # before each pass on a CPU: other libraries' threads spin for a while before they sleep
+REST_S = 0.02
+"""Pause before each pass on a CPU [s], because other libraries' idle threads spin for a while before they sleep."""
 
 
 def seconds_of(job: Job, device: str) -> float:
-    """One pass, from an idle device to an idle device."""
+    """Return the duration of one pass [s]; the device is idle before and after it."""
     if job.seconds is not None:
         return next(job.seconds)
     if device == "cpu":
@@ -52,7 +53,7 @@ def seconds_of(job: Job, device: str) -> float:
 
 
 def wrong(case: Case, errors: dict[str, float]) -> list[str]:
-    """The bars that are not kept."""
+    """Return the errors that exceed the case's limits, as text."""
     return [f"{k} {errors[k]:.3g} > {bar:g}" for k, bar in case.bars.items() if not errors[k] <= bar]
 
 
@@ -64,7 +65,7 @@ def row_of(case: Case, scene: str) -> dict[str, Any]:
 
 
 def prepared(case: Case, scene: Any, device: str, row: dict[str, Any]) -> Job | None:
-    """The job, its first pass done; None, and why, where its library is not there."""
+    """Return the job after its first pass, or None if its library is missing; ``row`` then holds the reason."""
     try:
         began = time.perf_counter()
         job = case.make(scene, device, case.model, case.vote)
@@ -79,7 +80,7 @@ def prepared(case: Case, scene: Any, device: str, row: dict[str, Any]) -> Job | 
 def measured(
     cases: list[Case], name: str, device: str, *, events: int | None, repeats: int, picture: Path | None
 ) -> list[dict[str, Any]]:
-    """All rows of one scene."""
+    """Measure all cases on one scene, and return their rows."""
     rows = [row_of(case, name) for case in cases]
     try:
         scene = SCENES[name].make(events or SCENES[name].events[kind(device)], device, picture)
@@ -106,16 +107,16 @@ def measured(
 
 
 def line(row: dict[str, Any]) -> str:
-    """A row for the screen."""
+    """Return a row as one line of text."""
     start = f"{row['scene']:20} {row['name']:28}"
     if "skipped" in row:
         return f"{start} skipped: {row['skipped']}"
     low, high = row["quartiles_s"]
     rate = f"{row['rate_per_s'] / 1e6:10.1f} M{row['unit']}/s" if row["unit"] else f"{row['events']:13,} ev"
-    told = ", ".join(f"{k} {v:.4g}" for k, v in (row["errors"] | row["also"]).items())
+    results = ", ".join(f"{k} {v:.4g}" for k, v in (row["errors"] | row["also"]).items())
     bad = f"  WRONG: {'; '.join(row['wrong'])}" if row["wrong"] else ""
     note = f"  ({row['note']})" if row["note"] else ""
-    return f"{start} {rate} {row['median_s'] * 1e3:9.3f} ms [{low * 1e3:.3f}, {high * 1e3:.3f}]  {told}{note}{bad}"
+    return f"{start} {rate} {row['median_s'] * 1e3:9.3f} ms [{low * 1e3:.3f}, {high * 1e3:.3f}]  {results}{note}{bad}"
 
 
 def versions() -> dict[str, str]:
@@ -129,7 +130,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """Of the checkout; a + where files have changed since."""
+    """Return the commit of the checkout, followed by + if files have changed since."""
     try:
         git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty=+"]
         return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
@@ -138,7 +139,7 @@ def commit() -> str:
 
 
 def about(device: str) -> dict[str, Any]:
-    """The machine and what ran on it."""
+    """Return a description of the machine, the library versions, the date and the commit."""
     cpu = f"{processor()}, {cpu_threads()} cores"
     return {
         "machine": cpu if device == "cpu" else wp.get_device(device).name, "host": cpu, "device": device,
@@ -148,7 +149,7 @@ def about(device: str) -> dict[str, Any]:
 
 
 def rounded(value: Any) -> Any:
-    """Four digits are enough for a file that people look at."""
+    """Return the value with all floats rounded to four significant digits."""
     if isinstance(value, dict):
         return {k: rounded(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -157,7 +158,7 @@ def rounded(value: Any) -> Any:
 
 
 def write(path: Path, results: dict[str, Any]) -> None:
-    """JSON, one row a line."""
+    """Write the results as JSON with one row per line."""
     head = json.dumps({k: v for k, v in results.items() if k != "rows"}, ensure_ascii=False)
     rows = ",\n".join(json.dumps(rounded(row), ensure_ascii=False) for row in results["rows"])
     part = path.with_name(path.name + ".part")
@@ -178,16 +179,16 @@ def chosen(device: str, only: list[str] | None) -> list[Case]:
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="cases whose name has this in it")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="only cases whose name contains NAME")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES), metavar="SCENE")
-    parser.add_argument("--events", type=int, help="of every scene; bars are for the default numbers")
-    parser.add_argument("--repeats", type=int, default=15, help="passes of each method; whole jobs have fewer")
-    parser.add_argument("--picture", type=Path, help="what the recording sees; default: PyVista's map of the earth")
+    parser.add_argument("--events", type=int, help="events per scene; the error limits are for the default")
+    parser.add_argument("--repeats", type=int, default=15, help="passes of each method; complete jobs have fewer")
+    parser.add_argument("--picture", type=Path, help="scene of the recording; default: PyVista's map of the earth")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args(arguments)
     if not chosen(args.device, args.only):
         names = ", ".join(c.name for c in chosen(args.device, None))
-        parser.error(f"no case of {kind(args.device)} is named so; there are: {names}")
+        parser.error(f"no case for {kind(args.device)} matches --only; the cases are: {names}")
     return args
 
 
@@ -212,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     if out in report.FILES.values():
         report.PAGE.write_text(report.refreshed())
     bad = [f"{row['scene']}, {row['name']}: {'; '.join(row['wrong'])}" for row in results["rows"] if row.get("wrong")]
-    print("wrong answers:\n" + "\n".join(bad) if bad else "all answers right")
+    print("wrong answers:\n" + "\n".join(bad) if bad else "all answers are correct")
     return 1 if bad else 0
 
 

@@ -1,10 +1,11 @@
-"""The prism's speed set from the stream, beside fixed ones: edges seen against events; JSON and a chart.
+"""Adaptive prism speed compared with fixed speeds: visible edges against event rate. Writes JSON and a chart.
 
     python -m benchmarks.adaptive [--out FILE.json] [--figure FILE.png]
 
-A 320 × 240 camera (60°) behind a prism (apex 1.8°) looks at PyVista's map of the earth, stands still or turns, its gaze
-going round a circle. Each window of 33 ms is simulated at the speed that the last one led to, the motor lagging behind.
-What ``ok`` means and how edges are counted is in docs/explanation/adaptive-speed.md. Exit status 1 where something is not ok.
+A 320 × 240 camera (60°) behind a prism (apex 1.8°) looks at PyVista's map of the earth. The camera stands still, or
+rotates so that its optical axis follows a circle. Each window of 33 ms is simulated at the speed that resulted from the
+previous window, including the lag of the motor. docs/explanation/adaptive-speed.md defines ``ok`` and how edges are
+counted. The exit status is 1 if a row is not ok.
 """
 
 from __future__ import annotations
@@ -45,32 +46,32 @@ from amiwarp.studies.machine import machine, versions
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 PRISM, SMALL, PHASE = Prism(math.radians(1.8)), Prism(math.radians(0.9)), 1.0
-"""Orbits of 5.8 and 2.9 px."""
+"""Two prisms, with orbits of 5.8 and 2.9 px, and their phase [rad]."""
 WINDOW_US = 33_000
 FIXED, USUAL = (180.0, 360.0, 540.0, 720.0, 1440.0), 720.0
 MOTIONS = {"still": (0.0, 1.0, 1), "slow": (15.0, 1.0, 1), "fast": (120.0, 1.0, 3), "very fast": (300.0, 0.4, 6)}
-"""The camera's rate [deg/s], the time in which its gaze goes round a circle [s], and how many circles are measured."""
+"""Angular speed of the camera [deg/s], duration of a circle of its optical axis [s], and number of measured circles."""
 SETTLED_S, ADAPTED_S = 0.2, 1.2
-"""When a circle of the gaze begins that is measured, at a fixed speed and adaptive [s]."""
+"""Start of the measured circles, for fixed and adaptive speed [s]."""
 CHANGING = (("still", 2.0), ("slow", 1.0), ("fast", 2.0), ("still", 2.0))
-"""One motion after the other, and how long: whole circles, whose beginnings meet [s]."""
+"""Sequence of motions and their durations [s]: whole circles, so that each starts where the last one ends."""
 MOST_RPM, START_RPM = 900.0, 540.0
-"""Of the controller: its limit, and where it starts, so as to have settled when it is measured."""
+"""The controller's highest speed, and its initial speed, from which it settles before the measurement starts."""
 BANDS: dict[str, dict[str, float]] = {"adaptive": {}, "adaptive, 99 %": {"low": 0.99, "high": 0.996}}
-"""Of the controller's coverage: its own, and one that is content with 99 %."""
+"""Coverage that the controller aims at: its default, and a lower one of about 99 %."""
 SPARE_S = 0.05
-"""Simulated past what is measured: windows do not end with it."""
+"""Time simulated after the measurement, because the last window extends past its end [s]."""
 MOTOR_S = 0.1
-"""Time constant of the motor."""
+"""Time constant of the motor [s]."""
 CONTRAST, NEAR, LEAST = 0.75, 1.0, 2
-"""An edge's change of log intensity within 3 × 3 pixels; distance [px] and number of events that show it."""
+"""Change of log intensity within 3 × 3 px of an edge; distance [px] and number of events that make it visible."""
 MARGIN = 24
-"""Of the image, not judged: it is not in view all the window [px]."""
+"""Border of the image that is not evaluated, because it is not in view during the whole window [px]."""
 
 
 @dataclass(eq=False)
 class Driven:
-    """A prism whose speed is told as it turns, for :class:`amiwarp.Simulation` in place of a PrismMotion."""
+    """Prism motion whose speed is set during the simulation; used instead of a :class:`PrismMotion`."""
 
     rpm: float
     largest_rpm: float
@@ -86,7 +87,7 @@ class Driven:
         return self.largest_rpm * math.tau / 60.0
 
     def drive(self, until_us: int, rpm: float) -> None:
-        """The motor is told ``rpm`` and has until then to follow."""
+        """Command the motor to ``rpm``; its speed approaches this value until the given time."""
         elapsed = until_us * 1e-6 - self.rows[-1][0]
         self.rpm = rpm + (self.rpm - rpm) * math.exp(-elapsed / MOTOR_S)
         self.rows.append((until_us * 1e-6, self.rpm))
@@ -96,7 +97,7 @@ class Driven:
 
 
 class Edges:
-    """The scene's true edges, as the camera would see them without the prism at any time."""
+    """True edges of the scene at any time, as the camera would see them without the prism."""
 
     def __init__(self, simulation: Simulation) -> None:
         placement = place_scene(simulation)
@@ -109,7 +110,7 @@ class Edges:
         self.orientation = simulation.camera_motion.orientation(simulation.duration_s)
 
     def at(self, seconds: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of edge pixels: crests of the gradient with a change of CONTRAST or more."""
+        """Return rows and columns of edge pixels: crests of the gradient with a change of at least CONTRAST."""
         out = wp.empty(CAMERA.width * CAMERA.height, dtype=float, device="cpu")
         matrix = self._to_texel @ self.orientation(np.array([seconds]))[0]
         launch(sight.see_without_prism, len(out), [self._view, wp.mat33(*matrix.ravel().tolist())], [out], device="cpu")
@@ -127,7 +128,7 @@ class Edges:
         return rows[crest], columns[crest]
 
     def seen(self, t_us: NDArray[np.int64], points: NDArray[np.float32], start_us: int, end_us: int) -> float:
-        """Share of the edges of a window's middle that have LEAST or more of its events within NEAR."""
+        """Return the share of edges at the window's middle with at least LEAST of its events within NEAR."""
         middle = 0.5e-6 * (start_us + end_us)
         grid = np.arange(start_us, end_us, 1000)
         turned = self.orientation(np.array([middle]))[0].T @ self.orientation((grid + 500) * 1e-6)
@@ -148,7 +149,7 @@ class Edges:
 
 
 def gaze(rates: ArrayLike, t: NDArray[np.float64], circle_s: float = 1.0) -> CameraMotion:
-    """Round a circle that closes, at the rates [deg/s] that belong to the even times [s]."""
+    """Return a camera motion along a closed circle, with speeds [deg/s] at evenly spaced times [s]."""
     turn = math.tau * t / circle_s
     radius = np.radians(np.broadcast_to(rates, t.shape)) * (circle_s / math.tau)
     faced = Rotation.from_rotvec(np.column_stack([radius * np.sin(turn), radius * (1.0 - np.cos(turn)), 0.0 * t]))
@@ -159,22 +160,28 @@ def gaze(rates: ArrayLike, t: NDArray[np.float64], circle_s: float = 1.0) -> Cam
 
 @dataclass(frozen=True)
 class Window:
-    """What became of a window."""
+    """Results of one window."""
 
     t_s: float
-    """Its middle."""
+    """Middle of the window [s]."""
     end_s: float
+    """End of the window [s]."""
     seconds: float
+    """Length of the window [s]."""
     rpm: float
+    """Speed of the prism [1/min]."""
     events: int
+    """Number of events."""
     share: float
+    """Share of visible edges."""
     coverage: float
+    """Coverage that the controller measured."""
 
 
 def run(
     motion: CameraMotion, seconds: float, rpm: float, controller: SpeedController | None = None, prism: Prism = PRISM
 ) -> Iterator[Window]:
-    """Windows of a run that starts at ``rpm``, or keeps it where there is no controller."""
+    """Yield the windows of a run that starts at ``rpm``; without a controller, the speed stays constant."""
     largest = rpm if controller is None else max(rpm, controller.most_rpm)
     driven = Driven(rpm, largest)
     scene = Scene.from_picture(earth(), fov=math.radians(100.0))
@@ -182,8 +189,8 @@ def run(
     edges, model, meter = Edges(made), ExactModel(CAMERA, prism, PHASE), CoverageMeter(CAMERA.width, CAMERA.height)
     step = step_us(made)
     length = WINDOW_US // step * step
-    start, told = 0, rpm
-    driven.drive(length, told)
+    start, target_rpm = 0, rpm
+    driven.drive(length, target_rpm)
     for events, points in made.blocks(chunk_us=WINDOW_US):
         end = start + length
         if end > made.duration_us:
@@ -196,16 +203,16 @@ def run(
         share = edges.seen(events.t, points, start, end)
         yield Window(0.5e-6 * (start + end), end * 1e-6, length * 1e-6, driven.rpm, len(events), share, coverage.share)
         if controller is not None:
-            told = controller.update(start, end, coverage, len(events) / length) or told
+            target_rpm = controller.update(start, end, coverage, len(events) / length) or target_rpm
         start = end
-        driven.drive(end + length, told)
+        driven.drive(end + length, target_rpm)
 
 
 Row = dict[str, Any]
 
 
 def summary(name: str, windows: list[Window], start_s: float, end_s: float) -> Row:
-    """Events a second and shares of a run between two times; events of windows across these are shared out."""
+    """Return event rate and shares of a run between two times; windows across a limit count in proportion."""
     chosen = [w for w in windows if start_s < w.t_s <= end_s]
     share = np.array([w.share for w in chosen])
     events = np.interp([start_s, end_s], [w.end_s for w in windows], np.cumsum([w.events for w in windows]))
@@ -222,21 +229,21 @@ def summary(name: str, windows: list[Window], start_s: float, end_s: float) -> R
 
 
 def judge(row: Row, usual: Row) -> None:
-    """Sets ``ok``: fewer events than at the usual speed, with its share to within the error, or with 99 %."""
+    """Set ``ok``: fewer events than at the usual speed, and the same share within the error, or at least 99 %."""
     row["within"] = 2.0 * math.hypot(row["share_error"], usual["share_error"])
     row["fewer_events"] = 1.0 - row["mev_s"] / usual["mev_s"]
     needed = usual["share"] - row["within"] if row["name"] == "adaptive" else 0.99
     row["ok"] = row["share"] >= needed and row["fewer_events"] > 0.0
 
 
-def told(row: Row) -> None:
+def print_row(row: Row) -> None:
     fewer = f"  {100 * row['fewer_events']:5.1f} % fewer  {'ok' if row['ok'] else 'NOT ok'}" if "ok" in row else ""
     print(f"  {row['name']:15} {row['rpm']:5.0f} rpm  {row['mev_s']:6.3f} Mev/s  {100 * row['share']:7.3f} % "
           f"± {100 * row['share_error']:.3f}, 5th {100 * row['share_p5']:7.3f} %{fewer}", flush=True)  # fmt: skip
 
 
 def one_motion(name: str, prism: Prism, speeds: tuple[float, ...]) -> list[Row]:
-    """Fixed speeds, then the controller, over the same circles of the gaze."""
+    """Return the rows of all fixed speeds and of the controller, for the same circles of the optical axis."""
     rate, circle_s, circles = MOTIONS[name]
     seconds = circle_s * circles
     motion = gaze(rate, np.arange(0.0, ADAPTED_S + seconds + 1.0, 0.005), circle_s)
@@ -244,7 +251,7 @@ def one_motion(name: str, prism: Prism, speeds: tuple[float, ...]) -> list[Row]:
     for rpm in speeds:
         windows = list(run(motion, SETTLED_S + seconds + SPARE_S, rpm, prism=prism))
         rows.append(summary(f"{rpm:g} rpm", windows, SETTLED_S, SETTLED_S + seconds))
-        told(rows[-1])
+        print_row(rows[-1])
     usual = rows[speeds.index(USUAL)]
     for band_name, band in BANDS.items():
         controller = SpeedController(
@@ -253,12 +260,12 @@ def one_motion(name: str, prism: Prism, speeds: tuple[float, ...]) -> list[Row]:
         windows = list(run(motion, ADAPTED_S + seconds + SPARE_S, START_RPM, controller, prism))
         rows.append(summary(band_name, windows, ADAPTED_S, ADAPTED_S + seconds))
         judge(rows[-1], usual)
-        told(rows[-1])
+        print_row(rows[-1])
     return rows
 
 
 def changing() -> tuple[list[Row], dict[str, Any]]:
-    """The camera's motion changes: whole runs, and their course."""
+    """Run a sequence of camera motions; return the rows, and the values over time."""
     ends = np.cumsum([seconds for _, seconds in CHANGING])
     t = np.arange(0.0, ends[-1] + 1.0, 0.005)
     rates = np.array([MOTIONS[name][0] for name, _ in CHANGING])
@@ -271,7 +278,7 @@ def changing() -> tuple[list[Row], dict[str, Any]]:
         rows.append(summary(name, windows, SETTLED_S, float(ends[-1])))
         if controller is not None:
             judge(rows[-1], rows[0])
-        told(rows[-1])
+        print_row(rows[-1])
         course[name] = {
             "t_s": [round(w.t_s, 4) for w in windows],
             "rpm": [round(w.rpm, 1) for w in windows],
@@ -282,7 +289,7 @@ def changing() -> tuple[list[Row], dict[str, Any]]:
 
 
 def draw(path: Path, results: dict[str, Any]) -> None:
-    """Edges unseen against events, and speed and events of the changing scene over time."""
+    """Draw missed edges against event rate, and speed and event rate over time for changing camera motion."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -304,9 +311,9 @@ def draw(path: Path, results: dict[str, Any]) -> None:
 COLOURS = {"still": "#0072b2", "slow": "#009e73", "fast": "#d55e00", "very fast": "#cc79a7"}
 COURSES = {f"{USUAL:g} rpm": ("#777777", "--"), "adaptive": ("#000000", "-"), "adaptive, 99 %": ("#e69f00", "-")}
 ALL = 2e-5
-"""An unseen share that is drawn for none."""
+"""Share of missed edges at which zero is drawn, because the axis is logarithmic."""
 LABELS = {"still": (-26, 8), "slow": (5, -11), "fast": (10, -9), "very fast": (-9, 10)}
-"""Where the speeds stand beside their points [point]."""
+"""Offsets of the speed labels from their points [pt]."""
 
 
 def _against(ax: Any, motions: dict[str, list[Row]]) -> None:
@@ -319,7 +326,7 @@ def _against(ax: Any, motions: dict[str, list[Row]]) -> None:
         )
         for k, (row, a, b) in enumerate(zip(fixed, x, y, strict=True)):
             if any(abs(a - x[j]) < 0.3 and abs(math.log(b / y[j])) < 0.1 for j in range(k)):
-                continue  # where another speed's stands
+                continue  # another label is already there
             ax.annotate(
                 f"{row['rpm']:g}", (a, b), LABELS[motion], textcoords="offset points", fontsize=8, color=COLOURS[motion]
             )
@@ -359,8 +366,10 @@ def _course(ax: Any, course: dict[str, Any], what: str, label: str) -> None:
 
 
 def measure_ms(events: int = 300_000, repeats: int = 50) -> tuple[float, float]:
-    """Time for a window's coverage and for what is foretold of it, median [ms]: points of a 640 × 480 image, each seen
-    again and again."""
+    """Return the median times to measure a window's coverage and to update the controller [ms].
+
+    The events lie near 20,000 points of a 640 × 480 image, each of which is seen many times.
+    """
     rng = np.random.default_rng(0)
     meter, orbit = CoverageMeter(640, 480), prism_orbit(ExactModel(CAMERA, PRISM, PHASE))
     controller = SpeedController(orbit)
@@ -382,9 +391,9 @@ def measure_ms(events: int = 300_000, repeats: int = 50) -> tuple[float, float]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="where the figures go (JSON)")
-    parser.add_argument("--figure", type=Path, help="where the chart goes (PNG)")
-    parser.add_argument("--again", type=Path, metavar="FILE.json", help="only draw what an earlier run wrote")
+    parser.add_argument("--out", type=Path, help="results to write (JSON)")
+    parser.add_argument("--figure", type=Path, help="chart to write (PNG)")
+    parser.add_argument("--again", type=Path, metavar="FILE.json", help="only draw the results of an earlier run")
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     if args.again:

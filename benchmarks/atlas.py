@@ -1,9 +1,9 @@
-"""Cells of the atlas of failures on a machine that has Python and a GPU but no Dask: a pool of processes.
+"""Compute cells of the stability atlas with a pool of processes, on a machine with Python and a GPU but without Dask.
 
     python -m benchmarks.atlas --out FOLDER [--device cuda:0] [--seeds 20] [--limit-s 500] [--quick] [--axes NAME …]
 
-Writes FOLDER/cells.tar, to be unpacked into the folder of ``amiwarp stability --out``, which then draws them and runs
-what is missing. Cells that an earlier run left in FOLDER/cells are taken from there.
+Writes FOLDER/cells.tar. Unpack it into the folder of ``amiwarp stability --out``, which then draws the atlas and
+computes missing cells. Cells of an earlier run in FOLDER/cells are reused.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _started = multiprocessing.get_context("spawn").Value("i", 0)
 
 
 def quiet(counter: object) -> None:
-    """Each process on a core of its own: work is in many processes, not in many threads."""
+    """Pin each process to its own core, because the work is spread over processes rather than threads."""
     wp.config.log_level = wp.LOG_ERROR
     with counter.get_lock():  # type: ignore[attr-defined]
         number = counter.value  # type: ignore[attr-defined]
@@ -55,18 +55,18 @@ def main() -> int:
     began = time.perf_counter()
     said = 0
 
-    def tell(what: str, share: float) -> None:
+    def show_progress(what: str, share: float) -> None:
         nonlocal said
         if int(20 * share) > said:
             said = int(20 * share)
             print(f"{time.perf_counter() - began:6.0f} s  {what}", flush=True)
 
     start = {"initializer": quiet, "initargs": (_started,), "mp_context": multiprocessing.get_context("spawn")}
-    with ProcessPoolExecutor(1, **start) as one:  # compiles kernels once, for all
+    with ProcessPoolExecutor(1, **start) as one:  # one process compiles the kernels for all
         one.submit(run_cell, Cell(axes[0].conditions()[0], 0), methods, args.device).result()
     print(f"{time.perf_counter() - began:6.0f} s  compiled", flush=True)
     with ProcessPoolExecutor(args.workers, **start) as pool:
-        run(axes, args.seeds, methods, cells, pool, device=args.device, progress=tell,
+        run(axes, args.seeds, methods, cells, pool, device=args.device, progress=show_progress,
             until=lambda: time.perf_counter() - began > args.limit_s)  # fmt: skip
     with tarfile.open(args.out / "cells.tar", "w") as tar:
         tar.add(cells, arcname="cells")

@@ -1,12 +1,13 @@
-"""Whether ``auto`` takes the smallest model that the truth finds sufficient, on simulated recordings of real pictures.
+"""Check that ``auto`` picks the smallest sufficient model, on simulated recordings of real pictures.
 
     python -m benchmarks.auto ladder FOLDER --out FILE.json [--device cuda:0] …
 
-``ladder``: every picture at each field of view and apex, some seeds each. Every rung of the ladder is fitted to the
-true exact model, weighted by the events that there are; the smallest whose error keeps the budget is the one to take.
-``parameters``: tilt, clock offset and index, each off and each as it is given: which are freed.
-The run fails (exit status 1) where under 95 % of the picks are right, one exceeds the budget by more than a tenth, or
-over 5 % are refused.
+``ladder``: every picture at each field of view and apex angle, with several seeds. Every model is fitted to the true
+exact model, weighted by the events. The correct pick is the smallest model whose error is within the budget.
+``parameters``: recordings in which the tilt, the clock offset or the index differs from the given value, or none does.
+The rows list the parameters that ``auto`` freed.
+The exit status is 1 if fewer than 95 % of the picks are correct, if one exceeds the budget by more than a tenth, or if
+more than 5 % of the recordings are refused.
 """
 
 from __future__ import annotations
@@ -38,9 +39,10 @@ from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.machine import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
-NOMINAL = 1.1  # nominal over true apex: no box is centred on the truth
+NOMINAL = 1.1
+"""Nominal over true apex angle, so that no search range is centred on the truth."""
 NEAR = 0.05
-"""A rung whose true error is within this share of the budget may fall on either side."""
+"""If a model's true error differs from the budget by less than this share, a pick on either side is plausible."""
 LEAST_RIGHT, MOST_OVER, MOST_REFUSED = 0.95, 1.1, 0.05
 TURNS_PER_S = 12.0
 
@@ -49,7 +51,7 @@ def recorded(
     picture: Path, size: tuple[int, int], fov_deg: float, apex_deg: float, seed: int, args: argparse.Namespace,
     *, index: float = 1.5168, ramp: bool = False, **changes: Any,
 ) -> Recording:  # fmt: skip
-    """A recording; its phase differs from seed to seed. ``ramp``: the prism's speed doubles meanwhile."""
+    """Simulate a recording. The phase depends on the seed; with ``ramp``, the speed of the prism doubles."""
     camera = Camera.from_fov(*size, math.radians(fov_deg))
     prism = Prism(math.radians(apex_deg), index)
     seconds = args.turns / TURNS_PER_S
@@ -64,7 +66,7 @@ def recorded(
 
 
 def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
-    """Of each rung, fitted to the true exact model [px rms over the events]; the exact one has none."""
+    """Return the rms error over the events of each model, fitted to the true exact model [px]."""
     assert recording.camera is not None
     assert recording.truth is not None
     assert recording.encoder is not None
@@ -82,7 +84,7 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
 
 
 def row_of(recording: Recording, args: argparse.Namespace) -> dict[str, Any]:
-    """One recording calibrated, and judged by the truth."""
+    """Calibrate one recording, and compare the result with the truth."""
     assert recording.camera is not None
     assert recording.truth is not None
     try:
@@ -144,7 +146,7 @@ def run_parameters(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Counts over the rows that were not refused."""
+    """Return statistics over the rows that were not refused."""
     done = [r for r in rows if "picked" in r]
     clear = [r for r in done if not r["near"]]
     return {
@@ -163,7 +165,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 HEADING = (
     "| recording | FOV | apex | budget [px] | true error of circle / radial / ellipse [px] | predicted | smallest | "
-    "picked | freed | judges agree | error of the answer [px] | time beside |"
+    "picked | freed | judges agree | error of the result [px] | extra time |"
 )
 
 
@@ -172,11 +174,11 @@ def table_row(r: dict[str, Any]) -> str:
     if "refused" in r:
         return f"{case} refused: {r['refused']} |"
     errors = " / ".join(f"{r['true_px'][n]:.3f}" for n in list(MODELS)[:-1])
-    told = " / ".join(f"{r['predicted_px'][n]:.3f}" for n in list(MODELS)[:-1])
+    predicted = " / ".join(f"{r['predicted_px'][n]:.3f}" for n in list(MODELS)[:-1])
     mark = "" if r["right"] else (" (near)" if r["near"] else " **wrong**")
     freed = ", ".join(r["freed"]) or "none"
     return (
-        f"{case} {r['budget_px']:.4f} | {errors} | {told} | {r['smallest']} | {r['picked']}{mark} | {freed} | "
+        f"{case} {r['budget_px']:.4f} | {errors} | {predicted} | {r['smallest']} | {r['picked']}{mark} | {freed} | "
         f"{'yes' if r['agreed'] else 'no'} | {r['model_error_px']:.3f} | {r['share_of_time']:.2f} |"
     )
 
@@ -185,7 +187,7 @@ def main() -> int:
     runs = {"ladder": run_ladder, "parameters": run_parameters}
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=runs)
-    parser.add_argument("folder", type=Path, help="of pictures")
+    parser.add_argument("folder", type=Path, help="folder of pictures")
     parser.add_argument("--pictures", nargs="+", default=["china.jpg", "brick.png", "astronaut.png", "graf1.png"])
     parser.add_argument("--fov", nargs="+", type=float, default=FOV_DEG, help="[deg]")
     parser.add_argument("--apex", nargs="+", type=float, default=APEX_DEG, help="[deg]")

@@ -1,18 +1,22 @@
-"""Calibration without a guess, by the defaults, on simulated recordings of real pictures; JSON, one object.
+"""Calibration without an initial guess, with default settings, on simulated recordings of real pictures.
 
     python -m benchmarks.calibration WHAT FOLDER --out FILE.json [--device cuda:0] …
 
-``pictures``: every picture of FOLDER through three prisms, three seeds each. Each row carries the model error, the blur
-beside the truth's, and the best point of a dense grid of the very cost that was maximised.
-``photometric``: the same recordings with thresholds mismatched by 5 %, ON 0.22 and OFF 0.28, calibrated by both stages:
-model error of either, and the phase, the sensor's latency and refractory time being known.
-``moving``: the camera turns at 2 to 60 degrees a second about each axis; its angular velocity is free.
-``refiners``: the photometric stage by Gauss-Newton and by NLopt's local algorithms, from the same start.
-``shares``: the same with ever fewer pairs of events.
-``videos``: FOLDER's clips, translated, to the same bar.
-``algorithms``: NLopt's algorithms, global at several budgets and local from 1 px away, on some of the recordings.
-``costs``: sharpness costs, smoothing and polarity on the same.
-The run fails (exit status 1) where a row misses its bar.
+WHAT is one of:
+
+``pictures``: every picture of FOLDER through three prisms, with three seeds each. Each row holds the model error, the
+blur compared with that of the true model, and the best point of a dense grid of the cost that was maximised.
+``photometric``: the same recordings with thresholds of 0.22 (ON) and 0.28 (OFF) and a mismatch of 5 %, calibrated by
+both stages. Each row holds the model error of both stages, and the phase error. The sensor's latency and refractory
+period are known.
+``moving``: the camera rotates at 2 to 60 degrees per second about each axis, and its angular velocity is calibrated.
+``refiners``: the photometric stage with Gauss-Newton and with NLopt's local algorithms, from the same start.
+``shares``: the photometric stage with fewer and fewer pairs of events.
+``videos``: the clips in FOLDER, converted to events, with the limits of ``pictures``.
+``algorithms``: NLopt's global algorithms with several budgets, and its local ones from 1 px away, on some recordings.
+``costs``: sharpness costs, smoothing and polarity, on the same recordings as ``algorithms``.
+
+The results are one JSON object. The exit status is 1 if a row exceeds its limits.
 """
 
 from __future__ import annotations
@@ -51,8 +55,10 @@ from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
 APEXES_DEG = (0.5, 1.0, 2.0)
-NOMINAL = 1.3  # nominal over true apex: no box is centred on the truth
-EVERY = 16  # events kept of a picture's recording: calibration thins further, to a million
+NOMINAL = 1.3
+"""Nominal over true apex angle, so that no search range is centred on the truth."""
+EVERY = 16
+"""Every 16th event of a picture's recording is kept. Calibration thins them further, to a million."""
 GRID_PX = 0.75
 BLUR_EVENTS = 1_000_000
 
@@ -69,7 +75,7 @@ def simulated(
     sensor: SensorModel | None = None,
     camera_rotation: CameraMotion | None = None,
 ) -> Recording:
-    """A recording thinned evenly while it is made; its phase differs from seed to seed."""
+    """Simulate a recording of which every ``every``-th event is kept. The phase depends on the seed."""
     prism = Prism(math.radians(apex_deg))
     phase = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
     simulation = Simulation(
@@ -93,7 +99,7 @@ def pictures(folder: Path) -> list[Path]:
 
 
 def best_of_grid(search: Any, best: np.ndarray) -> dict[str, float]:
-    """The best point of a dense grid over the whole box, and of a fine one about the optimum, against the optimum."""
+    """Compare the optimum with the best point of a dense grid over the search range and a fine grid around it."""
     low, high = search.space.bounds()
     wide = np.stack(np.meshgrid(*(np.arange(a, b, GRID_PX) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
     wide = wide[np.hypot(*wide.T) <= high[0]]
@@ -110,7 +116,7 @@ def best_of_grid(search: Any, best: np.ndarray) -> dict[str, float]:
 
 
 def judged(recording: Recording, c: Calibration, device: str) -> dict[str, Any]:
-    """Model error and blur of a calibration against the truth."""
+    """Return model error and blur of a calibration, compared with the truth."""
     assert recording.camera is not None
     assert recording.truth is not None
     assert recording.encoder is not None
@@ -141,7 +147,7 @@ def judged(recording: Recording, c: Calibration, device: str) -> dict[str, Any]:
 
 
 def row_of(recording: Recording, device: str) -> dict[str, Any]:
-    """One recording calibrated by the defaults, judged; a refusal is a row that misses its bar."""
+    """Calibrate one recording with the defaults, and compare the result with the truth; a refusal counts as a miss."""
     try:
         c = calibrate(recording, model="exact", device=device, stages=STAGES[:1])
     except AmiwarpError as error:
@@ -175,7 +181,7 @@ def run_photometric(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def photometric_row(recording: Recording, settings: PhotometricSettings, device: str) -> dict[str, Any]:
-    """Model error of both stages, phase, time and verdict."""
+    """Calibrate with both stages; return model errors, phase error, times and verdict."""
     assert recording.camera is not None
     assert recording.truth is not None
     try:
@@ -227,7 +233,7 @@ def run_moving(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def moving_row(recording: Recording, rate: np.ndarray, device: str) -> dict[str, Any]:
-    """Errors of the velocity and of the model by either stage."""
+    """Calibrate with free angular velocity; return the errors of velocity and model of both stages."""
     assert recording.camera is not None
     assert recording.truth is not None
     try:
@@ -283,7 +289,7 @@ def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def some(
     args: argparse.Namespace, *, every: int = EVERY, sensor: SensorModel | None = None
 ) -> Iterator[tuple[dict[str, Any], Recording]]:
-    """A third of the table: every picture with one prism, in turn."""
+    """Yield one recording per picture, with the three prisms in turn."""
     camera = Camera.from_fov(640, 480, math.radians(60.0))
     for k, picture in enumerate(pictures(args.folder)):
         apex = APEXES_DEG[k % len(APEXES_DEG)]
@@ -293,7 +299,7 @@ def some(
 
 
 def run_algorithms(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Whether each global search ends where the default local one reaches the optimum; how far each local one gets."""
+    """Measure how far each global and each local search ends from the optimum of the default search."""
     for label, recording in some(args):
         search = prepare(recording, Settings(), device=args.device)[0]
         search.run()
@@ -372,7 +378,7 @@ def main() -> int:
     parser.add_argument("--pictures", nargs="+", default=["china.jpg", "brick.png", "astronaut.png"], help="moving")
     parser.add_argument("--speeds", type=float, nargs="+", default=[2.0, 10.0, 30.0, 60.0], help="moving [deg/s]")
     parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--limit-s", type=float, default=math.inf, help="start no new row after so many seconds")
+    parser.add_argument("--limit-s", type=float, default=math.inf, help="start no new row after this time [s]")
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     began, rows, complete = time.perf_counter(), [], True
@@ -386,7 +392,7 @@ def main() -> int:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(result, indent=1) + "\n")
     missed = [row for row in rows if not row["ok"]]
-    print(f"{len(rows)} rows, {len(missed)} miss their bar, {time.perf_counter() - began:.0f} s", file=sys.stderr)
+    print(f"{len(rows)} rows, {len(missed)} exceed their limits, {time.perf_counter() - began:.0f} s", file=sys.stderr)
     return 1 if missed or not complete else 0
 
 

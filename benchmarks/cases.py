@@ -1,6 +1,7 @@
-"""What is measured, as data. A new row is a :class:`Case` here, and a function that makes its :class:`Job`.
+"""The measured cases, as data.
 
-A new kind of scene is an entry in ``SCENES``, an aim one in ``AIMS``.
+To add a row, add a :class:`Case` and a function that makes its :class:`Job`. To add a kind of scene, add an entry to
+``SCENES``; to add a target, add an entry to ``AIMS``.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from benchmarks.scenes import RECORDED, event_scene, file_scene, recording_scene
 
 @dataclass(frozen=True, slots=True)
 class SceneKind:
-    """What cases are given."""
+    """Kind of input for the cases."""
 
     make: Callable[[int, str, Path | None], Any]
-    """From a number of events, the device, and a picture to look at."""
+    """Function that makes the input from the number of events, the device and the picture of the scene."""
     events: dict[str, int]
-    """How many by default, on a CPU and on CUDA."""
+    """Default number of events on a CPU and on CUDA."""
 
 
 def _events(name: str, points: int) -> SceneKind:
@@ -48,31 +49,41 @@ BOTH = "calibration without a guess, both stages"
 PICTURE = "picture of one turn, from given parameters"
 MOVED = "compensation of a file"
 EXACT_PX = {"plane circle": 4.0, "circle": 2.5, "radial": 0.1, "ellipse": 0.02, "exact": 0.002}
-"""Bars of the models: what each costs at this camera, a little more."""
+"""Largest accepted rms error of each model [px]: slightly above its error with this camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One method. ``make(scene, device, model, vote)`` puts its data in place."""
+    """One method that is measured."""
 
     what: str
-    """The job; rows of one job share a table."""
+    """Task; rows of one task share a table."""
     name: str
+    """Name of the method."""
     make: Callable[[Any, str, str, Vote], Job]
+    """Function of scene, device, model and vote that prepares the data."""
     model: str = "plane circle"
+    """Optical model."""
     vote: Vote = Vote.BILINEAR
+    """How an event votes for pixels."""
     scenes: tuple[str, ...] = EVENT_SCENES
+    """Scenes on which the case runs."""
     devices: tuple[str, ...] = ("cpu", "cuda")
+    """Kinds of device on which the case runs."""
     bars: dict[str, float] = field(default_factory=dict)
-    """Largest errors by name: above one of them, or NaN, the answer is wrong."""
+    """Largest accepted errors by name; with a larger error, or NaN, the answer is wrong."""
     unit: str = "ev"
-    """Of the job's ``work``; none where its time is what counts."""
+    """Unit of the job's ``work``; empty if the time itself is reported."""
     most_repeats: int = 1_000
+    """Largest number of passes."""
 
 
 def image_bars(model: str, vote: Vote) -> dict[str, float]:
-    """Of an image. Votes in 1/256 px put 0.2 % elsewhere, the less the more events meet; a nearest vote at half a pixel
-    goes to either side, so one pixel may differ by a few events."""
+    """Return the largest accepted errors of an image.
+
+    Votes in steps of 1/256 px misplace 0.2 % of the votes, less if more events meet in a pixel. A nearest vote at half
+    a pixel may go to either side, so a pixel may differ by a few events.
+    """
     return {"misplaced": 4e-3, "local": 6e-3 if vote is Vote.BILINEAR else 0.3, "exact_px": EXACT_PX[model]}
 
 
@@ -116,24 +127,30 @@ WHOLE = (
         for model in ("circle", "exact")
     ),
 )  # fmt: skip
-"""Of the main job, from end to end."""
+"""Complete tasks, from end to end."""
 CASES = (*LADDER, *PEERS, *PREPARED_VOTES, *WHOLE)
 
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """What was asked for: a rate, a time, or how a case's rate or time compares with another's."""
+    """Target: a rate, a time, a memory size, or a ratio between two cases."""
 
     what: str
+    """Description in the table of targets."""
     device: str
+    """Kind of device."""
     of: str
+    """Name of the case."""
     bars: dict[str, float]
-    """By scene."""
+    """Target value for each scene."""
     unit: str
-    """``Gev/s`` and the like: at least so fast. ``s``: at most so long. ``x faster``: at least; ``x time``: at most.
-    ``MiB``: the process's memory at its peak, at most."""
-    beside: str | None = None
-    """The case it is compared with, round by round of the same run."""
+    """Unit of the target, which also tells its direction.
+
+    Rates such as ``Gev/s`` and ``x faster`` are minima. ``s``, ``x time`` and ``MiB`` (peak memory of the process) are
+    maxima.
+    """
+    compared_with: str | None = None
+    """Name of the case to compare with, pass by pass of the same run."""
 
 
 def _everywhere(bar: float, scenes: tuple[str, ...] = EVENT_SCENES) -> dict[str, float]:
@@ -141,7 +158,7 @@ def _everywhere(bar: float, scenes: tuple[str, ...] = EVENT_SCENES) -> dict[str,
 
 
 def _whole(device: str, seconds: tuple[float, float, float], mev_per_s: float) -> tuple[Aim, ...]:
-    """Of the main job on one kind of device: both calibrations, the picture, and the file."""
+    """Return the targets of the complete tasks on one kind of device: both calibrations, the picture and the file."""
     names, moved = [case.name for case in WHOLE[:3]], WHOLE[-1].name
     whats = (SHARPNESS, "the same with the photometric stage, to 0.02 px", PICTURE)
     return (
@@ -155,17 +172,18 @@ CIRCLE, EXACT = "amiwarp circle bilinear", "amiwarp exact bilinear"
 AIMS = (
     Aim("bilinear image, one pass, from device memory", "cuda", CIRCLE,
         dict(zip(EVENT_SCENES, (80.0, 75.0, 50.0), strict=True)), "Gev/s"),
-    Aim("the same beside four float atomics", "cuda", CIRCLE, _everywhere(3.3), "x faster", "Warp, four float atomics"),
-    Aim("the same beside PyTorch", "cuda", CIRCLE, _everywhere(10.0), "x faster", "PyTorch"),
+    Aim("the same, compared with four float atomics", "cuda", CIRCLE, _everywhere(3.3), "x faster",
+        "Warp, four float atomics"),
+    Aim("the same, compared with PyTorch", "cuda", CIRCLE, _everywhere(10.0), "x faster", "PyTorch"),
     Aim("bilinear votes of prepared events", "cuda", "amiwarp circle bilinear, prepared",
         _everywhere(300.0, EVENT_SCENES[:2]), "Gvotes/s"),
     Aim("nearest votes of prepared events", "cuda", "amiwarp circle nearest, prepared",
         _everywhere(600.0, EVENT_SCENES[:2]), "Gvotes/s"),
     Aim("exact model over circle, time", "cuda", EXACT, _everywhere(1.1), "x time", CIRCLE),
     *_whole("cuda", (0.05, 0.25, 0.05), 100.0),
-    Aim("bilinear image beside Numba", "cpu", CIRCLE, _everywhere(1.5), "x faster", "Numba"),
-    Aim("the same beside NumPy", "cpu", CIRCLE, _everywhere(12.0), "x faster", "NumPy"),
-    Aim("the same beside PyTorch", "cpu", CIRCLE, _everywhere(12.0), "x faster", "PyTorch"),
+    Aim("bilinear image, compared with Numba", "cpu", CIRCLE, _everywhere(1.5), "x faster", "Numba"),
+    Aim("the same, compared with NumPy", "cpu", CIRCLE, _everywhere(12.0), "x faster", "NumPy"),
+    Aim("the same, compared with PyTorch", "cpu", CIRCLE, _everywhere(12.0), "x faster", "PyTorch"),
     Aim("exact model over circle, time", "cpu", EXACT, _everywhere(1.5), "x time", CIRCLE),
     *_whole("cpu", (2.0, 6.0, 2.0), 40.0),
 )  # fmt: skip

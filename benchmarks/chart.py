@@ -1,7 +1,7 @@
-"""The charts of speed against error, without the command line's packages: for a machine that has only a GPU.
+"""Charts of speed against error, on a machine without the packages of amiwarp's command line.
 
 python -m benchmarks.chart PICTURE --out FOLDER [--device cuda:0] [--budget-px 0.3] [--quick]
-python -m benchmarks.chart --from chart.json --out FOLDER      draws what was measured elsewhere
+python -m benchmarks.chart --from chart.json --out FOLDER      draws the results of an earlier run
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ def _measured(args: argparse.Namespace) -> Charts:
     said: set[str] = set()
     began = time.perf_counter()
 
-    def tell(what: str, share: float) -> None:
+    def show_progress(what: str, share: float) -> None:
         step = f"{what}: {10 * int(10 * share)} %"
         if step not in said:
             said.add(step)
             print(f"{time.perf_counter() - began:6.0f} s  {step}", file=sys.stderr, flush=True)
 
-    tell("simulating", 0.0)
+    show_progress("simulating", 0.0)
     recording = simulated(args.picture, seed=args.seed, device=args.device, quick=args.quick)
     args.out.mkdir(parents=True, exist_ok=True)
     with own_folder(args.out):
@@ -73,9 +73,9 @@ def _measured(args: argparse.Namespace) -> Charts:
             seed=args.seed,
             quick=args.quick,
             libraries=library_tasks,
-            progress=tell,
+            progress=show_progress,
         )
-    tell("done", 1.0)
+    show_progress("done", 1.0)
     return charts
 
 

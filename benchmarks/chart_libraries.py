@@ -1,4 +1,4 @@
-"""Rows of the charts for other libraries, which make the same image of events with a circle."""
+"""Rows of the charts for other libraries, which make the same image of warped events with the circle model."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.imaging.choices import Vote
-from amiwarp.studies.chart.compensation import IMAGE, LibraryTask, Sample, Uploads, circle
+from amiwarp.studies.chart.compensation import IMAGE, ErrorSample, LibraryTask, Uploads, circle
 from amiwarp.studies.chart.rows import Task
 from benchmarks import libraries
 
 
-def library_tasks(sample: Sample, uploads: Uploads, device: str) -> tuple[list[LibraryTask], list[str]]:
+def library_tasks(sample: ErrorSample, uploads: Uploads, device: str) -> tuple[list[LibraryTask], list[str]]:
     """Make a task for every installed library, with the circle that fits the events best, and notes on the others."""
     known = sample.known
     camera, radius, turned = known.camera, *circle(sample)
 
-    def held(events: Any, theta: NDArray[np.float64]) -> libraries.PeerEvents:
+    def peer_events(events: Any, theta: NDArray[np.float64]) -> libraries.PeerEvents:
         angle = np.remainder(theta + turned, 2.0 * math.pi).astype(np.float32)
         margin = math.ceil(radius) + 2
         return libraries.PeerEvents(events.x, events.y, angle, radius, camera.width, camera.height, margin)
 
-    once = held(known.events, uploads.theta[: len(known.events)])
-    there = once if uploads.copies == 1 else held(uploads.events, uploads.theta)
+    once = peer_events(known.events, uploads.theta[: len(known.events)])
+    repeated = once if uploads.copies == 1 else peer_events(uploads.events, uploads.theta)
 
     def run(peer: libraries.Peer) -> libraries.Peer:
         peer.run()
@@ -39,7 +39,7 @@ def library_tasks(sample: Sample, uploads: Uploads, device: str) -> tuple[list[L
     for name, make in libraries.PEERS.items():
         on = "cpu" if name in libraries.ON_CPU else device
         try:
-            peer = make(once if name in libraries.ON_CPU else there, on)
+            peer = make(once if name in libraries.ON_CPU else repeated, on)
         except libraries.Missing as missing:
             notes.append(f"{name}: left out, {missing}")
             continue

@@ -1,15 +1,18 @@
-"""Speed of the compensation of a file, reading and writing included, and the error of that very run.
+"""Speed of the compensation of a file, including reading and writing, and the error of the same run.
 
     python -m benchmarks.compensate [--events 100000000] [--device cuda:0] [--models circle exact] [--out FILE]
 
-640x480, 60 degrees, 720 turns/min: half a second (six turns) of the simulator, repeated to the number of events asked
-for. Each row is a process of its own, so that its peak memory is its own. ``copy_s`` is what the disk needs for the
-same bytes: the recording read and the result written, in plain pieces. ``alone`` tells each stage's rate without the
-others. ``cpu_ns`` is processor time an event, which a busy machine stretches less than the clock. Nothing is flushed to
-the disk at the end, of neither; run it twice where the first run finds the file not in memory.
-With ``--columns`` both files are bare columns, for machines without HDF5's filters: that measures everything but the
-coding of chunks. Ends with 1 where a sample of the result is more than 1e-3 px off a float64 trace of its own, or where
-times, polarities or flags differ.
+The recording is half a second (six turns) of the simulator at 640x480, 60 degrees and 720 turns/min, repeated up to the
+number of events. Each row runs in a separate process, so that its peak memory can be measured.
+
+``copy_s`` is the time to read as many bytes as the recording has and to write as many as the result has, without any
+processing. ``alone_mev_per_s`` is the rate of each stage without the others. ``cpu_ns`` is the processor time per
+event, which depends less on other load than the elapsed time. Neither the result nor the copy is flushed to the disk.
+If the file is not in the page cache, run the benchmark twice.
+
+With ``--columns`` both files are plain binary columns, for machines without HDF5's filters. This measures everything
+except the coding of chunks. The exit status is 1 if a sample of the result is more than 1e-3 px from an independent
+float64 trace, or if times, polarities or flags differ.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.compensation.recordings import PIECE, Mover, compensate, inside_image
+from amiwarp.compensation.recordings import PIECE, BlockCompensator, compensate, inside_image
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
@@ -49,7 +52,8 @@ import reference
 APEX, PHASE, RPM, REPEATED_US = math.radians(2.0), 0.7, 720.0, 500_000
 CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, FOV), Prism(APEX, INDEX)
 BAR_PX = 1e-3
-ALONE = 20_000_000  # events of a stage that is measured alone
+ALONE = 20_000_000
+"""Number of events for measuring a stage without the others."""
 COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
 MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside": np.uint8}
 
@@ -73,7 +77,7 @@ def repeated(once: Events, events: int) -> Iterator[Events]:
 
 
 def make(path: Path, events: int, columns: bool) -> None:
-    """The recording: a file of the native layout, or a folder of bare columns."""
+    """Write the recording: a file in the native format, or a folder of plain binary columns."""
     once = half_a_second()
     encoder = Encoder.constant_speed(RPM, 0, (events // len(once) + 2) * REPEATED_US)
     if columns:
@@ -90,7 +94,7 @@ def make(path: Path, events: int, columns: bool) -> None:
 
 
 class Bare:
-    """A folder of bare columns, read and written by threads in place of HDF5."""
+    """Folder of plain binary columns, read and written by threads instead of HDF5."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -106,7 +110,7 @@ class Bare:
     def piece(self, start: int) -> Events:
         return Events(**self.read(start, COLUMNS))
 
-    def compensate(self, out: Path, mover: Mover) -> None:
+    def compensate(self, out: Path, mover: BlockCompensator) -> None:
         out.mkdir()
 
         def job(start: int) -> dict[str, Any]:
@@ -121,7 +125,7 @@ class Bare:
 
 
 class Calibrated:
-    """What compensation asks of a calibration."""
+    """Stand-in for a calibration, with the attributes that compensation needs."""
 
     def __init__(self, name: str) -> None:
         self.model_name, self.camera = name, CAMERA
@@ -138,7 +142,7 @@ def seconds(work: Callable[[], Any]) -> float:
 
 
 def truth(name: str, model: Any, xy: Any, theta: Any) -> Any:
-    """Places by the float64 oracle of the tests; for the ellipse, its own tables in float64."""
+    """Return the positions by the float64 oracle of the tests; for the ellipse, by its own tables in float64."""
     if name == "ellipse":
         phi = (theta + PHASE)[:, None]
         at = xy[:, 1].astype(int), xy[:, 0].astype(int)
@@ -147,7 +151,7 @@ def truth(name: str, model: Any, xy: Any, theta: Any) -> Any:
 
 
 def error_of(name: str, model: Any, encoder: Encoder, raw: Events, moved: Events, inside: Any) -> float:
-    """Largest distance to the truth [px]; infinite where anything else is wrong."""
+    """Return the largest distance to the truth [px]; infinite if times, polarities or flags differ."""
     xy = np.stack([raw.x, raw.y], axis=1).astype(np.float64)
     found = np.stack([moved.x, moved.y], axis=1)
     away = np.linalg.norm(found - truth(name, model, xy, encoder.angle_at(raw.t)), axis=1)
@@ -157,7 +161,7 @@ def error_of(name: str, model: Any, encoder: Encoder, raw: Events, moved: Events
 
 
 def plain_copy(source: Path, result: Path, folder: Path) -> float:
-    """Seconds to read the one and to write as much as the other."""
+    """Return the time to read ``source`` and to write as many bytes as ``result`` has [s]."""
 
     def files(path: Path) -> list[Path]:
         return sorted(path.iterdir()) if path.is_dir() else [path]
@@ -182,7 +186,7 @@ def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any]:
     return Events(events.x, events.y, events.t + piece * int(events.t[-1] - events.t[0]), events.p), inside
 
 
-def stages_alone(recording: Any, mover: Mover, folder: Path) -> dict[str, float]:
+def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[str, float]:
     """Million events a second of each stage, over all cores, the others left out."""
     reads = list(recording.events.pieces(PIECE))[: ALONE // PIECE]
     count = min(len(reads) * PIECE, len(recording.events))
@@ -209,7 +213,7 @@ def stages_alone(recording: Any, mover: Mover, folder: Path) -> dict[str, float]
 
 
 def peak_mib() -> float:
-    """Of this process; what its parent held when it started does not count."""
+    """Return the peak memory of this process [MiB], without that of its parent."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM"):
             return int(line.split()[1]) / 1024.0
@@ -226,7 +230,7 @@ def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> di
     encoder = Encoder.constant_speed(RPM, 0, int(bare.piece(bare.count - 1).t[0])) if bare else recording.encoder
     first, last = (0, int(encoder.t[-1])) if bare else (recording.events.t_first, recording.events.t_last)
     began = time.perf_counter()
-    mover = Mover(calibration.model, encoder, first, last, device)
+    mover = BlockCompensator(calibration.model, encoder, first, last, device)
     mover(bare.piece(0) if bare else recording.events.slice(0, PIECE))
     result["compile_s"] = time.perf_counter() - began
     for _ in range(repeats):
@@ -257,7 +261,7 @@ def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> di
 def errors(
     name: str, model: Model, encoder: Encoder, recording: Any, source: Path, out: Path, n: int
 ) -> Iterator[float]:
-    """Of stretches all over the file that was written."""
+    """Yield the error of short pieces spread over the written file."""
     written = None if recording is None else open_recording(out).events
     for start in np.linspace(0, max(n - 5000, 0), 40).astype(int).tolist():
         stop = min(start + 5000, n)
@@ -276,7 +280,7 @@ def errors(
 
 
 def about(device: str) -> dict[str, Any]:
-    from amiwarp.studies.machine import processor  # here: what a row's process loads counts to its memory
+    from amiwarp.studies.machine import processor  # imported here: imports of a row's process count towards its memory
 
     wp.init()
     found = {"python": platform.python_version()}
@@ -293,8 +297,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--models", nargs="+", choices=list(MODELS), default=["circle", "exact"])
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--columns", action="store_true", help="bare columns in place of HDF5")
-    parser.add_argument("--folder", type=Path, help="where the files go (default: a temporary folder)")
+    parser.add_argument("--columns", action="store_true", help="plain binary columns instead of HDF5")
+    parser.add_argument("--folder", type=Path, help="folder for the files (default: a temporary folder)")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     parser.add_argument("--row", type=Path, help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -320,7 +324,7 @@ def main() -> None:
         a.out.write_text(json.dumps(result, indent=1) + "\n")
     wrong = [r["model"] for r in result["rows"] if not r["error_px"] <= BAR_PX]
     if wrong:
-        raise SystemExit(f"more than {BAR_PX} px off: {', '.join(wrong)}")
+        raise SystemExit(f"errors above {BAR_PX} px: {', '.join(wrong)}")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""Damaged input of every kind: it is read, or refused in one line; nothing crashes, hangs, or takes much memory.
+"""Fuzz tests: damaged input is read or refused in one line, without crashes, hangs or high memory use.
 
     python -m benchmarks.fuzz --seconds 60
     python -m benchmarks.fuzz --files 20000 --frames 100000 --out benchmarks/results/fuzz.json
     python -m benchmarks.fuzz --guided stream --seconds 60
 
-Files are mutants of small samples of every format, read whole in processes that are watched; frames are packets of the
-stream and messages of the serial port, mutated likewise. ``--seed`` starts another series. ``--guided`` lets Atheris
-(``pip install '.[fuzz]'``) look for inputs that reach new code in one of the decoders that are Python. Findings are
-printed and kept in ``--keep``; exit status 1 then.
+Files are mutated samples of every format, read completely in supervised processes. Frames are mutated packets of the
+event stream and mutated messages of the serial port. ``--seed`` selects another series. ``--guided`` uses Atheris
+(``pip install '.[fuzz]'``) to search for inputs that reach new code in one of the decoders written in Python. Findings
+are printed and saved in the folder ``--keep``; the exit status is then 1.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from amiwarp.kernels.cores import cpu_threads
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 LONGEST_S = 300.0
-"""Bytes that keep a decoder busy for so long hang it, beyond doubt on any machine [s]."""
+"""A decoder that works longer than this on one input counts as hanging [s]."""
 
 
 def files(count: int | None, until: float | None, seed: int, keep: Path) -> dict[str, Counter[str]]:
-    """Check ``count`` mutated files, or as many as fit, on all cores; outcomes by kind."""
+    """Check ``count`` mutated files, or files until the time limit, on all cores; return the outcomes by kind."""
     kinds = list(importlib.import_module("mutation_files").KINDS)
     outcomes: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
     workers = cpu_threads()
@@ -56,7 +56,7 @@ def files(count: int | None, until: float | None, seed: int, keep: Path) -> dict
 
 
 def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: Path) -> dict[str, Counter[str]]:
-    """One watched process's share."""
+    """Check files with these numbers in one supervised process."""
     mutation = importlib.import_module("mutation_files")
     kinds = list(mutation.KINDS)
     outcomes: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
@@ -79,7 +79,7 @@ def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: P
 
 
 def frames(count: int | None, until: float | None, seed: int, keep: Path) -> dict[str, Counter[str]]:
-    """Feed mutated packets and messages to their decoders until ``count`` of them, or the time, are over."""
+    """Feed ``count`` mutated packets and messages to their decoders, or as many as fit into the time limit."""
     mutation = importlib.import_module("mutation_frames")
     wires: dict[str, tuple[Callable[[int], bytes], Callable[[bytes], int]]] = {
         "stream": (mutation.mutated_stream, mutation.read_stream),
@@ -110,7 +110,7 @@ def frames(count: int | None, until: float | None, seed: int, keep: Path) -> dic
 
 
 def guided(target: str, seconds: float, keep: Path) -> None:
-    """Let Atheris look for new paths through a decoder; ends the process."""
+    """Let Atheris search for new paths through a decoder. This ends the process."""
     import atheris
 
     with atheris.instrument_imports(include=["amiwarp"]):
@@ -167,7 +167,7 @@ def summary(outcomes: dict[str, Counter[str]], seconds: float) -> dict[str, Any]
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, help="half of them for files, half for frames")
+    parser.add_argument("--seconds", type=float, help="time limit: half for files, half for frames")
     parser.add_argument("--files", type=int)
     parser.add_argument("--frames", type=int)
     parser.add_argument("--guided", choices=GUIDED)

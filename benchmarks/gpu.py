@@ -1,10 +1,10 @@
-"""Everything a CUDA GPU is asked for, in one call: correctness, then every figure, each with the error of its own run.
+"""All tests and benchmarks for a CUDA GPU in one call.
 
     python -m benchmarks.gpu FOLDER_OF_PICTURES --out FOLDER [--limit-s 500] [--only tests speed …]
 
-Runs the tests on the device, then each benchmark as a process of its own: ``speed`` is ``python -m benchmarks``,
-``chart`` the two charts. Writes what they found beside what they said, and ends with a summary. Exit status 1 where
-anything failed.
+Runs the tests on the device, then each benchmark in a separate process. ``speed`` is ``python -m benchmarks``;
+``chart`` makes the two charts. Writes the results and the logs to FOLDER, and prints a summary at the end. The exit
+status is 1 if anything failed.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
     "simulate", "translate", "benchmarks",
 )  # fmt: skip
-"""Of what runs on a device, and needs neither the command line's packages nor video."""
+"""Test files that use a device, and need neither the packages of the command line nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
-"""What writes HDF5 through a plug-in that a bare GPU machine may lack."""
+"""Tests to skip without hdf5plugin, which a GPU machine may lack."""
 
 
 def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
-    """Every run by name."""
+    """Return the commands by name."""
     tests = [f"tests/test_{name}.py" for name in TESTS]
     module = [sys.executable, "-m"]
     calibration = [*module, "benchmarks.calibration"]
@@ -50,7 +50,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--limit-s", type=float, default=500.0, help="no new row of a table after so long")
+    parser.add_argument("--limit-s", type=float, default=500.0, help="start no new row of a table after this time [s]")
     parser.add_argument("--only", nargs="+")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

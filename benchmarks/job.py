@@ -1,4 +1,4 @@
-"""What a case hands to the runner."""
+"""The job that a case gives to the runner."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One method on one scene and device, its data in place."""
+    """One method on one scene and device, with its data prepared."""
 
     run: Callable[[], Any]
     """One pass, which is timed. On CUDA it may return before the device is done."""
     errors: Callable[[], dict[str, float]]
-    """Errors by name of what the latest pass left; the case has bars for them."""
+    """Function that returns the errors of the latest pass by name; the case has limits for them."""
     work: float = 1.0
-    """What a pass gets done, in the case's unit."""
+    """Work of one pass, in the case's unit."""
     also: Callable[[], dict[str, float]] = dict
-    """What else there is to tell, by name."""
+    """Function that returns further results by name."""
     seconds: Iterator[float] | None = None
-    """Of passes that clocked themselves, in a process of their own; ``run`` has nothing to do then."""
+    """Durations of passes that were timed in another process [s]; ``run`` then does nothing."""
     note: str = ""
-    """How this machine made it differ from what the case says."""
+    """How the case differs on this machine, if it does."""

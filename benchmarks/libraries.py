@@ -1,8 +1,9 @@
-"""The circle's image in other libraries, as their users would write it: x - r cos, y - r sin, four bilinear votes.
+"""Images of warped events by the circle model in other libraries, written as their users would write them.
 
-Each holds x, y and the angle within a turn before the clock starts: as uint16 and float32, and PyTorch, which has
-little use for uint16, all as float32. The image has a margin that no event leaves, so that nobody needs to look for its
-border. Speed and error of these are what amiwarp's are held against; nothing here is used for anything else.
+The formula is x - r cos, y - r sin, with four bilinear votes. Before the timing starts, x, y and the angle within one
+turn are in memory as uint16 and float32. PyTorch has little support for uint16, so it gets float32 only. The image has
+a margin wider than any displacement, so no bounds checks are needed. These implementations serve only to compare their
+speed and error with those of amiwarp.
 """
 
 from __future__ import annotations
@@ -21,27 +22,31 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BLOCK = 1 << 16
-"""Events that stay in a CPU's cache while NumPy and PyTorch go over them array by array."""
+"""Number of events whose arrays fit into a CPU's cache while NumPy and PyTorch process them array by array."""
 
 
 class Missing(Exception):
-    """A library that is not installed, or does not run on this device: the row is skipped, and says so."""
+    """Raised if a library is not installed, or does not run on this device; the row is then skipped with this text."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeerEvents:
-    """Events as the users of other libraries hold them, and the circle that is to be taken out."""
+    """Events in the form that users of other libraries have, and the circle to compensate."""
 
     x: NDArray[np.uint16]
+    """Column of each event [px]."""
     y: NDArray[np.uint16]
+    """Row of each event [px]."""
     angle: NDArray[np.float32]
-    """Of the displacement, within a turn [rad]."""
+    """Direction of each displacement, within one turn [rad]."""
     radius: float
-    """Of the circle [px]."""
+    """Radius of the circle [px]."""
     width: int
+    """Width of the image [px]."""
     height: int
+    """Height of the image [px]."""
     margin: int
-    """Around the image, that no event leaves [px]: more than the radius, and one."""
+    """Margin around the image that no event leaves [px]: larger than the radius plus 1."""
     _kept: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -50,13 +55,13 @@ class PeerEvents:
         return self.height + 2 * self.margin, self.width + 2 * self.margin
 
     def keep(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What ``make`` gives, made once."""
+        """Return the result of ``make``, which is called only once per key."""
         if key not in self._kept:
             self._kept[key] = make()
         return self._kept[key]
 
     def places(self, which: slice) -> NDArray[np.float32]:
-        """Where the formula in float32 puts events [px], shape (n, 2)."""
+        """Return the compensated positions by the formula in float32 [px], shape ``(n, 2)``."""
         angle, radius = self.angle[which], np.float32(self.radius)
         xy = np.stack([self.x[which], self.y[which]], axis=1).astype(np.float32)
         return np.asarray(xy - radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -64,21 +69,23 @@ class PeerEvents:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """One library with the events in place."""
+    """One library, with the events in memory."""
 
     run: Callable[[], Any]
     """One pass, which is timed. On CUDA it may return before the device is done."""
     with_margin: Callable[[], Any]
+    """Function that returns the image of the latest pass, including the margin."""
     events: PeerEvents
+    """Events that are voted."""
 
     def image(self) -> NDArray[np.floating[Any]]:
-        """What the latest pass left, without the margin, shape (height, width)."""
+        """Return the image of the latest pass without the margin, shape ``(height, width)``."""
         m = self.events.margin
         return np.asarray(self.with_margin()).reshape(self.events.shape)[m:-m, m:-m]
 
 
 def library(name: str) -> Any:
-    """Raises :class:`Missing` where it is not installed."""
+    """Import a library. Raises :class:`Missing` if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -86,7 +93,7 @@ def library(name: str) -> Any:
 
 
 def with_numpy(events: PeerEvents, device: str, *, block: int | None = None) -> Peer:
-    """Four ``add.at``, which in NumPy 2 beat ``bincount`` with weights; over whole arrays, or in blocks."""
+    """NumPy, with four calls of ``add.at`` (faster than ``bincount`` in NumPy 2) over whole arrays or blocks."""
     x, y, angle, radius, margin = events.x, events.y, events.angle, np.float32(events.radius), np.float32(events.margin)
     rows, columns = events.shape
     image = np.zeros(rows * columns, np.float32)
@@ -110,7 +117,7 @@ def with_numpy(events: PeerEvents, device: str, *, block: int | None = None) -> 
 
 @cache
 def numba_kernels() -> tuple[Any, Any]:
-    """Sine and cosine an event, and from a table of a turn's angles; each thread has an image of its own."""
+    """Return two kernels: sine and cosine per event, and a table of displacements. Each thread has its own image."""
     nb = library("numba")
     one = np.float32(1.0)
 
@@ -152,7 +159,7 @@ def _numba_images(events: PeerEvents) -> tuple[Any, Any]:
 
 
 def with_numba(events: PeerEvents, device: str) -> Peer:
-    """Parallel and with ``fastmath``."""
+    """Numba, parallel and with ``fastmath``."""
     kernel, _ = numba_kernels()
     images, total = _numba_images(events)
     sizes = np.float32(events.radius), np.float32(events.margin)
@@ -161,7 +168,7 @@ def with_numba(events: PeerEvents, device: str) -> Peer:
 
 
 def with_numba_table(events: PeerEvents, device: str) -> Peer:
-    """The same, given angles in 16 bits as amiwarp's events have, and a table of displacements."""
+    """Numba, with 16-bit angles as in amiwarp and a table of displacements."""
     _, kernel = numba_kernels()
     images, total = _numba_images(events)
     angle = np.arange(65536) * (2.0 * np.pi / 65536)
@@ -172,7 +179,7 @@ def with_numba_table(events: PeerEvents, device: str) -> Peer:
 
 
 def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> Peer:
-    """Four ``index_add_``; over whole arrays, or in blocks."""
+    """PyTorch, with four calls of ``index_add_`` over whole arrays or blocks."""
     torch = library("torch")
     if device != "cpu" and not torch.cuda.is_available():
         raise Missing("this PyTorch has no CUDA")
@@ -201,16 +208,16 @@ def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> 
 
 
 def _cupy_events(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
-    """The library, and x, y, angle on the device."""
+    """Return CuPy, and x, y and angle on the device."""
     cupy = library("cupy")
     if device == "cpu":
-        raise Missing("CuPy runs on CUDA alone")
+        raise Missing("CuPy runs only on CUDA")
     arrays = (events.x, events.y, events.angle)
     return cupy, events.keep(("cupy", device), lambda: [cupy.asarray(a) for a in arrays])
 
 
 def with_cupy(events: PeerEvents, device: str) -> Peer:
-    """Arrays, and four ``add.at``."""
+    """CuPy, with array operations and four calls of ``add.at``."""
     cupy, (x, y, angle) = _cupy_events(events, device)
     radius, margin, (rows, columns) = np.float32(events.radius), np.float32(events.margin), events.shape
     image = cupy.zeros(rows * columns, cupy.float32)
@@ -250,7 +257,7 @@ extern "C" __global__ void votes(const unsigned short* x, const unsigned short* 
 
 
 def with_cupy_kernel(events: PeerEvents, device: str) -> Peer:
-    """CUDA C++ through ``RawKernel``, four float atomics an event."""
+    """CuPy's ``RawKernel`` with CUDA C++: four float atomics per event."""
     cupy, (x, y, angle) = _cupy_events(events, device)
     kernel, n = cupy.RawKernel(CUDA_SOURCE, "votes"), len(x)
     image = cupy.zeros(events.shape, cupy.float32)
@@ -276,5 +283,6 @@ PEERS: dict[str, Callable[[PeerEvents, str], Peer]] = {
     "CuPy": with_cupy,
     "CuPy, CUDA C++": with_cupy_kernel,
 }
-"""The fastest way with each, by name. NumPy and Numba work on the CPU whatever the device."""
+"""Fastest implementation with each library, by name."""
 ON_CPU = ("NumPy", "Numba", "Numba, table")
+"""Names of the implementations that run on the CPU for every device."""

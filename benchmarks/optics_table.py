@@ -1,8 +1,8 @@
-"""Prints the tables of docs/explanation/optics.md: what each model costs in pixels, and what float32 costs the exact one.
+"""Print the tables of docs/explanation/optics.md: errors of the models, and rounding errors of the exact model.
 
     python benchmarks/optics_table.py
 
-Needs a checkout: the float32 table compares with the float64 oracle in tests/reference.py.
+This needs a checkout, because the rounding errors are those against the float64 oracle in tests/reference.py.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LENSES: dict[str, Distortion | None] = {
 
 
 def fitted_circle(exact: ExactModel) -> ModelError:
-    """The constant deflection of least rms error."""
+    """Return the error of the circle model with the constant deflection that has the smallest rms error."""
     start = CircleModel.from_prism(exact.camera, exact.prism).deflection
 
     def error(deflection: float) -> ModelError:
@@ -53,7 +53,7 @@ def fitted_circle(exact: ExactModel) -> ModelError:
 
 
 def ladder_rows() -> Iterator[str]:
-    """One row for each field of view, deflection and side: rms/worst error of every rung [px]."""
+    """Yield one row per field of view, deflection and side: rms/worst error of every model [px]."""
     yield "| FOV | δ₀ | flat side | circle, on-axis δ | circle, fitted δ | radial circle | ellipse |"
     yield "|---|---|---|---|---|---|---|"
     for fov in (40, 60, 75, 90):
@@ -71,7 +71,7 @@ def ladder_rows() -> Iterator[str]:
 
 
 def lens_camera(width: int, height: int, fov: float, lens: Distortion | None) -> Camera:
-    """A camera whose true horizontal field of view, lens included, is ``fov`` [rad]."""
+    """Return a camera whose horizontal field of view, including the lens distortion, is ``fov`` [rad]."""
     bare = Camera(width, height, 1.0, 1.0, 0.0, 0.0, lens)
     edge = reference.rays_to_pixels(bare, np.array([[math.sin(fov / 2), 0.0, math.cos(fov / 2)]]))[0, 0]
     focal = width / (2.0 * float(edge))
@@ -79,7 +79,10 @@ def lens_camera(width: int, height: int, fov: float, lens: Distortion | None) ->
 
 
 def rounding(camera: Camera, *, count: int = 20_000) -> tuple[float, float]:
-    """Worst deviation from the oracle and worst round trip [px], apex 4°, either side, with and without tilt."""
+    """Return the largest deviation from the oracle and the largest round-trip error [px].
+
+    The apex angle is 4°; both orientations of the prism are included, with and without tilt.
+    """
     rng = np.random.default_rng(0)
     given = rng.uniform(0.0, [camera.width - 1, camera.height - 1], (count, 2)).astype(np.float32)
     given[::2] = np.round(given[::2])
@@ -98,7 +101,7 @@ def rounding(camera: Camera, *, count: int = 20_000) -> tuple[float, float]:
 
 
 def rounding_rows() -> Iterator[str]:
-    """One row for each sensor and field of view: deviation / round trip [1e-3 px]."""
+    """Yield one row per sensor and field of view: deviation / round-trip error [1e-3 px]."""
     yield f"| sensor | FOV | {' | '.join(LENSES)} |"
     yield "|---|---|---|---|---|"
     for width, height in ((346, 260), (640, 480), (1280, 720), (2560, 1440)):

@@ -1,4 +1,4 @@
-"""Every call into amiwarp, and what a plain Warp kernel does with the same events."""
+"""Jobs that call amiwarp, and a plain Warp kernel for comparison."""
 
 import json
 import math
@@ -27,8 +27,9 @@ from benchmarks.scenes import PHASE, EventScene, FileScene, RecordingScene
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 CANDIDATES = 12
+"""Number of deflections voted in one pass."""
 FILE_PASSES = 3
-"""Of a file, after a first one that puts it in memory."""
+"""Timed passes over a file, after a first one that brings it into the page cache."""
 
 
 def model_of(scene: EventScene, name: str) -> Model:
@@ -40,7 +41,7 @@ def uploaded(scene: EventScene, device: str) -> Any:
 
 
 def image(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """Clear, vote, and the float image on the device. Events and their 16-bit angles are there before."""
+    """Clear the image, vote, and convert to a float image on the device. The events are uploaded before."""
     moves, events = model_of(scene, model), uploaded(scene, device)
     canvas = CanvasShape(scene.camera.width, scene.camera.height, vote=vote)
     votes, result = Votes(canvas, device), Image(canvas, 1, device)
@@ -54,16 +55,19 @@ def image(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
 
 
 def errors(scene: EventScene, model: str, vote: Vote, result: Image) -> dict[str, float]:
-    """Of an image; the places are by the functions that the votes call, at the 16-bit angles that the events have."""
+    """Return the errors of an image.
+
+    The compared positions come from the functions that the votes use, at the 16-bit angles of the uploaded events.
+    """
     xy, theta = scene.sample()
     angle = np.rint(theta * (TURNS / (2.0 * np.pi))) * (2.0 * np.pi / TURNS)
     return truth.iwe_errors(scene, model, vote, result.numpy()[0], model_of(scene, model).compensate_points(xy, angle))
 
 
 def prepared(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """Clear and vote, for several deflections a pass, events sorted by image tile before; work: events × candidates.
+    """Clear and vote for several deflections per pass, with events sorted by image tile before.
 
-    The image that is compared is the last candidate's, who has the true deflection.
+    The work is the number of events times candidates. The last candidate has the true deflection; its image is checked.
     """
     true = model_of(scene, model)
     canvas = CanvasShape(scene.camera.width, scene.camera.height, vote=vote)
@@ -102,7 +106,7 @@ def four_atomics(
 
 
 def warp_atomics(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """A kernel as Warp's users write it."""
+    """Plain Warp kernel with four float atomics per event."""
     events = peers.peer_events(scene)
     inputs = [
         wp.array(events.x, dtype=wp.uint16, device=device),
@@ -121,7 +125,7 @@ def warp_atomics(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
 
 
 def calibration(scene: RecordingScene, device: str, model: str, vote: Vote, *, stages: tuple[str, ...]) -> Job:
-    """From the recording to its parameters, by the default settings: events in the host's memory, no guess."""
+    """Calibrate a recording with default settings and no initial guess; its events are in host memory."""
     found: list[Calibration] = []
 
     def run() -> None:
@@ -139,7 +143,7 @@ def calibration(scene: RecordingScene, device: str, model: str, vote: Vote, *, s
 
 
 def picture(scene: RecordingScene, device: str, model: str, vote: Vote) -> Job:
-    """Of the turn in the middle, from the true parameters."""
+    """Reconstruct a picture of one turn in the middle of the recording, with the true parameters."""
     found: list[Picture] = []
     events = scene.recording.events
 
@@ -163,7 +167,7 @@ def picture(scene: RecordingScene, device: str, model: str, vote: Vote) -> Job:
 
 
 def file(scene: FileScene, device: str, model: str, vote: Vote) -> Job:
-    """From file to file, by a process of its own, so that the peak of memory is its own."""
+    """Compensate a file into a file, in a separate process so that its peak memory can be measured."""
     command = [sys.executable, "-m", "benchmarks.compensate", "--row", str(scene.source), "--models", model]
     command += ["--device", device, "--repeats", str(FILE_PASSES + 1), *["--columns"] * bool(scene.missing)]
     ran = subprocess.run(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[1], check=True)

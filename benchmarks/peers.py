@@ -1,4 +1,4 @@
-"""Other libraries at the same job, :mod:`benchmarks.libraries`, as rows here."""
+"""Jobs for the implementations of other libraries in :mod:`benchmarks.libraries`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from benchmarks.scenes import MARGIN, EventScene
 
 
 def peer_events(scene: EventScene) -> PeerEvents:
-    """The scene as all of them hold it."""
+    """Return the scene's events in the form that all libraries use."""
 
     def make() -> PeerEvents:
         angle = np.remainder(scene.theta, 2.0 * np.pi).astype(np.float32)
@@ -25,7 +25,7 @@ def peer_events(scene: EventScene) -> PeerEvents:
 
 
 def job(scene: EventScene, vote: Vote, peer: Peer, model: str = "plane circle") -> Job:
-    """Of a library that has the scene in place."""
+    """Return the job of a library whose data is prepared."""
 
     def errors() -> dict[str, float]:
         return truth.iwe_errors(scene, model, vote, peer.image(), peer.events.places(scene.some))
@@ -34,5 +34,5 @@ def job(scene: EventScene, vote: Vote, peer: Peer, model: str = "plane circle") 
 
 
 def image(way: Callable[[PeerEvents, str], Peer], scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """By one of the functions of :mod:`benchmarks.libraries`."""
+    """Return the job of one of the functions of :mod:`benchmarks.libraries`."""
     return job(scene, vote, way(peer_events(scene), device), model)

@@ -1,13 +1,18 @@
-"""Pictures from events beside the truth of simulated recordings, and beside peers that need no trained weights; JSON.
+"""Reconstructed pictures compared with the truth of simulated recordings, and with other methods without training.
 
     python -m benchmarks.reconstruct FOLDER --out FILE.json [--figure FILE.png] [--pictures china.jpg] …
 
-Every picture of FOLDER is seen by a 346 × 260 camera (60°) through a prism (apex 1°, 720 rpm), at noise of about 0, 10,
-25 and 50 % of all events. Windows start after a whole turn: until then the references of a simulated pixel are as it
-was switched on. The peers get the true optics too: ``integration`` adds up ±threshold at each event's place without
-the prism; ``leaky`` does so with a high-pass filter of 100 ms, as a complementary filter without frames (Scheerlinck,
-Barnes and Mahony, ACCV 2018); ``panning`` is the same solver on the same camera without a prism, which turns about a
-diagonal axis as fast as the prism moves the image. Rows that FILE already holds for other pictures are kept.
+A 346 × 260 camera (60°) sees every picture of FOLDER through a prism (apex angle 1°, 720 rpm), with noise of about 0,
+10, 25 and 50 % of all events. Windows start after a whole turn, because before that a simulated pixel still has the
+reference level of its start. The other methods also get the true optics:
+
+``integration`` adds ±threshold at the compensated position of each event.
+``leaky`` does the same with a high-pass filter of 100 ms, like a complementary filter without frames (Scheerlinck,
+Barnes and Mahony, ACCV 2018).
+``panning`` uses amiwarp's solver on the same camera without a prism, which rotates about a diagonal axis as fast as the
+prism moves the image.
+
+The results are written as JSON. Rows of other pictures that FILE already contains are kept.
 """
 
 from __future__ import annotations
@@ -35,7 +40,7 @@ from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_png
-from amiwarp.imaging.metrics import RANGE, picture_quality
+from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
@@ -55,19 +60,20 @@ SETTINGS = (
     (0.25, 0.0, ALL), (0.25, 0.25, ALL), (0.25, 0.1, SOME), (0.25, 0.5, SOME),
     (0.1, 0.0, ONE), (0.1, 0.25, ONE), (0.5, 0.0, ONE), (0.5, 0.25, ONE),
 )  # fmt: skip
-"""Threshold, share of shot noise among the events, windows [turns]."""
+"""Contrast threshold, share of shot noise among the events, and lengths of the windows [turns]."""
 TEXTURED = 0.05
-"""Areas where log intensity varies by more (standard deviation over 9 × 9 px) are textured."""
+"""Standard deviation of log intensity over 9 × 9 px above which an area counts as textured."""
 DECAY_S = 0.1
+"""Time constant of the high-pass filter [s]."""
 SHOWN = 0.25
 """Share of noise of the pictures in the figure, at a threshold of 0.25."""
 PEERS = {"panning": "panning, no prism", "integration": "integrated events", "leaky": "high-pass filter"}
-"""In the figure, over one turn."""
+"""Other methods and their titles in the figure, for windows of one turn."""
 METHODS = ("amiwarp", *PEERS)
 PROBE_S = 0.06
-"""Length of the noiseless recording that tells how many events the scene makes."""
+"""Length of the noise-free recording that measures the scene's event rate [s]."""
 MARGIN = 64
-"""A wider view of the scene, to cut that of a turned camera out of [px]."""
+"""Margin of the wider view from which the view of a rotated camera is cut out [px]."""
 
 
 def simulation(picture: Path, contrast: float, seconds: float, noise: float, device: str) -> Simulation:
@@ -78,13 +84,13 @@ def simulation(picture: Path, contrast: float, seconds: float, noise: float, dev
 
 
 def noise_rate(picture: Path, contrast: float, share: float, device: str) -> float:
-    """Rate of a pixel's shot noise [1/s] that makes about ``share`` of all events."""
+    """Return the rate of shot noise per pixel [1/s] that makes up about ``share`` of all events."""
     quiet = simulation(picture, contrast, PROBE_S, 0.0, device).run()
     return share / (1.0 - share) * len(quiet.events) / PROBE_S / (CAMERA.width * CAMERA.height)
 
 
 def speed() -> float:
-    """At which the prism moves the middle of the image [px/s]."""
+    """Return the mean speed at which the prism moves the middle of the image [px/s]."""
     theta = np.linspace(0.0, 2.0 * np.pi, 65)
     xy = np.tile(np.array([[CAMERA.cx, CAMERA.cy]], np.float32), (65, 1))
     path = np.asarray(ExactModel(CAMERA, PRISM).compensate_points(xy, theta))
@@ -92,7 +98,7 @@ def speed() -> float:
 
 
 def scene_fov(through: Simulation) -> float:
-    """Horizontal extent of the whole picture behind the prism [rad]."""
+    """Return the horizontal field of view that the whole picture fills in the scene behind the prism [rad]."""
     place = place_scene(through)
     left, _, right, _ = place.box
     plane = place.width / place.pitch[0] / (right - left)  # per pixel of the picture
@@ -100,7 +106,7 @@ def scene_fov(through: Simulation) -> float:
 
 
 def panning(through: Simulation, fov: float) -> tuple[Recording, CameraRotation]:
-    """The same scene, at the same scale, from a camera that turns instead of a prism; and how it turns."""
+    """Simulate the same scene at the same scale with a rotating camera without prism; return also the rotation."""
     rate = speed() / CAMERA.fx / math.sqrt(2.0)
     turn = CameraRotation((rate, rate, 0.0))
     still = replace(
@@ -111,7 +117,7 @@ def panning(through: Simulation, fov: float) -> tuple[Recording, CameraRotation]
 
 
 def seen_at(through: Simulation, rotation: NDArray[np.float64], fov: float) -> NDArray[np.float32]:
-    """The true log intensity for a camera turned by ``rotation`` [rad] from where it faces the picture."""
+    """Return the true log intensity for a camera rotated by ``rotation`` [rad] from the direction of the picture."""
     wide = Camera(
         CAMERA.width + 2 * MARGIN, CAMERA.height + 2 * MARGIN, CAMERA.fx, CAMERA.fy, CAMERA.cx + MARGIN,
         CAMERA.cy + MARGIN,
@@ -125,7 +131,7 @@ def seen_at(through: Simulation, rotation: NDArray[np.float64], fov: float) -> N
 
 
 def integrate(recording: Recording, model: ExactModel, length_us: int, *, decay_s: float | None) -> NDArray[np.float32]:
-    """Sum of polarities at the events' places without the prism, a vote spread over four pixels."""
+    """Return the sum of polarities at the compensated positions, with bilinear votes."""
     events = recording.events.between(START_US, START_US + length_us)
     assert recording.encoder is not None
     xy = compensate_events(events, model, recording.encoder)
@@ -145,13 +151,13 @@ def integrate(recording: Recording, model: ExactModel, length_us: int, *, decay_
 
 
 def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, dict[str, float]]:
-    """Quality over textured areas and over all; SSIM after the gain and offset that fit there."""
+    """Return the quality in textured areas and in the whole image; SSIM after fitting gain and offset."""
     spread = ndimage.uniform_filter(truth**2, 9) - ndimage.uniform_filter(truth, 9) ** 2
     out = {}
     for area, where in (("textured", spread > TEXTURED**2), ("all", np.ones(truth.shape, np.bool_))):
         quality = picture_quality(log, truth, where)
         fitted = (quality.gain * log + quality.offset).astype(np.float64)
-        span = float(np.ptp(np.percentile(truth, RANGE)))
+        span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))
         _, similar = structural_similarity(truth.astype(np.float64), fitted, data_range=span, full=True)
         out[area] = {
             "correlation": quality.correlation, "psnr_db": quality.psnr_db, "ssim": float(similar[where].mean()),
@@ -162,7 +168,7 @@ def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, di
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """One simulated scene: through the prism, and by a camera that turns instead."""
+    """One simulated scene, seen through the prism and by a rotating camera without prism."""
 
     through: Simulation
     fov: float
@@ -181,7 +187,7 @@ class Seen:
         return cls(through, fov, through.run(), through.log_view(), *panning(through, fov), noise)
 
     def row(self, turns: float) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-        """What is measured in a window, and the pictures."""
+        """Return the measurements of one window, and the pictures."""
         length = round(turns * TURN_US)
         model = ExactModel(CAMERA, PRISM, PHASE)
         found = Reconstruction(self.recording, model=model, device=self.through.device).window(START_US, length)
@@ -200,7 +206,7 @@ class Seen:
         return row, {"truth": self.truth} | pictures
 
     def panned(self, length: int) -> tuple[NDArray[np.float32], int, dict[str, dict[str, float]]]:
-        """The picture of the camera that turns, its equations, and its quality."""
+        """Return the picture of the rotating camera, its number of equations, and its quality."""
         found = Reconstruction(
             self.turning, model=ExactModel(CAMERA, Prism(0.0)), camera_rotation=self.turn, device=self.through.device,
             encoder=Encoder.constant_speed(0.0, 0, self.turning.events.t_last),
@@ -211,7 +217,7 @@ class Seen:
 
 
 def rows(picture: Path, device: str, shown: dict[str, dict[str, NDArray[np.float32]]]) -> Iterator[dict[str, Any]]:
-    """All windows of a picture; pictures of the share :data:`SHOWN` go into ``shown``."""
+    """Yield the rows of all windows of a picture; add reconstructions with noise :data:`SHOWN` to ``shown``."""
     for contrast, share, windows in SETTINGS:
         seen = Seen.make(picture, contrast, share, windows, device)
         rate = len(seen.recording.events) / seen.through.duration_s
@@ -229,7 +235,7 @@ def rows(picture: Path, device: str, shown: dict[str, dict[str, NDArray[np.float
 
 
 def grid(shown: dict[str, dict[str, NDArray[np.float32]]], path: Path) -> None:
-    """A row a picture: the truth, windows of rising length, and the peers."""
+    """Draw one row per picture: the truth, windows of increasing length, and the other methods."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -251,7 +257,10 @@ def grid(shown: dict[str, dict[str, NDArray[np.float32]]], path: Path) -> None:
 
 
 def real(folder: Path, device: str) -> dict[str, dict[str, NDArray[np.float32]]]:
-    """Recordings of a turning camera without a prism: the map with either sign, and what is known."""
+    """Reconstruct recordings of a rotating camera without prism, with either sign of its rotation.
+
+    Returns the pictures, and the mask of known pixels.
+    """
     out = {}
     for name in ("shapes_rotation", "dynamic_rotation"):
         recording = open_recording(folder / name / "events.txt")
@@ -263,7 +272,7 @@ def real(folder: Path, device: str) -> dict[str, dict[str, NDArray[np.float32]]]
         for title, sign in (("motion.txt", 1.0), ("the wrong sign", -1.0)):
             x, y, z = (sign * omega).tolist()
             found = reconstruct(
-                recording, model=model, encoder=Encoder.constant_speed(0.0, first, last), 
+                recording, model=model, encoder=Encoder.constant_speed(0.0, first, last),
                 camera_rotation=CameraRotation((x, y, z), middle_us=(first + last) // 2),
                 length_us=last - first + 1, device=device,
             )  # fmt: skip
@@ -280,8 +289,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--figure", type=Path)
-    parser.add_argument("--pictures", nargs="+", help="names in FOLDER; all where left out")
-    parser.add_argument("--real", type=Path, help="folder of shapes_rotation and dynamic_rotation")
+    parser.add_argument("--pictures", nargs="+", help="file names in FOLDER (default: all)")
+    parser.add_argument("--real", type=Path, help="folder that contains shapes_rotation and dynamic_rotation")
     parser.add_argument("--real-figure", type=Path)
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
@@ -303,7 +312,7 @@ def main() -> None:
 
 
 def table(found: list[dict[str, Any]], contrast: float, methods: tuple[str, ...]) -> Iterator[str]:
-    """Lines of Markdown: means over the pictures, and the worst correlation with its picture."""
+    """Yield lines of a Markdown table: means over the pictures, and the worst correlation with its picture's name."""
     chosen = [row for row in found if row["contrast"] == contrast]
     for turns, share in sorted({(row["turns"], row["share"]) for row in chosen}, key=lambda key: (key[1], key[0])):
         group = [row for row in chosen if (row["turns"], row["share"]) == (turns, share)]
@@ -322,21 +331,21 @@ def table(found: list[dict[str, Any]], contrast: float, methods: tuple[str, ...]
 
 
 def ordered(line: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-    """The columns of the figure: not all windows, and the peers last."""
+    """Return the columns of the figure: selected windows, then the other methods."""
     last = list(PEERS.values())
     kept = [name for name in line if name not in (*last, "0.5 turn", "2 turns")]
     return {name: line[name] for name in (*kept, *last)}
 
 
 def merge(path: Path, picture: str, found: list[dict[str, Any]], device: str) -> None:
-    """Put a picture's rows into the file, in place of older ones."""
+    """Write a picture's rows into the file; they replace older rows of this picture."""
     old = json.loads(path.read_text())["rows"] if path.exists() else []
     kept = [row for row in old if row["picture"] != picture] + found
     machine = {"device": device, "machine": platform.processor(), "python": platform.python_version()}
     text = json.dumps({"settings": machine, "rows": sorted(kept, key=lambda row: str(row["picture"]))}, indent=1)
-    beside = path.with_suffix(".tmp")
-    beside.write_text(text + "\n")
-    os.replace(beside, path)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(text + "\n")
+    os.replace(temporary, path)
 
 
 if __name__ == "__main__":

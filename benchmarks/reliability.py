@@ -1,11 +1,12 @@
-"""What kills and full disks leave behind: every command that writes is ended at random moments, and fills small disks.
+"""Reliability tests: kill every command that writes files at random moments, and run it on disks that are too small.
 
     python -m benchmarks.reliability kills --folder FOLDER [--kills 60] [--only NAME …] [--out FILE.json]
     python -m benchmarks.reliability disks --folder FOLDER [--only NAME …] [--out FILE.json]
 
-``kills`` ends each command by SIGKILL, SIGTERM and SIGINT in turn, at moments spread over its whole run, and looks at
-what is there then. ``disks`` runs each command on disks (tmpfs, which needs root) of sizes from almost nothing to all
-that it needs. Exit status 1 if anything was lost, half written, left over or hung; each such case is printed.
+``kills`` ends each command by SIGKILL, SIGTERM and SIGINT in turn, at moments spread over its whole run, and checks the
+files that remain. ``disks`` runs each command on disks (tmpfs, which needs root) with sizes from almost nothing to more
+than it needs. The exit status is 1 if a file was lost, incomplete or left over, or if a command hung; each such case is
+printed.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ from amiwarp.io import open_recording
 from amiwarp.io.output import NewFile, remove_abandoned
 
 LIMIT_S = 180.0
-"""A command that was told to end and lives on hangs."""
+"""A command that still runs this long after a signal counts as hanging [s]."""
 
 START_S = 0.3
-"""Until then Python starts and reads its own modules; what interrupts it there is answered by Python itself."""
+"""Time in which Python starts and imports its own modules [s]; a signal before then is handled by Python itself."""
 
 CELLS = "cells"
-"""A folder of whole results, which the next run goes on from."""
+"""Folder of complete intermediate results, from which the next run continues."""
 
 COMMANDS = {
     "simulate": ("simulate OUT/o.h5 --picture IN/pic.png --size 160x120 --duration 0.4", ("o.h5",)),
@@ -82,10 +83,10 @@ COMMANDS = {
         ("atlas.csv", "atlas.json", "atlas.pdf", "axis_apex.png", "overview.png", "summary.md", CELLS),
     ),
 }
-"""Each command, and the files it writes. IN is read, OUT is empty before."""
+"""Each command line, and the files it writes. IN is the folder of inputs; OUT is empty before."""
 
 LIVE = ("record", "live")
-"""Keep what had come: the file is whole, and may be shorter."""
+"""Commands that keep the events received so far: their file is valid, but may be shorter."""
 
 
 def prepare(folder: Path) -> Path:
@@ -121,7 +122,7 @@ def prepare(folder: Path) -> Path:
 
 
 def many_events(inputs: Path, count: int = 3_000_000) -> None:
-    """Write a recording of two seconds, evenly filled, as large as the time of a kill needs."""
+    """Write a recording of two seconds with evenly spread events, long enough to kill a command while it runs."""
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events, MemoryEvents
     from amiwarp.events.recording import Recording
@@ -147,7 +148,7 @@ def digest(folder: Path) -> dict[str, str]:
 
 
 def size_of(path: Path) -> Any:
-    """What tells a whole file of its kind, found by reading all of it."""
+    """Read a file completely, and return a property that identifies a complete file of its kind."""
     if path.is_dir():
         return all(json.loads(f.read_text())["results"] for f in path.glob("[!.]*"))
     if path.suffix == ".pdf":
@@ -159,7 +160,7 @@ def size_of(path: Path) -> Any:
         from PIL import Image
 
         with Image.open(path) as image:
-            image.load()  # a part of one is an error; a chart's size depends on its figures
+            image.load()  # raises an error for an incomplete image; a chart's size depends on its figures
             return image.mode
     if path.suffix == ".npy":
         return np.load(path).shape
@@ -176,7 +177,7 @@ def size_of(path: Path) -> Any:
 
 @contextlib.contextmanager
 def begun(line: str, inputs: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
-    """A command in a session of its own, of which nothing is left at the end."""
+    """Start a command in its own session; at the end, kill all processes of the session."""
     process = subprocess.Popen(
         words(line, inputs, out), text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
@@ -190,7 +191,7 @@ def begun(line: str, inputs: Path, out: Path) -> Iterator[subprocess.Popen[str]]
 
 
 def left_alive(group: int, wait_s: float = 30.0) -> list[str]:
-    """Processes of the session that live on ``wait_s`` after its leader."""
+    """Return the processes of the session that still run ``wait_s`` seconds after its leader ended."""
     until = time.monotonic() + wait_s
     while True:
         alive = []
@@ -204,7 +205,7 @@ def left_alive(group: int, wait_s: float = 30.0) -> list[str]:
 
 
 def whole_run(name: str, inputs: Path, out: Path) -> tuple[float, dict[str, Any], int]:
-    """Seconds of an undisturbed run, what its files hold, and their bytes."""
+    """Run a command undisturbed; return its duration [s], the properties of its files, and their size [bytes]."""
     line, files = COMMANDS[name]
     began = time.perf_counter()
     with begun(line, inputs, out) as process:
@@ -216,7 +217,7 @@ def whole_run(name: str, inputs: Path, out: Path) -> tuple[float, dict[str, Any]
 
 
 def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals, code: int) -> tuple[str, list[str]]:
-    """How a run ended, and all that is wrong with what it left."""
+    """Return how a run ended, and the problems of the files that it left."""
     wrong = []
     there = {f.name for f in out.iterdir()}
     left = set(out.rglob(".*.part"))
@@ -239,7 +240,7 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
         if place.is_dir():
             NewFile(place / "next").discard()
     wrong += [f"{f.name} outlived the next run" for f in left if f.exists()]
-    # -number: Python was starting, or all was done and it was ending
+    # -number: the signal arrived while Python was starting or exiting
     if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number, -signal.SIGINT}):
         wrong.append(f"exit status {code}")
     ended = "finished" if set(expected) <= there else "cut short" if there - unfinished else "nothing"
@@ -247,7 +248,7 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
 
 
 def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
-    """End a command ``count`` times."""
+    """Run a command ``count`` times, and kill it each time at another moment."""
     whole_run(name, inputs, emptied(folder))  # compiles
     seconds, expected, _ = whole_run(name, inputs, emptied(folder))
     before = digest(inputs)
@@ -260,18 +261,18 @@ def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random)
         with begun(COMMANDS[name][0], inputs, out) as process:
             time.sleep(after)
             process.send_signal(number)
-            told = time.perf_counter()
+            signalled_s = time.perf_counter()
             try:
                 _, error = process.communicate(timeout=LIMIT_S)
             except subprocess.TimeoutExpired:
-                problems.append(f"{number.name} after {after:.2f} s: lives on")
+                problems.append(f"{number.name} after {after:.2f} s: still running")
                 continue
-            longest = max(longest, time.perf_counter() - told)
+            longest = max(longest, time.perf_counter() - signalled_s)
             alive = left_alive(process.pid)
         unfinished += any(out.rglob(".*.part"))
-        starting = after < START_S and process.returncode in (1, -signal.SIGINT)  # in Python's own start
+        starting = after < START_S and process.returncode in (1, -signal.SIGINT)  # during Python's start
         how, wrong = judge(name, out, expected, number, 0 if starting else process.returncode)
-        wrong += [f"{line} lives on" for line in alive]
+        wrong += [f"{line} is still running" for line in alive]
         if "Traceback" in error and not starting:
             wrong.append(f"traceback: {error[-300:]}")
         ended[f"{number.name}: {how}"] += 1
@@ -302,7 +303,7 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 
 def disks(name: str, inputs: Path, folder: Path) -> dict[str, Any]:
-    """Run a command on disks of a twentieth to all of what it writes."""
+    """Run a command on disks from almost no space to one and a half times the size of its files."""
     _, expected, size = whole_run(name, inputs, emptied(folder))
     before = digest(inputs)
     ended: Counter[str] = Counter()
@@ -336,7 +337,7 @@ def disks(name: str, inputs: Path, folder: Path) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["kills", "disks"])
-    parser.add_argument("--folder", type=Path, required=True, help="where to work; inputs are kept there")
+    parser.add_argument("--folder", type=Path, required=True, help="working folder; the inputs are kept in it")
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
     parser.add_argument("--seed", type=int, default=0)

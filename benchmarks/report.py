@@ -1,8 +1,9 @@
-"""Tables of benchmarks/results/speed.md from the JSON files of the runs.
+"""Tables of benchmarks/results/speed.md, made from the JSON files of the runs.
 
     python -m benchmarks.report [--check]
 
-Writes between the two marker comments; ``--check`` only says (exit status 1) where page and files differ.
+Replaces the text between the two marker comments. ``--check`` changes nothing; its exit status is 1 if the page and the
+files differ.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ FILES = {kind: ROOT / "benchmarks" / "results" / f"speed_{kind}.json" for kind i
 BEGIN, END = "<!-- speed: from here on by python -m benchmarks.report -->", "<!-- speed: to here -->"
 IMAGES = (IMAGE, PREPARED)
 RATES = {IMAGE: "Mev/s", PREPARED: "Mvotes/s", MOVED: "Mev/s"}
-"""What is told in place of the time."""
+"""Unit of the rate that is shown instead of the time."""
 ERRORS = {
     "model_px": "model error [px]",
     "decorrelation": "1 − correlation",
     "places_px": "worst place [px]",
 }
 ALSO = {"psnr_db": "PSNR [dB]", "peak_mib": "peak memory [MiB]"}
-"""Names of what whole jobs tell."""
+"""Titles of further results of complete tasks."""
 SCALES = {"Gev/s": 1e9, "Mev/s": 1e6, "Gvotes/s": 1e9}
 
 Row = dict[str, Any]
@@ -46,14 +47,14 @@ def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
 
 
 def speed(value: float) -> str:
-    """Three digits."""
+    """Return a number with three significant digits."""
     if value < 100:
         return f"{value:.3g}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.1f}"
     return f"{value:,.0f}"
 
 
 def head(row: Row) -> list[str]:
-    """Of the table that the row is in."""
+    """Return the heading of the table that the row belongs to."""
     start = ["method", RATES.get(row["what"], "ms"), "quartiles"]
     if row["what"] in IMAGES:
         return [*start, "rms / worst pixel [events]", "misplaced", "px from exact"]
@@ -61,7 +62,7 @@ def head(row: Row) -> list[str]:
 
 
 def row_cells(row: Row) -> list[str]:
-    """Name, speed and its quartiles; then the errors."""
+    """Return the cells of a row: name, speed and its quartiles, then the errors."""
     if "skipped" in row:
         return [row["name"], row["skipped"]]
     low, high = row["quartiles_s"]
@@ -77,12 +78,12 @@ def row_cells(row: Row) -> list[str]:
             *start, f"{errors['rms_events']:.2g} / {errors['max_events']:.2g}", f"{100 * errors['misplaced']:.2g} %",
             f"{errors['exact_px']:.2g}",
         ]  # fmt: skip
-    told = errors | row["also"]
-    return [*start, *(f"{told[name]:.3g}" for name in ERRORS | ALSO if name in told)]
+    values = errors | row["also"]
+    return [*start, *(f"{values[name]:.3g}" for name in ERRORS | ALSO if name in values)]
 
 
 def measured(rows: list[Row]) -> Iterator[str]:
-    """One table: rows that did the same job on the same scene."""
+    """Yield one table: the rows of one task on one scene."""
     done = [row for row in rows if "skipped" not in row]
     count = f"{done[0]['events']:,} events" if done else "skipped"
     what = rows[0]["what"]
@@ -94,7 +95,7 @@ def measured(rows: list[Row]) -> Iterator[str]:
 
 
 def section(results: Results) -> Iterator[str]:
-    """All tables of one machine."""
+    """Yield all tables of one machine."""
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     yield f"### {results['machine']}"
     yield ""
@@ -103,37 +104,37 @@ def section(results: Results) -> Iterator[str]:
     aims = [cells for aim in AIMS if (cells := aim_cells(aim, results))]
     if aims:
         yield ""
-        yield from table(["aim", "asked for", "measured", "met"], aims)
+        yield from table(["task", "target", "measured", "met"], aims)
     for _, rows in groupby(results["rows"], lambda row: (row["what"], row["scene"])):
         yield from measured(list(rows))
     yield ""
 
 
-def value_of(aim: Aim, row: Row, beside: Row | None = None) -> float:
-    """In the aim's unit; comparisons are the median of rounds, which saw the same machine."""
+def value_of(aim: Aim, row: Row, compared_with: Row | None = None) -> float:
+    """Return the result in the target's unit. A comparison is the median over pairs of consecutive passes."""
     if aim.unit == "MiB":
         return float(row["also"]["peak_mib"])
-    if beside is None:
+    if compared_with is None:
         return float(row["median_s"] if aim.unit == "s" else row["rate_per_s"] / SCALES[aim.unit])
-    pairs = zip(row["seconds"], beside["seconds"], strict=False)
+    pairs = zip(row["seconds"], compared_with["seconds"], strict=False)
     if aim.unit == "x time":
         return statistics.median(a / b for a, b in pairs)
-    return statistics.median(b / a for a, b in pairs) * row["work"] / beside["work"]
+    return statistics.median(b / a for a, b in pairs) * row["work"] / compared_with["work"]
 
 
 def aim_cells(aim: Aim, results: Results) -> list[str]:
-    """One line of the table; empty where it was not asked of this device, or the results lack a side of it."""
+    """Return one line of the table of targets; empty if the target is for another device, or a case was not run."""
     if results["device"].partition(":")[0] != aim.device:
         return []
     rows = {(row["scene"], row["name"]): row for row in results["rows"]}
-    names = [name for name in (aim.of, aim.beside) if name]
+    names = [name for name in (aim.of, aim.compared_with) if name]
     if not all((scene, name) in rows for scene in aim.bars for name in names):
         return []
     sides = {scene: [rows[scene, name] for name in names] for scene in aim.bars}
     most = aim.unit in ("s", "x time", "MiB")
-    asked = " / ".join(f"{bar:g}" for bar in dict.fromkeys(aim.bars.values()))
+    target = " / ".join(f"{bar:g}" for bar in dict.fromkeys(aim.bars.values()))
     unit = aim.unit.replace("x ", "× ") if aim.unit != "x time" else "×"
-    start = [aim.what, f"{'≤' if most else '≥'} {asked} {unit}"]
+    start = [aim.what, f"{'≤' if most else '≥'} {target} {unit}"]
     skipped = [row["skipped"] for pair in sides.values() for row in pair if "skipped" in row]
     if skipped:
         return [*start, f"skipped: {skipped[0]}", "–"]
@@ -145,14 +146,14 @@ def aim_cells(aim: Aim, results: Results) -> list[str]:
 
 
 def page(text: str, results: list[Results]) -> str:
-    """The page with its tables made anew."""
+    """Return the page's text with new tables."""
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     tables = "\n".join(line for r in results for line in section(r))
     return f"{text[:start]}\n\n{tables}\n{text[end:]}"
 
 
 def refreshed() -> str:
-    """The page, its tables made anew from all files."""
+    """Return the text of speed.md with new tables from all files."""
     return page(PAGE.read_text(), [json.loads(path.read_text()) for path in FILES.values() if path.exists()])
 
 
@@ -164,7 +165,7 @@ def main() -> int:
         PAGE.write_text(refreshed())
         return 0
     same = refreshed() == PAGE.read_text()
-    print("page and files agree" if same else "they differ: run python -m benchmarks.report")
+    print("page and files agree" if same else "page and files differ: run python -m benchmarks.report")
     return int(not same)
 
 

@@ -1,4 +1,4 @@
-"""What the methods are given: events of a turning prism in the order of time, simulated recordings, files."""
+"""Inputs of the benchmarks: events of a rotating prism in order of time, simulated recordings, and files."""
 
 from __future__ import annotations
 
@@ -33,40 +33,48 @@ Array = NDArray[np.float64]
 
 SECONDS, TURNS_PER_S = 2.0, 12.0
 DEFLECTION, INDEX, FOV = math.radians(1.0), 1.5168, math.radians(60.0)
-PHASE = math.pi  # amiwarp compensates towards the angle, the peers' formula away from it
-MARGIN = 24  # px around the image that no event leaves: the orbit's radius is 9.7 px
+PHASE = math.pi
+"""Phase of the prism [rad]: amiwarp displaces events along the angle, the formula of the other libraries against it."""
+MARGIN = 24
+"""Margin around the image that no event leaves [px]; the radius of the orbit is 9.7 px."""
 CHUNK = 1 << 19
-SAMPLE = 100_000  # events at most, of which places are compared
+"""Number of events that one thread processes at a time."""
+SAMPLE = 100_000
+"""Largest number of events whose positions are compared."""
 WIDTH, HEIGHT = 640, 480
 RECORDED = 10_000_000
-"""Events of a recording of that size and length: it keeps their rate a pixel where fewer are asked for."""
+"""Number of events of a recording of full size and length; shorter recordings keep the rate per pixel."""
 SHORTEST_S = 0.25
+"""Shortest recording [s]; for fewer events, the image becomes smaller."""
 OFF_OVER_ON = 1.0 / 0.95
+"""OFF threshold over ON threshold."""
 PROBES, PROBE_S, DAMPED = 4, 0.1, 0.6
-"""To find the contrast at which there are so many: between 1/contrast and its square they fall as it rises."""
+"""Number and length [s] of the probes that find the contrast threshold for the wanted number of events, and the
+exponent of each correction: the number falls with a power of the threshold between -1 and -2."""
 FILTERS = ("hdf5plugin", "numcodecs")
-"""Without these the files are bare columns."""
+"""Libraries without which the files are plain binary columns."""
 threads = ThreadPoolExecutor(cpu_threads())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EventScene:
-    """Events with the prism's angle at each; what is derived from them is kept, so that methods share it."""
+    """Events with their prism angles. Derived data is kept, so that the methods share it."""
 
     name: str
     camera: Camera
     prism: Prism
     events: Events
     theta: Array
-    """The prism's angle at each event [rad], unwrapped."""
+    """Unwrapped prism angle of each event [rad]."""
     kept: dict[Any, Any] = field(default_factory=dict)
 
     @property
     def radius(self) -> float:
-        """Of the orbit of a point on the axis [px]: the circle that peers take out."""
+        """Radius of the orbit of a point on the optical axis [px]: the circle that other libraries compensate."""
         return self.camera.fx * math.tan(DEFLECTION)
 
     def keep(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return the result of ``make``, which is called only once per key."""
         if key not in self.kept:
             self.kept[key] = make()
         return self.kept[key]
@@ -76,22 +84,22 @@ class EventScene:
 
     @property
     def some(self) -> slice:
-        """Events evenly spread over the scene, of which places are compared."""
+        """Evenly spaced events whose positions are compared."""
         return slice(None, None, -(-len(self) // SAMPLE))
 
     def sample(self) -> tuple[Array, Array]:
-        """Their pixels (m, 2) and angles (m,)."""
+        """Return the pixels, shape ``(m, 2)``, and the angles [rad], shape ``(m,)``, of these events."""
         xy = np.stack([self.events.x[self.some], self.events.y[self.some]], axis=1).astype(np.float64)
         return xy, self.theta[self.some]
 
 
 def in_chunks(work: Callable[[int, int], Any], n: int) -> list[Any]:
-    """``work(start, stop)`` over ``range(n)`` on all cores."""
+    """Call ``work(start, stop)`` for chunks of ``range(n)`` on all cores, and return the results."""
     return list(threads.map(lambda start: work(start, min(start + CHUNK, n)), range(0, n, CHUNK)))
 
 
 def event_scene(name: str, n: int, *, points: int = 0, width: int = WIDTH, height: int = HEIGHT) -> EventScene:
-    """``points`` edge points, each seen on its orbit and rounded to the pixel; 0: any pixel at any time."""
+    """Return events of ``points`` edge points on their orbits, rounded to pixels; with 0 points, at random pixels."""
     camera = Camera.from_fov(width, height, FOV)
     scene = EventScene(
         name, camera, Prism(apex_from_deflection(DEFLECTION, INDEX), INDEX),
@@ -121,7 +129,7 @@ def event_scene(name: str, n: int, *, points: int = 0, width: int = WIDTH, heigh
 
 @dataclass(frozen=True, eq=False)
 class RecordingScene:
-    """A recording that was simulated, and how."""
+    """Simulated recording, and its simulation."""
 
     made: Simulation
     recording: Recording
@@ -131,20 +139,21 @@ class RecordingScene:
 
     @cached_property
     def model(self) -> ExactModel:
-        """The prism that it was made with."""
+        """Exact model with the true parameters."""
         assert self.recording.truth is not None
         return truth_model(self.made.camera, self.recording.truth, self.made.prism.flat_side)
 
     @cached_property
     def view(self) -> NDArray[np.float32]:
-        """What the camera sees without the prism: log intensity, shape (height, width)."""
+        """Log intensity that the camera would see without the prism, shape ``(height, width)``."""
         return self.made.log_view()
 
 
 def recording_scene(n: int, device: str, picture: Path | None) -> RecordingScene:
-    """About ``n`` events of a still picture, the demo's camera and prism; shorter and smaller for fewer of them.
+    """Simulate about ``n`` events of a still picture with the camera and the prism of the demo.
 
-    Without a ``picture`` it is PyVista's map of the earth. Raises :class:`Missing` where that is not there.
+    For fewer events the recording is shorter, then smaller. Without a ``picture`` the scene is PyVista's map of the
+    earth. Raises :class:`Missing` if PyVista is not installed.
     """
     seconds = max(SHORTEST_S, SECONDS * n / RECORDED)
     size = math.sqrt(n / seconds * SECONDS / RECORDED)
@@ -156,32 +165,34 @@ def recording_scene(n: int, device: str, picture: Path | None) -> RecordingScene
     contrast = SensorModel().contrast_on
     for _ in range(PROBES):
         probe = replace(made, sensor=sensor(contrast), duration_s=2.0 * PROBE_S).run().events
-        settled = probe.between(round(PROBE_S * 1e6), round(2e6 * PROBE_S))  # the first turn has more of them
+        settled = probe.between(round(PROBE_S * 1e6), round(2e6 * PROBE_S))  # the first turn has more events
         contrast *= (len(settled) / PROBE_S * seconds / n) ** DAMPED
     made = replace(made, sensor=sensor(contrast))
     return RecordingScene(made, made.run())
 
 
 def sensor(contrast: float) -> SensorModel:
-    """By its ON threshold [log intensity]."""
+    """Return the sensor with this ON threshold [log intensity]."""
     return SensorModel(contrast_on=contrast, contrast_off=contrast * OFF_OVER_ON)
 
 
 @dataclass(frozen=True, eq=False)
 class FileScene:
-    """A recording in a temporary folder, which goes when the scene does."""
+    """Recording in a temporary folder that is deleted with the scene."""
 
     source: Path
+    """Path of the recording."""
     n: int
+    """Number of events."""
     missing: tuple[str, ...]
-    """Libraries without which the file is bare columns."""
+    """Missing libraries, because of which the file consists of plain binary columns."""
 
     def __len__(self) -> int:
         return self.n
 
 
 def file_scene(n: int) -> FileScene:
-    """``n`` events in a file; see :mod:`benchmarks.compensate`."""
+    """Write ``n`` events into a file; see :mod:`benchmarks.compensate`."""
     folder = Path(tempfile.mkdtemp())
     missing = tuple(name for name in FILTERS if importlib.util.find_spec(name) is None)
     scene = FileScene(folder / "recording", n, missing)

@@ -1,10 +1,11 @@
-"""Speed of the simulator, and the error of the very events that were timed; prints JSON, one row a line.
+"""Speed of the simulator, and the error of the timed events. Prints JSON, one row per line.
 
     python benchmarks/simulate.py [--device cuda:0] [--picture FILE] [--apex 0.5 1 2] [--duration 1]
 
-640x480, 60 degrees, 720 turns/min, default sensor. ``ratio`` is time spent over time simulated: below 1 is faster than
-real time. ``device`` leaves the events where they were made, ``host`` brings them to NumPy arrays. Reading the picture
-and compiling come before; ``setup_s`` tells what preparing the map costs.
+The camera has 640x480 pixels and 60 degrees, the prism 720 turns/min, and the sensor its default settings. ``ratio`` is
+elapsed time over simulated time; below 1 is faster than real time. ``device`` leaves the events on the device; ``host``
+copies them to NumPy arrays. Reading the picture and compilation are not included; ``setup_s`` is the time to prepare
+the brightness map.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55
 
 
 def blocks_picture() -> np.ndarray:
-    """A picture of its own, so that the benchmark needs no file: soft random blocks of many sizes."""
+    """Return a picture of random blocks of several sizes, so that the benchmark needs no file."""
     rng = np.random.default_rng(0)
     light = np.zeros((960, 1280), np.float32)
     for size in (8, 20, 40, 80, 160):
@@ -42,7 +43,7 @@ def blocks_picture() -> np.ndarray:
 
 
 def time_run(simulation: Simulation, to_host: bool) -> tuple[float, int, float]:
-    """Seconds of the run, events, seconds of the setup."""
+    """Return the duration of the run [s], the number of events, and the duration of the setup [s]."""
     start = time.perf_counter()
     engine = Engine(simulation)
     engine.prepare()
@@ -56,9 +57,10 @@ def time_run(simulation: Simulation, to_host: bool) -> tuple[float, int, float]:
 
 
 def error_px(simulation: Simulation) -> float:
-    """RMS distance of the truth points to the exact model's at the encoder's angles, less the mean latency.
+    """Return the rms distance between the true positions and those of the exact model [px].
 
-    The sensor's jitter remains: 30 us are 0.02 px at an apex of 1 degree.
+    The model uses the encoder's angle at the event time minus the mean latency. The sensor's jitter remains: 30 us are
+    0.02 px at an apex angle of 1 degree.
     """
     encoder = simulation.encoder()
     model = ExactModel(simulation.camera, simulation.prism)
@@ -102,7 +104,7 @@ def main() -> None:
         result = row(scene, apex, arguments.duration, arguments.device, arguments.repeats)
         print(json.dumps(result), flush=True)
         if not result["error_px_rms"] < 0.1:
-            raise SystemExit(f"wrong answer: {result['error_px_rms']} px rms")
+            raise SystemExit(f"wrong answer: the error is {result['error_px_rms']} px rms")
 
 
 if __name__ == "__main__":

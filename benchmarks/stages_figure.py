@@ -1,4 +1,4 @@
-"""Draws what the two stages of calibration see: their costs about the true apex, and the errors of many recordings.
+"""Draw the costs of both calibration stages around the true apex angle, and the errors of many recordings.
 
 python -m benchmarks.stages_figure benchmarks/results/calibration_photometric_cuda.json docs/images/stages.png
 """
@@ -32,7 +32,10 @@ BLUE, ORANGE = "#0072b2", "#d55e00"
 
 
 def costs(offsets_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sharpness, and the share of the residual that one map leaves, at apexes about the truth [px]."""
+    """Return the sharpness and the residual of one brightness map at apex angles around the truth.
+
+    ``offsets_px`` are the differences from the true apex angle, as displacements in the image [px].
+    """
     recording = simulate(earth(), Camera.from_fov(346, 260, math.radians(60.0)), Prism(APEX), duration_s=0.34, seed=1)
     search = prepare(recording, Settings())[0]
     search.run()
@@ -72,7 +75,7 @@ def main() -> None:
     ):  # fmt: skip
         values = np.sort([row[name] for row in rows])
         right.step(values, np.arange(1, len(values) + 1), where="post", color=colour, label=label)
-    right.set(xscale="log", xlabel="model error [px]", title=f"of {len(rows)} recordings, so many have less")
+    right.set(xscale="log", xlabel="model error [px]", title=f"recordings with a smaller error (of {len(rows)})")
     right.legend(frameon=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")

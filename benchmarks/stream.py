@@ -1,13 +1,16 @@
-"""How fast streams are compensated, how late they come out, and whether memory stays flat for an hour.
+"""Speed and latency of stream compensation, and memory use over an hour of stream.
 
     python -m benchmarks.stream [--device cuda:0] [--picture FILE] [--only rate latency hour] [--out FILE.json]
 
-``rate``: packets of 10,000 events one after the other, an encoder of 1 kHz, an image each 33 ms of a stream at the rate
-that is asked for, the median of nine passes after a first. What is ready is taken for each packet, and (``together``)
-once a millisecond of stream at that rate, as a session takes in together what waits; on CUDA each 8 ms.
-``latency``: one packet each millisecond of real time, 10 million events a second, from put to taken, its encoder
-sample coming 0.2 ms after it. ``hour``: an hour of stream through a whole session, as fast as it goes. Places are
-compared with those of ``compensate_events`` in the same run. Exit status 1 where an aim is missed.
+``rate``: packets of 10,000 events without pauses, encoder samples at 1 kHz, and an image every 33 ms of stream. The
+stream times correspond to the target rate. The result is the median of nine passes after a first one. Compensated
+events are taken after each packet, and also (``together``) after each millisecond of stream, because a session
+processes all waiting packets together; on CUDA only after each 8 ms.
+``latency``: one packet per millisecond of real time, 10 million events per second. The latency is the time from putting
+a packet to taking its result; its encoder sample arrives 0.2 ms after the packet.
+``hour``: an hour of stream through a complete session, as fast as possible.
+
+In each run, positions are compared with those of ``compensate_events``. The exit status is 1 if a target is missed.
 """
 
 from __future__ import annotations
@@ -30,11 +33,13 @@ import warp as wp
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, Compensator
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import Packet
-from amiwarp.live.stream.session import IMAGE_US, Session, Status
+from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.status import IMAGE_US, SessionStatus
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import CircleModel, ExactModel, Model
 from amiwarp.optics.prism import Prism
@@ -45,23 +50,23 @@ PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Pri
 MODELS: dict[str, Model] = {
     "exact": ExactModel.from_prism(CAMERA, PRISM, 0.3), "circle": CircleModel.from_prism(CAMERA, PRISM, 0.3),
 }  # fmt: skip
-ASKED_MEV_S = {"cpu": 50.0, "cuda": 500.0}
+TARGET_MEV_S = {"cpu": 50.0, "cuda": 500.0}
 MOST_MS, LATENCY_MEV_S, MOST_ERROR_PX, MOST_GROWTH_MIB = 5.0, 10.0, 0.01, 16.0
 HOUR_S, HOUR_MEV_S = 3600.0, 0.5
 REPEATS = 9
 CHECKED = 50
-"""Packets whose places are compared, spread over the run."""
+"""Number of packets whose positions are compared, spread over the run."""
 
 
 def random_pool(n: int) -> Events:
-    """Events anywhere: the worst there can be for caches."""
+    """Return events at random pixels: the worst case for caches."""
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, CAMERA.width, n).astype(np.uint16), rng.integers(0, CAMERA.height, n).astype(np.uint16)
     return Events(x, y, np.arange(n), rng.integers(0, 2, n).astype(np.uint8))
 
 
 def seen_pool(picture: str) -> Events:
-    """Those of a still picture, in the order a sensor gives them."""
+    """Return simulated events of a still picture, in the order of a sensor."""
     recording = simulate(picture, CAMERA, PRISM, duration_s=0.25, motion=720.0)
     return recording.events.slice(0, len(recording.events))
 
@@ -71,7 +76,7 @@ def angles(t: np.ndarray) -> np.ndarray:
 
 
 class Stream:
-    """Packets of a pool's events, over and over, with new times at a rate; and samples of an encoder at 1 kHz."""
+    """Stream that repeats the events of a pool with new times at a given rate, and encoder samples at 1 kHz."""
 
     def __init__(self, pool: Events, mev_s: float) -> None:
         self._parts = [pool[k : k + PACKET] for k in range(0, len(pool) - PACKET + 1, PACKET)]
@@ -84,7 +89,7 @@ class Stream:
         return Events(part.x, part.y, self._within + int(k * self.span_us), part.p)
 
     def samples(self, until_us: int) -> tuple[np.ndarray, np.ndarray]:
-        """Those not given yet, up to the first after a time."""
+        """Return the next encoder samples, up to the first one after ``until_us``."""
         t = np.arange(self._sampled, until_us + 1001, 1000, dtype=np.int64)
         self._sampled += 1000 * len(t)
         return t, angles(t)
@@ -95,7 +100,7 @@ def copied(events: Events) -> Events:
 
 
 class Check:
-    """Keeps some of the packets that come out, to be compared when time no longer counts."""
+    """Keeps some compensated packets, and compares them after the timed run."""
 
     def __init__(self, packets: int) -> None:
         self._chosen = deque(np.unique(np.linspace(0, packets - 1, CHECKED).astype(int)).tolist())
@@ -103,7 +108,7 @@ class Check:
         self.count = 0
 
     def __call__(self, ahead: list[Events], found: Events) -> None:
-        """What came out next, of one packet or several, of those that went in."""
+        """Take the next compensated events, of one or several packets from ``ahead``."""
         first, self.count = self.count, self.count + len(found) // PACKET
         while self._chosen and self._chosen[0] < self.count:
             k = self._chosen.popleft()
@@ -111,7 +116,7 @@ class Check:
             self._kept.append((ahead[k], copied(found[start : start + PACKET])))
 
     def error_px(self, model: Model) -> float:
-        """Largest distance from the places of the same events in a recording; infinite where events differ."""
+        """Return the largest distance to the positions in a recording [px]; infinite if times or polarities differ."""
         worst = 0.0
         for given, found in self._kept:
             if not (np.array_equal(given.t, found.t) and np.array_equal(given.p, found.p)):
@@ -124,17 +129,17 @@ class Check:
 
 def rate(device: str, pool: Events, model: Model, together: int) -> dict[str, Any]:
     kind = "cuda" if "cuda" in device else "cpu"
-    asked, packets = ASKED_MEV_S[kind], 20_000 if kind == "cuda" else 2000
-    stream = Stream(pool, asked)
-    ahead = [stream.packet(k) for k in range(packets)]  # made by a sensor's driver
-    passes = [one_pass(device, pool, model, ahead, together, asked) for _ in range(REPEATS + 1)][1:]
+    target, packets = TARGET_MEV_S[kind], 20_000 if kind == "cuda" else 2000
+    stream = Stream(pool, target)
+    ahead = [stream.packet(k) for k in range(packets)]  # a sensor's driver would make these
+    passes = [one_pass(device, pool, model, ahead, together, target) for _ in range(REPEATS + 1)][1:]
     mev_s = [found["mev_s"] for found in passes]
     quartiles = np.percentile(mev_s, [25, 50, 75]).tolist()
     error, voted = max(found["error_px"] for found in passes), passes[-1]["voted"]
     whole = all(found["packets"] == packets for found in passes)
-    return {"together": together, "mev_s": quartiles[1], "quartiles": [quartiles[0], quartiles[2]], "asked": asked,
+    return {"together": together, "mev_s": quartiles[1], "quartiles": [quartiles[0], quartiles[2]], "asked": target,
             "packets": packets, "error_px": error, "voted": voted,
-            "ok": whole and quartiles[1] >= asked and error <= MOST_ERROR_PX}  # fmt: skip
+            "ok": whole and quartiles[1] >= target and error <= MOST_ERROR_PX}  # fmt: skip
 
 
 def one_pass(
@@ -169,7 +174,7 @@ def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> d
     began, put, sampled = monotonic_us() + 10_000, 0, 0
     while check.count < packets:
         now = monotonic_us() - began
-        while put < packets and now >= (put + 1) * stream.span_us:  # when its last event has happened
+        while put < packets and now >= (put + 1) * stream.span_us:  # the time of its last event has passed
             compensator.put(ahead[put], round((put + 1) * stream.span_us))
             put += 1
         if now >= sampled * 1000 + 1200:
@@ -189,7 +194,7 @@ def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> d
 
 
 class Hour:
-    """A source: an hour of stream, its encoder's samples along with it."""
+    """Source of an hour of stream, with encoder samples."""
 
     camera, prism, name, size, has_encoder = CAMERA, PRISM, "an hour", (CAMERA.width, CAMERA.height), True
 
@@ -212,7 +217,7 @@ def hour(device: str, pool: Events) -> dict[str, Any]:
     values = {"apex": PRISM.apex, "phase": 0.3}
     known = Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 0.0, 0.0, (), 0, 0.0)
 
-    def note(status: Status) -> None:
+    def note(status: SessionStatus) -> None:
         with open("/proc/self/statm") as statm:
             sizes.append((status.events, int(statm.read().split()[1]) * resource.getpagesize() / 2**20))
 
@@ -235,7 +240,7 @@ def hour(device: str, pool: Events) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--picture", help="what the camera looks at; default: PyVista's map of the earth")
+    parser.add_argument("--picture", help="scene; default: PyVista's map of the earth")
     parser.add_argument("--only", nargs="+", default=["rate", "latency", "hour"])
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()

@@ -1,6 +1,6 @@
-"""The images that votes are compared with: float64 NumPy, the angle from time, and places by independent formulas.
+"""True images of warped events: float64 NumPy, with angles from event times and positions by independent formulas.
 
-Needs a checkout: the traces are those of the oracle in tests/reference.py.
+This needs a checkout, because the positions come from the oracle in tests/reference.py.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ import reference
 
 Floats = NDArray[np.floating[Any]]
 
-HARMONIC_ANGLES = 16  # of the ellipse's least squares
+HARMONIC_ANGLES = 16
+"""Number of angles for the least-squares fit of the ellipses."""
 
 
 def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
-    """Where events belong [px], shape (n, 2)."""
+    """Return the true compensated positions of events [px], shape ``(n, 2)``."""
     if model == "plane circle":
         return xy - scene.radius * np.stack([np.cos(theta), np.sin(theta)], axis=1)
     if model == "ellipse":
@@ -40,7 +41,7 @@ def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
 
 
 def _ellipses(scene: EventScene) -> Array:
-    """Per pixel the mean and first harmonic of the exact displacement, shape (height, width, 3, 2)."""
+    """Return mean and first harmonic of each pixel's exact displacement [px], shape ``(height, width, 3, 2)``."""
     width, height = scene.camera.width, scene.camera.height
     xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
 
@@ -53,7 +54,7 @@ def _ellipses(scene: EventScene) -> Array:
 
 
 def votes(xy: Array, width: int, height: int) -> dict[Vote, Array]:
-    """Images of both votes [events]; what falls outside is left out, corner by corner."""
+    """Return images with both kinds of vote [events per pixel]; parts of a vote outside the image are dropped."""
     columns, rows = width + 2 * MARGIN, height + 2 * MARGIN
     inner = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
     u, v = (xy + MARGIN).T
@@ -73,7 +74,7 @@ def votes(xy: Array, width: int, height: int) -> dict[Vote, Array]:
 
 
 def images(scene: EventScene, model: str) -> dict[Vote, Array]:
-    """The true images of all events."""
+    """Return the true images of all events."""
     camera, e = scene.camera, scene.events
 
     def part(start: int, stop: int) -> dict[Vote, Array]:
@@ -82,7 +83,7 @@ def images(scene: EventScene, model: str) -> dict[Vote, Array]:
 
     def total() -> dict[Vote, Array]:
         if model == "ellipse":
-            scene.keep("ellipse", lambda: _ellipses(scene))  # before the threads would each make it
+            scene.keep("ellipse", lambda: _ellipses(scene))  # once, before the threads start
         parts = in_chunks(part, len(e))
         return {vote: np.sum([p[vote] for p in parts], axis=0) for vote in Vote}
 
@@ -90,11 +91,11 @@ def images(scene: EventScene, model: str) -> dict[Vote, Array]:
 
 
 def iwe_errors(scene: EventScene, model: str, vote: Vote, image: Floats, found: Floats) -> dict[str, float]:
-    """Of an image against the true one, and of the places ``found`` for the scene's sample against the exact model's.
+    """Return the errors of an image, and of the positions ``found`` of the scene's sample.
 
-    ``rms_events``, ``max_events``: difference of a pixel [events]. ``misplaced``: share of all votes that another pixel
-    got. ``local``: largest difference over what the pixel's neighbourhood holds, plus 10 events. ``exact_px``: rms
-    distance of the places to the exact model's [px].
+    ``rms_events``, ``max_events``: difference between a pixel and the true image [events]. ``misplaced``: share of all
+    votes that went to a wrong pixel. ``local``: largest ratio of a difference to the largest true value in its
+    neighbourhood plus 10 events. ``exact_px``: rms distance of ``found`` to the positions of the exact model [px].
     """
     true = images(scene, model)[vote]
     difference = np.abs(image.astype(np.float64) - true)

@@ -1,9 +1,9 @@
-"""How fast the inspector is: frames a second while its clouds turn, a knob's way to the picture, opening a long file.
+"""Speed of the inspector: frames per second while the view rotates, response to a parameter change, start-up time.
 
     python -m benchmarks.view [--device cuda:0] [--knob-only] [--events 100_000_000] [--out FILE.json]
 
-Each figure is checked in the same run: the frames differ, the compensated places are those of ``compensate_events``,
-the count is that of the file.
+Each figure is checked in the same run: the frames must differ, the compensated positions must be those of
+``compensate_events``, and the number of events must be that of the file.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from amiwarp.viewer.scene import Look, Scene
 from amiwarp.viewer.values import jpeg
 
 SIZE, WIDTH, HEIGHT = (1048, 514), 640, 480
-"""Of the clouds' picture in a window of 1366 x 768; of the sensor."""
+"""Size of the clouds' picture in a window of 1366 x 768 [px], and size of the sensor [px]."""
 REPEATS = 20
 LEAST_FPS, MOST_CPU_MS, MOST_CUDA_MS, MOST_S, MOST_GIB = 10.0, 150.0, 50.0, 3.0, 1.0
 OPENED = """
@@ -61,7 +61,7 @@ print(time.perf_counter() - began, imported, int(most.split()[1]) / 2**20, opene
 
 
 def made(n: int, seconds: float, seed: int = 0) -> Events:
-    """Events at random places and times."""
+    """Return events at random pixels and times."""
     rng = np.random.default_rng(seed)
     t = np.sort(rng.integers(0, round(seconds * 1e6), n))
     x, y = rng.integers(0, WIDTH, n).astype(np.uint16), rng.integers(0, HEIGHT, n).astype(np.uint16)
@@ -75,7 +75,7 @@ def recorded(events: Events) -> Recording:
 
 
 def orbiting(device: str) -> dict[str, Any]:
-    """200,000 points of two clouds, the camera turning, the picture read back."""
+    """Measure frames per second for 200,000 points in two clouds: the camera moves, and the picture is read back."""
     inspector, scene = Inspector(recorded(made(1_000_000, 0.2)), device=device), Scene(SIZE)
     inspector.open(0, 200_000)
     shown = inspector.show()
@@ -91,7 +91,7 @@ def orbiting(device: str) -> dict[str, Any]:
 
 
 def knob(device: str, *, drawn: bool) -> dict[str, Any]:
-    """From a knob's new value to the cloud drawn, both images encoded and the sharpness, a window of 1 M events."""
+    """Measure the time from a new parameter value to drawn clouds, encoded images and sharpness, for 1 M events."""
     inspector, scene = Inspector(recorded(made(1_000_000, 0.2)), device=device), Scene(SIZE) if drawn else None
     inspector.open(0, 200_000)
     inspector.show()
@@ -119,7 +119,7 @@ def knob(device: str, *, drawn: bool) -> dict[str, Any]:
 
 
 def opening(device: str, n: int) -> dict[str, Any]:
-    """A process of its own from its start to the first picture, the event rate read too; the median of three."""
+    """Measure the time from the start of a process to its first picture and event rate; median of three runs."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.h5"
         block, seconds = 5_000_000, 0.5
@@ -131,7 +131,7 @@ def opening(device: str, n: int) -> dict[str, Any]:
             for k in range(n // block):
                 e = made(block, seconds, k)
                 writer.append(Events(e.x, e.y, e.t + round(k * seconds * 1e6), e.p))
-        os.sync()  # what was just written is on the disk before it is read
+        os.sync()  # finish writing before the timed reading
         command = [sys.executable, "-c", OPENED, str(path), device]
         runs = [
             subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-5:] for _ in range(3)
@@ -147,7 +147,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--events", type=int, default=100_000_000)
-    parser.add_argument("--knob-only", action="store_true", help="where there is no VTK: without drawing")
+    parser.add_argument("--knob-only", action="store_true", help="only the parameter change, without drawing")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR

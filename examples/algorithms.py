@@ -1,4 +1,4 @@
-"""Any pair of NLopt's derivative-free algorithms, and any measure of sharpness, on the same recording."""
+"""Calibrate one recording with different NLopt algorithms and measures of sharpness."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The main job in a few lines: make a recording, calibrate it without a guess, compensate it."""
+"""Simulate a recording, calibrate the prism without an initial guess, and compensate the motion of the prism."""
 
 import math
 

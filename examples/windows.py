@@ -1,4 +1,4 @@
-"""Images of compensated events for each 50 ms: a video of edges, as a robot behind the prism would see them."""
+"""Make an image of compensated events for every 50 ms: a video of the edges in the scene."""
 
 import math
 

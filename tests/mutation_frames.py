@@ -20,18 +20,18 @@ from amiwarp.live.link.following import Follower
 from amiwarp.live.link.protocol import (
     LONGEST,
     Answer,
+    ControllerStatus,
+    FrameDecoder,
     Index,
     Message,
     Ping,
     Pong,
     Samples,
     SetSpeed,
-    Status,
     Sync,
     encode,
 )
-from amiwarp.live.link.protocol import Decoder as SerialDecoder
-from amiwarp.live.stream.packets import COLUMNS, END, EVENTS, HEADER, HELLO, MAGIC, Decoder
+from amiwarp.live.stream.packets import COLUMNS, END, EVENTS, HEADER, HELLO, MAGIC, PacketDecoder
 from amiwarp.live.stream.sources import StreamSource
 
 WIDTH, HEIGHT = 64, 48
@@ -160,7 +160,8 @@ def frames(rng: random.Random) -> list[bytes]:
         speed = rng.choice([720.0, 0.0, math.nan, math.inf, -math.inf, 1e-45, 3e38])
         message: Message = rng.choice(
             [Samples((t,), (signed,)), Samples((t,) * 3, (signed,) * 3), Index(t, signed), Sync(t, number()),
-             Status(t, rng.randrange(256), rng.randrange(1 << 16), speed, 720.0, rng.choice([4096, 4096, 0, number()])),
+             ControllerStatus(t, rng.randrange(256), rng.randrange(1 << 16), speed, 720.0,
+                              rng.choice([4096, 4096, 0, number()])),
              Pong(rng.choice([1, 2, 3, 4, number()]), t), Answer(rng.randrange(1 << 16), rng.randrange(256)),
              Ping(number()), SetSpeed(speed, speed)]
         )  # fmt: skip
@@ -230,20 +231,20 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
 
 def read_stream(data: bytes) -> int:
     """Take a stream as ``amiwarp record`` does; the number of packets. Raises :class:`AmiwarpError`."""
-    decoder = Decoder("the stream")
+    decoder = PacketDecoder("the stream")
     with tempfile.TemporaryFile(buffering=0) as file:
         file.write(data)
         file.seek(0)
         source = StreamSource("the stream", file)
         count = sum(1 for _ in source.packets())
     for _ in decoder.feed(data):
-        assert len(decoder.room()) < 1 << 23
+        assert len(decoder.free_buffer()) < 1 << 23
     return count
 
 
 def read_serial(data: bytes) -> int:
     """Take bytes of a serial port as :class:`Link` does; the number of samples."""
-    decoder, follower, count = SerialDecoder(), Follower("the port", 4096), 0
+    decoder, follower, count = FrameDecoder(), Follower("the port", 4096), 0
     follower.opened(0)
     for n, start in enumerate(range(0, len(data), 61)):
         part = data[start : start + 61]

@@ -90,7 +90,8 @@ def has_taken_in(session: Session, source: Counted, camera: EmulatedCamera, link
     first, last = camera._events.t_first, camera._events.t_last
 
     def ready() -> bool:
-        if link._follower._kept or (source.triggers < len(camera._controller.pulses) and not camera.done.is_set()):
+        missing = source.triggers < len(camera._controller.pulses) and not camera.done.is_set()
+        if link._follower.updates.samples or missing:
             return False
         due = camera._time(camera._now_us()) - LAG_US
         return due < first or session._last_us >= min(due, last)

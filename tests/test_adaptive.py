@@ -123,7 +123,7 @@ def follow(controller: SpeedController, scenes: list[Coverage], mev_per_rpm: flo
 
 
 def unseen(radius: float, rpm: float, seen: Coverage) -> float:
-    return 1.0 - float(seen.foretold(np.array([rpm]), circle(radius), 1e-6 * WINDOW_US)[0])
+    return 1.0 - float(seen.predict(np.array([rpm]), circle(radius), 1e-6 * WINDOW_US)[0])
 
 
 @pytest.mark.parametrize("drift", [(0.0, 0.0), (90.0, -40.0), (0.0, 700.0)])

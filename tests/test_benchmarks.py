@@ -209,7 +209,7 @@ def test_missing_libraries_are_seen_and_files_are_read(
     assert "old" not in text
     assert text.count("| absent | nolib is not installed |") == 3
     assert "| exact model over circle, time | ≤ 1.5 × |" in text
-    assert "beside NumPy" not in text  # which was not in the run
+    assert "compared with NumPy" not in text  # which was not in the run
     assert report.page(text, [results]) == text
 
 
@@ -247,7 +247,7 @@ def test_aims_and_names_belong_together() -> None:
     names = [case.name for case in cases.CASES]
     assert len(set(names)) == len(names)
     for aim in cases.AIMS:
-        for name in filter(None, (aim.of, aim.beside)):
+        for name in filter(None, (aim.of, aim.compared_with)):
             (case,) = (c for c in cases.CASES if c.name == name)
             assert aim.device in case.devices
             assert set(aim.bars) <= set(case.scenes)

@@ -12,7 +12,7 @@ import warp as wp
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.camera import CameraParams, solve_ray
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.device_camera import camera_params, fold
+from amiwarp.optics.device_camera import camera_params, fold_radius
 from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
 
 # as the package's kernels: a GPU would else fuse multiplications and additions here alone
@@ -129,13 +129,13 @@ def test_table_of_bearings_is_what_the_solver_gives(device: str, lens: Distortio
 
 
 def test_fold_is_the_first_root_of_the_slope() -> None:
-    assert fold(-0.4, 0.0, 0.0, largest=100.0) == pytest.approx(1.0 / math.sqrt(1.2), abs=1e-12)
-    assert fold(0.3, 0.2, 0.0, largest=100.0) == 100.0
-    assert fold(-0.368, 0.151, 0.0, largest=100.0) == 100.0  # the slope's smallest value is 0.6
-    assert fold(0.0, 0.0, 0.0, largest=1.5) == 1.5
-    assert fold(-0.4, 0.0, 5e-324, largest=100.0) == pytest.approx(1.0 / math.sqrt(1.2), abs=1e-12)
+    assert fold_radius(-0.4, 0.0, 0.0, largest=100.0) == pytest.approx(1.0 / math.sqrt(1.2), abs=1e-12)
+    assert fold_radius(0.3, 0.2, 0.0, largest=100.0) == 100.0
+    assert fold_radius(-0.368, 0.151, 0.0, largest=100.0) == 100.0  # the slope's smallest value is 0.6
+    assert fold_radius(0.0, 0.0, 0.0, largest=1.5) == 1.5
+    assert fold_radius(-0.4, 0.0, 5e-324, largest=100.0) == pytest.approx(1.0 / math.sqrt(1.2), abs=1e-12)
     k = (0.3, -0.5, 0.01)
-    assert fold(*k, largest=100.0) == pytest.approx(reference.monotonic_limit(*k, largest=100.0), abs=1e-9)
+    assert fold_radius(*k, largest=100.0) == pytest.approx(reference.monotonic_limit(*k, largest=100.0), abs=1e-9)
 
 
 @pytest.mark.parametrize("lens", [RadialTangential(k1=-0.4), Fisheye(k1=-0.3)], ids=str)

@@ -31,6 +31,7 @@ from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.models import MODELS, ExactModel, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.plotting import figures
+from amiwarp.progress import silent
 from amiwarp.studies.chart import Charts, calibration, compensation
 from amiwarp.studies.chart.rows import (
     Row,
@@ -43,7 +44,7 @@ from amiwarp.studies.chart.rows import (
     near_front,
     told_apart,
 )
-from amiwarp.studies.chart.truth import Known, exact_image, exact_places, rms
+from amiwarp.studies.chart.truth import KnownRecording, exact_image, exact_places, rms
 from benchmarks import libraries as peers
 
 
@@ -59,10 +60,10 @@ def fails(*args: str | Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def known(recording: Recording) -> Known:
+def known(recording: Recording) -> KnownRecording:
     """The first 0.1 s of the suite's recording."""
     events = recording.events.between(0, 100_000)
-    return Known.of(replace(recording, events=MemoryEvents(events, *recording.events.size)))
+    return KnownRecording.of(replace(recording, events=MemoryEvents(events, *recording.events.size)))
 
 
 @pytest.fixture(scope="module")
@@ -91,13 +92,13 @@ def test_exact_places_are_those_of_the_trace(side: FlatSide, distortion: Any, ba
     np.testing.assert_allclose(exact_places(model, xy, theta), expected, rtol=0.0, atol=bar)
 
 
-def test_exact_image_is_the_one_that_votes_make(known: Known) -> None:
+def test_exact_image_is_the_one_that_votes_make(known: KnownRecording) -> None:
     image = iwe(known.events, known.camera.width, known.camera.height, model=known.model, encoder=known.encoder)
     truth = exact_image(known)
     assert np.sqrt(np.mean((image - truth) ** 2)) < 0.005 * np.std(truth)
 
 
-def test_every_library_makes_the_same_image(known: Known) -> None:
+def test_every_library_makes_the_same_image(known: KnownRecording) -> None:
     n = 20_000
     theta = known.encoder.angle_at(known.events.t[:n])
     events = peers.PeerEvents(
@@ -122,10 +123,10 @@ def test_every_library_makes_the_same_image(known: Known) -> None:
     np.testing.assert_allclose(np.hypot(*moved.T), 5.5, atol=1e-4)
 
 
-def test_compensation_rows_tell_speed_and_error(known: Known, device: str, tmp_path: Path) -> None:
+def test_compensation_rows_tell_speed_and_error(known: KnownRecording, device: str, tmp_path: Path) -> None:
     said = []
     rows, _ = compensation.rows(
-        known, device, repeats=1, quick=True, folder=tmp_path, tell=lambda what, share: said.append((what, share))
+        known, device, repeats=1, quick=True, folder=tmp_path, progress=lambda what, share: said.append((what, share))
     )
     by_label = {row.label: row for row in rows}
     assert by_label["exact, bilinear"].error_px < 0.001
@@ -145,13 +146,15 @@ def test_compensation_rows_tell_speed_and_error(known: Known, device: str, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-def test_an_image_that_is_wrong_is_refused(known: Known, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_that_is_wrong_is_refused(
+    known: KnownRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(compensation, "exact_image", lambda known: np.roll(exact_image(known), 1, axis=1))
     with pytest.raises(AmiwarpError, match=r"exact, bilinear differs from the float64 one"):
-        compensation.rows(known, "cpu", repeats=1, quick=True, folder=tmp_path, tell=lambda what, share: None)
+        compensation.rows(known, "cpu", repeats=1, quick=True, folder=tmp_path, progress=lambda what, share: None)
 
 
-def test_settings_are_different_and_one_is_the_default(known: Known) -> None:
+def test_settings_are_different_and_one_is_the_default(known: KnownRecording) -> None:
     for quick in (False, True):
         ways = calibration.settings(known, quick=quick)
         assert len({way.label for way in ways}) == len(ways)
@@ -166,7 +169,7 @@ def test_settings_are_different_and_one_is_the_default(known: Known) -> None:
 def test_what_cannot_be_charted_is_refused(recording: Recording) -> None:
     for lacking in ({"truth": None}, {"encoder": None}, {"camera": None}, {"prism": None}):
         with pytest.raises(AmiwarpError, match="amiwarp simulate"):
-            Known.of(replace(recording, **lacking))
+            KnownRecording.of(replace(recording, **lacking))
 
 
 def row(label: str, seconds: float, error_px: float, **more: Any) -> Row:
@@ -235,7 +238,7 @@ def test_what_cannot_reach_the_front_is_not_repeated() -> None:
     ran: list[str] = []
     tasks = [Task(lambda name=name: ran.append(name), 1) for name in "abc"]
     timed = measure(
-        tasks, 3, lambda share: None, warm_up=False, again=lambda once: [t.task is not tasks[1] for t in once]
+        tasks, 3, silent, "measuring", warm_up=False, again=lambda once: [t.task is not tasks[1] for t in once]
     )
     assert "".join(ran) == "abcacac"
     assert [len(t.times) for t in timed] == [3, 1, 3]
@@ -245,13 +248,18 @@ def test_tasks_take_turns() -> None:
     order: list[str] = []
     shares: list[float] = []
     tasks = [Task(lambda name=name: order.append(name), 1, keep=lambda _: len(order)) for name in "ab"]
-    timed = measure(tasks, 2, shares.append)
+
+    def progress(what: str, share: float) -> None:
+        assert what == "measuring"
+        shares.append(share)
+
+    timed = measure(tasks, 2, progress, "measuring")
     assert "".join(order) == "ababab"
     assert [len(t.times) for t in timed] == [2, 2]
     assert [t.result for t in timed] == [3, 4]  # of the first round on the clock
     assert shares == [(k + 1) / 6 for k in range(6)]
     order.clear()
-    assert [len(t.times) for t in measure(tasks, 9, shares.append, warm_up=False, limit_s=0.0)] == [1, 1]
+    assert [len(t.times) for t in measure(tasks, 9, progress, "measuring", warm_up=False, limit_s=0.0)] == [1, 1]
 
 
 def test_quick_chart_writes_everything(charted: tuple[Path, dict[str, Any]]) -> None:
@@ -397,11 +405,11 @@ def test_chart_refuses_what_makes_no_sense(charted: tuple[Path, dict[str, Any]],
     assert "give one of them" in fails("chart", file, "--budget-px", "1", "--budget-ms", "1")
     assert "give one of them" in fails("chart", file, "--picture", "x.png")
     save_recording(tmp_path / "plain.h5", replace(open_recording(file), truth=None))
-    assert "carries no truth" in fails("chart", tmp_path / "plain.h5", "--out", tmp_path / "out")
+    assert "has no ground truth" in fails("chart", tmp_path / "plain.h5", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_simpler_models_of_the_same_prism(known: Known) -> None:
+def test_simpler_models_of_the_same_prism(known: KnownRecording) -> None:
     exact = known.calibration()
     errors = [predicted_error(simplified(exact, m).model, known.model).rms for m in ("circle", "radial", "ellipse")]
     assert errors[0] > errors[1] > errors[2] > 0.0
@@ -420,7 +428,7 @@ def test_simpler_models_of_the_same_prism(known: Known) -> None:
         simplified(circle, "radial")
 
 
-def calibrations(known: Known, low_ms: float, high_ms: float, error_px: float) -> list[Row]:
+def calibrations(known: KnownRecording, low_ms: float, high_ms: float, error_px: float) -> list[Row]:
     """The rows of a whole chart with times and errors within these."""
     rng = np.random.default_rng(0)
     out = []
@@ -481,7 +489,9 @@ DRAWN = {
 
 
 @pytest.mark.parametrize("name", DRAWN)
-def test_letters_do_not_overlap(name: str, known: Known, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_letters_do_not_overlap(
+    name: str, known: KnownRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from amiwarp.studies.chart.drawing import draw
 
     drawn: list[Any] = []

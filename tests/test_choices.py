@@ -164,9 +164,9 @@ def test_simplified_names_its_models() -> None:
 
 
 def test_views_are_taken_by_name(tmp_path: Path) -> None:
-    from amiwarp.viewer.scene import STANDS
+    from amiwarp.viewer.scene import CAMERA_DIRECTIONS
 
-    assert set(STANDS) == {view.value for view in View}  # a name finds its stand as the member does
+    assert set(CAMERA_DIRECTIONS) == {view.value for view in View}  # a name finds its stand as the member does
 
 
 def test_the_wrong_side_can_no_longer_be_taken_by_its_name() -> None:

@@ -1,4 +1,4 @@
-"""The command line: every command, its examples, its JSON, and how it fails."""
+"""Command line: help, examples, JSON output and failures of the commands."""
 
 import json
 import os
@@ -69,7 +69,7 @@ def run(*args: str | Path) -> Result:
 
 
 def ok(*args: str | Path) -> dict[str, Any]:
-    """The command's JSON object; nothing else may be on stdout."""
+    """Run a command with ``--json`` and return its JSON object. Nothing else may be on stdout."""
     result = run(*args, "--json")
     assert result.exit_code == 0, result.stderr
     data = json.loads(result.stdout)
@@ -78,7 +78,7 @@ def ok(*args: str | Path) -> dict[str, Any]:
 
 
 def fails(code: int, *args: str | Path) -> str:
-    """The one line on stderr of a command that fails with ``code``."""
+    """Run a command that must exit with ``code``, and return its only line on stderr."""
     result = run(*args)
     assert (result.exit_code, result.stdout) == (code, ""), result.output
     assert result.stderr.count("\n") == 1, result.stderr
@@ -88,7 +88,7 @@ def fails(code: int, *args: str | Path) -> str:
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> Path:
-    """A picture, a recording of it and its calibration: 160 × 120, 0.2 s; read only."""
+    """Folder with a picture, its recording (160 × 120 px, 0.2 s) and its calibration. Not to be written to."""
     folder = tmp_path_factory.mktemp("cli")
     Image.fromarray(texture).save(folder / "photo.jpg", quality=95)
     ok(
@@ -101,7 +101,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> Pat
 
 @pytest.fixture
 def place(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder to work in, with links to the files of ``folder``."""
+    """Working folder with links to the files of ``folder``."""
     for file in folder.iterdir():
         (tmp_path / file.name).symlink_to(file)
     monkeypatch.chdir(tmp_path)
@@ -109,7 +109,7 @@ def place(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 
 def left_behind(place: Path, *expected: str) -> set[str]:
-    """Files in ``place`` besides the fixture's and those expected."""
+    """Return the names of files in ``place`` that are neither the fixture's nor in ``expected``."""
     known = {"photo.jpg", "recording.h5", "calibration.json", *expected}
     return {file.name for file in place.iterdir()} - known
 
@@ -131,7 +131,7 @@ def test_version() -> None:
 
 
 def test_examples_of_the_help_run(place: Path, texture: np.ndarray) -> None:
-    """Those that need the fixture's files only; the demo has a test of its own."""
+    """Run the help examples that need only the fixture's files. The demo is tested elsewhere."""
     for name in ("info", "compensate", "calibrate"):
         words = shlex.split(COMMANDS[name].EXAMPLE)
         if name == "calibrate":
@@ -152,7 +152,7 @@ def test_examples_of_the_help_run(place: Path, texture: np.ndarray) -> None:
 
 
 def _own_recording(place: Path) -> None:
-    """``events.npz`` with 1,000 events over a second, and ``encoder.csv`` at one turn a second."""
+    """Write ``events.npz`` with 1,000 events in one second, and ``encoder.csv`` with one turn per second."""
     rng = np.random.default_rng(5)
     t = np.sort(rng.integers(0, 1_000_000, 1000))
     np.savez(place / "events.npz", x=rng.integers(0, 64, 1000), y=rng.integers(0, 48, 1000), t=t, p=t % 2)
@@ -160,7 +160,7 @@ def _own_recording(place: Path) -> None:
     (place / "encoder.csv").write_text("\n".join(["t_us,count", *rows]) + "\n")
 
 
-def test_simulate_tells_its_truth(place: Path) -> None:
+def test_simulate_stores_its_ground_truth(place: Path) -> None:
     data = ok("info", "recording.h5")
     assert (data["width"], data["height"], data["compensated"]) == (160, 120, False)
     assert data["truth"]["apex_deg"] == pytest.approx(2.0, abs=1e-9)
@@ -205,7 +205,7 @@ def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
 def test_calibrate_finds_the_truth(place: Path) -> None:
     found = Calibration.load("calibration.json")
     assert np.degrees(found.parameters["apex"]) == pytest.approx(2.0, abs=0.1)
-    # Events lag their edges, the more the higher the thresholds: the phase is not the mechanical one.
+    # Events lag behind the edges, more so at higher thresholds, so the phase differs from the mechanical one.
     assert np.degrees(found.parameters["phase"]) == pytest.approx(100.0, abs=8.0)
 
 
@@ -263,7 +263,7 @@ def test_iwe_whole(place: Path, layers: str, shape: tuple[int, ...]) -> None:
         inside = int(file["events/inside"][:].sum())
     assert (image.shape, image.dtype) == (shape, np.float32)
     if layers != "signed":
-        # an event at the border shares its vote with pixels beyond it
+        # events at the border lose a part of their vote to pixels outside the image
         assert 0.98 * inside <= image.sum() <= inside * 1.001
     picture = np.asarray(Image.open("iwe.png"))
     assert picture.shape == ((120, 160, 3) if layers == "polarity" else (120, 160))
@@ -281,7 +281,7 @@ def test_iwe_by_windows_adds_up_to_the_whole(place: Path) -> None:
     assert left_behind(place) == {"out.h5", "whole.npy", "parts.npy", *(f"parts_{k:05d}.png" for k in range(7))}
 
 
-def test_convert_puts_encoder_camera_and_prism_in(place: Path) -> None:
+def test_convert_adds_encoder_camera_and_prism(place: Path) -> None:
     _own_recording(place)
     camera = {"width": 64, "height": 48, "fx": 80.0, "fy": 80.0, "cx": 31.5, "cy": 23.5}
     (place / "camera.json").write_text(json.dumps(camera))
@@ -295,7 +295,7 @@ def test_convert_puts_encoder_camera_and_prism_in(place: Path) -> None:
     assert seen["prism"] == {"apex_deg": pytest.approx(1.5), "index": 1.6, "flat_side": "scene"}
 
 
-def test_info_for_people(place: Path) -> None:
+def test_info_prints_a_table(place: Path) -> None:
     result = run("info", "recording.h5")
     assert result.exit_code == 0
     assert re.search(r"^size +160 x 120 px$", result.stdout, re.M)
@@ -401,7 +401,7 @@ def test_wrong_usage_is_exit_2_and_one_line(place: Path, args: tuple[str, ...]) 
 
 
 def test_a_turning_camera_without_a_prism(place: Path, data_dir: Path) -> None:
-    """From an ordinary event recording to its picture, the camera's motion found on the way."""
+    """Estimate the camera's motion from a recording without a prism, then reconstruct the picture."""
     events = str(data_dir / "text" / "dynamic_rotation" / "events.txt")
     args = ["--free", "motion", "--start", "apex=0deg", "--start", "rate_y=20deg/s", "--bound", "rate_z=-1rad/s:1rad/s"]
     found = ok("calibrate", events, "moving.json", *args, "--photometric-algorithm", "LN_BOBYQA")
@@ -412,7 +412,7 @@ def test_a_turning_camera_without_a_prism(place: Path, data_dir: Path) -> None:
 
 
 INTERRUPTIBLE = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
-"""A shell's job in the background ignores Ctrl-C, and so would its children."""
+"""Code that restores Ctrl-C in a child process. Background jobs of a shell and their children ignore it."""
 
 
 @pytest.mark.parametrize(
@@ -442,7 +442,7 @@ def test_interrupt_leaves_nothing(place: Path, command: str, number: signal.Sign
                 wait_until(lambda: any(file.name.endswith(".part") for file in place.iterdir()))
             else:
                 assert process.stdout.readline() == "at work\n"
-                time.sleep(1.0)  # to any point of its work, which would last for hours
+                time.sleep(1.0)  # interrupt at an arbitrary point of a calibration that would take hours
             process.send_signal(number)
             out, error = process.communicate(timeout=120)
         finally:
@@ -466,7 +466,7 @@ def test_interrupt_while_the_command_is_loaded_is_one_line() -> None:
 
 
 def test_interrupt_inside_a_finaliser_is_not_lost(place: Path) -> None:
-    """Python drops an exception there; the command must end all the same."""
+    """Python drops exceptions raised inside a finaliser; the command must end nevertheless."""
     script = f"""
 {INTERRUPTIBLE}
 import time
@@ -504,7 +504,7 @@ def wait_until(done: Any, seconds: float = 120.0) -> None:
 
 
 def test_stdout_of_a_process_is_json_alone(place: Path) -> None:
-    """Warp's banner and VTK's warnings go nowhere near it."""
+    """Warp's banner and VTK's warnings do not appear on stdout."""
     args = ["compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--json", "--device", "cpu"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     done = subprocess.run(
@@ -527,6 +527,6 @@ def test_numbers_with_units(text: str, unit: str, value: float) -> None:
 @pytest.mark.parametrize(
     ("text", "unit"), [("1", "rad"), ("1", "rad/s"), ("1rpm", "rad"), ("nan", "1"), ("", "us"), ("infdeg", "rad")]
 )
-def test_numbers_without_sense(text: str, unit: str) -> None:
+def test_invalid_numbers_are_refused(text: str, unit: str) -> None:
     with pytest.raises(AmiwarpError, match="not a value"):
         number(text, unit, "x")

@@ -1,4 +1,4 @@
-"""What reaches the terminal: names from outside are shown, never obeyed, and a message is one line."""
+"""Printed text: control characters from files and names are escaped, and every message is one line."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 
 NASTY = "a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
-"""A name that sets a terminal's title, turns it red, breaks the line and turns the direction of writing round."""
+"""File name that sets the terminal's title and colour, breaks the line and reverses the direction of text."""
 SHOWN = r"a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
 
 
@@ -26,15 +26,15 @@ def run(*words: str) -> subprocess.CompletedProcess[bytes]:
     return subprocess.run([sys.executable, "-m", "amiwarp", *words], capture_output=True, timeout=300, check=False)
 
 
-def obeyed(output: bytes) -> list[str]:
-    """Characters that a terminal would obey, newlines at the ends of lines aside."""
+def control_characters(output: bytes) -> list[str]:
+    """Return the characters that a terminal would interpret, except newlines."""
     return [c for c in output.decode() if not c.isprintable() and c != "\n"]
 
 
-def test_a_name_in_an_error_is_shown_and_not_obeyed(tmp_path: Path) -> None:
+def test_a_name_in_an_error_is_escaped(tmp_path: Path) -> None:
     ended = run("info", str(tmp_path / NASTY))
     assert ended.returncode == 1
-    assert obeyed(ended.stderr) == []
+    assert control_characters(ended.stderr) == []
     assert ended.stderr.count(b"\n") == 1
     assert f"{SHOWN}: no such file" in ended.stderr.decode()
 
@@ -53,17 +53,17 @@ def test_wrong_usage_is_one_line() -> None:
     ]
     strange = run("simulate", "--fl\x1b]0;x\x07at")
     assert strange.returncode == 2
-    assert obeyed(strange.stderr) == []
+    assert control_characters(strange.stderr) == []
 
 
-def test_texts_within_a_recording_are_shown_and_not_obeyed(tmp_path: Path) -> None:
+def test_texts_within_a_recording_are_escaped(tmp_path: Path) -> None:
     path = tmp_path / NASTY
     column = np.zeros(1, np.uint16)
     with RecordingWriter(path, width=4, height=4, metadata={"made\x1b[2Jby": "one\ntwo\x1b[5m"}) as writer:
         writer.append(Events(column, column, np.zeros(1, np.int64), np.zeros(1, np.uint8)))
     ended = run("info", str(path))
     assert ended.returncode == 0, ended.stderr
-    assert obeyed(ended.stdout) == []
+    assert control_characters(ended.stdout) == []
     assert SHOWN in ended.stdout.decode()
     assert r"one\ntwo\x1b[5m" in ended.stdout.decode()
     data = json.loads(run("info", str(path), "--json").stdout)

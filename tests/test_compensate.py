@@ -24,7 +24,7 @@ from amiwarp.imaging.sharpness_costs import sharpness
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.chunks import CHUNK
-from amiwarp.kernels.encoder import EncoderParams, angle_at
+from amiwarp.kernels.encoder import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye, RadialTangential
@@ -35,7 +35,7 @@ from amiwarp.optics.prism import FlatSide
 @wp.kernel
 def angles(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, out: wp.array(dtype=wp.uint32)):
     i = start + wp.tid()
-    out[i] = angle_at(encoder, t[i])
+    out[i] = theta_u32_at(encoder, t[i])
 
 
 def angle_error(encoder: Encoder, t: np.ndarray, device: str) -> float:

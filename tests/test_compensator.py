@@ -11,7 +11,8 @@ import pytest
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.optics.camera import Camera
@@ -120,7 +121,7 @@ def test_batches_under_way_come_with_the_next_call(device: str) -> None:
     """Marked by the samples there were when they were begun; each event once, in order."""
     events, stream = random_events(60_000), EncoderStream()
     compensator = Compensator(MODEL, stream, wait_us=0, batch=1024, device=device)
-    compensator._many = 2  # as on CUDA
+    compensator._least_returned = 2  # as on CUDA
     out, known = [], ENCODER.t <= 90_000
     for start in range(0, 60_000, 6000):
         part = events[start : start + 6000]

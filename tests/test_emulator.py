@@ -16,10 +16,11 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulator import MOST_RPM, Controller, Fault
+from amiwarp.live.link.emulator import MOST_RPM, Controller, EmulatedFault
 from amiwarp.live.link.protocol import (
     Answer,
-    Decoder,
+    ControllerStatus,
+    FrameDecoder,
     Index,
     Message,
     Ping,
@@ -27,7 +28,6 @@ from amiwarp.live.link.protocol import (
     Samples,
     SetCounts,
     SetSpeed,
-    Status,
     Stop,
     Sync,
     encode,
@@ -47,7 +47,7 @@ def speeds(motor: Motor, t_us: np.ndarray) -> np.ndarray:
 
 def sent(controller: Controller, until_us: int, step_us: int = 10_000) -> list[Message]:
     """All that it sends, whole."""
-    decoder = Decoder()
+    decoder = FrameDecoder()
     data = b"".join(controller.advance(t) for t in range(0, until_us + 1, step_us))
     found = [message for _, message in decoder.feed(data)]
     assert decoder.received.damaged == decoder.received.lost == decoder.received.unknown == 0
@@ -115,26 +115,26 @@ def test_counts_pulses_and_status_are_those_of_the_rotor(rpm: float) -> None:
     t = (rows[:, 0] + S) % WRAP  # its clock wraps a second after the start
     assert len(t) == pytest.approx(3000, abs=6)
     assert (np.diff(t) == 1000).all()
-    angle = motor.angle(controller.world(t + WRAP - S))
+    angle = motor.angle(controller.time_at(t + WRAP - S))
     np.testing.assert_array_equal(rows[:, 1], np.floor(angle * 1000 / math.tau))
     pulses = [m for m in messages if isinstance(m, Index)]
     assert len(pulses) == pytest.approx(36, abs=1)
     assert all(m.count % 1000 == 0 for m in pulses)
-    at = motor.angle(controller.world(np.array([(m.t_us + S) % WRAP for m in pulses]) + WRAP - S))
+    at = motor.angle(controller.time_at(np.array([(m.t_us + S) % WRAP for m in pulses]) + WRAP - S))
     np.testing.assert_allclose(at, np.round(at / math.tau) * math.tau, atol=2e-4)
     syncs = [m for m in messages if isinstance(m, Sync)]
     assert [m.number for m in syncs] == list(range(30))
     assert [n for n, _ in controller.pulses] == list(range(30))
     away = [(controller.clock(w) - m.t_us + 1) % WRAP for m, (_, w) in zip(syncs, controller.pulses, strict=True)]
     assert max(away) <= 2
-    status = [m for m in messages if isinstance(m, Status)]
+    status = [m for m in messages if isinstance(m, ControllerStatus)]
     assert 3 <= len(status) <= 5
     assert {(m.state, m.faults, m.target_rpm, m.counts_per_turn) for m in status} == {(1, 0, rpm, 1000)}
     assert all(m.rpm == pytest.approx(rpm, rel=0.03) for m in status)
 
 
 def test_steps_of_any_size_send_the_same() -> None:
-    a, b = (sent(Controller(Motor(500.0), faults=[Fault("slip", 0.5)]), S, step) for step in (1000, 250_000))
+    a, b = (sent(Controller(Motor(500.0), faults=[EmulatedFault("slip", 0.5)]), S, step) for step in (1000, 250_000))
     np.testing.assert_array_equal(counted(a), counted(b))
     assert [m for m in a if isinstance(m, Index)] == [m for m in b if isinstance(m, Index)]
 
@@ -147,16 +147,16 @@ def test_commands_are_obeyed_answered_and_refused() -> None:
          SetCounts(0), Ping(77), Index(0, 0))
     ):  # fmt: skip
         controller.feed(encode(message, k), S)
-    found = [m for _, m in Decoder().feed(controller.advance(S + 1))]
+    found = [m for _, m in FrameDecoder().feed(controller.advance(S + 1))]
     answers = [(m.sequence, m.refused) for m in found if isinstance(m, Answer)]
     assert answers == [(0, 0), (1, 2), (2, 2), (3, 2), (4, 2), (6, 1)]
     assert [m for m in found if isinstance(m, Pong)] == [Pong(77, S)]
     assert found[-1] == Answer(6, 1)
-    assert any(isinstance(m, Status) and (m.state, m.target_rpm) == (2, 600.0) for m in found)
+    assert any(isinstance(m, ControllerStatus) and (m.state, m.target_rpm) == (2, 600.0) for m in found)
     controller.feed(encode(SetCounts(100), 8), 3 * S)
     controller.feed(encode(Stop(), 9), 3 * S + 100_000)
-    found = [m for _, m in Decoder().feed(controller.advance(6 * S))]
-    status = [m for m in found if isinstance(m, Status)]
+    found = [m for _, m in FrameDecoder().feed(controller.advance(6 * S))]
+    status = [m for m in found if isinstance(m, ControllerStatus)]
     assert (status[-1].state, status[-1].rpm, status[-1].counts_per_turn) == (0, pytest.approx(0.0, abs=1.0), 100)
     assert np.ptp(counted(found)[-100:, 1]) <= 1
 
@@ -164,23 +164,23 @@ def test_commands_are_obeyed_answered_and_refused() -> None:
 def test_a_host_that_is_silent_is_told_of_and_stops_nothing() -> None:
     controller = Controller(Motor(300.0))
     messages = sent(controller, 5 * S)
-    faults = {m.t_us // S: m.faults for m in messages if isinstance(m, Status)}
+    faults = {m.t_us // S: m.faults for m in messages if isinstance(m, ControllerStatus)}
     assert [faults[k] for k in (0, 1, 2, 4)] == [0, 0, 0, 16]
-    assert [m.state for m in messages if isinstance(m, Status)][-1] == 1
+    assert [m.state for m in messages if isinstance(m, ControllerStatus)][-1] == 1
     controller.feed(encode(Ping(1), 0), 5 * S)
-    found = [m for _, m in Decoder().feed(controller.advance(5 * S))]
-    assert [m.faults for m in found if isinstance(m, Status)] == [0]
+    found = [m for _, m in FrameDecoder().feed(controller.advance(5 * S))]
+    assert [m.faults for m in found if isinstance(m, ControllerStatus)] == [0]
 
 
 def test_faults_are_written_as_name_and_time() -> None:
-    assert Fault.parse("slip@5") == Fault("slip", 5.0)
-    assert Fault.parse("unplug@1.5+0.25") == Fault("unplug", 1.5, 0.25)
-    assert Fault.parse("stall@3").duration_s == 2.0
+    assert EmulatedFault.parse("slip@5") == EmulatedFault("slip", 5.0)
+    assert EmulatedFault.parse("unplug@1.5+0.25") == EmulatedFault("unplug", 1.5, 0.25)
+    assert EmulatedFault.parse("stall@3").duration_s == 2.0
     for text, says in (("melt@3", "garbage, truncate"), ("slip", "NAME@SECONDS"), ("reset@1+2", "happens at once")):
         with pytest.raises(AmiwarpError, match=says):
-            Fault.parse(text)
+            EmulatedFault.parse(text)
     with pytest.raises(AmiwarpError, match="reverse"):
-        Controller(Played(Encoder.constant_speed(300.0, 0, S)), faults=[Fault("reverse", 1.0, 1.0)])
+        Controller(Played(Encoder.constant_speed(300.0, 0, S)), faults=[EmulatedFault("reverse", 1.0, 1.0)])
 
 
 def test_nothing_is_left_of_a_pseudo_terminal(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_nothing_is_left_of_a_pseudo_terminal(tmp_path: Path) -> None:
     with PseudoTerminal(Controller(Motor()), path) as terminal:
         assert terminal.name == str(path)
         assert path.resolve().is_char_device()
-        with pytest.raises(AmiwarpError, match="is there already"):
+        with pytest.raises(AmiwarpError, match="already exists"):
             PseudoTerminal(Controller(Motor()), path)
         port = path.resolve()
     assert list(tmp_path.iterdir()) == []
@@ -220,7 +220,7 @@ def test_emulate_and_motor_as_commands(tmp_path: Path) -> None:
                     break
             assert (done.returncode, done.stderr) == (0, "")
             assert "set to 720 rpm" in done.stdout
-            assert f"it goes on turning; to end that: amiwarp motor stop --port {path}" in done.stdout
+            assert f"the motor keeps turning; to stop it: amiwarp motor stop --port {path}" in done.stdout
             emulator.send_signal(signal.SIGINT)
             assert emulator.wait(LONG_S) == 0
         finally:

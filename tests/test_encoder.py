@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder, EncoderStream
+from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.io import read_encoder_csv
 
 SPEED = TURN * 50e-6

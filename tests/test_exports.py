@@ -1,4 +1,4 @@
-"""The names that a page may give to files: plain ones, in one folder, of nothing that exists."""
+"""Names of exported files: plain file names in one folder that never replace an existing file."""
 
 import os
 from pathlib import Path
@@ -32,8 +32,8 @@ PNG = (".png",)
         ("a\u202eb.png", r"holds '\\u202e'"),
         ("\ud800.png", "holds"),
         ("x" * 300, "300 characters"),
-        ("x.h5", "ends in .png"),
-        ("x.json", "ends in .png"),
+        ("x.h5", "must end in .png"),
+        ("x.json", "must end in .png"),
     ],
     ids=ascii,
 )

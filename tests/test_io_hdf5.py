@@ -65,8 +65,8 @@ def link(name: str, to: object) -> object:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (external_storage, "data set 'events/x' takes its values from other files"),
-        (virtual, "data set 'events/x' takes its values from other files"),
+        (external_storage, "dataset 'events/x' takes its values from other files"),
+        (virtual, "dataset 'events/x' takes its values from other files"),
         (link("events/x", h5py.ExternalLink("other.h5", "/x")), "'events/x' is a soft or external link"),
         (link("events/x", h5py.SoftLink("/events/y")), "'events/x' is a soft or external link"),
         (link("metadata", h5py.ExternalLink("other.h5", "/metadata")), "'metadata' is a soft or external link"),

@@ -74,7 +74,7 @@ def test_real_text_has_its_camera(data_dir):
 @pytest.mark.parametrize("keep", [True, False])
 def test_every_format_reads_back(tmp_path, monkeypatch, name, keep):
     if not keep:
-        monkeypatch.setattr(scan, "KEEP", 0)
+        monkeypatch.setattr(scan, "KEEP_EVENTS", 0)
     recording = open_recording(write_sample(tmp_path, name, EVENTS))
     assert recording.events.size == SIZE
     assert recording.metadata["format"] == WRITERS[name][0]
@@ -256,7 +256,7 @@ def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch):
         ({"t": np.full(5, 2**63, np.uint64)}, "beyond int64"),
         ({"t": np.array([None] * 5)}, "pickle"),
         ({"x": np.zeros(0, int), "y": np.zeros(0, int), "t": np.zeros(0, int), "p": np.zeros(0, int)}, "no events"),
-        ({"width": 0}, "size of 0x9"),
+        ({"width": 0}, "size 0x9"),
     ],
 )
 def test_npz_refuses(tmp_path, arrays, message):

@@ -11,7 +11,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import upload_events
-from amiwarp.imaging.warped_image import PROBE, CanvasShape, Image, Votes, iwe
+from amiwarp.imaging.warped_image import FIRST_BATCH, CanvasShape, Image, Votes, iwe
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, ExactModel
 from amiwarp.optics.prism import Prism
@@ -151,7 +151,7 @@ def test_cpu_and_cuda_agree_bit_for_bit(name: str, vote: Vote, points: int) -> N
     """On CUDA by the fast way, where words overflow (500 points) and where not, and the rest exactly."""
     camera = Camera.from_fov(64, 48, math.radians(60))
     model = MODELS[name].from_prism(camera, Prism(math.radians(2)), 0.4)
-    n = PROBE + 100_000
+    n = FIRST_BATCH + 100_000
     where = np.random.default_rng(3).integers(0, points, n)
     t = np.sort(np.random.default_rng(4).integers(0, 250_000, n))
     events = Events.from_arrays(where % 64, where // 64, t, where % 2)

@@ -27,15 +27,15 @@ READERS: dict[str, Callable[[Path], Any]] = {
 }
 
 NO_JSON: dict[str, tuple[bytes, str]] = {
-    "empty": (b"", "is no JSON"),
-    "cut off": (b'{"format": ', "is no JSON"),
-    "binary": (b"\x89HDF\r\n\x1a\n\x00", "no UTF-8"),
-    "latin-1": ('{"a": "\xe9"}'.encode("latin-1"), "byte 7 is no UTF-8"),
-    "UTF-16": ('{"a": 1}'.encode("utf-16"), "no UTF-8"),
+    "empty": (b"", "is not JSON"),
+    "cut off": (b'{"format": ', "is not JSON"),
+    "binary": (b"\x89HDF\r\n\x1a\n\x00", "not UTF-8"),
+    "latin-1": ('{"a": "\xe9"}'.encode("latin-1"), "byte 7 is not UTF-8"),
+    "UTF-16": ('{"a": 1}'.encode("utf-16"), "not UTF-8"),
     "NaN": (b'{"format": NaN}', "holds NaN"),
     "Infinity": (b'{"format": [1, -Infinity]}', "holds -Infinity"),
     "beyond float64": (b'{"format": 1e400}', "'1e400', beyond the largest float64"),
-    "5000 digits": (b'{"format": ' + b"9" * 5000 + b"}", "is no JSON: .*digits"),
+    "5000 digits": (b'{"format": ' + b"9" * 5000 + b"}", "is not JSON: .*digits"),
     "deep lists": (b'{"a":' + b"[" * 200_000, "nests too deeply"),
     "deep objects": (b'{"a":' * 200_000, "nests too deeply"),
     "a list": (b"[1, 2]", r"holds \[1, 2\]; expected an object"),

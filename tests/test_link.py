@@ -18,16 +18,17 @@ from typer.testing import CliRunner
 
 from amiwarp.cli import motor as command
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link import following
+from amiwarp.live.link import following, updates
 from amiwarp.live.link import link as link_module
 from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulator import LASTING, Controller, Fault
-from amiwarp.live.link.following import Follower, News
+from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault
+from amiwarp.live.link.following import Follower
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.port import open_port, usb_id
-from amiwarp.live.link.protocol import Answer, Decoder, Index, Message, Ping, Samples, Status, encode
+from amiwarp.live.link.protocol import Answer, ControllerStatus, FrameDecoder, Index, Message, Ping, Samples, encode
 from amiwarp.live.link.rotors import Motor
 from amiwarp.live.link.terminal import PseudoTerminal
+from amiwarp.live.link.updates import LinkUpdate
 
 S = 1_000_000
 RPM = 720.0
@@ -42,20 +43,20 @@ class Line:
 
     def __init__(self, *faults: str, follower: Follower | None = None, **settings: float) -> None:
         self.motor = Motor(RPM)
-        self.controller = Controller(self.motor, faults=[Fault.parse(f) for f in faults], **settings)  # type: ignore[arg-type]
+        self.controller = Controller(self.motor, faults=[EmulatedFault.parse(f) for f in faults], **settings)  # type: ignore[arg-type]
         self.follower = follower or Follower("port")
         self.follower.opened(HOST)
         self.now, self.arrived = 0, 0
-        self._decoder, self._plugged, self._pings = Decoder(), True, itertools.count()
+        self._decoder, self._plugged, self._pings = FrameDecoder(), True, itertools.count()
 
-    def run(self, seconds: float, step_us: int = 5000) -> list[News]:
+    def run(self, seconds: float, step_us: int = 5000) -> list[LinkUpdate]:
         """Goes on, by pings ten times a second too; the news of all of it."""
         for now in range(self.now + step_us, self.now + round(seconds * S) + 1, step_us):
             self.now = now
             data = self.controller.advance(self.now)
             if self.controller.plugged and not self._plugged:
                 self.follower.opened(HOST + self.now)
-                self._decoder = Decoder()
+                self._decoder = FrameDecoder()
             self._plugged = self.controller.plugged
             self.arrived += sum(len(m.t_us) for _, m in self._decoder.feed(data) if isinstance(m, Samples))
             self.follower.feed(data, HOST + self.now + 400)
@@ -65,13 +66,13 @@ class Line:
                 self.controller.feed(encode(Ping(number), number), self.now)
         return taken(self.follower)
 
-    def away(self, news: News) -> np.ndarray:
+    def away(self, news: LinkUpdate) -> np.ndarray:
         """The angle's errors, by the controller's clock as it is now [rad]."""
-        error = news.angle - self.motor.angle(self.controller.world(news.t_us))
+        error = news.angle - self.motor.angle(self.controller.time_at(news.t_us))
         return np.asarray((error + math.pi) % math.tau - math.pi)
 
 
-def taken(follower: Follower) -> list[News]:
+def taken(follower: Follower) -> list[LinkUpdate]:
     """All there is."""
     found = [follower.take()]
     while len(found[-1].t_us) or found[-1].messages:
@@ -79,7 +80,7 @@ def taken(follower: Follower) -> list[News]:
     return found[:-1]
 
 
-def said(news: Iterable[News]) -> str:
+def said(news: Iterable[LinkUpdate]) -> str:
     return "\n".join(m for n in news for m in n.messages)
 
 
@@ -125,10 +126,10 @@ def test_after_a_fault_angles_are_right_and_it_was_said(fault: str, says: str) -
     assert len(news.t_us) == line.arrived
     assert (np.diff(news.t_us) > 0).all()
     name = fault.partition("@")[0]
-    begin = Fault.parse(fault).start_s * S
-    end = begin + Fault.parse(fault).duration_s * S + 90_000  # a turn: until the next index
+    begin = EmulatedFault.parse(fault).start_s * S
+    end = begin + EmulatedFault.parse(fault).duration_s * S + 90_000  # a turn: until the next index
     away = np.abs(line.away(news))
-    world = line.controller.world(news.t_us)
+    world = line.controller.time_at(news.t_us)
     assert away[(world < begin) | (world > end)].max() < TOLERANCE
     if name not in ("stall", "slip"):
         assert away.max() < TOLERANCE
@@ -146,7 +147,7 @@ def test_a_controller_that_begins_anew(fault: str, at: float) -> None:
     after = [n for n in news if n.restarted]
     assert len(after) == 1
     assert sum(len(n.t_us) for n in news) == line.arrived
-    assert "angles begin anew" in said(after)
+    assert "angles restart" in said(after)
     assert "lost" not in said(news)
     assert np.abs(line.away(after[0])).max() < TOLERANCE
     assert abs(len(after[0].t_us) - 1000 * (4.0 - at)) < 20
@@ -176,7 +177,7 @@ def test_a_wrap_of_the_clock_is_no_restart() -> None:
 
 def test_a_wrap_of_the_counts_is_no_restart() -> None:
     follower, rng = Follower("port"), random.Random(0)
-    status = Status(0, 1, 0, RPM, RPM, 1000)
+    status = ControllerStatus(0, 1, 0, RPM, RPM, 1000)
     follower.feed(encode(status, 0), HOST)
     first = (1 << 31) - 1500
     for k in range(4000):
@@ -206,21 +207,21 @@ def test_samples_wait_for_the_index_two_turns_at_most() -> None:
     news = line.run(0.15)
     assert sum(len(n.t_us) for n in news) == 0
     (news,) = line.run(0.35)
-    assert "no index pulse in 2 turns: angles are from where the encoder was first read" in news.messages
+    assert "no index pulse in 2 turns: angles are relative to the first encoder count" in news.messages
     assert news.angle[0] == 0.0
     (news,) = line.run(1.5)
-    assert any("the index pulse came: angles are absolute from here" in m for m in news.messages)
+    assert any("first index pulse: angles are absolute from now on" in m for m in news.messages)
     absolute = news.t_us >= news.index_t_us[0]
     assert np.abs(line.away(news)[absolute]).max() < TOLERANCE
     assert np.abs(np.diff(news.angle)).max() < math.pi + TOLERANCE
 
 
 def test_counts_per_turn_are_the_controller_s_else_those_given() -> None:
-    def rows(told: int | None, given: int | None) -> list[News]:
+    def rows(told: int | None, given: int | None) -> list[LinkUpdate]:
         follower = Follower("port", given)
         for k in range(4000):
             if told is not None and k == 900:
-                follower.feed(encode(Status(k * 1000, 1, 0, 60.0, 60.0, told), k), HOST)
+                follower.feed(encode(ControllerStatus(k * 1000, 1, 0, 60.0, 60.0, told), k), HOST)
             message: Message = Index(k * 1000, 100) if k == 100 else Samples((k * 1000,), (k,))
             follower.feed(encode(message, k), HOST + k * 1000)
         return taken(follower)
@@ -271,7 +272,7 @@ def test_a_wrong_digit_in_a_line_is_left_out_and_a_reset_is_not() -> None:
 def test_faults_that_the_controller_reports_are_said_once() -> None:
     follower = Follower("port")
     for k, bits in enumerate((0, 2, 2, 3, 16, 0, 2)):
-        follower.feed(encode(Status(k * S, 1, bits, 0.0, 0.0, 4096), k), HOST + k * S)
+        follower.feed(encode(ControllerStatus(k * S, 1, bits, 0.0, 0.0, 4096), k), HOST + k * S)
     assert [m.rpartition(": ")[2] for m in said(taken(follower)).splitlines()] == [
         "over-current",
         "stall",
@@ -280,7 +281,7 @@ def test_faults_that_the_controller_reports_are_said_once() -> None:
     line = Line()  # the host is lost before the first ping: no news; after it: some
     line.run(1.0)
     t = line.controller.clock(line.now)
-    line.follower.feed(encode(Status(t, 1, 16, RPM, RPM, 4096), 0), HOST + line.now)
+    line.follower.feed(encode(ControllerStatus(t, 1, 16, RPM, RPM, 4096), 0), HOST + line.now)
     assert "the controller reports a fault: host lost" in said(taken(line.follower))
 
 
@@ -298,7 +299,7 @@ def test_a_host_that_sleeps_takes_nothing_for_a_reset() -> None:
 
 
 def test_memory_is_bounded_and_what_is_dropped_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(following, "MOST", 1000)
+    monkeypatch.setattr(updates, "MOST_WAITING_SAMPLES", 1000)
     line = Line("reset@1.5")
     news = [n for n in (line.follower.take(), *line.run(4.0)) if len(n.t_us)]
     assert sum(len(n.t_us) for n in news) == 1000
@@ -318,7 +319,7 @@ def test_garbage_is_said_in_a_sentence_and_raises_nothing() -> None:
     assert "neither frames nor lines of samples" in news.messages[0]
     for k in range(2000):  # whole frames of nonsense
         t, c = rng.getrandbits(32), rng.getrandbits(31)
-        status = Status(t, rng.randrange(256), rng.getrandbits(16), math.nan, math.inf, rng.getrandbits(32))
+        status = ControllerStatus(t, rng.randrange(256), rng.getrandbits(16), math.nan, math.inf, rng.getrandbits(32))
         for message in (Samples((t,), (c,)), status, Index(t, c)):
             follower.feed(encode(message, rng.getrandbits(16)), HOST + 6 * S + k * 2000)
     assert sum(len(n.t_us) for n in taken(follower)) <= 2000
@@ -362,7 +363,7 @@ class Live:
     ) -> None:  # fmt: skip
         self.motor = Motor(rpm)
         self.controller = Controller(
-            self.motor, faults=[Fault.parse(f) for f in faults], drift_ppm=drift_ppm, sample_hz=sample_hz
+            self.motor, faults=[EmulatedFault.parse(f) for f in faults], drift_ppm=drift_ppm, sample_hz=sample_hz
         )
         self.terminal = PseudoTerminal(self.controller, path, now_us=now_us)
 
@@ -372,8 +373,8 @@ class Live:
     def __exit__(self, *_: object) -> None:
         self.terminal.close()
 
-    def away(self, news: News) -> np.ndarray:
-        error = news.angle - self.motor.angle(self.controller.world(news.t_us))
+    def away(self, news: LinkUpdate) -> np.ndarray:
+        error = news.angle - self.motor.angle(self.controller.time_at(news.t_us))
         return np.asarray((error + math.pi) % math.tau - math.pi)
 
 
@@ -430,7 +431,7 @@ def test_a_port_that_was_unplugged_comes_back(path: Path) -> None:
         gap = int(np.argmax(np.diff(t)))
         assert np.diff(t)[gap] > 300_000
         assert gap > 200
-        away = angle - live.motor.angle(live.controller.world(t))
+        away = angle - live.motor.angle(live.controller.time_at(t))
         assert np.abs(away - math.tau * np.round(away[0] / math.tau)).max() < TOLERANCE  # turns go on too
 
 
@@ -445,7 +446,7 @@ def test_commands_over_the_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with Paced(path, rpm=0.0) as live, live.link() as link:
         link.set_speed(900.0, 10_000.0)
         wait(lambda: link.status is not None and (link.status.state, link.status.target_rpm) == (1, 900.0))
-        with pytest.raises(AmiwarpError, match=r"set speed 1e\+06 rpm: refused by the controller, out of its range"):
+        with pytest.raises(AmiwarpError, match=r"set speed 1e\+06 rpm: refused by the controller, out of range"):
             link.set_speed(1e6, 100.0)
         with pytest.raises(AmiwarpError, match="-5 counts per turn"):
             link.set_counts(-5)
@@ -484,7 +485,7 @@ def test_ports_by_usb_id_and_by_what_they_send(path: Path, tmp_path: Path, monke
 
         def clock() -> float:
             assert other.terminal._master is not None
-            if other.terminal._alone(other.terminal._master):
+            if other.terminal._without_peer(other.terminal._master):
                 return 0.0
             return 0.05 * next(listened)
 
@@ -502,7 +503,7 @@ def test_a_port_that_is_not_there_is_said_with_those_that_are(monkeypatch: pytes
     for where, says in (
         ("/dev/nothing", r"/dev/nothing: no such port; there are /dev/ttyACM7 \(16c0:0483 Board\)"),
         ("1234:abcd", "USB id 1234:abcd: 0 ports have it; there are /dev/ttyACM7"),
-        (None, "no port sends what a controller sends; there are /dev/ttyACM7.*no such port.*give one by name"),
+        (None, "no port sends controller data; there are /dev/ttyACM7.*no such port.*give a port by name"),
         ("nowhere://x", "nowhere://x: cannot be opened"),
     ):
         with pytest.raises(AmiwarpError, match=says):
@@ -533,7 +534,7 @@ def test_answers_to_no_command_are_not_kept() -> None:
         peer = held.enter_context(server.accept()[0])
         held.callback(link.close)
         answers = [encode(Answer(k, 2), k) for k in range(500)]
-        peer.sendall(b"".join(answers) + encode(Status(0, 1, 0, 720.0, 720.0, 4096), 500))
+        peer.sendall(b"".join(answers) + encode(ControllerStatus(0, 1, 0, 720.0, 720.0, 4096), 500))
         wait(lambda: link.status is not None)
         assert link._answers == {}
         with pytest.raises(AmiwarpError, match="no answer in 1 s"):
@@ -571,8 +572,8 @@ def test_the_command_sets_shows_and_stops(path: Path, monkeypatch: pytest.Monkey
         (("set", "--rpm", 3001), "--rpm 3001 is beyond the limit of 3000 rpm"),
         (("set", "--rpm", -200, "--limit-rpm", 100), "--rpm -200 is beyond the limit of 100 rpm"),
         (("set", "--rpm", "nan"), "--rpm nan is beyond"),
-        (("set",), "needs it"),
-        (("stop", "--rpm", 5), "nothing else takes it"),
+        (("set",), "needs --rpm"),
+        (("stop", "--rpm", 5), "stop do not accept it"),
     ],
 )
 def test_a_speed_beyond_the_limit_is_refused_before_the_port_is_opened(args: tuple[object, ...], says: str) -> None:
@@ -582,6 +583,6 @@ def test_a_speed_beyond_the_limit_is_refused_before_the_port_is_opened(args: tup
 
 
 def test_every_fault_is_tested_above() -> None:
-    assert set(LASTING) == {
+    assert set(LASTING_FAULTS) == {
         "garbage", "truncate", "crc", "drop", "missed-index", "stall", "reverse", "unplug",
     }  # fmt: skip

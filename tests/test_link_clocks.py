@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.clocks import WRAP, Unwrapped, from_pulses, from_round_trips
+from amiwarp.live.link.clocks import WRAP, UnwrappedClock, fit_to_pulses, fit_to_round_trips
 
 DRIFT, OFFSET = 35e-6, 123_456_789_000
 
@@ -12,13 +12,13 @@ DRIFT, OFFSET = 35e-6, 123_456_789_000
 def test_a_clock_of_32_bits_goes_on() -> None:
     rng = np.random.default_rng(0)
     true = 4_000_000_000 + np.cumsum(rng.integers(100, 100_000_000, 500))  # over eleven wraps
-    clock = Unwrapped()
+    clock = UnwrappedClock()
     found = np.array([clock(int(t) % WRAP) for t in true])
     np.testing.assert_array_equal(found - found[0], true - true[0])
 
 
 def test_what_comes_late_is_put_where_it_belongs() -> None:
-    clock = Unwrapped()
+    clock = UnwrappedClock()
     assert [clock(t % WRAP) for t in (WRAP - 10, WRAP + 20, WRAP - 5, WRAP + 30)] == [
         WRAP - 10, WRAP + 20, WRAP - 5, WRAP + 30]  # fmt: skip
 
@@ -35,7 +35,7 @@ def test_pulses_give_offset_and_drift_with_honest_deviations(jitter_us: float) -
     misses = []
     for seed in range(60):
         own, other = pulses(50, jitter_us, seed)
-        clock = from_pulses(own, other)
+        clock = fit_to_pulses(own, other)
         assert clock.drift == pytest.approx(DRIFT, abs=6 * clock.drift_std)
         true = OFFSET + DRIFT * (clock.at_us - own[0])
         misses.append((clock.offset_us - true) / clock.offset_std_us)
@@ -49,7 +49,7 @@ def test_pulses_give_offset_and_drift_with_honest_deviations(jitter_us: float) -
 def test_pulses_taken_for_others_are_left_out() -> None:
     own, other = pulses(60, 1.0, 3)
     other[[7, 20, 41]] += [40_000, -900, 250]
-    clock = from_pulses(own, other)
+    clock = fit_to_pulses(own, other)
     assert clock.pairs == 57
     assert clock.drift == pytest.approx(DRIFT, abs=6 * clock.drift_std)
 
@@ -61,7 +61,7 @@ def test_round_trips_give_it_to_within_their_way() -> None:
     back[::9] += 30_000.0  # the host was busy
     at = sent + there
     other = np.rint(at + OFFSET + DRIFT * (at - sent[0])).astype(np.int64)
-    clock = from_round_trips(sent, other, np.rint(at + back).astype(np.int64))
+    clock = fit_to_round_trips(sent, other, np.rint(at + back).astype(np.int64))
     true = OFFSET + DRIFT * (clock.at_us - sent[0])
     assert abs(clock.offset_us - true) < 4 * clock.offset_std_us < 200.0
     assert clock.drift == pytest.approx(DRIFT, abs=5 * clock.drift_std)
@@ -69,16 +69,16 @@ def test_round_trips_give_it_to_within_their_way() -> None:
 
 def test_too_little_is_said() -> None:
     with pytest.raises(AmiwarpError, match="2 and 2 pulses"):
-        from_pulses([1, 2], [3, 4])
+        fit_to_pulses([1, 2], [3, 4])
     with pytest.raises(AmiwarpError, match="3 and 2 pulses"):
-        from_pulses([1, 2, 3], [3, 4])
+        fit_to_pulses([1, 2, 3], [3, 4])
     with pytest.raises(AmiwarpError, match="2 round trips"):
-        from_round_trips([1, 2], [3, 4], [5, 6])
+        fit_to_round_trips([1, 2], [3, 4], [5, 6])
     with pytest.raises(AmiwarpError, match="the shortest -1 us"):
-        from_round_trips([1, 2, 3], [3, 4, 5], [5, 6, 2])
+        fit_to_round_trips([1, 2, 3], [3, 4, 5], [5, 6, 2])
 
 
 def test_all_at_one_time_leaves_the_drift_open() -> None:
-    clock = from_pulses([10, 10, 10], [30, 30, 31])
+    clock = fit_to_pulses([10, 10, 10], [30, 30, 31])
     assert clock.offset_us == pytest.approx(20.0, abs=1.0)
     assert clock.drift_std > 1.0

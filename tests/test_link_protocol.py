@@ -13,7 +13,8 @@ from amiwarp.live.link.protocol import (
     LONGEST,
     MOST_SAMPLES,
     Answer,
-    Decoder,
+    ControllerStatus,
+    FrameDecoder,
     Index,
     Message,
     Ping,
@@ -21,7 +22,6 @@ from amiwarp.live.link.protocol import (
     Samples,
     SetCounts,
     SetSpeed,
-    Status,
     Stop,
     Sync,
     encode,
@@ -35,7 +35,7 @@ PAIRS = st.lists(st.tuples(U32, I32), min_size=1, max_size=MOST_SAMPLES)
 MESSAGES = st.one_of(
     PAIRS.map(lambda pairs: Samples(tuple(t for t, _ in pairs), tuple(c for _, c in pairs))),
     st.builds(Index, U32, I32), st.builds(Sync, U32, U32), st.builds(Pong, U32, U32), st.builds(Answer, U16, U8),
-    st.builds(Status, U32, U8, U16, F32, F32, U32), st.builds(SetSpeed, F32, F32), st.just(Stop()),
+    st.builds(ControllerStatus, U32, U8, U16, F32, F32, U32), st.builds(SetSpeed, F32, F32), st.just(Stop()),
     st.builds(SetCounts, U32), st.builds(Ping, U32),
 )  # fmt: skip
 
@@ -59,13 +59,13 @@ def test_every_message_comes_back(message: Message, sequence: int) -> None:
     assert frame.count(0) == 1
     assert frame[-1] == 0
     assert len(frame) <= LONGEST
-    assert Decoder().feed(frame) == [(sequence, message)]
+    assert FrameDecoder().feed(frame) == [(sequence, message)]
 
 
 @given(st.lists(MESSAGES, max_size=8), st.lists(st.integers(1, 30), min_size=1))
 def test_it_does_not_matter_how_the_bytes_are_cut(messages: list[Message], cuts: list[int]) -> None:
     data = b"".join(encode(m, k) for k, m in enumerate(messages))
-    decoder, found, at = Decoder(), [], 0
+    decoder, found, at = FrameDecoder(), [], 0
     for k in range(len(data)):
         step = cuts[k % len(cuts)]
         found += decoder.feed(data[at : at + step])
@@ -84,7 +84,7 @@ def test_layout_is_as_documented() -> None:
 def test_a_hundred_thousand_strings_of_garbage_are_refused() -> None:
     """Random bytes, and frames with bytes changed, lost, doubled and put in."""
     rng = random.Random(1)
-    decoder, whole = Decoder(), 0
+    decoder, whole = FrameDecoder(), 0
     for _ in range(50_000):
         assert decoder.feed(rng.randbytes(rng.randrange(1, 40)) + b"\0") == []
     for _ in range(60_000):
@@ -121,7 +121,7 @@ def test_what_was_whole_is_found_among_losses(seed: int) -> None:
     else:
         data[first:last] = bytes(rng.randrange(1, 256) for _ in range(last - first))
         touched |= {max(touched) + 1} if data[ends[max(touched)] - 1] else set()  # its zero is gone
-    decoder = Decoder()
+    decoder = FrameDecoder()
     found = dict(decoder.feed(bytes(data)))
     assert all(found[k] == messages[k] for k in found if k is not None)
     assert set(range(60)) - set(found) <= touched
@@ -129,7 +129,7 @@ def test_what_was_whole_is_found_among_losses(seed: int) -> None:
 
 
 def test_a_frame_without_end_is_let_go() -> None:
-    decoder = Decoder()
+    decoder = FrameDecoder()
     assert decoder.feed(b"\x05" * 100_000) == []
     assert decoder.received.damaged > 100
     assert decoder.feed(b"\0" + encode(Ping(7), 0)) == [(0, Ping(7))]
@@ -138,20 +138,20 @@ def test_a_frame_without_end_is_let_go() -> None:
 def test_another_version_or_type_is_counted_and_passed_over() -> None:
     for head in (bytes([2, 1, 0, 0]), bytes([1, 0x77, 0, 0]), bytes([1, 2, 0, 0, 9])):
         packet = head + struct.pack("<I", zlib.crc32(head))
-        decoder = Decoder()
+        decoder = FrameDecoder()
         assert decoder.feed(cobs.encode(packet) + b"\0") == []
         assert (decoder.received.unknown, decoder.received.damaged) == (1, 0)
 
 
 def test_lost_frames_and_a_reset_are_told_apart() -> None:
-    decoder = Decoder()
+    decoder = FrameDecoder()
     for sequence in (65534, 65535, 0, 5, 1, 2):
         decoder.feed(encode(Stop(), sequence))
     assert (decoder.received.lost, decoder.received.restarts, decoder.received.frames) == (4, 1, 6)
 
 
 def test_lines_of_text() -> None:
-    decoder = Decoder()
+    decoder = FrameDecoder()
     lines = b"345,678\r\nt_us,count\r\n1000,12\n2000,-13\r\nnonsense\n4294967296,1\n3000,4\n"
     found = [m for _, m in decoder.feed(lines)]
     assert found == [Samples((1000,), (12,)), Samples((2000,), (-13,)), Samples((3000,), (4,))]
@@ -161,7 +161,7 @@ def test_lines_of_text() -> None:
 def test_a_frame_with_a_line_feed_in_it_is_no_line() -> None:
     frame = encode(Ping(0x0A0A0A0A), 0x0A0A)
     assert b"\n" in frame
-    assert Decoder().feed(frame) == [(0x0A0A, Ping(0x0A0A0A0A))]
+    assert FrameDecoder().feed(frame) == [(0x0A0A, Ping(0x0A0A0A0A))]
 
 
 def test_a_frame_that_begins_with_a_line_feed_is_no_line() -> None:
@@ -169,11 +169,11 @@ def test_a_frame_that_begins_with_a_line_feed_is_no_line() -> None:
     message = Sync(0x01010101, 0x01010001)
     frame = encode(message, 0x0101)
     assert frame[0] == 10
-    assert Decoder().feed(frame) == [(0x0101, message)]
+    assert FrameDecoder().feed(frame) == [(0x0101, message)]
 
 
 def test_empty_lines_do_no_harm() -> None:
-    assert [m for _, m in Decoder().feed(b"\n\nt,c\n\n1,2\n\n3,4\n")] == [Samples((1,), (2,)), Samples((3,), (4,))]
+    assert [m for _, m in FrameDecoder().feed(b"\n\nt,c\n\n1,2\n\n3,4\n")] == [Samples((1,), (2,)), Samples((3,), (4,))]
 
 
 def test_what_does_not_fit_is_not_sent() -> None:

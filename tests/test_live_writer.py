@@ -21,7 +21,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import CHUNK
-from amiwarp.io.live_writer import WASTE, LiveWriter
+from amiwarp.io.live_writer import MAX_WASTE_BYTES, LiveWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
@@ -87,7 +87,7 @@ def test_everything_comes_back(tmp_path, flush_s):
             np.testing.assert_array_equal(got[name][()], expected[name][()], strict=True)
             assert got[name].dtype == expected[name].dtype
     wasted = os.path.getsize(path) - os.path.getsize(tmp_path / "b.h5")
-    assert wasted < (WASTE if flush_s == 0.0 else 500_000)
+    assert wasted < (MAX_WASTE_BYTES if flush_s == 0.0 else 500_000)
 
 
 def test_index_pulses_may_come_before_the_samples_about_them(tmp_path):
@@ -221,11 +221,11 @@ def test_a_full_disk_keeps_all_that_came_before(tmp_path, limit, flush_s):
     count, _, said = done.stdout.partition(" ")
     assert done.stderr == ""
     if limit < 10_000:
-        assert said.strip() == f"{path}: cannot be begun: File too large; choose another place"
+        assert said.strip() == f"{path}: cannot be created: File too large; choose another place"
         assert os.listdir(tmp_path) == []
         return
     assert said.strip() == (
-        f"{path}: File too large after {count} events; it holds these; make room, or write to another disk"
+        f"{path}: File too large after {count} events, which the file holds; make room, or write to another disk"
     )
     assert os.listdir(tmp_path) == ["a.h5"]
     recording = open_recording(path)
@@ -251,7 +251,7 @@ def test_an_exception_keeps_what_was_appended(tmp_path, error):
         with live(tmp_path / "a.h5") as writer:
             writer.append(events)
             raise error
-    assert caught.value.__notes__ == [f"{tmp_path / 'a.h5'}: holds the 1000 events up to then"]
+    assert caught.value.__notes__ == [f"{tmp_path / 'a.h5'}: holds the 1000 events before the error"]
     assert_equal(read(tmp_path / "a.h5"), events)
     assert os.listdir(tmp_path) == ["a.h5"]
 
@@ -274,7 +274,7 @@ def test_the_file_that_was_there_is_replaced_at_the_end(tmp_path):
         (lambda w: w.append(make(5)[::-1]), "event 11 .* earlier"),
         (lambda w: w.append(make(5, start=1000)), "event 10 .* earlier than the one before"),
         (lambda w: w.append(Events.from_arrays([320], [0], [9_000_000], [0])), "event 10 .* outside the 320x240 frame"),
-        (lambda w: w.append(make(5), inside=np.ones(5)), "a sensor's with neither"),
+        (lambda w: w.append(make(5), inside=np.ones(5)), "give events from a sensor without flags"),
         (lambda w: w.append(make(1, start=2**61)), "timestamp is damaged"),
         (lambda w: w.append_encoder([7, 6], [0.0, 0.0]), "encoder samples 7 .. 6 us do not follow"),
         (lambda w: w.append_encoder([5, 6], [0.0, 0.0]), "encoder samples 5 .. 6 us do not follow 5 us"),

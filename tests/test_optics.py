@@ -393,7 +393,7 @@ def test_fit_says_when_pairs_do_not_determine_it() -> None:
     xy, theta = samples(camera(), 30)
     with pytest.raises(AmiwarpError, match="30 pairs determine 30 of 45"):
         EllipseModel.fit(camera(), xy, theta, xy)
-    with pytest.raises(AmiwarpError, match="spread them over image and angle"):
+    with pytest.raises(AmiwarpError, match="spread them over the image and the angles"):
         EllipseModel.fit(camera(), *(samples(camera(), 500)[0], np.zeros(500)), samples(camera(), 500)[0])
 
 

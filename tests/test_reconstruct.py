@@ -28,7 +28,8 @@ from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, save_video, tones
-from amiwarp.reconstruction.picture import Picture, Reconstruction, grown, reconstruct, without_pinholes
+from amiwarp.reconstruction.known import dilated, without_small_holes
+from amiwarp.reconstruction.picture import Picture, Reconstruction, reconstruct
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 
@@ -172,7 +173,7 @@ def test_hot_pixels_are_told_from_texture(device: str) -> None:
     y, x = (np.repeat(a.ravel(), count.ravel()) for a in np.indices(count.shape))
     events = Events.from_arrays(x.astype(np.uint16), y.astype(np.uint16), np.arange(len(x)), np.ones(len(x)))
     table = EventTable([events], np.zeros(count.shape, np.int32), device)
-    assert np.array_equal(table.leave_out_hot(), count)
+    assert np.array_equal(table.exclude_hot_pixels(), count)
     assert np.argwhere(table.tile_of.numpy() < 0).tolist() == [[5, 7]]
 
 
@@ -186,7 +187,7 @@ def test_hot_pixels_are_those_of_a_percentile_filter(device: str) -> None:
     events = Events.from_arrays(x.astype(np.uint16), y.astype(np.uint16), np.arange(len(x)), np.ones(len(x)))
     typical = ndimage.percentile_filter(count.astype(np.float32), 75, size=5, mode="mirror")
     table = EventTable([events], np.zeros(count.shape, np.int32), device)
-    table.leave_out_hot()
+    table.exclude_hot_pixels()
     expected = count > 3.0 * typical + 5.0 * np.sqrt(typical) + 8.0
     assert 50 < expected.sum() < (count > 40).sum() - 20  # some stand out, some do not
     assert np.array_equal(table.tile_of.numpy() < 0, expected)
@@ -195,7 +196,7 @@ def test_hot_pixels_are_those_of_a_percentile_filter(device: str) -> None:
 def test_growing_is_a_dilation() -> None:
     mask = np.random.default_rng(2).random((30, 40)) < 0.05
     before = mask.copy()
-    assert np.array_equal(grown(mask, 3), ndimage.binary_dilation(mask, iterations=3))
+    assert np.array_equal(dilated(mask, 3), ndimage.binary_dilation(mask, iterations=3))
     assert np.array_equal(mask, before)
 
 
@@ -204,7 +205,7 @@ def test_the_mask_has_no_pinholes(picture: Picture) -> None:
     known[5, 7] = known[9, 12:16] = known[14, 20:25] = False
     expected = np.ones((20, 30), np.bool_)
     expected[14, 20:25] = False
-    assert np.array_equal(without_pinholes(known), expected)
+    assert np.array_equal(without_small_holes(known), expected)
     label, count = ndimage.label(~picture.known)
     inside = [np.argwhere(label == k + 1) for k in range(count) if (label == k + 1).sum() <= 4]
     size = np.array(picture.known.shape) - 1
@@ -321,7 +322,7 @@ def test_command_refuses(recording: Recording, tmp_path: Path) -> None:
     for out, more, said in (
         ("p.bmp", [], "ends in .bmp"),
         ("none/p.png", [], "does not exist"),
-        ("p.png", ["--fps", "20"], "--fps goes with a video"),
+        ("p.png", ["--fps", "20"], "--fps applies to a video"),
         ("v.mp4", ["--mask", "m.png"], "--mask"),
         ("p.png", ["--start", "9"], "no events in"),
         ("p.png", ["--bits", "12"], "12 bits"),

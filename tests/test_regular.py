@@ -124,7 +124,7 @@ def test_npz_of_other_compressions(tmp_path):
 
 def test_an_archive_that_unpacks_to_much_takes_little_memory(tmp_path, monkeypatch):
     """Four arrays of 64 MiB in a quarter of a megabyte."""
-    monkeypatch.setattr("amiwarp.io.scan.KEEP", 0)
+    monkeypatch.setattr("amiwarp.io.scan.KEEP_EVENTS", 0)
     path = npz(tmp_path / "a.npz", f"({1 << 23},)", bytes(1 << 26))
     assert path.stat().st_size < 1 << 20
     tracemalloc.start()

@@ -1,4 +1,4 @@
-"""The viewer's server, in a real browser: tabs apart, tabs closed, failures shown, strangers refused."""
+"""The viewer's server in a real browser: independent tabs, closed tabs, errors shown, foreign clients refused."""
 
 import asyncio
 import gc
@@ -15,13 +15,13 @@ from urllib.parse import urlsplit
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.gate import Check, number
+from amiwarp.viewer.message_filter import Check, number
 from amiwarp.viewer.serve import Session, serve
 
 pytest.importorskip("trame_vuetify")
 TOKEN = "s3cret & more"
 WAIT_S = 120.0
-"""For what takes no second on a machine that does nothing else."""
+"""Timeout of every wait [s]; on an idle machine each takes less than a second."""
 COUNT = {"count": number()}
 
 
@@ -29,7 +29,7 @@ COUNT = {"count": number()}
 def served(
     build: Session, settable: Mapping[str, Check] = COUNT, **more: Any
 ) -> Iterator[tuple[str, asyncio.AbstractEventLoop]]:
-    """Serves in a thread; gives the URL and the event loop."""
+    """Serve in a thread; yield the URL and the event loop."""
     urls: list[str] = []
     started: list[tuple[asyncio.AbstractEventLoop, asyncio.Task[None]]] = []
     listening = threading.Event()
@@ -60,7 +60,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def get(url: str, path: str) -> tuple[int, str, str | None]:
-    """Status, text and cookie of ``path``, which is sent as it is."""
+    """Return status, text and cookie of a request for ``path``, which is sent unchanged."""
     connection = HTTPConnection(urlsplit(url).netloc, timeout=WAIT_S)
     try:
         connection.request("GET", path)
@@ -71,14 +71,14 @@ def get(url: str, path: str) -> tuple[int, str, str | None]:
 
 
 def opened(context: Any) -> Any:
-    """A page that waits as long as a busy machine may take."""
+    """Return a new page with a timeout long enough for a busy machine."""
     page = context.new_page()
     page.set_default_timeout(1e3 * WAIT_S)
     return page
 
 
 class Counters:
-    """A button that counts in the browser, and twice the count from the server."""
+    """Page with a button that counts in the browser, and a text from the server with twice the count."""
 
     def __init__(self) -> None:
         self.servers: list[weakref.ref[Any]] = []
@@ -88,7 +88,7 @@ class Counters:
         from trame.ui.vuetify3 import VAppLayout
         from trame.widgets import html, vtk, vuetify3
 
-        vtk.initialize(server)  # it keeps what it makes for a server
+        vtk.initialize(server)  # it keeps objects of the server in a global variable
         self.servers.append(weakref.ref(server))
         server.state.count = 0
 
@@ -193,7 +193,7 @@ def test_failures_are_shown(browser: Any, error: Exception, caplog: pytest.LogCa
         page = opened(context)
         page.goto(url)
         page.get_by_text(str(error) or "RuntimeError").wait_for()
-    assert bool(caplog.records) == isinstance(error, RuntimeError)  # a traceback for what nobody foresaw
+    assert bool(caplog.records) == isinstance(error, RuntimeError)  # only an unexpected error logs a traceback
 
 
 @pytest.mark.parametrize("origin", ["http://example.org", "null", None])

@@ -1,4 +1,4 @@
-"""What hostile, slow and absent clients of the inspector's page cannot do; spoken in the page's own protocol."""
+"""Hostile, slow and absent clients cannot harm the inspector's server. The tests speak the page's own protocol."""
 
 import asyncio
 import base64
@@ -31,9 +31,9 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.frames import MOST_IN_FLIGHT
-from amiwarp.viewer.gate import MOST_BYTES, Gate
-from amiwarp.viewer.hosts import Names, address, is_local, reachable, warning
+from amiwarp.viewer.hosts import HostNames, address, is_local, reachable, warning
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.message_filter import MOST_BYTES, MessageFilter
 from amiwarp.viewer.serve import serve
 from amiwarp.viewer.values import SETTABLE
 
@@ -47,7 +47,7 @@ def recording(texture: np.ndarray) -> Recording:
 
 
 class Panels:
-    """Builds a panel for each page, remembers all that belongs to it weakly, and the panels while ``keep``."""
+    """Builds a panel for each page, and keeps weak references to its objects; ``keep`` also keeps the panels."""
 
     def __init__(self, recording: Recording, folder: Path, *, keep: bool = True) -> None:
         self.recording, self.folder, self.keep = recording, folder, keep
@@ -67,13 +67,13 @@ class Panels:
 
 
 def packed(call: Any) -> bytes:
-    """A message in one part."""
+    """Return a call as a message in one part."""
     body = msgpack.packb(call)
     return b"abcd" + struct.pack("<II", 0, len(body)) + body
 
 
 class Client:
-    """One end of a WebSocket that speaks as the page does."""
+    """WebSocket client that uses the page's protocol."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket, self.calls = socket, itertools.count()
@@ -84,7 +84,7 @@ class Client:
         return str(call["id"])
 
     async def call(self, method: str, *args: Any, **more: Any) -> Any:
-        """Sends it and waits for the answer."""
+        """Send a call and return the answer."""
         wanted = await self.send(method, *args, **more)
         async with asyncio.timeout(WAIT_S):
             async for message in self.socket:
@@ -99,7 +99,7 @@ class Client:
 
 @contextlib.asynccontextmanager
 async def client(url: str) -> AsyncIterator[Client]:
-    """A page's connection, greeted."""
+    """Open a connection like a page's, including the initial greeting."""
     origin = url.partition("/?")[0]
     async with (
         aiohttp.ClientSession() as session,
@@ -148,7 +148,7 @@ def nested(depth: int) -> Any:
 def test_junk_changes_nothing_and_the_page_goes_on(
     recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Each method with junk of each kind, each variable of the state, each trigger, and bytes that are no messages."""
+    """Send junk to each method, state variable and trigger, and bytes that are not messages."""
     (tmp_path / "exports").mkdir()
     build, rng = Panels(recording, tmp_path / "exports"), random.Random(7)
 
@@ -207,7 +207,7 @@ def test_junk_changes_nothing_and_the_page_goes_on(
 def test_all_that_the_page_may_set_leaves_it_alive(
     recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The outermost of what passes the gate, in every variable, slider, call, mouse and size."""
+    """Send the extreme values that the filter allows, to every variable, trigger, mouse call and picture size."""
     build = Panels(recording, tmp_path)
 
     async def attack(url: str) -> None:
@@ -241,7 +241,7 @@ def test_all_that_the_page_may_set_leaves_it_alive(
             for _ in range(7):  # plays and stops at once
                 await page.call("trame.trigger", "key", [" "], {})
             await page.call("trame.trigger", "key", [" "], {})
-            await until_async(lambda: not build.panels[0].playing.runs)
+            await until_async(lambda: not build.panels[0].playback.runs)
             for name, value in first.items():
                 if name in SETTABLE and SETTABLE[name](value):
                     await page.call("trame.state.update", [{"key": name, "value": value}])
@@ -256,7 +256,7 @@ def test_all_that_the_page_may_set_leaves_it_alive(
 
 
 def check_values(state: dict[str, Any], name: str) -> list[Any]:
-    """Values about the first one."""
+    """Return values to try for a state variable, its current value included."""
     value = state[name]
     return [value, 1e12, -1e12, [65536, 0], [0, 0], 0.01, "OFF", "circle", "residual", "time", "x-θ", "a" * 200]
 
@@ -271,7 +271,7 @@ def test_numbers_that_are_none_do_not_pass() -> None:
 
 
 def upgraded(url: str) -> sockets.socket:
-    """A raw WebSocket."""
+    """Open a WebSocket as a raw TCP socket."""
     parts = urlsplit(url)
     raw = sockets.create_connection((parts.hostname, parts.port), timeout=WAIT_S)
     key = base64.b64encode(os.urandom(16)).decode()
@@ -288,7 +288,7 @@ def upgraded(url: str) -> sockets.socket:
 
 
 def closing_code(raw: sockets.socket) -> int:
-    """Reads frames up to the one that closes."""
+    """Read WebSocket frames until the closing one, and return its code."""
     with raw, raw.makefile("rb") as stream:
         while True:
             first, second = stream.read(2)
@@ -301,7 +301,7 @@ def closing_code(raw: sockets.socket) -> int:
 
 
 def test_a_large_message_is_refused_before_it_has_come() -> None:
-    """Its first bytes say how long it is; no more of it is sent, and no more is waited for."""
+    """The test sends only the header with the length; the server must not wait for the rest."""
     with served(Counters()) as (url, _):
         raw = upgraded(url)
         raw.sendall(bytes([0x82, 0x80 | 127]) + struct.pack(">Q", MOST_BYTES + 1) + b"mask")
@@ -339,7 +339,7 @@ def test_bodies_are_refused_before_they_have_come() -> None:
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "192.0.2.7", "0.0.0.0", "a b", ""])
 def test_other_names_are_not_served(host: str) -> None:
-    """A page of another site whose name was made to lead here has its own name in Host."""
+    """A foreign page whose name resolves to this machine (DNS rebinding) sends its own name in ``Host``."""
     build = Counters()
     with served(build) as (url, _):
         parts = urlsplit(url)
@@ -357,7 +357,7 @@ def test_other_names_are_not_served(host: str) -> None:
 
 @pytest.mark.parametrize("name", ["localhost", "LOCALHOST", "127.0.0.1", "[::1]"])
 def test_its_own_names_are_served(name: str) -> None:
-    """Also with another port, which a tunnel has."""
+    """Each name is also accepted with another port, as through an SSH tunnel."""
     with served(Counters()) as (url, _):
         parts = urlsplit(url)
         for port in (parts.port, 4321):
@@ -421,7 +421,7 @@ def test_others_can_reach_it_and_that_is_said(host: str) -> None:
     text = warning(host)
     assert text is not None
     assert host in text
-    assert "everybody in the network" in text
+    assert "everybody on the network" in text
     assert not is_local(host)
 
 
@@ -432,7 +432,11 @@ def test_this_machine_alone_needs_no_warning(host: str) -> None:
 
 @pytest.mark.parametrize(
     ("host", "says"),
-    [("192.0.2.1", "no address of this machine"), ("no.such.host.invalid", "no known name"), ("  ", "host is empty")],
+    [
+        ("192.0.2.1", "not an address of this machine"),
+        ("no.such.host.invalid", "unknown name"),
+        ("  ", "host is empty"),
+    ],
 )
 def test_a_host_that_is_not_here_is_one_error(host: str, says: str) -> None:
     with pytest.raises(AmiwarpError, match=says) as error:
@@ -449,17 +453,17 @@ def test_an_occupied_port_is_one_error() -> None:
 
 
 def test_names_of_a_host_that_others_reach() -> None:
-    names = Names("0.0.0.0")
+    names = HostNames("0.0.0.0")
     assert sockets.gethostname().lower() in names.known
     assert "0.0.0.0" not in names.known
-    assert sockets.gethostname().lower() not in Names("127.0.0.1").known - {"localhost"}
+    assert sockets.gethostname().lower() not in HostNames("127.0.0.1").known - {"localhost"}
 
 
 # slow and absent pages, many of them
 
 
 class Unread:
-    """A WebSocket whose other end takes three messages and no more, until it is gone."""
+    """WebSocket whose other end takes three messages, then nothing until it disconnects."""
 
     def __init__(self) -> None:
         self.taken, self.gone = 0, asyncio.Event()
@@ -474,7 +478,7 @@ class Unread:
 def test_for_a_page_that_takes_nothing_nothing_more_is_drawn(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Everything that makes pictures goes on: knobs, the mouse that turns, a recording that is played."""
+    """Meanwhile everything that causes pictures goes on: parameters, rotation by the mouse, playback."""
     build = Panels(recording, tmp_path)
 
     async def work() -> None:
@@ -488,7 +492,7 @@ def test_for_a_page_that_takes_nothing_nothing_more_is_drawn(
                 (("wslink.hello", {"secret": "wslink-secret"}), ("viewport.image.push.observer.add", view))
             ):
                 message = packed({"id": "rpc:1" if number else "system:0", "method": method, "args": args})
-                assert Gate(server, SETTABLE).passes(message)
+                assert MessageFilter(server, SETTABLE).passes(message)
                 await connection.send(True, aiohttp.WSMessage(aiohttp.WSMsgType.BINARY, message, None))
             panel.play()
             application.InvokeEvent("StartInteractionEvent")
@@ -496,11 +500,11 @@ def test_for_a_page_that_takes_nothing_nothing_more_is_drawn(
             drawn.clear()
             for number in range(200):
                 panel.state.dark = bool(number % 2)
-                panel.ask("look")
+                panel.request("look")
                 application.InvokeEvent("UpdateEvent")
                 await asyncio.sleep(0.01)
                 waiting.append(monitor.pending)
-            assert len(drawn) <= 1  # what had begun
+            assert len(drawn) <= 1  # a drawing that had already started
             assert max(waiting) < 3 * MOST_IN_FLIGHT
             unread.gone.set()
 
@@ -530,7 +534,7 @@ def test_tabs_are_bounded_and_the_next_one_is_told(monkeypatch: pytest.MonkeyPat
 
 
 def native_threads() -> int:
-    """Threads that Python knows nothing of: VTK's and the renderer's."""
+    """Return the number of threads that Python does not manage: those of VTK and of the renderer."""
     tasks = Path("/proc/self/task")
     return len(list(tasks.iterdir())) - threading.active_count() if tasks.is_dir() else 0
 

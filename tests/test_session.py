@@ -30,9 +30,10 @@ from amiwarp.live.stream import sources
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
 from amiwarp.live.stream.opening import open_source
-from amiwarp.live.stream.packets import Packet, packet
+from amiwarp.live.stream.packets import Packet, make_packet
 from amiwarp.live.stream.policy import Policy
-from amiwarp.live.stream.session import Session, Status
+from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.status import SessionStatus
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
@@ -64,7 +65,7 @@ def points(n: int, seconds: float, seed: int = 0) -> Recording:
 class Ran:
     """What a session left."""
 
-    status: Status
+    status: SessionStatus
     raw: Recording
     out: Events
     guessed: np.ndarray
@@ -79,7 +80,7 @@ def world() -> Callable[[], int]:
 
 def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran:
     """The recording played by an emulated rig through a session, which writes both files."""
-    from amiwarp.live.link.emulator import Controller, Fault
+    from amiwarp.live.link.emulator import Controller, EmulatedFault
     from amiwarp.live.link.link import Link
     from amiwarp.live.link.rotors import Played
     from amiwarp.live.link.terminal import PseudoTerminal
@@ -88,7 +89,7 @@ def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran
     rotor = Played(recording.encoder)
     controller = Controller(
         rotor, counts_per_turn=COUNTS, drift_ppm=80.0, clock_start=2**32 - 2_000_000,
-        faults=[Fault.parse(fault) for fault in faults],
+        faults=[EmulatedFault.parse(fault) for fault in faults],
     )  # fmt: skip
     begun, messages = threading.Event(), []
     world = World(begun.is_set)
@@ -160,7 +161,7 @@ def test_live_is_offline_compensation_of_what_was_recorded(tmp_path: Path) -> No
 @TURNING
 @pytest.mark.parametrize(
     ("fault", "said"),
-    [("unplug@1.5+0.3", "back"), ("reset@1.6", "anew"), ("clock-jump@1.6", "anew"), ("slip@1.6", "slip"),
+    [("unplug@1.5+0.3", "back"), ("reset@1.6", "restart"), ("clock-jump@1.6", "restart"), ("slip@1.6", "slip"),
      ("crc@1.5+0.3", "frames"), ("drop@1.5+0.3", "frames"), ("stall@1.5+0.2", "slip"),
      ("missed-index@1.4+0.4", "index")],
 )  # fmt: skip
@@ -185,13 +186,13 @@ def test_a_fault_loses_nothing_and_is_told(tmp_path: Path, fault: str, said: str
 
 def test_an_emulated_camera_sees_the_pulses_of_a_controller_that_was_reset(tmp_path: Path) -> None:
     """Which counts them from 0 again."""
-    from amiwarp.live.link.emulator import Controller, Fault
+    from amiwarp.live.link.emulator import Controller, EmulatedFault
     from amiwarp.live.link.rotors import Played
 
     recording, clock = points(1000, 0.1), World()
     assert recording.encoder is not None
     rotor = Played(recording.encoder)
-    controller = Controller(rotor, faults=[Fault.parse("reset@0.55")])
+    controller = Controller(rotor, faults=[EmulatedFault.parse("reset@0.55")])
     got: list[int] = []
     with EmulatedCamera(recording, rotor, controller, f"unix:{tmp_path / 'camera'}", clock.now) as camera:
         source = open_source(camera.address)
@@ -250,12 +251,12 @@ def packets_of(recording: Recording, size: int = 500) -> list[Packet]:
     out = []
     for events in recording.events.blocks(count=size):
         until = int(np.searchsorted(encoder.t, events.t[-1])) + 2
-        out.append(packet(0, events, encoder_t=encoder.t[sent:until], encoder_angle=encoder.angle[sent:until]))
+        out.append(make_packet(0, events, encoder_t=encoder.t[sent:until], encoder_angle=encoder.angle[sent:until]))
         sent = until
     return out
 
 
-def through(source: Made, **given: object) -> tuple[list[Compensated], Status]:
+def through(source: Made, **given: object) -> tuple[list[Compensated], SessionStatus]:
     out: list[Compensated] = []
     session = Session(source, KNOWN, sinks=(out.append,), **given)  # type: ignore[arg-type]
     status = session.run(threading.Event(), lambda _: None)
@@ -269,8 +270,8 @@ def test_packets_out_of_order_come_out_sorted_and_once() -> None:
     rng = np.random.default_rng(0)
     order = np.argsort(np.arange(len(given)) + rng.uniform(0, 1.6, len(given)))  # late by a packet or two
     shuffled = [given[k] for k in order]
-    samples = [packet(0, encoder_t=p.encoder_t, encoder_angle=p.encoder_angle) for p in given]
-    out, status = through(Made(samples + [packet(0, p.events) for p in shuffled]))
+    samples = [make_packet(0, encoder_t=p.encoder_t, encoder_angle=p.encoder_angle) for p in given]
+    out, status = through(Made(samples + [make_packet(0, p.events) for p in shuffled]))
     found = Events.concatenate([p.events for p in out])
     assert (found.t[1:] >= found.t[:-1]).all()
     assert len(found) == 20_000
@@ -353,7 +354,9 @@ class Whole(Made):
 def test_samples_that_wait_in_the_queue_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each packet's come after it; a sink was slow for longer than one waits for the encoder."""
     given = packets_of(points(100_000, 0.5))
-    apart = [packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)]
+    apart = [
+        make_packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)
+    ]
     now_us = 0
     out: list[Compensated] = []
     monkeypatch.setattr(session_module, "monotonic_us", lambda: now_us)
@@ -424,7 +427,7 @@ def test_a_slow_sink_makes_a_queue_drop_and_not_grow() -> None:
 
 def test_a_status_tells_rate_latency_coverage_and_sharpness(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a stream whose packets each come when their time is over, and are compensated 3 ms later."""
-    seen: list[Status] = []
+    seen: list[SessionStatus] = []
     now_us = 0
     monkeypatch.setattr(session_module, "monotonic_us", lambda: now_us)
     given = packets_of(points(400_000, 3.0))

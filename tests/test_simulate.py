@@ -22,7 +22,7 @@ from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place, read_picture
+from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
 from amiwarp.simulation.scenery import step_us
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
 
@@ -432,7 +432,7 @@ def test_luminance_is_linear_light() -> None:
 
 
 def test_a_picture_is_cut_to_the_view() -> None:
-    placed = place((200, 100), (-0.5, -0.5, 0.5, 0.5), 64.0)
+    placed = place_picture((200, 100), (-0.5, -0.5, 0.5, 0.5), 64.0)
     assert placed == Placement(64, 64, (50.0, 0.0, 150.0, 100.0), -0.5, -0.5, (64.0, 64.0))
     light = np.tile(np.linspace(0.0, 1.0, 200, dtype=np.float32), (100, 1))
     np.testing.assert_allclose(np.exp(log_map(light, placed, 0.0)[32, [1, 62]]) - DARK, [0.26, 0.74], rtol=0, atol=0.01)

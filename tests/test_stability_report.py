@@ -34,7 +34,7 @@ from amiwarp.studies.stability import (
 )
 from amiwarp.studies.stability import Result as Found
 from amiwarp.studies.stability.figures import OVERVIEW, _overview, _page, draw
-from amiwarp.studies.stability.report import Rate, most_said, words_of
+from amiwarp.studies.stability.points import Rate, most_common_message, value_label
 
 METHOD = {m.name: m for m in METHODS}
 NOISE = Axis("background noise", "noise", (0.0, 0.25, 0.5, 0.8), "of all events")
@@ -98,11 +98,11 @@ def test_spots_count_what_the_cells_hold(atlas: Atlas) -> None:
     assert (atlas.cells, atlas.methods) == (6 * 8, ["default", "paper", "circle"])
     spot = atlas.of(NOISE)["default", 0.8]
     assert [spot.rate(o).count for o in Outcome] == [0, 8, 0]
-    assert (spot.errors, spot.quantiles, spot.said(Outcome.REFUSAL)) == ([], {}, "too hard by 1.00")
+    assert (spot.errors, spot.quantiles, spot.common_message(Outcome.REFUSAL)) == ([], {}, "too hard by 1.00")
     silent = atlas.of(SCENE)["paper", "one edge direction"]
     assert silent.rate(Outcome.SILENT) == Rate(8, 8)
     assert silent.quantiles[50] == pytest.approx(1.5, abs=1e-12)
-    assert silent.said(Outcome.REFUSAL, Outcome.SILENT) == ""
+    assert silent.common_message(Outcome.REFUSAL, Outcome.SILENT) == ""
     assert [s.value for s in atlas.failing(Outcome.REFUSAL)] == [0.8, "blank wall"]
 
 
@@ -145,15 +145,15 @@ def test_worse_than_the_paper_is_told_by_the_same_recordings() -> None:
 
 def test_messages_that_differ_in_numbers_are_one() -> None:
     said = ["simulation: 1000 events are too few", "no edges", "simulation: 1,200 events are too few", ""]
-    assert most_said(said) == "1000 events are too few"
-    assert most_said(["", ""]) == ""
+    assert most_common_message(said) == "1000 events are too few"
+    assert most_common_message(["", ""]) == ""
 
 
 def test_values_read_as_people_write_them() -> None:
-    assert words_of(Axis("events", "window_events", (0,)), 0) == "all"
-    assert words_of(Axis("events", "window_events", (0,)), 300_000) == "300,000"
-    assert words_of(Axis("hot pixels", "hot", (), "of all pixels"), 0.0002) == "0.02 %"
-    assert words_of(Axis("direction", "backwards", ()), True) == "wrong"
+    assert value_label(Axis("events", "window_events", (0,)), 0) == "all"
+    assert value_label(Axis("events", "window_events", (0,)), 300_000) == "300,000"
+    assert value_label(Axis("hot pixels", "hot", (), "of all pixels"), 0.0002) == "0.02 %"
+    assert value_label(Axis("direction", "backwards", ()), True) == "wrong"
 
 
 def test_files_hold_every_spot(atlas: Atlas, tmp_path: Path) -> None:
@@ -254,8 +254,8 @@ def test_command_runs_goes_on_and_redraws(tiny: Axis, tmp_path: Path) -> None:
 
 def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:
     words = ("--out", tmp_path, "--device", "cpu")
-    assert "no axis 'colour' is here; choose among width" in fails("--axes", "colour", *words)
-    assert "no method 'magic' is here; choose among default, paper" in fails("--methods", "magic", *words)
+    assert "unknown axis 'colour'; choose among width" in fails("--axes", "colour", *words)
+    assert "unknown method 'magic'; choose among default, paper" in fails("--methods", "magic", *words)
     assert "no cells of this version" in fails("--redraw", *words)
     (tmp_path / "file").write_text("")
     assert "cannot be made a folder" in fails("--out", tmp_path / "file" / "deeper", "--device", "cpu")

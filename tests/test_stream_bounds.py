@@ -20,25 +20,26 @@ from test_session import KNOWN, MODEL, Made, points, world
 
 from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
-from amiwarp.live.link.emulator import MOST_OUT, Controller, Fault
-from amiwarp.live.link.news import News
-from amiwarp.live.link.rotors import MOST_PIECES, Motor, Played
+from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, EmulatedFault
+from amiwarp.live.link.rotors import MOST_SEGMENTS, Motor, Played
 from amiwarp.live.link.terminal import RETRY_S, PseudoTerminal
+from amiwarp.live.link.updates import LinkUpdate
 from amiwarp.live.stream import phase_check as watch_module
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream import speed_control as speed_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import EmulatedCamera
-from amiwarp.live.stream.packets import Packet, encode_hello, packet
+from amiwarp.live.stream.packets import Packet, encode_hello, make_packet
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.sockets import MOST_CLIENTS, PIECE, REST_S, PipeSink, SocketSink
+from amiwarp.live.stream.sockets import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
 from amiwarp.live.stream.speed_control import SpeedKeeper
 
 MOST = 1 << 20
@@ -50,17 +51,17 @@ LONG_S = 120.0
 def samples(k: int, n: int = 500) -> Packet:
     """The k-th packet of encoder samples alone."""
     t = np.arange(k * n, (k + 1) * n, dtype=np.int64)
-    return packet(0, encoder_t=t, encoder_angle=t * 1e-5)
+    return make_packet(0, encoder_t=t, encoder_angle=t * 1e-5)
 
 
 def pulses(k: int, n: int = 500) -> Packet:
     """The k-th packet of triggers alone."""
-    return packet(0, triggers=np.arange(k * n, (k + 1) * n, dtype=np.int64))
+    return make_packet(0, triggers=np.arange(k * n, (k + 1) * n, dtype=np.int64))
 
 
 def single(k: int) -> Packet:
     """The k-th packet of one event."""
-    return packet(0, events(1, k))
+    return make_packet(0, events(1, k))
 
 
 def events(n: int, t: int) -> Events:
@@ -122,7 +123,7 @@ def test_dropped_events_leave_their_samples_in_order() -> None:
     queue = PacketQueue(10, Policy.DROP_OLDEST)
     for k in range(100):
         queue.put(samples(k, 3))
-        queue.put(packet(0, events(10, k), triggers=np.array([k])))
+        queue.put(make_packet(0, events(10, k), triggers=np.array([k])))
     assert queue.dropped == 990
     queue.close()
     got: list[Packet] = []
@@ -166,7 +167,7 @@ class Flood(Made):
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions whose queues are small."""
-    monkeypatch.setattr("amiwarp.live.stream.session.BackgroundWorker", partial(BackgroundWorker, MOST))
+    monkeypatch.setattr("amiwarp.live.stream.consumers.BackgroundWorker", partial(BackgroundWorker, MOST))
     monkeypatch.setattr("amiwarp.live.stream.session.PacketQueue", partial(PacketQueue, most_bytes=MOST))
 
 
@@ -181,7 +182,7 @@ def test_a_session_bounds_encoder_samples_without_events() -> None:
     for _ in range(50):  # it stays there
         time.sleep(0.002)
         assert session._queue.held_bytes <= MOST
-        assert session._raw[0][1].held_bytes <= MOST
+        assert session._consumers.raw[0].worker.held_bytes <= MOST
     assert source.given * samples(0).held_bytes < 2.1 * MOST
     taker.go.set()
     thread.join(LONG_S)
@@ -285,16 +286,16 @@ def test_a_window_that_never_ends_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A controller that sends without end while the camera sends nothing."""
-    monkeypatch.setattr("amiwarp.live.stream.session.MOST_HELD", 1000)
+    monkeypatch.setattr("amiwarp.live.stream.encoder_feed.MOST_WAITING", 1000)
     said: list[str] = []
 
     class Sending:
         polls = 0
 
-        def poll(self) -> News:
+        def poll(self) -> LinkUpdate:
             self.polls += 1
             t = np.arange(100 * self.polls, 100 * (self.polls + 1), dtype=np.int64)
-            return News(t, t * 1e-5, t[:1], (), False, ())
+            return LinkUpdate(t_us=t, angle=t * 1e-5, index_t_us=t[:1], sync=(), restarted=False, messages=())
 
         def clock(self) -> None:
             return None
@@ -302,14 +303,15 @@ def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest
     class Silent(Flood):
         def packets(self) -> Iterator[Packet]:
             while controller.polls < 50:
-                yield packet(0)
+                yield make_packet(0)
 
     controller = Sending()
     session = Session(Silent(samples, 0), link=controller, say=said.append)  # type: ignore[arg-type]
     session.run(threading.Event(), lambda _: None)
     assert controller.polls >= 50
-    assert session._held_samples == sum(len(news.t_us) + len(news.index_t_us) for news in session._held)
-    assert 900 <= session._held_samples <= 1000
+    feed = session._feed
+    assert feed._waiting_samples == sum(len(update.t_us) + len(update.index_t_us) for update in feed._waiting)
+    assert 900 <= feed._waiting_samples <= 1000
     assert [message for message in said if "clock is not known" in message] == said
     assert len(said) == 1
 
@@ -319,13 +321,13 @@ def test_a_motor_remembers_a_bounded_past() -> None:
     motor = Motor(720.0)
     for k in range(5000):
         motor.set_speed(700.0 + k % 40, 500.0, 1000 * k)
-    assert len(motor._pieces) <= MOST_PIECES + 2
+    assert len(motor._segments) <= MOST_SEGMENTS + 2
     assert motor.target_rpm(5_000_000) == 700.0 + 4999 % 40
 
 
 def test_an_emulator_that_was_suspended_sends_a_bounded_rest() -> None:
     controller = Controller(Motor(720.0))
-    assert len(controller.advance(1_000_000_000)) < MOST_OUT + 1000
+    assert len(controller.advance(1_000_000_000)) < MOST_OUT_BYTES + 1000
 
 
 def test_an_emulated_port_comes_back_after_a_lack_of_descriptors(
@@ -340,7 +342,7 @@ def test_an_emulated_port_comes_back_after_a_lack_of_descriptors(
             raise OSError(24, "Too many open files")
         return openpty()
 
-    controller = Controller(Motor(720.0), faults=[Fault.parse("unplug@0.1+0.1")])
+    controller = Controller(Motor(720.0), faults=[EmulatedFault.parse("unplug@0.1+0.1")])
     with PseudoTerminal(controller, tmp_path / "prism", now_us=World().step):
         monkeypatch.setattr(os, "openpty", exhausted)
         reached(lambda: len(failed) == 3)
@@ -375,7 +377,7 @@ def test_a_client_that_reads_nothing_is_bounded(tmp_path: Path) -> None:
         client.connect(f"{tmp_path}/s")
         for _ in range(20_000):
             sink.send(bytes(40))
-            assert sink.waiting <= most + 40 + PIECE
+            assert sink.waiting <= most + 40 + PACKET_OVERHEAD
         assert sink.clients == 1
         assert sink.lost > 1000
         sink._clients[0].waiting.clear()  # no parting
@@ -468,11 +470,11 @@ def test_a_pipe_whose_reader_takes_nothing_can_be_ended() -> None:
         stop.set()
         thread.join(LONG_S)
         assert not thread.is_alive()
-        assert "its reader takes nothing any more" in str(raised[0])
+        assert "its reader accepts no more data" in str(raised[0])
 
 
 def test_descriptors_above_a_thousand_can_be_waited_for() -> None:
-    from amiwarp.live.stream.sockets import ready
+    from amiwarp.live.stream.connections import ready
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     ours, theirs = socket.socketpair()

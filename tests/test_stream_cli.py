@@ -1,4 +1,4 @@
-"""``amiwarp live`` and ``record`` as commands: a whole rig, Ctrl-C and SIGKILL at any moment, a full disk, pipes."""
+"""Commands ``live`` and ``record``: a whole rig, Ctrl-C and SIGKILL at any moment, a full disk, and pipes."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
+from amiwarp.live.stream.connections import close_listener, listen
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
-from amiwarp.live.stream.sockets import listen, shut
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -42,14 +42,14 @@ SCRIPT = (
     "from amiwarp.__main__ import main; from amiwarp.cli import app; run = app.app; "
     "app.app = lambda **given: (print('up', file=sys.stderr, flush=True), run(**given)); main()"
 )
-"""A shell's job in the background ignores Ctrl-C, and so would its children. Says when the command line is at work."""
+"""Code of a child process that restores Ctrl-C (background jobs of a shell ignore it) and prints "up" once it runs."""
 SENT = 400_000
 HELLO = encode_hello(64, 48, CAMERA, PRISM)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of four seconds, one without encoder, and a calibration."""
+    """Folder with a recording of four seconds, a recording without encoder, and a calibration."""
     path, rng = tmp_path_factory.mktemp("stream"), np.random.default_rng(0)
     t = np.sort(rng.integers(0, 4_000_000, SENT))
     x, y = rng.integers(0, 64, SENT), rng.integers(0, 48, SENT)
@@ -62,8 +62,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.PARTING_S = 120.0; "
-"""Before a command that serves: it waits for whoever is slow at the end."""
+PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.DRAIN_S = 120.0; "
+"""Code placed before a command that serves packets: at the end it waits longer for slow receivers."""
 
 
 def start(args: Sequence[str | Path], *, before: str = "", **given: object) -> subprocess.Popen[str]:
@@ -88,7 +88,7 @@ def reached(done: Callable[[], object], process: subprocess.Popen[str] | None = 
 
 
 def flushed(part: Path) -> int:
-    """Return the number of events in a recording that is being written; 0 while it cannot be read."""
+    """Return the number of events in a recording that is being written; 0 if it cannot be read yet."""
     copy = part.with_name("copy.h5")
     try:
         shutil.copyfile(part, copy)
@@ -118,7 +118,7 @@ def test_a_replayed_file_is_compensated_recorded_and_reported(folder: Path, tmp_
 
 @pytest.mark.parametrize("when", ["up", "opened", "flowing"])
 def test_interrupted_recordings_are_whole_files(folder: Path, tmp_path: Path, when: str) -> None:
-    """Ctrl-C while it starts leaves nothing; later, all that had come."""
+    """Ctrl-C during the start leaves no file; later it leaves a file with all events received so far."""
     out = tmp_path / "r.h5"
     with start(["record", folder / "recording.h5", out, "--json"]) as process:
         try:
@@ -143,7 +143,7 @@ def test_interrupted_recordings_are_whole_files(folder: Path, tmp_path: Path, wh
 
 
 def test_a_killed_recording_holds_what_came_before_its_last_moment(folder: Path, tmp_path: Path) -> None:
-    """All that came is soon in the file, also while nothing more comes; SIGKILL takes what came after it at most."""
+    """Received events are written soon, even if no more arrive. SIGKILL loses only the most recent ones."""
     out, part = tmp_path / "r.h5", tmp_path / "r.part.h5"
     recording = open_recording(folder / "recording.h5")
     assert recording.encoder is not None
@@ -163,7 +163,7 @@ def test_a_killed_recording_holds_what_came_before_its_last_moment(folder: Path,
         finally:
             process.kill()
             process.communicate()
-            shut(server)
+            close_listener(server)
     assert not out.exists()
     found = times(part)
     assert len(found) >= 200_000
@@ -174,7 +174,7 @@ def test_a_killed_recording_holds_what_came_before_its_last_moment(folder: Path,
 
 
 def test_a_full_disk_ends_it_and_keeps_what_came(folder: Path, tmp_path: Path) -> None:
-    """The limit on a file's size stands for the disk's end."""
+    """A limit on the file size simulates the full disk."""
     out, most = tmp_path / "r.h5", 4_600_000
 
     def limit() -> None:
@@ -194,7 +194,7 @@ def test_a_full_disk_ends_it_and_keeps_what_came(folder: Path, tmp_path: Path) -
 
 
 def relayed(server: socket.socket, camera: Path, go: threading.Event) -> None:
-    """Be the camera to who connects; the emulated one, which begins when somebody comes, is called at ``go``."""
+    """Relay the emulated camera to one client. Connect to the camera, which then starts to play, once ``go`` is set."""
     with server.accept()[0] as client, socket.socket(socket.AF_UNIX) as source:
         client.sendall(HELLO)
         assert go.wait(LONG_S)
@@ -206,7 +206,7 @@ def relayed(server: socket.socket, camera: Path, go: threading.Event) -> None:
 
 
 def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
-    """The emulator with its camera, ``live`` at its port, what comes in handed on to a ``record``."""
+    """Run ``emulate`` with its camera, ``live`` on its port, and ``record`` on the packets that ``live`` passes on."""
     rig = ["emulate", "--link", tmp_path / "prism", "--recording", folder / "recording.h5", "--counts-per-turn", 65536]
     handed, recording = f"unix:{tmp_path / 'handed'}", threading.Event()
     server, served = listen(f"unix:{tmp_path / 'relay'}")
@@ -222,7 +222,7 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
             with start([*args, *files, "--json"], before=PATIENT) as live:
                 reached((tmp_path / "handed").exists, live)
                 with start(["record", handed, tmp_path / "h.h5", "--json"]) as record:
-                    reached((tmp_path / "h.part.h5").exists, record)  # it was greeted
+                    reached((tmp_path / "h.part.h5").exists, record)  # it has connected
                     recording.set()
                     said, error = live.communicate(timeout=LONG_S)
                     recorded, other = record.communicate(timeout=LONG_S)
@@ -233,11 +233,11 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
         finally:
             emulator.kill()
             relay.join(LONG_S)
-            shut(server)
+            close_listener(server)
     data = json.loads(said)
     assert data["events"] == data["compensated"] == SENT
     assert data["dropped"] == data["late"] == 0
-    # on a busy machine samples come late: those angles are marked, and all others are those of offline compensation
+    # on a busy machine samples arrive late: those angles are marked, all others equal those of offline compensation
     with h5py.File(tmp_path / "o.h5") as file:
         marked = file["events/extrapolated"][:].astype(bool)
     assert np.count_nonzero(marked) == data["extrapolated"] + data["without_angle"]
@@ -246,14 +246,14 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(live_events.t, offline.t)
     apart = np.hypot(live_events.x - offline.x, live_events.y - offline.y)
     assert (apart[~marked] <= 1e-3).all()
-    # who was connected before the camera began has got all
+    # the client that connected before the camera started has received all events
     assert json.loads(recorded)["events"] == SENT
     np.testing.assert_array_equal(times(tmp_path / "h.h5"), times(folder / "recording.h5"))
     assert not [p for p in tmp_path.iterdir() if p.name in ("prism", "camera", "handed")]
 
 
 def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From rest; events at random are more than the limit allows, so that it is slowed down."""
+    """The motor starts from rest. Random events exceed the allowed event rate, so the speed is reduced."""
     from amiwarp.live.link.emulator import Controller
     from amiwarp.live.link.rotors import Motor
     from amiwarp.live.link.terminal import PseudoTerminal
@@ -271,7 +271,7 @@ def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monke
 
 
 def test_packets_go_through_pipes(folder: Path, tmp_path: Path) -> None:
-    """``live --raw-to -`` into ``record -``."""
+    """Pipe ``live --raw-to -`` into ``record -``."""
     args = ["live", folder / "recording.h5", "--fast", "--calibration", folder / "c.json", "--raw-to", "-"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     words = [sys.executable, "-c", "from amiwarp.__main__ import main; main()"]
@@ -291,7 +291,7 @@ def test_packets_go_through_pipes(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (["live", "still.h5", "--calibration", "c.json"], "still.h5: gives no encoder samples"),
+        (["live", "still.h5", "--calibration", "c.json"], "still.h5: contains no encoder samples"),
         (["record", "still.h5", "o.h5"], "give the controller's --port"),
         (["live", "recording.h5", "--calibration", "c.json", "--adaptive"], "give the controller's --port"),
         (["live", "nowhere.h5", "--calibration", "c.json"], "nowhere.h5"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from amiwarp.live.link.clocks import from_round_trips
+from amiwarp.live.link.clocks import fit_to_round_trips
 from amiwarp.live.stream.clocking import CameraClock
 
 OFFSET, DRIFT = 1_700_000_000_000_000, 40e-6
@@ -114,7 +114,7 @@ def test_without_pulses_arrivals_tell_within_what_they_say() -> None:
     """The host's clock is 7 s ahead of the controller's; packets need 2 ms and up to 3 more."""
     rng, clock = np.random.default_rng(0), CameraClock()
     sent = np.arange(20) * 50_000 + 7_000_000
-    host = from_round_trips(sent, sent - 7_000_000 + 150, sent + 300)
+    host = fit_to_round_trips(sent, sent - 7_000_000 + 150, sent + 300)
     for t in range(0, 1_000_000, 1000):
         clock.packet(camera_time(t), t + 7_000_000 + 2000 + int(rng.integers(0, 3000)))
     found = clock.clock(host)

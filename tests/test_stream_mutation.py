@@ -9,10 +9,10 @@ import pytest
 from mutation_frames import CAMERA, mutated_serial, mutated_stream, packed, read_serial, read_stream
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.following import MOST_PARTS, Follower
-from amiwarp.live.link.protocol import LONGEST, Samples, Status, Sync, encode
-from amiwarp.live.link.protocol import Decoder as SerialDecoder
-from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Decoder, Hello
+from amiwarp.live.link.following import Follower
+from amiwarp.live.link.protocol import LONGEST, ControllerStatus, FrameDecoder, Samples, Sync, encode
+from amiwarp.live.link.updates import MOST_UPDATES
+from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Hello, PacketDecoder
 
 SEEDS = 300
 
@@ -37,7 +37,7 @@ def test_any_bytes_of_a_serial_port_are_taken() -> None:
 
 
 def hello(text: str) -> Hello:
-    (message,) = Decoder("tcp:there").feed(packed(HELLO, 0, text.encode()))
+    (message,) = PacketDecoder("tcp:there").feed(packed(HELLO, 0, text.encode()))
     assert isinstance(message, Hello)
     return message
 
@@ -105,7 +105,7 @@ def test_a_length_is_bounded_before_anything_is_held(kind: int, length: int) -> 
     tracemalloc.start()
     try:
         with pytest.raises(AmiwarpError, match="expected up to"):
-            list(Decoder("it").feed(HEADER.pack(MAGIC, 1, kind, 0, (1 << 32) - 1, length, 0)))
+            list(PacketDecoder("it").feed(HEADER.pack(MAGIC, 1, kind, 0, (1 << 32) - 1, length, 0)))
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
@@ -113,7 +113,7 @@ def test_a_length_is_bounded_before_anything_is_held(kind: int, length: int) -> 
 
 def test_a_serial_decoder_holds_one_frame() -> None:
     for byte in (b"\1", b"5", b"\n"):
-        decoder = SerialDecoder()
+        decoder = FrameDecoder()
         for _ in range(200):
             assert decoder.feed(byte * 997) == []
             assert len(decoder._held) <= LONGEST
@@ -125,17 +125,18 @@ def test_a_controller_that_always_begins_anew_is_bounded() -> None:
     sequence = 0
     for k in range(1000):
         messages = [
-            Status(k, 1, 0, 720.0, 720.0, 4096), Samples((k + 10,), (0,)), Sync(k + 11, k), Samples((k + 20,), (9000,)),
+            ControllerStatus(k, 1, 0, 720.0, 720.0, 4096), Samples((k + 10,), (0,)), Sync(k + 11, k),
+            Samples((k + 20,), (9000,)),
         ]  # fmt: skip
         for message in messages:
             follower.feed(encode(message, sequence), 1000 * k)
             sequence += 1
         sequence = (sequence - 40_000) & 0xFFFF  # backwards: it was reset
-    assert len(follower._parts) <= MOST_PARTS
+    assert len(follower.updates) <= MOST_UPDATES
     taken, said = 0, []
-    for _ in range(MOST_PARTS):
+    for _ in range(MOST_UPDATES):
         news = follower.take()
         taken += len(news.t_us)
         said += news.messages
-    assert 0 < taken <= 2 * MOST_PARTS
+    assert 0 < taken <= 2 * MOST_UPDATES
     assert any("samples were dropped, the oldest" in message for message in said)

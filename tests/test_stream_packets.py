@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.live.stream.event_sorter import EventSorter
 from amiwarp.live.stream.packets import (
     ENCODER,
     HEADER,
     HELLO,
     MAGIC,
     MOST,
-    Angles,
     Compensated,
-    Decoder,
+    EncoderSamples,
     End,
     Hello,
-    Sorter,
+    PacketDecoder,
     Triggers,
     encode_compensated,
     encode_encoder,
@@ -59,7 +59,7 @@ def stream() -> tuple[list[object], bytes]:
     flags = (np.arange(500) % 8).astype(np.uint8)
     t, angle = np.arange(100) * 1000, np.linspace(-1.0, 9.0, 100)
     hello = Hello(640, 480, CAMERAS[2], Prism(0.04, 1.5, FlatSide.CAMERA))
-    messages = [hello, events, Compensated(moved, flags), Triggers(t), Angles(t, angle), End()]
+    messages = [hello, events, Compensated(moved, flags), Triggers(t), EncoderSamples(t, angle), End()]
     parts = [
         encode_hello(640, 480, hello.camera, hello.prism),
         encode_events(events),
@@ -75,7 +75,7 @@ def assert_same(got: object, expected: object) -> None:
     assert type(got) is type(expected)
     if isinstance(expected, np.ndarray):
         np.testing.assert_array_equal(got, expected, strict=True)
-    elif isinstance(expected, (Events, Compensated, Triggers, Angles)):
+    elif isinstance(expected, (Events, Compensated, Triggers, EncoderSamples)):
         for name in type(expected).__slots__:
             assert_same(getattr(got, name), getattr(expected, name))
     else:
@@ -86,11 +86,11 @@ def assert_same(got: object, expected: object) -> None:
 @given(cuts=st.lists(st.integers(0, 25_000), max_size=40))
 def test_all_kinds_come_back_from_pieces_of_any_size(cuts):
     messages, data = stream()
-    decoder, got = Decoder("here"), []
+    decoder, got = PacketDecoder("here"), []
     edges = [0, *sorted(cuts), len(data)]
     for start, stop in itertools.pairwise(edges):
         got += decoder.feed(data[start:stop])
-    assert decoder.within is None
+    assert decoder.unfinished_at is None
     for one, other in zip(got, messages, strict=True):
         assert_same(one, other)
 
@@ -98,12 +98,14 @@ def test_all_kinds_come_back_from_pieces_of_any_size(cuts):
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_hello_tells_camera_and_prism(camera):
     for prism in (None, Prism(0.03)):
-        assert list(Decoder("here").feed(encode_hello(640, 480, camera, prism))) == [Hello(640, 480, camera, prism)]
+        assert list(PacketDecoder("here").feed(encode_hello(640, 480, camera, prism))) == [
+            Hello(640, 480, camera, prism)
+        ]
 
 
 def test_many_events_become_packets_of_bounded_size():
     events = make(2 * MOST + 5)
-    got = list(Decoder("here").feed(encode_events(events)))
+    got = list(PacketDecoder("here").feed(encode_events(events)))
     assert [len(part) for part in got] == [MOST, MOST, 5]
     assert_same(Events.concatenate(got), events)
     assert encode_events(Events.empty()) == b""
@@ -111,7 +113,7 @@ def test_many_events_become_packets_of_bounded_size():
 
 def test_events_are_views_of_the_packet_and_it_is_not_used_again():
     events = make(1000)
-    decoder = Decoder("here")
+    decoder = PacketDecoder("here")
     first, second = decoder.feed(encode_events(events) + encode_events(events[::-1]))
     assert first.t.base is not None
     assert_same(first, events)
@@ -127,7 +129,7 @@ def packet(kind: int, count: int, payload: bytes, *, magic: bytes = MAGIC, versi
     [
         (packet(4, 1, bytes(8), magic=b"AMIX"), "begins with b'AMIX'"),
         (packet(4, 1, bytes(8), version=2), "of version 2, not 1"),
-        (packet(4, 1, bytes(8), wrong=1), "check of its 8 bytes"),
+        (packet(4, 1, bytes(8), wrong=1), "checksum of its 8 bytes"),
         (packet(4, 2, bytes(8)), "2 rows in 8 bytes"),
         (packet(4, MOST + 1, bytes(8 * MOST + 8)), f"{MOST + 1} rows"),
         (HEADER.pack(MAGIC, 1, 99, 0, 0, 1 << 31, 0), "2147483648 bytes"),
@@ -144,7 +146,7 @@ def packet(kind: int, count: int, payload: bytes, *, magic: bytes = MAGIC, versi
 def test_a_wrong_stream_is_refused_after_all_before_it(bad, message):
     events, got = make(300), []
     with pytest.raises(AmiwarpError, match=message) as caught:  # noqa: PT012
-        for one in Decoder("tcp:here:5").feed(encode_events(events) + bad + encode_end()):
+        for one in PacketDecoder("tcp:here:5").feed(encode_events(events) + bad + encode_end()):
             got.append(one)
     assert f"tcp:here:5: packet at byte {HEADER.size + 300 * 13}: " in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -153,21 +155,21 @@ def test_a_wrong_stream_is_refused_after_all_before_it(bad, message):
 
 def test_kinds_that_are_unknown_are_passed_over():
     data = packet(77, 3, b"whatever") + packet(78, 0, b"") + encode_end()
-    assert list(Decoder("here").feed(data)) == [End()]
+    assert list(PacketDecoder("here").feed(data)) == [End()]
 
 
 def test_an_end_within_a_packet_is_told():
-    decoder = Decoder("here")
+    decoder = PacketDecoder("here")
     assert list(decoder.feed(encode_end() + encode_triggers(np.arange(5))[:-1])) == [End()]
-    assert decoder.within == HEADER.size
+    assert decoder.unfinished_at == HEADER.size
 
 
 def test_room_is_never_more_than_the_packet():
-    decoder, data = Decoder("here"), encode_encoder(np.arange(MOST), np.zeros(MOST))
-    assert len(decoder.room()) == HEADER.size
-    decoder.room()[:] = data[: HEADER.size]
-    assert decoder.filled(HEADER.size) is None
-    assert len(decoder.room()) == len(data) - HEADER.size
+    decoder, data = PacketDecoder("here"), encode_encoder(np.arange(MOST), np.zeros(MOST))
+    assert len(decoder.free_buffer()) == HEADER.size
+    decoder.free_buffer()[:] = data[: HEADER.size]
+    assert decoder.commit(HEADER.size) is None
+    assert len(decoder.free_buffer()) == len(data) - HEADER.size
     assert HEADER.unpack_from(data)[2] == ENCODER
 
 
@@ -180,8 +182,8 @@ def test_the_sender_of_the_documentation_is_understood():
     events, t, angle = make(50), np.arange(3), np.arange(3.0)
     with ours, theirs:
         names["send"](theirs, [(events.t, events.x, events.y, events.p)], [(t, angle)])
-        got = list(Decoder("here").feed(ours.recv(100_000)))
-    for one, other in zip(got, [Hello(640, 480), Angles(t, angle), events, End()], strict=True):
+        got = list(PacketDecoder("here").feed(ours.recv(100_000)))
+    for one, other in zip(got, [Hello(640, 480), EncoderSamples(t, angle), events, End()], strict=True):
         assert_same(one, other)
     (end,) = re.findall(r"`((?:[0-9A-F]{2} ){19}[0-9A-F]{2})`", text)
     assert bytes.fromhex(end) == encode_end()
@@ -194,7 +196,7 @@ def at(*times: int) -> Events:
 
 
 def test_what_is_in_order_passes_untouched():
-    sorter = Sorter()
+    sorter = EventSorter()
     for packet in (at(1, 2, 2), at(2, 5), at(), at(9)):
         assert sorter.put(packet) is packet
     assert len(sorter.flush()) == sorter.late == 0
@@ -202,13 +204,13 @@ def test_what_is_in_order_passes_untouched():
 
 def test_a_packet_is_sorted_and_equal_times_keep_their_order():
     events = Events.from_arrays([0, 1, 2, 3], [0, 0, 0, 0], [5, 3, 5, 3], [1, 0, 1, 0])
-    got = Sorter().put(events)
+    got = EventSorter().put(events)
     assert got.t.tolist() == [3, 3, 5, 5]
     assert got.x.tolist() == [1, 3, 0, 2]
 
 
 def test_late_ones_are_raised_once_and_then_waited_for():
-    sorter = Sorter()
+    sorter = EventSorter()
     assert sorter.put(at(1000, 2000)).t.tolist() == [1000, 2000]
     got = sorter.put(at(1500, 2000))  # 500 us late
     assert (len(got), sorter.late) == (0, 1)
@@ -221,7 +223,7 @@ def test_late_ones_are_raised_once_and_then_waited_for():
 
 
 def test_after_a_second_without_disorder_all_passes_at_once_again():
-    sorter = Sorter()
+    sorter = EventSorter()
     sorter.put(at(1000))
     sorter.put(at(900))
     assert sorter.put(at(1100, 10_000)).t.tolist() == [1000, 1100]
@@ -235,7 +237,7 @@ def test_after_a_second_without_disorder_all_passes_at_once_again():
     most=st.integers(1, 60),
 )
 def test_every_event_comes_out_once_in_order(times, most):
-    sorter = Sorter(most=most)
+    sorter = EventSorter(most_events=most)
     got = []
     for part in times:
         got.append(sorter.put(at(*part)))
@@ -249,7 +251,7 @@ def test_every_event_comes_out_once_in_order(times, most):
 
 def test_packets_late_by_a_little_lose_nothing_but_the_first():
     """A camera that hands every third packet over 4 ms late."""
-    rng, sorter, out = np.random.default_rng(0), Sorter(), []
+    rng, sorter, out = np.random.default_rng(0), EventSorter(), []
     packets = [at(*np.sort(rng.integers(1000 * k, 1000 * k + 1000, 50)).tolist()) for k in range(60)]
     for k in range(0, 60, 6):
         out += [sorter.put(packets[k + j]) for j in (0, 1, 3, 4, 5, 2)]
@@ -262,7 +264,7 @@ def test_packets_late_by_a_little_lose_nothing_but_the_first():
 
 def test_order_costs_one_comparison(monkeypatch):
     """Packets in order are neither sorted nor copied nor joined, however much passes."""
-    events, sorter = make(10_000), Sorter()
+    events, sorter = make(10_000), EventSorter()
 
     def never(*_args, **_options):
         raise AssertionError

@@ -24,10 +24,10 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import open_recording
+from amiwarp.live.stream.connections import close_listener, listen
 from amiwarp.live.stream.opening import open_source
 from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
 from amiwarp.live.stream.recent_events import RecentEvents, followed
-from amiwarp.live.stream.sockets import listen, shut
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -75,7 +75,7 @@ def sender(path: Path, *streams: bytes | Callable[[], bytes]) -> Iterator[str]:
     finally:
         server.shutdown(socket.SHUT_RDWR)
         thread.join(LONG_S)
-        shut(server)
+        close_listener(server)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_a_stream_that_breaks_off_is_a_failure_with_whole_files(
     assert done.exit_code == 1
     (line,) = done.stderr.splitlines()
     assert f"{address}: the stream broke off: ended " in line
-    assert f"the {N:,} events until then were kept" in line
+    assert f"the {N:,} events received until then are kept" in line
     assert "--wait-for-source" in line
     assert len(sent(out)) == json.loads(done.stdout)["events"] == N
     assert json.loads(done.stdout)["broke_off"] in line
@@ -143,7 +143,7 @@ def test_a_sender_that_returns_is_gone_on_with(tmp_path: Path, calibration: Path
 @pytest.mark.parametrize(
     ("back", "says"),
     [
-        (HELLO + part(100_000) + END, "its clock began anew"),
+        (HELLO + part(100_000) + END, "its clock restarted"),
         (encode_hello(32, 24) + END, "is back with a camera of 32x24 pixels, before it had 64x48"),
         (encode_hello(64, 48) + END, "is back with another camera or prism"),
         (b"GET / HTTP/1.1\r\n\r\n    ", "it begins with b'GET '"),
@@ -164,8 +164,8 @@ def test_a_clock_that_does_not_fit_the_hosts_is_said(tmp_path: Path) -> None:
         packets = list(open_source(address, wait_s=LONG_S, say=said.append).packets())
     assert sum(len(packet.events) for packet in packets) == 2 * N
     assert [packet.returned for packet in packets].count(True) == 1
-    assert "3599.7 s went by on the camera's clock" in said[-1]
-    assert "may have begun anew" in said[-1]
+    assert "3599.7 s passed on the camera's clock" in said[-1]
+    assert "may have restarted" in said[-1]
 
 
 def test_a_sender_that_does_not_return_ends_it(tmp_path: Path) -> None:
@@ -281,7 +281,7 @@ def test_a_flood_without_events_can_be_ended(tmp_path: Path, number: int, kind: 
             finally:
                 process.kill()
     finally:
-        shut(server)
+        close_listener(server)
         thread.join(LONG_S)
     assert (process.returncode, error.splitlines()[1:]) == (0, []), error
     assert json.loads(said)["events"] == 0

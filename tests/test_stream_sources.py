@@ -18,14 +18,14 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream import cameras, sockets, sources
+from amiwarp.live.stream import cameras, connections, sockets, sources
 from amiwarp.live.stream.opening import open_source
 from amiwarp.live.stream.packets import (
     HEADER,
-    Decoder,
     End,
     Hello,
     Packet,
+    PacketDecoder,
     encode_compensated,
     encode_encoder,
     encode_end,
@@ -247,15 +247,15 @@ def address(request, tmp_path):
 
 
 def test_any_number_of_clients_get_hello_packets_and_end(address, tmp_path, monkeypatch):
-    monkeypatch.setattr(sockets, "PARTING_S", LONG_S)
+    monkeypatch.setattr(sockets, "DRAIN_S", LONG_S)
     events = make(60_000)
     with SocketSink(address, HELLO) as sink:
         assert sink.address.startswith("tcp:127.0.0.1:" if address == "tcp::0" else address[: address.rfind(":") + 1])
         sink.send(encode_events(events[:10]))  # nobody is there yet
-        early = [sockets.connect(sink.address) for _ in range(2)]
+        early = [connections.connect(sink.address) for _ in range(2)]
         sink.tick()
         assert sink.clients == 2
-        late = sockets.connect(sink.address)
+        late = connections.connect(sink.address)
         sink.send(encode_events(events[10:20]))
         parts = [StreamSource("it", one.makefile("rb", buffering=0)) for one in (*early, late)]
         got: list[list[Packet]] = [[] for _ in parts]
@@ -279,12 +279,12 @@ def test_any_number_of_clients_get_hello_packets_and_end(address, tmp_path, monk
 
 
 def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path, monkeypatch):
-    monkeypatch.setattr(sockets, "PARTING_S", LONG_S)
+    monkeypatch.setattr(sockets, "DRAIN_S", LONG_S)
     with SocketSink(f"unix:{tmp_path}/s", HELLO, most_bytes=1 << 18) as sink:
-        slow, quick, gone = (sockets.connect(sink.address) for _ in range(3))
+        slow, quick, gone = (connections.connect(sink.address) for _ in range(3))
         sink.tick()
         gone.close()
-        decoder, seen = Decoder("quick"), []
+        decoder, seen = PacketDecoder("quick"), []
         quick.setblocking(False)
         for k in range(300):
             sink.send(encode_events(make(1000, start=10_000 * k)))
@@ -307,7 +307,7 @@ def test_a_slow_client_loses_whole_packets_and_no_other_does(tmp_path, monkeypat
     slow.close()
     quick.close()
     assert [type(message) for message in seen] == [Hello, *[Events] * 300, End]
-    got = list(Decoder("slow").feed(data))
+    got = list(PacketDecoder("slow").feed(data))
     assert isinstance(got[0], Hello)
     assert isinstance(got[-1], End)
     starts = [int(message.t[0]) // 10_000 for message in got[1:-1]]
@@ -321,7 +321,7 @@ def test_a_source_may_listen_for_its_sender(tmp_path):
     def send() -> None:
         while not path.exists():
             time.sleep(0.002)
-        with sockets.connect(f"unix:{path}") as connection:
+        with connections.connect(f"unix:{path}") as connection:
             connection.sendall(HELLO)
             connection.sendall(encode_events(events) + encode_end())
 
@@ -366,12 +366,12 @@ def test_empty_packets_come_each_50_ms_of_silence(monkeypatch):
         packets = list(itertools.islice(source.packets(), 5))
         source.close()
     assert [packet.arrived_us for packet in packets] == [70_050_100, 70_100_200, 70_150_300, 70_200_400, 70_250_500]
-    assert all(packet.bare for packet in packets)
+    assert all(packet.empty for packet in packets)
 
 
 def test_addresses_that_are_none(tmp_path):
     for address in ("tcp:host", "tcp:host:99999", "tcp:", "unix:", "tcp:1:x"):
-        with pytest.raises(AmiwarpError, match=f"{address}: is no address; give tcp:HOST:PORT or unix:PATH"):
+        with pytest.raises(AmiwarpError, match=f"{address}: is not an address; give tcp:HOST:PORT or unix:PATH"):
             open_source(address)
     with socket.create_server(("127.0.0.1", 0)) as server:
         taken = f"tcp:127.0.0.1:{server.getsockname()[1]}"

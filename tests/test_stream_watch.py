@@ -18,7 +18,7 @@ import pytest
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.streams import Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import EncoderStream
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.io import save_recording
@@ -26,7 +26,7 @@ from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
 from amiwarp.live.stream.forward import Forward
 from amiwarp.live.stream.opening import open_source
-from amiwarp.live.stream.packets import Angles, Decoder, Packet
+from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
 from amiwarp.live.stream.sources import FileSource
@@ -61,7 +61,7 @@ def streamed(recording: Recording) -> EncoderStream:
 def looked(watch: PhaseCheck, encoder: EncoderStream, until_s: float = 120.0) -> float:
     """What the watch finds, which it is asked again and again as by a session."""
     end = time.monotonic() + until_s
-    while (found := watch.look(encoder)) is None:
+    while (found := watch.update(encoder)) is None:
         assert time.monotonic() < end
         time.sleep(0.01)
     return math.degrees(found)
@@ -93,17 +93,17 @@ def test_a_watch_tells_a_phase_that_is_far_off(recording: Recording) -> None:
     watch = PhaseCheck(known(recording, 12.0), 0.0, said.append)
     watch.put(recording.events.slice(0, len(recording.events)))
     assert looked(watch, streamed(recording)) == pytest.approx(12.0, abs=BIAS_DEG)
-    assert "calibrate anew" in said[0]
+    assert "calibrate again" in said[0]
     watch.close()
 
 
 def test_a_watch_says_nothing_of_too_little(recording: Recording) -> None:
     watch = PhaseCheck(known(recording, 0.0), 0.0, print)
-    assert not watch.begin(streamed(recording))
+    assert not watch.start_check(streamed(recording))
     watch.put(recording.events.slice(0, 1000))
-    assert not watch.begin(streamed(recording))
-    assert not watch.begin(EncoderStream())
-    assert watch.look(streamed(recording)) is None
+    assert not watch.start_check(streamed(recording))
+    assert not watch.start_check(EncoderStream())
+    assert watch.update(streamed(recording)) is None
 
 
 def kept(recording: Recording, *, most_mev_s: float, fail: bool = False) -> tuple[list[float], list[str]]:
@@ -257,8 +257,8 @@ def test_what_is_handed_on_is_what_came(recording: Recording) -> None:
     forward.append_encoder(np.array([1, 2]), np.array([0.5, 0.6]))
     forward.tick()
     assert sent.pop() == b""
-    first, second = [message for data in sent for message in Decoder("here").feed(data)]
+    first, second = [message for data in sent for message in PacketDecoder("here").feed(data)]
     assert isinstance(first, Events)
     np.testing.assert_array_equal(first.t, events.t)
-    assert isinstance(second, Angles)
+    assert isinstance(second, EncoderSamples)
     np.testing.assert_array_equal(second.angle, [0.5, 0.6])

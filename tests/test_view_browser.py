@@ -1,4 +1,4 @@
-"""The inspector as its user meets it: mouse and keys in a real browser, the server in a thread of this process."""
+"""The inspector in a real browser, used with mouse and keys; its server runs in a thread of the test process."""
 
 import asyncio
 import io
@@ -42,7 +42,7 @@ SIZE = {"width": 1366, "height": 768}
 
 @pytest.fixture(scope="module")
 def recording(texture: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """Four turns, read from a file."""
+    """Return a recording of four turns, read from a file."""
     made = simulate(
         texture, Camera.from_fov(128, 96, math.radians(50.0)), Prism(math.radians(APEX_DEG)), duration_s=4 * 60 / RPM,
         motion=PrismMotion(RPM, phase=2.0), nominal_prism=Prism(math.radians(NOMINAL_DEG)), seed=3,
@@ -54,12 +54,12 @@ def recording(texture: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture(scope="module")
 def context(browser: Any) -> Any:
-    """Windows of it."""
+    """Return a browser context with the window size of the tests."""
     return browser.new_context(viewport=SIZE)
 
 
 class Tabs:
-    """Builds a panel for each page that is opened, of the inspector that ``make`` gives, and counts those closed."""
+    """Builds a panel with the inspector from ``make`` for each opened page, and counts the closed pages."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.url, self.closed = folder, "", 0
@@ -67,10 +67,10 @@ class Tabs:
         self.loop: asyncio.AbstractEventLoop
         self.panels: list[Any] = []
         self.failures: list[str] = []
-        """What browsers' consoles told."""
+        """Errors and warnings from the browser's console."""
 
     def open(self, context: Any, make: Callable[[], Inspector]) -> Any:
-        """A page that has come to rest."""
+        """Open a page, and wait until all its parts are drawn."""
         self.make = make
         page = context.new_page()
         page.set_default_timeout(1e3 * WAIT_S)
@@ -85,7 +85,7 @@ class Tabs:
 
     def _console(self, message: Any) -> None:
         if message.type in ("error", "warning") and not message.location["url"].endswith("/paraview/"):
-            self.failures.append(message.text)  # the page asks ParaView's launcher first, which is not there
+            self.failures.append(message.text)  # the page first tries ParaView's launcher, which does not exist
 
     def __call__(self, server: Any) -> Callable[[], None]:
         from amiwarp.viewer.panel import Panel
@@ -109,7 +109,7 @@ def tabs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tabs]:
 
 @pytest.fixture
 def nothing_fails(tabs: Tabs, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
-    """Neither in the browser nor in the server."""
+    """Check after the test that neither the browser nor the server reported an error."""
     yield
     assert tabs.failures == []
     assert [record.getMessage() for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
@@ -121,7 +121,7 @@ Open = Callable[..., Any]
 
 @pytest.fixture
 def opened(context: Any, tabs: Tabs, recording: Recording, nothing_fails: None) -> Iterator[Open]:
-    """Opens pages, and closes them."""
+    """Return a function that opens a page; close these pages after the test."""
     pages: list[Any] = []
 
     def open_page(of: Recording | None = None, calibration: Calibration | None = None, **more: Any) -> Any:
@@ -137,18 +137,18 @@ def opened(context: Any, tabs: Tabs, recording: Recording, nothing_fails: None) 
 
 @pytest.fixture(scope="module")
 def kept(context: Any, tabs: Tabs, recording: Recording) -> tuple[Any, Any, dict[str, Any]]:
-    """A page, its panel and what its state was at first: opening one for each test takes longer than the tests."""
+    """Return a page shared by the tests, its panel and its initial state. Opening a page takes longer than a test."""
     page = tabs.open(context, lambda: Inspector(recording))
     return page, tabs.panels[-1], dict(tabs.panels[-1].state.to_dict())
 
 
 @pytest.fixture
 def page(kept: tuple[Any, Any, dict[str, Any]], tabs: Tabs, nothing_fails: None) -> Any:
-    """A page as it was opened."""
+    """Return the shared page, reset to its initial state."""
     page, panel, first = kept
 
     async def anew() -> str:
-        panel.calibrating.cancel()
+        panel.calibration_job.cancel()
         panel.discard()
         with panel.state:
             panel.state.update({**first, "trame__title": panel.state.trame__title})
@@ -168,27 +168,27 @@ def page(kept: tuple[Any, Any, dict[str, Any]], tabs: Tabs, nothing_fails: None)
 
 
 def sharpness(page: Any) -> tuple[float, float]:
-    """As recorded and compensated."""
+    """Return the sharpness as recorded and compensated, read from the page."""
     found = re.search(r"sharpness ([\d.]+) → ([\d.]+) \(×[\d.]+\)", page.locator("#sharpness").inner_text())
     assert found is not None
     return float(found[1]), float(found[2])
 
 
 def source(page: Any, name: str) -> str:
-    """Of a picture."""
+    """Return the address of an image on the page."""
     address = page.locator(f"#{name}").get_attribute("src")
     assert address.startswith("data:image/jpeg;base64,")
     return str(address)
 
 
 def cloud(page: Any) -> np.ndarray:
-    """What is seen of the clouds, shape (height, width, 3)."""
+    """Return a screenshot of the clouds, shape ``(height, width, 3)``."""
     png = page.locator("#cloud").screenshot()
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), np.int16)
 
 
 def seen_change(page: Any, before: np.ndarray) -> np.ndarray:
-    """Waits until the clouds look otherwise than ``before``."""
+    """Wait until the clouds differ from ``before``; return the new screenshot."""
     now = before
 
     def changed() -> bool:
@@ -205,7 +205,7 @@ def field(page: Any, name: str) -> float:
 
 
 def enter(page: Any, name: str, value: float | str) -> None:
-    """Types a number into a field."""
+    """Type a number into a field, and press Enter."""
     page.locator(f"#field-{name}").fill(str(value))
     page.locator(f"#field-{name}").press("Enter")
 
@@ -215,7 +215,7 @@ def thumb(page: Any, of: str) -> Any:
 
 
 def grab(page: Any, of: str) -> tuple[float, float]:
-    """Presses the mouse on a slider's thumb; gives its middle [px]."""
+    """Press the mouse button on a slider's thumb; return the thumb's centre [px]."""
     thumb(page, of).scroll_into_view_if_needed()
     box = thumb(page, of).bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -225,17 +225,17 @@ def grab(page: Any, of: str) -> tuple[float, float]:
 
 
 def message(page: Any, text: str) -> None:
-    """Waits until the page says it."""
+    """Wait until the page shows a message with this text."""
     page.locator("#message").filter(has_text=text).wait_for()
 
 
 def unsaid(page: Any) -> None:
-    """Waits until the page says nothing."""
+    """Wait until the page shows no message."""
     page.locator("#message").wait_for(state="detached")
 
 
 def true_phase(recording: Recording, at_us: float | None = None) -> float:
-    """[deg]; without an encoder, where the angle is 0 ``at_us``."""
+    """Return the true phase [deg]. ``at_us`` is the time at which the angle is 0 if there is no encoder [us]."""
     assert recording.truth is not None
     assert recording.encoder is not None
     turned = 0.0 if at_us is None else float(recording.encoder.angle_at(np.array([at_us], np.int64))[0])
@@ -309,7 +309,7 @@ def test_what_calibration_found_is_accepted_saved_and_opened_again(
     apex, phase = map(float, re.findall(r"(?:apex|phase) (-?[\d.]+)°", text))
     assert apex == pytest.approx(APEX_DEG, rel=0.05)
     assert math.remainder(phase - true_phase(recording), 360.0) == pytest.approx(0.0, abs=2.0)
-    assert (sharpness(page), field(page, "apex")) == (before, NOMINAL_DEG)  # not yet accepted
+    assert (sharpness(page), field(page, "apex")) == (before, NOMINAL_DEG)  # the result is not accepted yet
 
     page.locator("#do-accept").click()
     page.locator("#found").wait_for(state="detached")
@@ -325,7 +325,7 @@ def test_what_calibration_found_is_accepted_saved_and_opened_again(
     page.locator("#do-save").click()
     message(page, f"{path}: written")
     saved = Calibration.load(path)
-    assert saved.photometric is not None  # as found, and not only the rounded numbers on the page
+    assert saved.photometric is not None  # the complete result is saved, not the rounded numbers of the page
     assert math.degrees(saved.exact.parameters["apex"]) == pytest.approx(apex, abs=1e-3)
 
     again = opened(calibration=saved)
@@ -348,14 +348,14 @@ def test_what_was_set_by_hand_is_saved(page: Any, tabs: Tabs, recording: Recordi
 
 
 def endless(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """Calibrations begin again when they are done; set when one was ended."""
+    """Make calibrations repeat forever. Return an event that is set when one is cancelled."""
     ended = threading.Event()
 
     def again(*args: Any, **kwargs: Any) -> None:
         try:
             while True:
                 calibrate(*args, **kwargs)
-        except jobs.Cancelled:
+        except jobs.JobCancelled:
             ended.set()
             raise
 
@@ -369,7 +369,7 @@ def test_a_calibration_is_cancelled_and_leaves_nothing(page: Any, monkeypatch: p
     page.locator(".side").get_by_text("calibrating, ").wait_for()
     before = sharpness(page)
     enter(page, "apex", 0.7)
-    until(lambda: sharpness(page) != before)  # the view is alive meanwhile
+    until(lambda: sharpness(page) != before)  # the page still responds
     page.locator("#do-calibrate").filter(has_text="cancel").click()
     message(page, "calibration cancelled")
     page.locator("#do-calibrate").filter(has_text="calibrate").wait_for()
@@ -397,7 +397,7 @@ def test_bad_windows_are_said_and_a_good_one_makes_the_view_go_on(page: Any, rec
     enter(page, "apex", 0.8)
     until(lambda: sharpness(page) != first)
     page.locator("#curve-text").filter(has_text="best at 0.").wait_for()
-    message(page, "a window of 0 ms")  # it still is
+    message(page, "a window of 0 ms")  # the window is still invalid
     enter(page, "start_ms", 0)
     enter(page, "length_ms", "1e300")
     unsaid(page)
@@ -433,7 +433,7 @@ def test_exports_go_to_one_folder_under_new_plain_names(page: Any, tabs: Tabs, t
         ("picture", str(outside), "holds '/'"),
         ("picture", "../outside.png", "holds '/'"),
         ("save", "..", "is not the name of an ordinary file"),
-        ("save", "c.h5", "such a file ends in .json"),
+        ("save", "c.h5", "the name must end in .json"),
     ):
         page.locator("#out").fill(given)
         page.locator(f"#do-{name}").click()
@@ -448,7 +448,7 @@ def test_exports_go_to_one_folder_under_new_plain_names(page: Any, tabs: Tabs, t
     with Image.open(io.BytesIO(written)) as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     page.locator("#do-picture").click()
-    message(page, "exists, and a page replaces nothing")
+    message(page, "exists, and the page never replaces a file")
     assert (tabs.folder / "seen.png").read_bytes() == written
     page.locator("#out").fill("")
     for expected in ("discs.png", "discs.2.png"):
@@ -523,8 +523,8 @@ def test_keys(page: Any) -> None:
 
     page.keyboard.press("?")
     page.locator("#help").wait_for()
-    told = [row.locator("td").all_inner_texts() for row in page.locator("#help tr").all()]
-    assert told == [["space" if key == " " else key, words] for key, _, words in KEYS]
+    shown = [row.locator("td").all_inner_texts() for row in page.locator("#help tr").all()]
+    assert shown == [["space" if key == " " else key, words] for key, _, words in KEYS]
     page.keyboard.press("?")
     page.locator("#help").wait_for(state="hidden")
 
@@ -542,7 +542,7 @@ def test_keys_typed_into_a_field_do_nothing_else(page: Any) -> None:
     start = field(page, "start_ms")
     page.locator("#field-apex").click()
     page.keyboard.press("ArrowRight")
-    page.locator("#field-length_ms").fill("50")  # the server answers in order
+    page.locator("#field-length_ms").fill("50")  # the server handles calls in order
     page.keyboard.press("Enter")
     until(lambda: field(page, "turns") == 0.6)
     assert field(page, "start_ms") == start
@@ -604,12 +604,12 @@ def test_a_click_on_an_event_tells_all_about_it(page: Any, kept: Any, recording:
             clicks.append((columns[k], rows[k]))
             found.append((x, y) if side[0] else place)
         steps, moved = np.diff(clicks, axis=0), np.diff(found, axis=0)
-        scale = np.linalg.norm(steps, axis=1) / np.linalg.norm(moved, axis=1)  # both in the same way, by about as much
+        scale = np.linalg.norm(steps, axis=1) / np.linalg.norm(moved, axis=1)  # one scale and direction
         np.testing.assert_allclose(moved * scale[:, None], steps, atol=12)
         np.testing.assert_allclose(scale, scale.mean(), rtol=0.1)
     text = picked()
     enter(page, "apex", 0.5)
-    until(lambda: picked() != text)  # where it is now
+    until(lambda: picked() != text)  # the compensated position has changed
     assert picked().split(";")[:-1] == text.split(";")[:-1]
 
 
@@ -624,7 +624,7 @@ def test_everything_needed_is_inside_the_window(page: Any) -> None:
     assert sum(name.startswith("tile") for name in boxes) == 4
     for name, box in boxes.items():
         assert box["width"] > 0, name
-        assert box["height"] > 8 or name.startswith(".bar >"), name  # the gap between has none
+        assert box["height"] > 8 or name.startswith(".bar >"), name  # the gap between the items has no height
         assert min(box["x"], box["y"]) >= 0, name
         assert box["x"] + box["width"] <= SIZE["width"], name
         assert box["y"] + box["height"] <= SIZE["height"], name
@@ -668,7 +668,7 @@ def test_without_encoder_and_prism_the_speed_that_is_set_brings_the_angle(opened
 
 
 def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, recording: Recording) -> None:
-    """It grows by 5 ms each time the page asks; stopped, the page works on what it has."""
+    """The stream grows by 5 ms at each request. After a stop, the page keeps working with the events it has."""
     events, asked = recording.events, [0]
     width, height = events.size
 
@@ -683,7 +683,7 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     until(lambda: field(page, "start_ms") > shown + 8.0 and source(page, "image-before") != picture)
     page.locator("#do-play").click()
     page.locator("#do-play").filter(has_text=re.compile("follow", re.I)).wait_for()
-    until(lambda: not tabs.panels[-1].playing.runs)
+    until(lambda: not tabs.panels[-1].playback.runs)
     times = len(asked)
     start, counts = field(page, "start_ms"), page.locator("#events").inner_text()
     enter(page, "apex", APEX_DEG)

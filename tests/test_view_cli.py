@@ -1,4 +1,4 @@
-"""``amiwarp view`` on the command line: pictures without a window, and what is said of bad input."""
+"""Command ``view``: pictures without a window, and errors for bad input."""
 
 import asyncio
 import json
@@ -29,7 +29,7 @@ from amiwarp.viewer.inspector import Inspector
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> Path:
-    """A recording, and its calibration by the truth."""
+    """Folder with a recording, and a calibration made from its ground truth."""
     folder = tmp_path_factory.mktemp("view")
     camera, prism = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(1.0))
     recording = simulate(texture, camera, prism, duration_s=0.2, seed=1, nominal_prism=Prism(math.radians(1.3)))
@@ -73,7 +73,7 @@ def test_window_model_and_axis(files: Path, tmp_path: Path) -> None:
     [
         (["--screenshot", "out.jpg"], "written as .png"),
         (["--screenshot", "nowhere/out.png"], "nowhere"),
-        (["--screenshot", "out.png", "--window", "5:2"], "--window '5:2' is no span of time"),
+        (["--screenshot", "out.png", "--window", "5:2"], "--window '5:2' is not a time span"),
         (["--screenshot", "out.png", "--window", "50:60"], "take another window"),
         (["--screenshot", "out.png", "--model", "sphere"], "choose among circle, exact, radial, ellipse"),
         (["--screenshot", "out.png", "--size", "9x9"], "--size"),
@@ -81,7 +81,7 @@ def test_window_model_and_axis(files: Path, tmp_path: Path) -> None:
     ],
     ids=lambda v: str(v)[:40],
 )
-def test_bad_input_is_said_in_a_line(files: Path, args: list[str], says: str, tmp_path: Path,
+def test_bad_input_is_reported_in_one_line(files: Path, args: list[str], says: str, tmp_path: Path,
                                      monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     code, said, error = view(files / "recording.h5", *args)
@@ -121,8 +121,8 @@ def test_a_window_opens_only_where_there_is_a_display(monkeypatch: pytest.Monkey
     assert "chromium" in BROWSERS
 
 
-def test_what_others_can_reach_is_said(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exports go to the recording's folder, or to another."""
+def test_a_page_in_the_network_prints_a_warning(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A warning names who can reach the page. Exports go to the recording's folder or to ``--out-dir``."""
     folders: list[Path] = []
 
     def serve_panel(make: object, folder: Path, *, host: str, port: int, ready: Callable[[str], None]) -> None:
@@ -132,7 +132,7 @@ def test_what_others_can_reach_is_said(files: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(viewer_app, "serve_panel", serve_panel)
     code, said, error = view(files / "recording.h5", "--web", "--host", "0.0.0.0", "--out-dir", tmp_path)
     assert code == 0
-    assert "everybody in the network" in error
+    assert "everybody on the network" in error
     assert "control the inspector" in error
     assert said.startswith("recording.h5: http://")
     assert view(files / "recording.h5", "--web")[2] == ""
@@ -142,13 +142,13 @@ def test_what_others_can_reach_is_said(files: Path, tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        (["--host", "192.0.2.1"], "is no address of this machine"),
+        (["--host", "192.0.2.1"], "is not an address of this machine"),
         (["--port", "{port}"], "is in use"),
-        (["--out-dir", "none"], "is no folder"),
-        (["--out-dir", "{file}"], "is no folder"),
+        (["--out-dir", "none"], "is not a folder"),
+        (["--out-dir", "{file}"], "is not a folder"),
     ],
 )
-def test_what_cannot_be_served_is_said_in_a_line(files: Path, args: list[str], says: str) -> None:
+def test_a_page_that_cannot_be_served_is_reported_in_one_line(files: Path, args: list[str], says: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         given = [a.format(port=other.getsockname()[1], file=files / "c.json") for a in args]
         code, said, error = view(files / "recording.h5", "--web", *given)
@@ -165,7 +165,7 @@ def test_exports_of_a_notebook_s_page_have_a_folder_too(files: Path, tmp_path: P
 
 
 def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The browser is one that writes down how it was called, asks for the page and closes."""
+    """A fake browser saves the page that it is started with, and closes."""
     browser = tmp_path / BROWSERS[0]
     browser.write_text(
         f"#!{sys.executable}\n"
@@ -184,7 +184,7 @@ def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkey
 
 
 def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its display is one that fetches the page."""
+    """A fake IPython display collects the page's address."""
     pages: list[bytes] = []
     shown = types.ModuleType("IPython.display")
     vars(shown).update(IFrame=lambda url, width, height: url, display=pages.append)

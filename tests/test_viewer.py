@@ -1,4 +1,4 @@
-"""What the inspector shows, and how its clouds are drawn; without a browser."""
+"""The inspector's values and the drawing of its clouds, without a browser."""
 
 import math
 from collections.abc import Iterator
@@ -26,8 +26,9 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.colouring import colours_of, residual
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection
-from amiwarp.viewer.scene import Look, Scene, colours_of, residual
+from amiwarp.viewer.scene import Look, Scene
 from amiwarp.viewer.timeline import event_rate, read_span
 
 TRUE = Prism(math.radians(1.0))
@@ -63,7 +64,7 @@ def calibration_of(recording: Recording, **parameters: float) -> Calibration:
 
 
 class Counted:
-    """A source that counts the events that were read."""
+    """Event source that counts the events read from it."""
 
     def __init__(self, source: MemoryEvents) -> None:
         self.source, self.read, self.find = source, 0, source.find
@@ -95,14 +96,14 @@ def test_every_source_finds_a_moment(million: MemoryEvents, tmp_path: Path) -> N
     sources = [open_recording(tmp_path / name).events for name in ("events.txt", "events.h5")] + [hidden]
     for moment in (-5, int(some.t[0]), 3_456, int(some.t[-1]), 10_000_000):
         assert {source.find(moment) for source in sources} == {int(np.searchsorted(some.t, moment))}
-    runs = [read_span(source, 1000, 5000, most=640).events for source in (*sources, MemoryEvents(some, 4, 4))]
+    runs = [read_span(source, 1000, 5000, most_events=640).events for source in (*sources, MemoryEvents(some, 4, 4))]
     assert len(runs[0]) == 640
     assert all(np.array_equal(run.t, runs[0].t) for run in runs)
 
 
 def test_a_long_window_is_thinned_evenly_and_its_true_count_is_told(million: MemoryEvents) -> None:
     source = Counted(million)
-    span = read_span(source, 200_000, 1_000_000, most=64_000)  # type: ignore[arg-type]
+    span = read_span(source, 200_000, 1_000_000, most_events=64_000)  # type: ignore[arg-type]
     t = million.slice(0, len(million)).t
     inside = t[(t >= 200_000) & (t < 1_200_000)]
     assert span.count == len(inside)
@@ -111,7 +112,7 @@ def test_a_long_window_is_thinned_evenly_and_its_true_count_is_told(million: Mem
     assert (np.diff(span.events.t) >= 0).all()
     shares = np.histogram(span.events.t, 8, (200_000, 1_200_000))[0] / np.histogram(inside, 8, (200_000, 1_200_000))[0]
     assert shares.max() < 1.3 * shares.min()
-    whole = read_span(million, 200_000, 10_000, most=64_000)
+    whole = read_span(million, 200_000, 10_000, most_events=64_000)
     assert np.array_equal(whole.events.t, t[(t >= 200_000) & (t < 210_000)])
 
 
@@ -136,20 +137,21 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
     inspector.set(replace(true_knobs(recording), model=model, clock_offset=300.0))
     inspector.open(*inspector.first_window())
     shown = inspector.show()
-    encoder = inspector.set_encoder
+    encoder = inspector.adjusted_encoder
     events = recording.events.between(shown.span.start_us, shown.span.start_us + shown.span.length_us)
     assert shown.span.count == shown.selected == len(events)
     expected = compensate_events(shown.events, inspector.model, encoder)
-    np.testing.assert_allclose(shown.after, expected, atol=2e-3)  # the knob's offset is linear in the angle
+    np.testing.assert_allclose(shown.after, expected, atol=2e-3)  # the clock offset is applied linearly
     image = iwe(events, *recording.events.size, model=inspector.model, encoder=encoder)
     raw = iwe(events, *recording.events.size)
-    for ours, plain in ((shown.image_after, image), (shown.image_before, raw)):  # but for the dither of the votes
+    # the inspector dithers its votes: compare smoothed images
+    for ours, plain in ((shown.image_after, image), (shown.image_before, raw)):
         ours, plain = (gaussian_filter(each, 2.0)[6:-6, 6:-6] for each in (ours, plain))
         assert np.abs(ours - plain).max() < 0.05 * plain.max()
 
 
 def test_points_are_thinned_evenly(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "DRAWN", 1000)
+    monkeypatch.setattr(viewer, "MOST_POINTS", 1000)
     shown = inspector.show()
     assert len(shown.events) == len(shown.after) == 1000
     parts = np.histogram(shown.events.t, 4, (shown.span.start_us, shown.span.start_us + shown.span.length_us))[0]
@@ -246,9 +248,9 @@ def test_an_encoder_s_own_clock_offset_counts_once(recording: Recording) -> None
     for each in (inspector, punctual):
         each.open(*punctual.first_window())
     np.testing.assert_allclose(inspector.show().after, punctual.show().after, atol=0.01)
-    assert inspector.set_encoder.clock_offset_us == 0.0
+    assert inspector.adjusted_encoder.clock_offset_us == 0.0
     found = calibration_of(recording, clock_offset=700.0)
-    assert Inspector(late, found).set_encoder.clock_offset_us == 700.0
+    assert Inspector(late, found).adjusted_encoder.clock_offset_us == 700.0
 
 
 def test_what_was_set_by_hand_can_be_saved_and_opened(
@@ -280,7 +282,7 @@ def test_what_cannot_be_shown_is_said(inspector: Inspector, recording: Recording
     with pytest.raises(AmiwarpError, match="none of them selected"):
         inspector.open(*inspector.first_window(), Selection(region=(5, 5, 5, 9)))
     assert inspector.selection == Selection()
-    assert inspector.show().region == (0, 0, *recording.events.size)  # as before
+    assert inspector.show().region == (0, 0, *recording.events.size)  # unchanged
     other = replace(calibration_of(recording), camera=Camera.from_fov(64, 48, 1.0))
     with pytest.raises(AmiwarpError, match="64x48 pixels, the events are of 160x120"):
         Inspector(recording, other)
@@ -317,7 +319,7 @@ LOOKS = {
 
 
 def away(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean difference of two pictures, single pixels smoothed: renderers differ in which one a point takes."""
+    """Return the mean difference of two smoothed pictures, because renderers round a point's pixel differently."""
     return float(
         np.abs(gaussian_filter(a.astype(float), (2, 2, 0)) - gaussian_filter(b.astype(float), (2, 2, 0))).mean()
     )
@@ -325,7 +327,7 @@ def away(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", LOOKS)
 def test_pictures_are_as_they_were(scene: Scene, inspector: Inspector, recording: Recording, name: str) -> None:
-    """Beside the committed ones; every other of these differs by much more."""
+    """Each picture is close to its committed reference and far from the other references."""
     inspector.set(true_knobs(recording))
     look, view = LOOKS[name]
     scene.show(inspector.show(), look)
@@ -343,7 +345,7 @@ def test_the_model_s_orbit_is_drawn_in_front(scene: Scene, inspector: Inspector)
     scene.look_from(view, look)
     before = scene.picture()
     theta, xy = inspector.orbit(80.0, 60.0)
-    scene.mark([(0, scene.box.places(xy, np.degrees(theta)), "#009e73")])
+    scene.mark([(0, scene.box.positions(xy, np.degrees(theta)), "#009e73")])
     after = scene.picture()
     green = (np.abs(after.astype(int) - [0, 158, 115]).max(axis=2) < 12).sum()
     assert green > 20
@@ -359,7 +361,7 @@ def test_an_event_is_picked_where_it_is_seen(scene: Scene, inspector: Inspector)
     k = scene.pick(0.25, 0.5)
     assert k is not None
     x, y = shown.before[k]
-    assert (x, y) == pytest.approx((80.0, 60.0), abs=6.0)  # the image's middle is that of the left half
+    assert (x, y) == pytest.approx((80.0, 60.0), abs=6.0)  # the left half shows the whole image
     right = scene.pick(0.75, 0.5)
     assert right is not None
     assert tuple(shown.after[right]) == pytest.approx((80.0, 60.0), abs=6.0)

@@ -1,6 +1,6 @@
-"""Pairs of consecutive events of a pixel: what the equations of :mod:`amiwarp.brightness.solver` are made of.
+"""Pairs of consecutive events of a pixel: the equations of :mod:`amiwarp.brightness.solver`.
 
-Built on the device: events are sorted by pixel, candidates for pairs marked, and those that are marked written.
+They are built on the device: sort the events by pixel, mark candidates for pairs, write the marked ones.
 """
 
 from __future__ import annotations
@@ -30,42 +30,52 @@ if TYPE_CHECKING:
 
 
 COLUMNS = {"x": 1, "y": 1, "tile": 1, "on": 1, "azimuth": 4, "time": 2, "slope": 2}
-"""Of the kernels' ``Pairs``: how many parts each array has."""
+"""Number of values per pair in each array of the kernels' ``Pairs``."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorTiming:
-    """What is known of the sensor's timing [us]; zero where nothing is."""
+    """Known timing of the sensor [us]; 0 for unknown values.
+
+    Examples
+    --------
+    >>> amiwarp.SensorTiming(latency_us=100.0)
+    SensorTiming(latency_us=100.0, refractory_us=0.0)
+    """
 
     latency_us: float = 0.0
-    """Time from a change of brightness to its stamp."""
+    """Time from a brightness change to its time stamp [us]."""
     refractory_us: float = 0.0
-    """Time after an event at whose end a pixel takes its new reference."""
+    """Refractory period: time after an event until the pixel takes its new reference [us]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairSet:
-    """Pairs on a device, as the kernels' ``Pairs``: two events of a pixel each, or an event and a window's end."""
+    """Pairs on a device: two events of a pixel, or one event and the end of the time window."""
 
     arrays: Any
+    """The kernels' struct ``Pairs``."""
     device: Any
 
     def __len__(self) -> int:
         return int(self.arrays.count)
 
     def column(self, name: str) -> NDArray[Any]:
-        """``x``, ``y``, ``tile`` or ``on`` on the host, shape (n,)."""
+        """Return ``x``, ``y``, ``tile`` or ``on`` as a host array, shape (n,)."""
         values: NDArray[Any] = getattr(self.arrays, name).numpy()
         return values[: len(self)]
 
     @property
     def time(self) -> NDArray[np.float32]:
-        """Times of both [s] from the window's middle, shape (2, n)."""
+        """Both times of each pair [s], relative to the window's middle, shape (2, n)."""
         values: NDArray[np.float32] = self.arrays.time.numpy()
         return values.reshape(2, -1)[:, : len(self)]
 
     def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
-        """The same; ``slope_of``: change of the encoder's angle at times [us] per unit of a drifting parameter."""
+        """Attach the change of the prism angle per unit of a drifting parameter, and return the set.
+
+        ``slope_of`` returns that change for times [us].
+        """
         values = np.zeros((2, self.arrays.stride), np.float32)
         for k, t in enumerate(self.time.astype(np.float64)):
             values[k, : len(self)] = slope_of(np.rint(t * 1e6).astype(np.int64) + middle_us)
@@ -74,7 +84,7 @@ class PairSet:
 
     @classmethod
     def concatenate(cls, parts: Sequence[PairSet]) -> PairSet:
-        """One behind the other; all of one weight of silence."""
+        """Concatenate pair sets, which must give silence the same weight."""
         if len(parts) == 1:
             return parts[0]
         first = parts[0].arrays
@@ -90,11 +100,11 @@ class PairSet:
         return cls(out, parts[0].device)
 
     def of_tiles(self, listed: NDArray[np.bool_]) -> PairSet:
-        """The pairs of the tiles that are ``listed``."""
-        return self._select(kernels.mark_listed, [self.arrays.tile, _ints(listed, self.device)])
+        """Return the pairs of the tiles for which ``listed`` is true."""
+        return self._select(kernels.mark_listed, [self.arrays.tile, _int_array(listed, self.device)])
 
     def of_square(self, left: int, top: int, side: int) -> PairSet:
-        """The pairs of a square of pixels."""
+        """Return the pairs of a square of pixels."""
         return self._select(kernels.mark_square, [self.arrays, left, top, side])
 
     def on_tiles(
@@ -105,7 +115,10 @@ class PairSet:
         tile_of: NDArray[np.int32],
         listed: NDArray[np.bool_],
     ) -> PairSet:
-        """The pairs whose compensated events both fall on one tile (``tile_of``, by pixel) of those ``listed``."""
+        """Return the pairs whose compensated events both fall on the same tile, if it is ``listed``.
+
+        ``tile_of``: tile of each pixel of the map.
+        """
         places = wp.empty(len(self), dtype=wp.vec4, device=self.device)
         inputs = [
             model.params(self.device),
@@ -116,28 +129,35 @@ class PairSet:
         ]
         launch(find_places, len(self), inputs, [places], device=self.device)
         tiles = wp.array(tile_of, dtype=int, device=self.device)
-        marked = [places, tiles, _ints(listed, self.device)]
+        marked = [places, tiles, _int_array(listed, self.device)]
         return self._select(kernels.mark_same_tile, marked, [self.arrays.tile])
 
     def hold_out(self, every: int) -> int:
-        """Marks every so many-th pair of two events, which must come first, as not to be used; how many."""
+        """Hold out every ``every``-th pair of two events, which must come first in the set.
+
+        Returns the number held out.
+        """
         launch(kernels.hold_out, len(self), [every], [self.arrays.on], device=self.device)
         return int(np.count_nonzero(self.column("on") & int(HELD)))
 
     def _select(self, kernel: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> PairSet:
+        """Return the pairs that ``kernel`` marks."""
         flag = wp.empty(len(self), dtype=int, device=self.device)
         launch(kernel, len(self), inputs, [*outputs, flag], device=self.device)
-        place, count = _places(flag)
+        place, count = _running_count(flag)
         out = _empty(count, self.device, drifts=self.arrays.slope.shape[0] > 0)
         launch(kernels.select, len(self), [self.arrays, flag, place], [out], device=self.device)
         return PairSet(out, self.device)
 
 
 class EventTable:
-    """Events of one or more spans of time on a device, in the order of their pixels."""
+    """Events of one or more time spans on a device, sorted by pixel."""
 
     def __init__(self, spans: Sequence[Events], tile_of: Any, device: Any) -> None:
-        """Of pixels of a tile (``tile_of`` (height, width) >= 0, NumPy or on the device) alone."""
+        """Copy the events to the device.
+
+        Only pixels with ``tile_of`` >= 0 are used: shape (height, width), NumPy or on the device.
+        """
         self.device = wp.get_device(device)
         if isinstance(tile_of, np.ndarray):
             tile_of = wp.array(tile_of, dtype=int, device=device)
@@ -155,11 +175,11 @@ class EventTable:
         return min(int(s.t[0]) for s in self.spans), max(int(s.t[-1]) for s in self.spans)
 
     def sort(self) -> None:
-        """By span and pixel; within a pixel events stay in order."""
+        """Sort by span and pixel; within a pixel, events stay in time order."""
         s, n = self.arrays, len(self.arrays.x)
         flag = wp.empty(n, dtype=int, device=self.device)
         launch(kernels.mark_inside, n, [s.x, s.y, self.tile_of], [flag], device=self.device)
-        place, s.count = _places(flag)
+        place, s.count = _running_count(flag)
         s.key, s.order = (wp.empty(2 * s.count, dtype=int, device=self.device) for _ in "ko")
         first = np.cumsum([0, *(len(span) for span in self.spans[:-1])])
         inputs = [s.x, s.y, self.tile_of, place, wp.array(first, dtype=int, device=self.device)]
@@ -180,16 +200,18 @@ class EventTable:
         window: tuple[int, int] | None = None,
         quiet: tuple[NDArray[np.int64], int] | None = None,
     ) -> PairSet:
-        """Consecutive events of each pixel, no further apart than ``longest_gap_us``, further than ``shortest_gap_us``.
+        """Return pairs of consecutive events of each pixel.
 
-        With a ``window`` (start, stop) [us] come the pairs of open ends and of silence, of weight ``weak``:
+        Their gap is at most ``longest_gap_us`` and more than ``shortest_gap_us``. With a ``window`` (start, stop) [us],
+        pairs of open ends and of silence are added, with weight ``weak``:
 
-        - From the window's start to each pixel's first event, and from its last to the stop. At the start the
-          brightness is anywhere within a threshold of the reference, so that the first event finds it one threshold
-          further in the mean; after the last it stays within one. Without the former, every edge that enters would look
-          lower than it looks when it leaves, and the map would slope.
-        - ``quiet``: rising edges [us] of spans, and a number: spans of pixels that fire in none of so many spans about
-          them. Silence is information: along the pixel's way brightness changed by no more than about a threshold.
+        - Open ends: from the window's start to each pixel's first event, and from its last event to the stop. At the
+          start, the brightness is anywhere within one threshold of the reference, so on average the first event finds
+          it one threshold further. After the last event, it stays within one threshold. Without the pairs at the start,
+          every edge that enters would look lower than when it leaves, and the map would slope.
+        - Silence: ``quiet`` gives the increasing boundaries of time spans [us], and a number n. Used are runs of at
+          least n successive spans in which a pixel does not fire. Silence is information: along the pixel's path, the
+          brightness changed by no more than about one threshold.
         """
         self.sort()
         sensor = sensor or SensorTiming()
@@ -207,7 +229,7 @@ class EventTable:
         edges_d = wp.array(edges, dtype=wp.int64, device=device)
         if spans:
             self._mark_quiet(edges_d, at_least, base, flag)
-        place, count = _places(flag)
+        place, count = _running_count(flag)
         out = _empty(count, device, weak=weak)
         if not count:
             return PairSet(out, device)
@@ -219,22 +241,23 @@ class EventTable:
         return PairSet(out, device)
 
     def _mark_quiet(self, edges: Any, at_least: int, base: int, flag: Any) -> None:
+        """Mark the spans of pixels that are silent."""
         fired = wp.zeros((len(edges) - 1) * self.arrays.pixels, dtype=wp.uint8, device=self.device)
         launch(kernels.mark_spans, len(self.arrays.x), [self.arrays, edges], [fired], device=self.device)
         inputs = [fired, self.tile_of.flatten(), at_least, base]
         launch(kernels.mark_quiet, self.arrays.pixels, inputs, [flag], device=self.device)
 
-    def leave_out_hot(self) -> NDArray[np.int32]:
-        """Marks pixels that fire far more than the busiest of those around them -1 in ``tile_of``.
+    def exclude_hot_pixels(self) -> NDArray[np.int32]:
+        """Set ``tile_of`` to -1 for pixels that fire far more often than the busiest pixels around them.
 
-        Returns how many events each pixel fired, shape (height, width).
+        Returns the number of events of each pixel, shape (height, width).
         """
         rows, columns = self.tile_of.shape
         count = wp.zeros(rows * columns, dtype=int, device=self.device)
         n = len(self.arrays.x)
         launch(
             kernels.count_pixels, n, [self.arrays], [count], device=self.device, smallest=n + 1
-        )  # slices would collide
+        )  # in one slice: all slices add to the same counters
         launch(kernels.mark_hot, rows * columns, [count.reshape((rows, columns)), 0], [self.tile_of.flatten()],
                device=self.device)  # fmt: skip
         counts: NDArray[np.int32] = count.numpy().reshape(rows, columns)
@@ -242,10 +265,11 @@ class EventTable:
 
 
 def off_excess(pairs: PairSet, *, with_leak: bool = False) -> float:
-    """Excess of the OFF threshold over the ON threshold, counted, not solved for: that would shrink it with the map.
+    """Return OFF threshold over ON threshold, minus 1, from counts of pairs.
 
-    Over a whole turn brightness comes back to where it was, so ON steps and OFF steps add up to nothing, or
-    ``with_leak`` to what leaked meanwhile: then places with many and with few events tell the two apart.
+    A solved value would be biased, because damping shrinks it together with the map. Over a whole turn, brightness
+    returns to its start. So ON steps and OFF steps sum to zero, or, ``with_leak``, to the leakage: places with many and
+    with few events then separate the two.
     """
     on = pairs.column("on") == 1
     if not with_leak:
@@ -262,7 +286,7 @@ def off_excess(pairs: PairSet, *, with_leak: bool = False) -> float:
 
 
 def _upload(parts: Sequence[NDArray[Any]], dtype: Any, device: Any) -> Any:
-    """Arrays one behind the other on a device, without a copy of them all on the host."""
+    """Concatenate arrays on a device, without a concatenated copy on the host."""
     if len(parts) == 1:
         return wp.array(np.ascontiguousarray(parts[0]), dtype=dtype, device=device, copy=False)
     out = wp.empty(sum(map(len, parts)), dtype=dtype, device=device)
@@ -274,12 +298,13 @@ def _upload(parts: Sequence[NDArray[Any]], dtype: Any, device: Any) -> Any:
     return out
 
 
-def _ints(values: NDArray[Any], device: Any) -> Any:
+def _int_array(values: NDArray[Any], device: Any) -> Any:
+    """Return values as an int32 array on the device."""
     return wp.array(values.astype(np.int32), dtype=int, device=device)
 
 
-def _places(flag: Any) -> tuple[Any, int]:
-    """Running count of the marks, and the whole."""
+def _running_count(flag: Any) -> tuple[Any, int]:
+    """Return the running count of the marks, and the total."""
     place = wp.empty_like(flag)
     if not len(flag):
         return place, 0
@@ -288,7 +313,7 @@ def _places(flag: Any) -> tuple[Any, int]:
 
 
 def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) -> Any:
-    """Pairs to be written, padded with zeros to whole blocks."""
+    """Return empty pairs, padded with zeros to whole blocks."""
     out = Pairs()
     block = int(BLOCK)
     out.count, out.stride, out.weak = count, -(-count // block) * block, weak

@@ -1,4 +1,4 @@
-"""Corrections of a large map on ever coarser grids: the preconditioner that carries brightness across it."""
+"""Multigrid preconditioner: corrections of a large map on coarser and coarser grids, which transport brightness far."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from amiwarp.kernels import multilevel as k
 from amiwarp.kernels.descent import gather
 
 COARSEST = 6
-"""A grid of fewer rows or columns has no coarser one."""
+"""Smallest number of rows or columns of a grid."""
 STRIDE = 8
-"""Every so many-th pair tells a coarse grid's diagonal, which need only be about right."""
+"""Stride over the pairs that estimate a coarse grid's diagonal, which need not be exact."""
 
 
-class Levels:
-    """Grids over one tile of (rows, columns) nodes, each of twice the spacing of the one before."""
+class GridHierarchy:
+    """Grids over one tile of (rows, columns) nodes; each has twice the spacing of the one before."""
 
     def __init__(self, rows: int, columns: int, device: Any) -> None:
+        """Allocate the grids."""
         self.shapes = [(rows, columns)]
         while min(self.shapes[-1]) // 2 + 1 >= COARSEST:
             self.shapes.append((self.shapes[-1][0] // 2 + 1, self.shapes[-1][1] // 2 + 1))
@@ -28,14 +29,14 @@ class Levels:
         )
 
     def prepare(self, program: Any, equations: list[Any], count: int, sums: Any, slices: list[Any]) -> None:
-        """Adds to ``program`` what finds the grids' diagonals, for the equations' weights as they are."""
+        """Add to ``program`` the computation of the grids' diagonals for the current weights of the equations."""
         for level, diagonal in enumerate(self._diagonal, start=1):
             inputs = [*equations, float(2**level), self.shapes[level][1], STRIDE]
             program.add_slices(k.add_coarse_diagonal, count // STRIDE, inputs, slices)
             program.add(gather, len(diagonal), [sums], [diagonal])
 
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
-        """Adds to ``program``: ``out`` = the sum of all grids' corrections for the finest one's ``residual``."""
+        """Add to ``program``: ``out`` = sum of all grids' corrections for the ``residual`` of the finest grid."""
         program.add(k.divide, len(out), [diagonal, residual], [out])
         fine = residual
         for level, (rows, columns) in enumerate(self.shapes[1:], start=1):

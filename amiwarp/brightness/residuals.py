@@ -1,4 +1,4 @@
-"""What the residuals of a map's equations come to: costs, sums, and their median, found on the device."""
+"""Statistics of the residuals of a map's equations, computed on the device: costs, sums, median."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from amiwarp.brightness.event_pairs import PairSet
 
 CHUNKS = 8
-"""Vectors of fewer chunks are not worth a second CPU thread."""
+"""Smallest number of chunks of a vector for which a second CPU thread is used."""
 
 
 class Residuals:
-    """Of the equations of ``pairs`` [thresholds], NaN for pairs off the map, and their weights."""
+    """Residuals of the equations of ``pairs`` [thresholds], NaN for pairs off the map, and their weights."""
 
     def __init__(self, pairs: PairSet, tiles: int) -> None:
         self.pairs, self.tiles, self.device, self.count = pairs, tiles, wp.get_device(pairs.device), len(pairs)
@@ -33,9 +33,9 @@ class Residuals:
         self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
 
     def mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> float:
-        """Mean of Cauchy's cost, log(1 + (r / ``scale``)²), of the residuals of all pairs or of those held out.
+        """Return the mean Cauchy cost, log(1 + (r / ``scale``)²), of all residuals, or, if ``held``, of those held out.
 
-        A pair off the map has the residual ``missing``, or is left out.
+        A pair off the map has the residual ``missing``; NaN excludes it.
         """
         threads, parts = self._sum_shape
         partial = self._doubles(2, parts)
@@ -45,7 +45,7 @@ class Residuals:
         return float(total / number) if number else math.nan
 
     def products(self, factors: list[tuple[Any, Any]]) -> NDArray[np.float64]:
-        """Sums over the pairs of a b weight, for each (a, b) on the device."""
+        """Return the sum over the pairs of a · b · weight, for each (a, b) on the device."""
         threads, parts = self._sum_shape
         partial = self._doubles(len(factors), parts)
         for k, (a, b) in enumerate(factors):
@@ -53,19 +53,19 @@ class Residuals:
         return np.asarray(partial.numpy().sum(axis=1))
 
     def clusters(self, slopes: list[Any]) -> NDArray[np.float64]:
-        """Sums of slope x weight x residual over clusters of pairs near each other, shape (slopes, clusters)."""
+        """Return sums of slope · weight · residual over clusters of neighbouring pairs, shape (slopes, clusters)."""
         size = self.tiles if self.tiles > 1 else 1 << 20
         rows = []
         for slope in slopes:
             sums = wp.zeros((2, size), dtype=wp.int64, device=self.device)
             inputs = [self.pairs.arrays, self.tiles, slope, self.weight, self.values, 0, sums]
-            wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)  # CPU slices would collide
+            wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)  # one slice: sums are shared
             total, number = sums.numpy()
             rows.append(total[number > 0] / 2.0**32)
         return np.array(rows)
 
     def median(self, first: int | None = None) -> float:
-        """Median of the absolute residuals of the ``first`` pairs, or all; NaN where there is none."""
+        """Return the median absolute residual of the ``first`` pairs, or of all; NaN if there is none."""
         n = self.count if first is None else first
         if self.device.is_cpu:
             values = np.abs(self.values.numpy()[:n])
@@ -80,7 +80,7 @@ class Residuals:
 
     @cached_property
     def _sum_shape(self) -> tuple[int, int]:
-        """Threads and partial sums of a sum over all pairs."""
+        """Number of threads and of partial sums for a sum over all pairs."""
         threads = -(-self.count // self._width)
         return threads, threads if self.device.is_cpu else -(-threads // BLOCK_DIM)
 

@@ -1,8 +1,8 @@
-"""The scene's log brightness from pairs of events: sparse least squares, matrix-free, on the device.
+"""The scene's log brightness from pairs of events: sparse, matrix-free least squares on the device.
 
-An event says that log brightness at its pixel changed by the threshold since that pixel's last event. With L the map on
-the prism-free pixel grid and w(x, θ) the compensated place, L(w(x, θ₂)) − L(w(x, θ₁)) = ±C: linear in L. L is in units
-of the ON threshold. See ``docs/calibration.md``.
+An event states that the log brightness at its pixel changed by one threshold since the last event of that pixel. With L
+the map on the prism-free pixel grid and w(x, θ) the compensated coordinates, L(w(x, θ₂)) − L(w(x, θ₁)) = ±C: linear in
+L. L is in units of the ON threshold. See ``docs/explanation/photometric.md``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.brightness.multigrid import Levels
+from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.brightness.residuals import CHUNKS, Residuals
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import descent as cg
@@ -38,40 +38,44 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 DAMPING = 0.02
-"""Weight of the map's own square beside the equations: it holds unknowns that none determines."""
+"""Weight of the map's square relative to the equations. It fixes unknowns that no equation determines."""
 FEW_BLOCKS = 256
-"""Fewer blocks of pairs are not worth a second CPU thread."""
+"""Smallest number of blocks of pairs for which a second CPU thread is used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Smoothness:
-    """A prior that carries the map into places without equations, and takes salt out."""
+    """Smoothness prior: extends the map into regions without equations, and suppresses isolated outliers."""
 
     weight: float
-    """Of the squared difference of neighbouring nodes, beside the equations' weight of 1."""
+    """Weight of the squared difference of neighbouring nodes; an equation has weight 1."""
     edge: float = 0.0
-    """Neighbours that differ by more [thresholds] are linked the less (Charbonnier); 0 for links of equal weight."""
+    """Difference of neighbours above which their link weakens (Charbonnier) [thresholds]; 0 for equal weights."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tiles:
-    """Parts of the map: equal rectangles, nodes ``1 / density`` px apart."""
+    """Parts of the map: rectangles of equal size, with nodes ``1 / density`` px apart."""
 
     origin: NDArray[np.float32]
     """Pixel of each tile's first node, shape (tiles, 2)."""
     rows: int
+    """Number of rows of nodes per tile."""
     columns: int
+    """Number of columns of nodes per tile."""
     density: float = 2.0
+    """Nodes per pixel along each axis."""
 
     @property
     def nodes(self) -> int:
+        """Total number of nodes."""
         return len(self.origin) * self.rows * self.columns
 
 
 class BrightnessMap:
-    """The map of a set of pairs and its solver; owns its buffers. Solves warm-start from the last map.
+    """Brightness map for a set of pairs, and its solver; owns its buffers. A solve starts from the last map.
 
-    What is done often is recorded once (:class:`amiwarp.kernels.replay.Program`); nothing is read back meanwhile.
+    Repeated launches are recorded once (:class:`amiwarp.kernels.replay.Program`). Nothing is read back in between.
     """
 
     def __init__(
@@ -85,12 +89,14 @@ class BrightnessMap:
         smoothness: Smoothness | None = None,
         middle_us: int = 0,
     ) -> None:
-        """``off_excess``: the OFF threshold's excess over the ON threshold where it is known: held, not solved for.
+        """Allocate buffers.
 
-        ``middle_us``: the time to which a turning camera is turned back, the pairs' times being from there.
+        ``off_excess``: OFF threshold over ON threshold, minus 1, if it is known; it is then fixed, not solved for.
+        ``middle_us``: time to which a rotating camera is turned back; the times of the pairs are relative to it.
+        Raises :class:`AmiwarpError` if there are no pairs.
         """
         if not len(pairs):
-            raise AmiwarpError("no pixel fired twice in time: there is no pair of events to learn the brightness from")
+            raise AmiwarpError("no pixel fired twice in time, so there are no pairs of events; give a longer recording")
         self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
         self.pairs, self.middle_us, self.smoothness = pairs, middle_us, smoothness
         self._atlas = kernels.Atlas()
@@ -114,6 +120,7 @@ class BrightnessMap:
         return wp.zeros(n, dtype=float, device=self.device)
 
     def _make_vectors(self, unknowns: int) -> None:
+        """Allocate the vectors of the conjugate gradients."""
         self._width = cg.CPU_WIDTH if self.device.is_cpu else 1
         self._threads = -(-unknowns // self._width)
         self._u, self._dots = cg.Unknowns(), cg.Dots()
@@ -124,6 +131,7 @@ class BrightnessMap:
             setattr(self._dots, name, wp.zeros(n, dtype=wp.float64, device=self.device))
 
     def _make_prior(self, damping: float, unknowns: int) -> None:
+        """Set up damping, smoothness, and the multigrid preconditioner of a single tile."""
         linked = self.smoothness is not None
         self._prior = Prior()
         self._prior.damping, self._prior.columns = damping, self.tiles.columns
@@ -133,24 +141,25 @@ class BrightnessMap:
         if self.smoothness is not None:
             self._prior.smooth.fill_(self.smoothness.weight)
         one = linked and len(self.tiles.origin) == 1
-        self._levels = Levels(self.tiles.rows, self.tiles.columns, self.device) if one else None
+        self._grids = GridHierarchy(self.tiles.rows, self.tiles.columns, self.device) if one else None
         self._z = self._zeros(unknowns * one)
 
     def _new_geometry(self) -> Any:
+        """Return buffers for the positions of the pairs on the map."""
         g = Geometry()
         g.stride = self.pairs.arrays.stride
         g.cell = wp.full(2 * g.stride, -1, dtype=int, device=self.device)
         g.part = self._zeros(4 * g.stride)
         return g
 
-    # -- where pairs fall
+    # -- positions of the pairs
 
     def place(self, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
-        """Where the pairs fall for these parameters, the camera's ``turning`` taken back to ``middle_us``."""
+        """Compute the positions of the pairs on the map, with the camera rotation compensated to ``middle_us``."""
         self._place(model, drift, camera_rotation, self._geometry)
 
     def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
-
+        """Compute the positions of the pairs into ``out``."""
         arrays, params = self.pairs.arrays, model.params(self.device)
         camera_rotation = (camera_rotation or CameraRotation()).about(self.middle_us)
         pinhole = pinhole_params(model.camera)
@@ -172,13 +181,13 @@ class BrightnessMap:
 
     @cached_property
     def _sides(self) -> tuple[Any, Any]:
-        """Two more geometries, for differences."""
+        """Two more geometries, for finite differences."""
         return self._new_geometry(), self._new_geometry()
 
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float) -> Any:
-        """Slope of the residuals, the map as it is, by their difference between two placings, on the device.
+        """Return the slope of the residuals for a fixed map: a difference quotient of two parameter sets.
 
-        ``plus`` and ``minus``: arguments of :meth:`place`, ``width`` apart; the pairs' own places stay.
+        ``plus`` and ``minus``: arguments of :meth:`place`, ``width`` apart. The positions of the pairs do not change.
         """
         for side, at in zip(self._sides, (plus, minus), strict=True):
             self._place(at["model"], at["drift"], at["camera_rotation"], side)
@@ -188,7 +197,7 @@ class BrightnessMap:
         return out
 
     def keep(self, nodes: NDArray[np.bool_]) -> None:
-        """Pairs of two events that lie off ``nodes`` (tiles, rows, columns), either of them, are left out: noise."""
+        """Exclude pairs of two events, as noise, if either event is off ``nodes`` (tiles, rows, columns)."""
         on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
         inputs = [on, self.pairs.arrays.on, self._geometry.stride]
         launch(keep_nodes, self.count, inputs, [self._geometry.cell], device=self.device)
@@ -196,9 +205,9 @@ class BrightnessMap:
     # -- solving
 
     def solve(self, scale: float, *, steps: int, rounds: int = 1) -> None:
-        """``rounds`` of Cauchy weights of ``scale`` [thresholds] and ``steps`` of conjugate gradients each.
+        """Run ``rounds`` of Cauchy weights of ``scale`` [thresholds] with ``steps`` of conjugate gradients each.
 
-        Leaves the residual of every pair [thresholds], NaN for pairs off the map, in ``residuals`` on the device.
+        Afterwards ``residuals`` holds the residual of every pair [thresholds] on the device, NaN for pairs off the map.
         """
         self._scale.fill_(scale)
         for _ in range(rounds):
@@ -208,23 +217,23 @@ class BrightnessMap:
         self._weigh.run()
 
     def restart(self, smoothness: float) -> None:
-        """From an empty map, with another weight of the prior."""
+        """Clear the map and set another weight of the smoothness prior."""
         self._image[: self.tiles.nodes].zero_()
         self._prior.smooth.fill_(smoothness)
 
     def prepare_projection(self) -> None:
-        """For :meth:`unexplained`, with the weights of the last :meth:`solve`."""
+        """Prepare :meth:`unexplained` with the weights of the last :meth:`solve`."""
         self._prepare.run()
 
     def new_change(self) -> Any:
-        """No change of the map, on the device: for :meth:`unexplained` to start from."""
+        """Return a zero change of the map on the device, as a start for :meth:`unexplained`."""
         return self._zeros(len(self._image))
 
     def unexplained(self, target: Any, change: Any, *, steps: int) -> Any:
-        """What of ``target`` (pairs, on the device) no change of the map explains.
+        """Return the part of ``target`` (pairs, on the device) that no change of the map explains.
 
-        The projection of variable projection (Golub and Pereyra 1973), by conjugate gradients from ``change``, a guess
-        of the change that explains it; a better one is left there.
+        This is the projection of variable projection (Golub and Pereyra 1973). It is solved by conjugate gradients that
+        start from ``change``, which is replaced by the better solution.
         """
         inputs = [self.pairs.arrays, self._atlas, self._geometry, self._projection.image]
         wp.copy(self._projection.image, change)
@@ -238,10 +247,12 @@ class BrightnessMap:
 
     @property
     def _equations(self) -> list[Any]:
+        """Kernel arguments that describe the weighted equations."""
         return [self.pairs.arrays, self._atlas, self._geometry, self.residuals.weight]
 
     @cached_property
     def _weigh(self) -> Any:
+        """Program that computes residuals and weights."""
         program = Program(self.device)
         self._add_weigh(program)
         return program
@@ -252,30 +263,30 @@ class BrightnessMap:
 
     @cached_property
     def _prepare(self) -> Any:
-        """Links and diagonals, for the weights and the map as they are."""
+        """Program that computes links and diagonals for the current weights and map."""
         program = Program(self.device)
         if self.smoothness is not None:
             inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
             program.add(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
         program.add_slices(add_diagonal, self.count, self._equations, self._slices)
         program.add(gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
-        if self._levels is not None:
-            self._levels.prepare(program, self._equations[1:], self.count, self._sums, self._slices)
+        if self._grids is not None:
+            self._grids.prepare(program, self._equations[1:], self.count, self._sums, self._slices)
         return program
 
     @cached_property
-    def _descent(self) -> _Descent:
-        return _Descent(self, self._image, self.residuals.values)
+    def _descent(self) -> _ConjugateGradients:
+        return _ConjugateGradients(self, self._image, self.residuals.values)
 
     @cached_property
-    def _projection(self) -> _Descent:
-        return _Descent(self, self._zeros(len(self._image)), self._zeros(self.pairs.arrays.stride))
+    def _projection(self) -> _ConjugateGradients:
+        return _ConjugateGradients(self, self._zeros(len(self._image)), self._zeros(self.pairs.arrays.stride))
 
-    # -- what came out
+    # -- results
 
     @property
     def unknowns(self) -> NDArray[np.float32]:
-        """A copy of the map and, behind it, the leak [1/s] and the OFF threshold's excess over the ON threshold."""
+        """Copy of the map, followed by the leak [1/s] and by OFF threshold over ON threshold, minus 1."""
         values: NDArray[np.float32] = self._image.numpy()
         return values.copy() if self.device.is_cpu else values
 
@@ -284,12 +295,15 @@ class BrightnessMap:
         self._image.assign(values)
 
     def maps(self) -> NDArray[np.float32]:
-        """The map [ON thresholds], shape (tiles, rows, columns)."""
+        """Return the map [ON thresholds], shape (tiles, rows, columns)."""
         shape = (len(self.tiles.origin), self.tiles.rows, self.tiles.columns)
         return self.unknowns[: self.tiles.nodes].reshape(shape)
 
     def coverage(self, scale: float = 1.0) -> NDArray[np.float32]:
-        """How much pairs of two events say of each node, with weights of ``scale``, shape (tiles, rows, columns)."""
+        """Return how well pairs of two events determine each node, shape (tiles, rows, columns).
+
+        Each equation contributes its weight for the Cauchy scale ``scale`` [thresholds].
+        """
         self._scale.fill_(scale)
         weak, self.pairs.arrays.weak = self.pairs.arrays.weak, 0.0
         program = Program(self.device)
@@ -305,35 +319,36 @@ class BrightnessMap:
 
     @property
     def extra(self) -> NDArray[np.float32]:
-        """The unknowns behind the map: the leak [thresholds/s], and the OFF threshold's excess."""
+        """Unknowns after the map: the leak [thresholds/s], and OFF threshold over ON threshold, minus 1."""
         return self.unknowns[self.tiles.nodes :]
 
 
-class _Descent:
-    """Conjugate gradients on the normal equations, preconditioned by the diagonal or by :class:`Levels`.
+class _ConjugateGradients:
+    """Conjugate gradients on the normal equations, preconditioned by the diagonal or by :class:`GridHierarchy`.
 
-    ``image`` moves so that less is left of ``residual``, which is that of ``image`` as it comes in.
+    They change ``image`` to reduce ``residual``, which must be the residual of the initial ``image``.
     """
 
     def __init__(self, of: BrightnessMap, image: Any, residual: Any) -> None:
         self.image, self.residual = image, residual
-        self._of, self._begin, self._step = of, Program(of.device), Program(of.device)
-        self._add_begin(self._begin)
+        self._map, self._start, self._step = of, Program(of.device), Program(of.device)
+        self._add_start(self._start)
         self._add_step(self._step)
 
     def run(self, steps: int) -> None:
-        self._begin.run()
+        """Start from the current image and run ``steps`` iterations."""
+        self._start.run()
         self._step.run(steps)
 
-    def _add_begin(self, program: Any) -> None:
-        of = self._of
+    def _add_start(self, program: Any) -> None:
+        of = self._map
         program.add_slices(kernels.apply_transpose, of.count, [*of._equations, self.residual], of._slices)
         self._add(program, cg.start_descent, [of._sums, of._prior, self.image], [of._u, of._dots])
         self._correct(program)
 
     def _add_step(self, program: Any) -> None:
-        of = self._of
-        if of._levels is None:
+        of = self._map
+        if of._grids is None:
             self._add(program, cg.turn, [], [of._u, of._dots])
         else:
             self._add(program, cg.turn_to, [of._z], [of._u, of._dots])
@@ -348,11 +363,11 @@ class _Descent:
         self._correct(program)
 
     def _correct(self, program: Any) -> None:
-        """The preconditioned residual, and its product with the residual."""
-        of = self._of
-        if of._levels is not None:
-            of._levels.correct(program, of._u.diagonal, of._prior, of._u.residual, of._z)
+        """Compute the preconditioned residual and its product with the residual."""
+        of = self._map
+        if of._grids is not None:
+            of._grids.correct(program, of._u.diagonal, of._prior, of._u.residual, of._z)
             self._add(program, dot, [of._u.residual, of._z], [of._dots.rz])
 
     def _add(self, program: Any, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        program.add(kernel, self._of._threads, [*inputs, self._of._width], outputs, smallest=CHUNKS)
+        program.add(kernel, self._map._threads, [*inputs, self._map._width], outputs, smallest=CHUNKS)

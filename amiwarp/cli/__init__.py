@@ -1,6 +1,7 @@
-"""The command line: subcommands, the choice of a device, everything that is printed.
+"""Command line: subcommands, choice of the device, and everything that is printed.
 
-Results go to stdout, progress and errors to stderr. Exit codes: 0 done, 1 bad input, 2 wrong usage, 130 interrupted.
+Results go to stdout; progress and errors go to stderr. Exit codes: 0 success, 1 bad input, 2 wrong usage,
+130 interrupted.
 """
 
 import sys
@@ -13,12 +14,12 @@ STOPPED = "interrupted; nothing was left half-written"
 
 
 def say(message: str) -> None:
-    """Print a note or a warning on stderr, as one line."""
+    """Print a note or a warning on stderr as one line."""
     print(printable(message), file=sys.stderr, flush=True)
 
 
 def fail(code: int, message: str) -> NoReturn:
-    """Print one line on stderr and end the process."""
-    # Typer lists the choices of an option a line each.
+    """Print one line on stderr and exit with ``code``."""
+    # Typer puts each choice of an option on a line of its own.
     say(f"amiwarp: {message.strip().replace(chr(10) + chr(9), ' ')}")
     sys.exit(code)

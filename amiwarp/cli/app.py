@@ -1,4 +1,4 @@
-"""The application: which subcommands there are, and how each way of failing ends."""
+"""The application: registration of the subcommands, and exit codes for failures."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from amiwarp.errors import AmiwarpError
 BAD_INPUT, USAGE = 1, 2
 
 _UsageError: Any = typer.BadParameter.__base__
-"""Typer carries its own copy of click since 0.2x, and used the real one before: this is either's."""
+"""Click's ``UsageError``. Taken from Typer, because newer versions of Typer carry their own copy of click."""
 
 
 class _Group(TyperGroup):
-    """Every failure a user can meet becomes one line on stderr and an exit code."""
+    """Command group that reports every failure as one line on stderr and an exit code."""
 
     def main(self, *args: Any, **extra: Any) -> Any:
         extra["standalone_mode"] = False
@@ -63,7 +63,7 @@ class _Group(TyperGroup):
 app = typer.Typer(
     cls=_Group,
     name="amiwarp",
-    help="Take the motion of a rotating wedge prism out of the events of the camera behind it.",
+    help="Compensate the motion of a rotating wedge prism in the events of the camera behind it.",
     epilog="Start with: amiwarp demo",
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
@@ -73,7 +73,9 @@ app = typer.Typer(
 
 
 @app.callback(invoke_without_command=True)
-def _version(ctx: typer.Context, version: bool = typer.Option(False, "--version", help="Print the version.")) -> None:
+def _version(
+    ctx: typer.Context, version: bool = typer.Option(False, "--version", help="Print the version and exit.")
+) -> None:
     if version:
         import amiwarp
 
@@ -90,23 +92,23 @@ for module in (
 
 
 def main() -> None:
-    """Run the command line; ends the process."""
-    sys.unraisablehook = _interrupt_again
+    """Run the command line and exit the process."""
+    sys.unraisablehook = _repeat_dropped_interrupt
     app(prog_name="amiwarp")
 
 
-def _interrupt_again(dropped: Any) -> None:
-    """Ctrl-C that reaches Python inside a finaliser is dropped there; it is given once more, a moment later."""
-    if not issubclass(dropped.exc_type, KeyboardInterrupt):
-        sys.__unraisablehook__(dropped)
+def _repeat_dropped_interrupt(unraisable: Any) -> None:
+    """Repeat a Ctrl-C that Python dropped because it arrived inside a finaliser."""
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
         return
-    again = threading.Timer(0.05, _interrupt)
-    again.daemon = True
-    again.start()
+    timer = threading.Timer(0.05, _interrupt)
+    timer.daemon = True
+    timer.start()
 
 
 def _interrupt() -> None:
-    """Interrupt the main thread, also in a call that waits."""
+    """Interrupt the main thread, even while it waits in a blocking call."""
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
     else:

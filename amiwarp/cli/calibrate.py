@@ -1,4 +1,4 @@
-"""``amiwarp calibrate``: the prism's parameters from the recording itself."""
+"""``amiwarp calibrate``: estimation of the prism's parameters from a recording."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.
 _SEARCH, _PARAMETERS = "Search", "Parameters"
 
 
-class Method(enum.StrEnum):
-    """Whose way to calibrate."""
+class CalibrationMethod(enum.StrEnum):
+    """Calibration method."""
 
     AMIWARP = "amiwarp"
     PAPER = "paper"
@@ -39,76 +39,94 @@ class Method(enum.StrEnum):
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How to search; what is left out takes the default of ``amiwarp.calib.Settings``."""
+    """Options for the search. Defaults are those of ``amiwarp.Settings``."""
 
     model: Annotated[
         str | None,
         typer.Option(
-            help="circle, exact, radial or ellipse; auto (default): the smallest that keeps the budget.",
+            help="Prism model: circle, exact, radial, ellipse, or auto: the smallest model within --budget-px. "
+            "Default: auto.",
             rich_help_panel=_SEARCH,
         ),
     ] = None
     budget_px: Annotated[
         float | None,
         typer.Option(
-            help="Error of a model that counts as none, for --model auto. Default: a tenth of the blur that "
-            "quantisation and timing leave anyway.",
+            help="Largest model error that --model auto accepts (px). Default: a tenth of the blur from quantisation "
+            "and timing.",
             rich_help_panel=_SEARCH,
         ),
     ] = None
     sharpness: Annotated[
-        Sharpness | None, typer.Option(help="What is maximised. Default: variance.", rich_help_panel=_SEARCH)
+        Sharpness | None,
+        typer.Option(help="Sharpness measure to maximise. Default: variance.", rich_help_panel=_SEARCH),
     ] = None
     global_algorithm: Annotated[
         str | None,
-        typer.Option(help="NLopt's name, as GN_DIRECT_L; none starts at --start at once.", rich_help_panel=_SEARCH),
+        typer.Option(
+            help="NLopt algorithm of the global search, such as GN_DIRECT_L. none: search locally from --start.",
+            rich_help_panel=_SEARCH,
+        ),
     ] = None
     local_algorithm: Annotated[
-        str | None, typer.Option(help="NLopt's name, as LN_BOBYQA.", rich_help_panel=_SEARCH)
+        str | None,
+        typer.Option(help="NLopt algorithm of the local search, such as LN_BOBYQA.", rich_help_panel=_SEARCH),
     ] = None
     global_evaluations: Annotated[
-        int | None, typer.Option(min=1, help="Budget of the global search.", rich_help_panel=_SEARCH)
+        int | None,
+        typer.Option(min=1, help="Largest number of evaluations in the global search.", rich_help_panel=_SEARCH),
     ] = None
     local_evaluations: Annotated[
-        int | None, typer.Option(min=1, help="Budget of each local search.", rich_help_panel=_SEARCH)
+        int | None,
+        typer.Option(min=1, help="Largest number of evaluations in each local search.", rich_help_panel=_SEARCH),
     ] = None
     tolerance_px: Annotated[
         float | None,
-        typer.Option(min=0.0, help="The local search ends when its steps are smaller.", rich_help_panel=_SEARCH),
+        typer.Option(
+            min=0.0, help="Smallest step of the local search, as motion of events (px).", rich_help_panel=_SEARCH
+        ),
     ] = None
     smoothing_px: Annotated[
-        float | None, typer.Option(min=0.0, help="Smoothing of the fine image.", rich_help_panel=_SEARCH)
+        float | None, typer.Option(min=0.0, help="Smoothing of the local search's image (px).", rich_help_panel=_SEARCH)
     ] = None
     per_polarity: Annotated[
-        bool, typer.Option("--per-polarity", help="ON and OFF events in images apart.", rich_help_panel=_SEARCH)
+        bool, typer.Option("--per-polarity", help="Use separate images for ON and OFF events.", rich_help_panel=_SEARCH)
     ] = False
     events: Annotated[
-        int | None, typer.Option(min=1, help="At most so many events, thinned evenly.", rich_help_panel=_SEARCH)
+        int | None,
+        typer.Option(min=1, help="Largest number of events to use; more are thinned evenly.", rich_help_panel=_SEARCH),
     ] = None
     fold: Annotated[
         int | None,
         typer.Option(
-            min=0, help="Join a pixel's events within one of so many angles a turn. Default: 0, none.",
+            min=0,
+            help="Number of angle bins per turn; events of one pixel in the same bin are joined. Default: 0 (off).",
             rich_help_panel=_SEARCH,
         ),
-    ] = None  # fmt: skip
+    ] = None
     stages: Annotated[
         str | None,
-        typer.Option(help="sharpness: without the photometric stage. Default: both.", rich_help_panel=_SEARCH),
+        typer.Option(
+            help="Stages to run: sharpness, or sharpness,photometric. Default: both stages.", rich_help_panel=_SEARCH
+        ),
     ] = None
     photometric_algorithm: Annotated[
         str | None,
-        typer.Option(help="gauss-newton (default), or NLopt's name, as LN_BOBYQA.", rich_help_panel=_SEARCH),
+        typer.Option(
+            help="Algorithm of the photometric stage: gauss-newton, or an NLopt algorithm such as LN_BOBYQA. "
+            "Default: gauss-newton.",
+            rich_help_panel=_SEARCH,
+        ),
     ] = None
     latency_us: Annotated[
-        float, typer.Option(min=0.0, help="Known delay of the sensor's time stamps.", rich_help_panel=_SEARCH)
+        float, typer.Option(min=0.0, help="Known delay of the sensor's time stamps (us).", rich_help_panel=_SEARCH)
     ] = 0.0
     refractory_us: Annotated[
-        float, typer.Option(min=0.0, help="Known refractory time of the sensor.", rich_help_panel=_SEARCH)
+        float, typer.Option(min=0.0, help="Known refractory period of the sensor (us).", rich_help_panel=_SEARCH)
     ] = 0.0
 
     def changes(self, base: PhotometricSettings) -> dict[str, Any]:
-        """Fields of the settings that were given; ``base``: those of the photometric stage that were not."""
+        """Return the fields of the settings that options give. ``base`` holds the other photometric settings."""
         from amiwarp.brightness.event_pairs import SensorTiming
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
@@ -124,21 +142,22 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class ParameterOptions:
-    """What is free, where it starts and how far it may go."""
+    """Options for the parameters: which are estimated, their start values and bounds."""
 
     free: Annotated[
         str | None,
         typer.Option(
-            help="Names separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, tilt_y, index, "
-            "focal_length; motion (or rate_x, rate_y, rate_z) and change_x, change_y, change_z for a camera that "
-            "turns; off_ratio and leak of the sensor. Default: apex,phase, and rpm without an encoder.",
+            help="Parameters to estimate, separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, "
+            "tilt_y, index, focal_length; motion (or rate_x, rate_y, rate_z) and change_x, change_y, change_z for a "
+            "rotating camera; off_ratio and leak of the sensor. Default: apex,phase, and rpm without an encoder.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None
     start: Annotated[
         list[str] | None,
         typer.Option(
-            help="Known value, free or not, as apex=1.1deg or clock_offset=-250us; can be given more than once.",
+            help="Start value of an estimated parameter, or known value of another one, such as apex=1.1deg or "
+            "clock_offset=-250us. Can be repeated.",
             metavar="NAME=VALUE",
             rich_help_panel=_PARAMETERS,
         ),
@@ -146,7 +165,7 @@ class ParameterOptions:
     bound: Annotated[
         list[str] | None,
         typer.Option(
-            help="Bounds of a free parameter, as phase=-10:10deg; can be given more than once.",
+            help="Bounds of an estimated parameter, such as phase=-10:10deg. Can be repeated.",
             metavar="NAME=LOW:HIGH",
             rich_help_panel=_PARAMETERS,
         ),
@@ -154,14 +173,17 @@ class ParameterOptions:
     rpm: Annotated[
         float | None,
         typer.Option(
-            help="Speed (turns/min) where there is no encoder, negative backwards; it is refined. "
-            "Default: found in the events.",
+            help="Start value of the prism's speed without an encoder (turns/min); negative: backwards. "
+            "Default: estimated from the events.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None
 
     def changes(self) -> dict[str, Any]:
-        """Fields of the settings that were given. Raises :class:`AmiwarpError` for names and values that are none."""
+        """Return the fields of the settings that options give.
+
+        Raises :class:`AmiwarpError` for unknown parameters and values that cannot be read.
+        """
         start = {name: number(text, unit, f"--start {name}") for name, unit, text in map(_named, self.start or ())}
         bounds = {name: interval(text, unit, f"--bound {name}") for name, unit, text in map(_named, self.bound or ())}
         if self.rpm is not None:
@@ -176,32 +198,38 @@ def _named(text: str) -> tuple[str, str, str]:
     name, equals, value = text.partition("=")
     name = name.strip()
     if not equals or name not in UNITS:
-        raise AmiwarpError(f"{text!r} names no parameter; write NAME=VALUE with one of {', '.join(UNITS)}")
+        raise AmiwarpError(f"{text!r} does not name a parameter; write NAME=VALUE with NAME one of {', '.join(UNITS)}")
     return name, UNITS[name], value
 
 
 def run(
-    recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[
         Path | None,
-        typer.Argument(help="Calibration to write; default: NAME.calibration.json beside the recording."),
+        typer.Argument(help="Calibration file to write. Default: NAME.calibration.json next to the recording."),
         OUTPUT,
     ] = None,
     *,
     method: Annotated[
-        Method,
+        CalibrationMethod,
         typer.Option(
-            help="paper: He et al.'s, to compare with: a circle, their cost J, a grid about the nominal prism."
+            help="Calibration method. paper: the method of He et al. for comparison (circle model, their cost J, grid "
+            "around the nominal prism)."
         ),
-    ] = Method.AMIWARP,
+    ] = CalibrationMethod.AMIWARP,
     preset: Annotated[
-        Path | None, typer.Option(help="Settings that 'amiwarp chart' chose; options given beside it win.")
+        Path | None, typer.Option(help="Preset with settings from 'amiwarp chart'. Other options override it.")
     ] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Draw the cost surface, and the events' image before and after (.png)."), OUTPUT
+        Path | None,
+        typer.Option(help="Figure to write: cost surface, and image of the events before and after (.png)."),
+        OUTPUT,
     ] = None,
     window: Annotated[
-        str | None, typer.Option(help="Only these seconds of the recording.", metavar="START:END")
+        str | None,
+        typer.Option(
+            help="Time window to use (s from the first event). Default: the whole recording.", metavar="START:END"
+        ),
     ] = None,
     search: SearchOptions,
     parameters: ParameterOptions,
@@ -209,7 +237,10 @@ def run(
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
-    """Find the prism's parameters: those that make the image of the events sharpest. No guess is needed."""
+    """Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest.
+
+    No initial guess is needed. A photometric stage refines the result.
+    """
     from amiwarp.calib import Settings, calibrate
     from amiwarp.calib.paper_method import calibrate_as_paper
     from amiwarp.calib.presets import Preset
@@ -222,9 +253,9 @@ def run(
     out = out or recording.with_name(f"{recording.stem}.calibration.json")
     check_output(out)
     if figure is not None and figure.suffix.lower() != ".png":
-        raise AmiwarpError(f"{figure}: figures are written as .png")
+        raise AmiwarpError(f"{figure}: figures are written as .png; give a name that ends in .png")
     with progress("calibrating") as advance:
-        if method is Method.PAPER:
+        if method is CalibrationMethod.PAPER:
             check_paper(search, parameters, preset)
             found = calibrate_as_paper(opened, start=settings.start, device=device, progress=advance)
         else:
@@ -239,35 +270,35 @@ def run(
 
 
 def check_paper(search: SearchOptions, parameters: ParameterOptions, preset: Path | None) -> None:
-    """The paper's method has no settings but where it starts."""
+    """Raise :class:`AmiwarpError` if settings other than the start phase are given for the paper's method."""
     if search != SearchOptions() or preset is not None or replace(parameters, start=None) != ParameterOptions():
-        raise AmiwarpError("--method paper takes no settings of the search but --start phase=…; leave the others out")
+        raise AmiwarpError("--method paper accepts no search options except --start phase=…; leave the others out")
 
 
 def cut(recording: Recording, window: str) -> Recording:
-    """The recording's ``START:END`` seconds after its first event; either may be left out.
+    """Return the part of the recording in ``window``: ``START:END`` [s from the first event]; both are optional.
 
-    Raises :class:`AmiwarpError` for a window that is none or holds no event.
+    Raises :class:`AmiwarpError` if the text is not a time span, or no event is in it.
     """
     first, last = recording.events.t_first, recording.events.t_last
     low, high = span(window, first, last)
     events = recording.events.between(low, high)
     if not len(events):
         raise AmiwarpError(
-            f"{recording.name}: no events in the window {window} s; the recording has {(last - first) * 1e-6:.6g} s"
+            f"{recording.name}: no events in the window {window} s; the recording is {(last - first) * 1e-6:.6g} s long"
         )
     return replace(recording, events=MemoryEvents(events, *recording.events.size))
 
 
 def summary(c: Calibration) -> dict[str, Any]:
-    """What was found, angles in degrees beside radians; without the samples, which are in the file."""
+    """Return the calibration for JSON, with angles in radians and degrees; evaluated points are left out."""
     data = c.to_json()
     data["stages"] = [{k: v for k, v in stage.items() if k != "points"} for stage in data["stages"]]
     return data
 
 
 def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
-    """The tables for people."""
+    """Return the calibration as tables and lines of text."""
     rows = [(name, *_shown(entry)) for name, entry in data["parameters"].items()]
     stages = [
         (s["name"], s["algorithm"], str(s["evaluations"]), f"{s['seconds']:.2f} s", f"{s['sharpness']:.5g}", s["ended"])
@@ -288,27 +319,37 @@ def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
 
 
 def _ladder(ladder: ModelChoice | None) -> list[Any]:
-    """Why this model, and what was freed."""
+    """Return the comparison of the models and the check of additional parameters."""
     if ladder is None:
         return []
-    rungs = [
+    models = [
         (r.model, r.numbers, f"{r.predicted_px:.4f} px", f"{r.sharpness:.5g}", f"{r.loss:.2g} ± {r.loss_std:.1g}",
          _range(r.seen_px), f"{r.cost_ns:.3g} ns", ("chosen: " if r.chosen else "") + r.verdict)
         for r in ladder.rungs
     ]  # fmt: skip
     freed = [(p.name, "" if p.std_px is None else f"{p.std_px:.2g} px", p.verdict) for p in ladder.parameters]
     return [
-        table(rungs, "model", "numbers", "predicted", "held out", "loss", "as motion", "per event", "verdict"),
-        f"budget {ladder.budget_px:.3g} px; timing leaves {ladder.timing_px:.2g} px of blur; "
-        f"the judges {'agree' if ladder.agreed else 'do not agree'}",
-        *([table(freed, "parameter", "± std", "freed or why not")] if freed else []),
+        table(
+            models,
+            "model",
+            "parameters",
+            "predicted error",
+            "held-out sharpness",
+            "loss",
+            "loss as motion",
+            "time per event",
+            "verdict",
+        ),
+        f"budget {ladder.budget_px:.3g} px; blur from timing {ladder.timing_px:.2g} px; predicted errors and held-out "
+        f"sharpness {'agree' if ladder.agreed else 'do not agree'}",
+        *([table(freed, "additional parameter", "± std", "verdict")] if freed else []),
         *(_exact(ladder) if not any(r.chosen and r.model == "exact" for r in ladder.rungs) else []),
         "",
     ]
 
 
 def _exact(ladder: ModelChoice) -> list[str]:
-    """The prism itself, where the chosen model does not name its apex."""
+    """Return the apex of the exact model, for a chosen model without an apex."""
     std = ladder.exact_uncertainty.get("apex", 0.0)
     return [f"the exact model's apex: {math.degrees(ladder.exact['apex']):.6g} ± {math.degrees(std):.2g} deg"]
 
@@ -324,7 +365,7 @@ def _photometric(c: Calibration) -> list[str]:
     if c.photometric is None or not c.photometric.accepted:
         return []
     p = c.photometric
-    return [f"photometric: {p.verdict}; {p.pairs:,} pairs, {p.moved_px:.3f} px from the answer of sharpness"]
+    return [f"photometric: {p.verdict}; {p.pairs:,} pairs, {p.moved_px:.3f} px from the result of the sharpness stage"]
 
 
 def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:

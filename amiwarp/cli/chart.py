@@ -1,4 +1,4 @@
-"""``amiwarp chart``: what each bit of speed costs on this machine, drawn; and settings for a budget."""
+"""``amiwarp chart``: charts of speed against error on this machine, and settings for a budget."""
 
 from __future__ import annotations
 
@@ -24,31 +24,33 @@ EXAMPLE = "amiwarp chart --out amiwarp-chart --budget-px 0.3"
 
 def run(
     recording: Annotated[
-        Path | None, typer.Argument(help="Recording with truth. Default: simulated, 10 million events.")
+        Path | None, typer.Argument(help="Recording with ground truth. Default: simulated, 10 million events.")
     ] = None,
     *,
     out: Annotated[Path, typer.Option(help="Folder for charts, tables and presets."), OUTPUT_FOLDER] = Path(
         "amiwarp-chart"
     ),
-    picture: Annotated[Path | None, typer.Option(help="Picture to simulate from. Default: a map of the earth.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the simulated scene. Default: a map of the earth.")
+    ] = None,
     budget_px: Annotated[
-        float | None, typer.Option(min=0.0, help="Answer with the fastest settings within this error (px).")
+        float | None, typer.Option(min=0.0, help="Error limit (px): choose the fastest settings within it.")
     ] = None,
     budget_ms: Annotated[
-        float | None, typer.Option(min=0.0, help="Answer with the most accurate calibration within this time (ms).")
+        float | None, typer.Option(min=0.0, help="Time limit (ms): choose the most accurate calibration within it.")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A few settings, once each: to see that it works.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Measure a few settings once each, as a short trial.")] = False,
     common: Common,
 ) -> None:
-    """Measure speed and error of every sensible setting on a recording with truth, and draw both Pareto fronts.
+    """Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.
 
-    The answer to a budget is written as preset_calibration.json and preset_compensation.json, which calibrate and
-    compensate take as --preset.
+    With a budget, the chosen settings are written to preset_calibration.json and preset_compensation.json. Pass these
+    files to calibrate and compensate with --preset.
     """
     if budget_px is not None and budget_ms is not None:
-        raise AmiwarpError("--budget-px and --budget-ms both ask for a setting; give one of them")
+        raise AmiwarpError("--budget-px and --budget-ms are two budgets; give one of them")
     if recording is not None and picture is not None:
-        raise AmiwarpError("a recording and --picture both say what to measure on; give one of them")
+        raise AmiwarpError("a recording and --picture both provide the events to measure on; give one of them")
     device = choose_device(common.device)
     from amiwarp.studies.chart import make, simulated
 
@@ -70,7 +72,7 @@ def run(
 
 
 def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
-    """Fronts, defaults and answers; the whole table is in the files."""
+    """Return the fronts, defaults and chosen settings for JSON. The full tables are in the files."""
 
     def fields(row: Row) -> dict[str, Any]:
         return {"label": row.label, "job": row.job, "mev_per_s": row.mev_per_s, "ms": row.seconds * 1e3,
@@ -89,7 +91,7 @@ def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[s
 
 
 def lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> list[Any]:
-    """The same for people."""
+    """Return the results as tables and lines of text."""
     shown: list[Any] = []
     for rows in (charts.compensation, charts.calibration):
         for job, chosen in fronts(rows):
@@ -101,11 +103,13 @@ def lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> list[Any
     shown += [f"note: {note}" for note in charts.notes]
     for kind, row in answers.items():
         if row is None:
-            shown.append(f"{kind}: nothing measured lies within the budget; see the front above")
+            shown.append(f"{kind}: no measured setting is within the budget; see the front above")
         else:
             speed, error = _speed(row)
             file = out / f"preset_{kind}.json"
-            shown.append(f"{kind} within the budget: {row.label}, {speed}, {error} measured; --preset {file}")
+            shown.append(
+                f"{kind} within the budget: {row.label}, {speed}, {error} measured; use it with --preset {file}"
+            )
     return [*shown, *(f"{name}: {path}" for name, path in charts.files.items())]
 
 

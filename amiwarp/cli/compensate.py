@@ -1,4 +1,4 @@
-"""``amiwarp compensate``: a recording and its calibration into a recording without the prism's motion."""
+"""``amiwarp compensate``: motion compensation of a recording with its calibration."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _IWE = "Image of warped events"
 
 @dataclass(frozen=True)
 class IweOptions:
-    """The image of warped events, written along the way."""
+    """Options for images of warped events (IWE), written during the compensation."""
 
     iwe: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Image of the compensated events: .png to look at, .npy with the counts; can be given twice.",
+            help="Image of warped events (IWE) to write: .png for viewing, .npy with the counts. Can be given twice.",
             metavar="<path>",
             rich_help_panel=_IWE,
         ),
@@ -39,19 +39,23 @@ class IweOptions:
     iwe_window_ms: Annotated[
         float | None,
         typer.Option(
-            min=0.001, help="One image for each window of time: NAME_00000.png ..., or one stack in .npy.",
-            rich_help_panel=_IWE,
+            min=0.001, rich_help_panel=_IWE,
+            help="Write one image per time window of this length (ms): NAME_00000.png ..., or one stack in .npy.",
         ),
     ] = None  # fmt: skip
     iwe_layers: Annotated[
         Layers,
-        typer.Option(help="merged: all events; signed: ON minus OFF; polarity: both, apart.", rich_help_panel=_IWE),
+        typer.Option(
+            help="Use of polarity. merged: ignored; signed: ON minus OFF; polarity: ON and OFF in separate layers.",
+            rich_help_panel=_IWE,
+        ),
     ] = Layers.MERGED
 
     def build(self, recording: Recording, device: str) -> IweFiles | None:
+        """Return the writer of the images, or None if no image is requested."""
         if not self.iwe:
             if self.iwe_window_ms is not None or self.iwe_layers is not Layers.MERGED:
-                raise AmiwarpError("--iwe-window-ms and --iwe-layers describe an image; give --iwe too")
+                raise AmiwarpError("--iwe-window-ms and --iwe-layers apply to --iwe; give --iwe too")
             return None
         from amiwarp.imaging.export import IweFiles
 
@@ -60,18 +64,20 @@ class IweOptions:
 
 
 def run(
-    recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[Path, typer.Argument(help="Compensated recording to write (.h5)."), OUTPUT],
     *,
-    calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
+    calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
     preset: Annotated[
         Path | None,
-        typer.Option(help="The model that 'amiwarp chart' chose, of the same prism. Default: as calibrated."),
+        typer.Option(help="Preset from 'amiwarp chart': sets the prism model to use. Default: the calibrated model."),
     ] = None,
     iwe: IweOptions,
     common: Common,
 ) -> None:
-    """Move every event to where it would be without the prism: sub-pixel, in order, none dropped, constant memory.
+    """Compensate the prism's motion: move every event to its position without the prism.
+
+    Positions are sub-pixel. All events are kept, in order. Memory use does not depend on the length of the recording.
 
     A PNG shows counts from 0 (black) to their 99.5th percentile over pixels with events (white), with gamma 0.5.
     """

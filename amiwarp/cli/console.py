@@ -1,4 +1,4 @@
-"""What commands share at run time: the device, progress on stderr, the result on stdout."""
+"""Parts that the commands share: choice of the device, progress bar, printed result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ from amiwarp.progress import Progress
 
 
 def choose_device(name: str | None) -> str:
-    """The device to work on, once Warp is loaded and silenced. Raises :class:`AmiwarpError` where it is not here."""
+    """Initialise Warp without its banner and return the device to run on.
+
+    Raises :class:`AmiwarpError` if the named device is not available.
+    """
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR
@@ -32,22 +35,22 @@ def choose_device(name: str | None) -> str:
     known = [device.alias for device in wp.get_devices()]
     chosen = name or ("cuda:0" if "cuda:0" in known else "cpu")
     if chosen not in known:
-        raise AmiwarpError(f"device {chosen!r} is not here; choose among {', '.join(known)}")
+        raise AmiwarpError(f"device {chosen!r} is not available; choose one of {', '.join(known)}")
     return chosen
 
 
 @contextlib.contextmanager
 def _without(line: str) -> Iterator[None]:
-    """Drops one expected line that native code writes to stderr, and nothing else."""
+    """Remove one expected line from what native code writes to stderr; print the rest."""
     sys.stderr.flush()
-    kept = os.dup(2)
+    original = os.dup(2)
     with tempfile.TemporaryFile() as caught:
         os.dup2(caught.fileno(), 2)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(original, 2)
+            os.close(original)
             caught.seek(0)
             for text in caught.read().decode(errors="replace").splitlines():
                 if line not in text:
@@ -56,7 +59,7 @@ def _without(line: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress(what: str) -> Iterator[Progress]:
-    """A progress bar on stderr, gone when it is done; nothing where stderr is no terminal."""
+    """Show a progress bar on stderr and remove it at the end. Print nothing if stderr is not a terminal."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -65,14 +68,15 @@ def progress(what: str) -> Iterator[Progress]:
 
 
 def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -> None:
-    """Print the result: ``data`` as one JSON object, or ``lines`` for people, each one line (see :func:`printable`).
+    """Print the result: ``data`` as one JSON object with ``--json``, otherwise ``lines`` as text.
 
-    In JSON a number that is not finite becomes null.
+    Each string in ``lines`` is printed as a single line, see :func:`printable`. In JSON, numbers that are not finite
+    become null.
     """
     if common.json:
         print(json.dumps(plain(data), allow_nan=False), flush=True)
         return
-    # Into a file or a pipe nothing is wrapped.
+    # Lines are not wrapped if stdout is a file or a pipe.
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 1000)
     with console.capture() as text:
         for line in lines:
@@ -81,7 +85,7 @@ def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -
 
 
 def plain(value: Any) -> Any:
-    """The same as objects that JSON knows."""
+    """Convert ``value`` to types that JSON supports. Numbers that are not finite become None."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -94,7 +98,7 @@ def plain(value: Any) -> Any:
 
 
 def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:
-    """Return two columns and more, without lines; strings are shown without markup, see :func:`printable`."""
+    """Return a table without rules. Cells are shown without markup, see :func:`printable`."""
     from rich.text import Text
 
     grid = Table(box=None, show_header=bool(headings), pad_edge=False, header_style="bold")

@@ -1,4 +1,4 @@
-"""``amiwarp convert``: any recording into the native format."""
+"""``amiwarp convert``: conversion of recordings to the native format."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ _PANEL = "Encoder"
 
 @dataclass(frozen=True)
 class EncoderOptions:
-    """A log of the prism's encoder."""
+    """Options for a log of the prism's encoder."""
 
     encoder: Annotated[
         Path | None,
         typer.Option(
-            help="CSV with a header t_us,angle_deg or t_us,count, and index (0 or 1) where there is one.",
+            help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1).",
             rich_help_panel=_PANEL,
         ),
     ] = None
     counts_per_turn: Annotated[
-        int | None, typer.Option(min=1, help="Counts of the encoder per turn.", rich_help_panel=_PANEL)
+        int | None, typer.Option(min=1, help="Encoder counts per turn.", rich_help_panel=_PANEL)
     ] = None
     counter_bits: Annotated[
         int | None,
         typer.Option(
             min=0,
             max=64,
-            help="Width of the encoder's counter, 0 for a counter that starts anew each turn. "
-            "Default: found in the counts.",
+            help="Width of the encoder's counter (bits); 0: the counter restarts at every turn. "
+            "Default: inferred from the counts.",
             rich_help_panel=_PANEL,
         ),
     ] = None
     direction: Annotated[
-        Literal["1", "-1"], typer.Option(help="-1 where the encoder counts backwards.", rich_help_panel=_PANEL)
+        Literal["1", "-1"], typer.Option(help="Counting direction; -1: backwards.", rich_help_panel=_PANEL)
     ] = "1"
 
     def build(self) -> Encoder | None:
-        """The encoder of the log, or None where none is given."""
+        """Return the encoder of the log, or None if no log is given."""
         if self.encoder is None:
             if self != EncoderOptions():
                 what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
@@ -68,20 +68,24 @@ class EncoderOptions:
 
 
 def run(
-    source: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
+    source: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[Path, typer.Argument(help="Native recording to write (.h5)."), OUTPUT],
+    *,
     encoder: EncoderOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
-    """Convert a recording to amiwarp's HDF5, with its encoder, camera and prism put in. In constant memory."""
+    """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
+
+    Memory use does not depend on the length of the recording.
+    """
     began = time.perf_counter()
     log = encoder.build()
     lens = wedge = None
-    if camera != CameraOptions() or prism != NominalPrismOptions():  # opening may cost a pass over the file
+    if camera != CameraOptions() or prism != NominalPrismOptions():  # opening may read the whole file
         recording = open_recording(source)
-        # A file that does not tell its size takes the camera's.
+        # If the file does not hold the sensor's size, the camera's size is used.
         lens = camera.build(*recording.events.size, fixed=getattr(recording.events, "size_is_known", True))
         wedge = prism.build(recording.prism)
     with progress("converting") as advance:
@@ -104,7 +108,7 @@ def _lines(d: dict[str, Any]) -> list[str]:
     ]
     lines += [f"note: {name}: {count:,}" for name, count in d["repairs"].items()]
     if d["encoder_covers"] is False:
-        lines.append("warning: the encoder does not cover all events")
+        lines.append("warning: the encoder samples do not cover all events")
     if d["encoder_gaps"]:
         first = d["encoder_gaps"][0]
         lines.append(

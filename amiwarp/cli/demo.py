@@ -1,4 +1,4 @@
-"""``amiwarp demo``: the whole main job on a real picture."""
+"""``amiwarp demo``: simulation, calibration, compensation and reconstruction of one picture."""
 
 from __future__ import annotations
 
@@ -16,20 +16,25 @@ from amiwarp.cli.options import OUTPUT_FOLDER, Common
 EXAMPLE = "amiwarp demo --out amiwarp-demo"
 
 OWN_FOLDER = Path("amiwarp-demo")
-"""What an earlier demo left in this folder is replaced."""
+"""Default folder. Files of an earlier demo in it are replaced."""
 
 
 def run(
     *,
     out: Annotated[
-        Path, typer.Option(help="Folder for recording, calibration, picture and figure."), OUTPUT_FOLDER
+        Path, typer.Option(help="Folder for the recording, calibration, picture and figure."), OUTPUT_FOLDER
     ] = OWN_FOLDER,
-    picture: Annotated[Path | None, typer.Option(help="Your own picture. Default: a map of the earth.")] = None,
-    size: Annotated[str, typer.Option(help="Pixels of the camera.", metavar="WIDTHxHEIGHT")] = "640x480",
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture to use as the scene. Default: a map of the earth.")
+    ] = None,
+    size: Annotated[str, typer.Option(help="Size of the camera's image (px).", metavar="WIDTHxHEIGHT")] = "640x480",
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.5,
     common: Common,
 ) -> None:
-    """Simulate a recording, calibrate it without a guess, compensate it, reconstruct the picture. Under a minute."""
+    """Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.
+
+    Takes less than a minute.
+    """
     began = time.perf_counter()
     device = choose_device(common.device)
     with progress("starting") as advance:
@@ -46,7 +51,7 @@ def run(
 
 
 def lines(d: dict[str, Any]) -> list[Any]:
-    """The outcome for people."""
+    """Return the outcome as lines of text."""
     rows = [
         ("apex", f"{d['apex_deg']:.4f} deg found, {d['apex_true_deg']:.4f} deg true"),
         ("model error", f"{d['model_error_px']:.4f} px rms over image and turn, "

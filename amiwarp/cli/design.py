@@ -1,4 +1,4 @@
-"""``amiwarp design``: which prism, and how fast, for one's own camera; charted, and chosen with the reasons."""
+"""``amiwarp design``: comparison of prisms and speeds for a camera, with a recommendation."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 
 if TYPE_CHECKING:
-    from amiwarp.optics.camera import Camera
     from amiwarp.studies.design import Choice, Design, Limits, Timing
 
 EXAMPLE = "amiwarp design --size 640x480 --fov-deg 60 --tolerance-px 0.5 --out amiwarp-design"
 FOV_DEG = 60.0
+"""Horizontal field of view if no option describes the camera [deg]."""
 _LIMITS, _FAULTS, _PRISM = "Limits", "Faults", "Prism"
 
 
 @dataclass(frozen=True)
 class GridOptions:
-    """What there is to choose from."""
+    """Options for the prisms and speeds to compare."""
 
     apex_deg: Annotated[
         str, typer.Option(help="Apex angles to compare (deg).", metavar="A,B,...", rich_help_panel=_PRISM)
@@ -39,44 +39,53 @@ class GridOptions:
     rpm: Annotated[
         str, typer.Option(help="Speeds to compare (turns/min).", metavar="A,B,...", rich_help_panel=_PRISM)
     ] = "180,360,720,1440,2880"
-    index: Annotated[float, typer.Option(help="Refractive index.", rich_help_panel=_PRISM)] = 1.5168
-    flat_side: Annotated[FlatSide, typer.Option(help="Where the flat face looks.", rich_help_panel=_PRISM)] = (
-        FlatSide.SCENE
-    )
+    index: Annotated[float, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = 1.5168
+    flat_side: Annotated[
+        FlatSide, typer.Option(help="Direction that the prism's flat face points to.", rich_help_panel=_PRISM)
+    ] = FlatSide.SCENE
 
     @property
     def apexes(self) -> list[float]:
-        """[rad]."""
+        """Apex angles to compare [rad]."""
         return [math.radians(v) for v in _list(self.apex_deg, "--apex-deg")]
 
     @property
     def rpms(self) -> list[float]:
-        """[turns/min]."""
+        """Speeds to compare [turns/min]."""
         return list(_list(self.rpm, "--rpm"))
 
 
 @dataclass(frozen=True)
 class LimitOptions:
-    """What a choice must keep."""
+    """Options for the limits that a choice must meet."""
 
     tolerance_px: Annotated[
-        float, typer.Option(help="Largest error across an edge after compensation (px).", rich_help_panel=_LIMITS)
+        float,
+        typer.Option(
+            help="Largest standard deviation across an edge after compensation (px).", rich_help_panel=_LIMITS
+        ),
     ] = 0.5
     window_ms: Annotated[
         float,
-        typer.Option(help="Time in which edges of every direction must have been seen (ms).", rich_help_panel=_LIMITS),
+        typer.Option(help="Time within which edges of every direction must be seen (ms).", rich_help_panel=_LIMITS),
     ] = 33.4
     bandwidth_mev_s: Annotated[
         float | None,
-        typer.Option(help="What sensor and cable carry (million events/s). Default: any.", rich_help_panel=_LIMITS),
+        typer.Option(
+            help="Largest event rate of sensor and cable (million events/s). Default: any.", rich_help_panel=_LIMITS
+        ),
     ] = None
     budget_px: Annotated[
         float | None,
-        typer.Option(help="What the model may be wrong by (px rms). Default: a tenth of the blur that is there anyway.",
-                     rich_help_panel=_LIMITS),
-    ] = None  # fmt: skip
+        typer.Option(
+            help="Largest error of the prism model (px rms). Default: a tenth of the blur from pixels, clock and "
+            "encoder.",
+            rich_help_panel=_LIMITS,
+        ),
+    ] = None
 
     def build(self) -> Limits:
+        """Return the limits of the study."""
         from amiwarp.studies.design import Limits
 
         most = None if self.bandwidth_mev_s is None else self.bandwidth_mev_s * 1e6
@@ -85,20 +94,21 @@ class LimitOptions:
 
 @dataclass(frozen=True)
 class FaultOptions:
-    """What the sensor and the encoder are like."""
+    """Options for the errors of the sensor and the encoder."""
 
     clock_us: Annotated[
         float,
-        typer.Option(help="Standard deviation of an event's time: readout, jitter (us).", rich_help_panel=_FAULTS),
+        typer.Option(
+            help="Standard deviation of the event times, from readout and jitter (us).", rich_help_panel=_FAULTS
+        ),
     ] = 60.0
     encoder_deg: Annotated[
         float, typer.Option(help="Standard deviation of the encoder's angle (deg).", rich_help_panel=_FAULTS)
     ] = 0.1
-    contrast: Annotated[
-        float, typer.Option(help="Change of log intensity that makes an event.", rich_help_panel=_FAULTS)
-    ] = 0.25
+    contrast: Annotated[float, typer.Option(help="Contrast threshold (log intensity).", rich_help_panel=_FAULTS)] = 0.25
 
     def timing(self) -> Timing:
+        """Return the errors of event times and encoder angles."""
         from amiwarp.studies.design import Timing
 
         return Timing(self.clock_us, math.radians(self.encoder_deg))
@@ -111,21 +121,22 @@ def run(
     ),
     size: Annotated[
         str | None,
-        typer.Option(help="Pixels of the camera. Default: 640x480, or as --camera says.", metavar="WIDTHxHEIGHT",
-                     rich_help_panel="Camera"),
+        typer.Option(help="Size of the camera's image (px). Default: 640x480, or the size in --camera.",
+                     metavar="WIDTHxHEIGHT", rich_help_panel="Camera"),
     ] = None,
     camera: CameraOptions,
     grid: GridOptions,
     limits: LimitOptions,
     faults: FaultOptions,
     picture: Annotated[
-        Path | None, typer.Option(help="Scene that makes the events: any picture. Default: a map of the earth.")
+        Path | None, typer.Option(help="Picture of the scene. Default: a map of the earth.")
     ] = None,
     common: Common,
 ) -> None:  # fmt: skip
-    """Compare prisms and speeds for a camera before they are bought, and recommend one with the reasons.
+    """Compare prisms and speeds for a camera, and recommend one with the reasons.
 
-    Events are predicted from small simulated parts of the image; blur, window and models from the optics.
+    Event rates are predicted from simulations of small parts of the image. Blur, window and models are predicted from
+    the optics.
     """
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
@@ -164,7 +175,7 @@ def _list(text: str, name: str) -> tuple[float, ...]:
 
 
 def summary(design: Design) -> dict[str, Any]:
-    """Everything that was computed; angles in degrees."""
+    """Return all results of the study for JSON, with angles in degrees."""
     from amiwarp.studies.design.recommendation import headline, reasons
 
     camera, volume = design.camera, design.volume
@@ -227,7 +238,7 @@ def _csv(rows: list[dict[str, Any]]) -> str:
 
 
 def lines(design: Design, files: dict[str, str]) -> list[Any]:
-    """The same for people."""
+    """Return the results as tables and lines of text."""
     from amiwarp.studies.design.recommendation import degrees, headline, rate, reasons
 
     rows = [

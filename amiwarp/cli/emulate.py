@@ -1,4 +1,4 @@
-"""``amiwarp emulate``: the prism's controller as a program, behind a serial port that programs can open."""
+"""``amiwarp emulate``: an emulated prism controller behind a serial port that other programs can open."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import math
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,102 +19,176 @@ from amiwarp.cli.streams import stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.link.emulator import Controller, Fault
+from amiwarp.live.link.emulator import Controller, EmulatedFault
 from amiwarp.live.link.rotors import Motor, Played
 from amiwarp.live.link.terminal import PseudoTerminal
 
 if TYPE_CHECKING:
-    from amiwarp.events.encoder import Encoder
+    from collections.abc import Callable
+
     from amiwarp.events.recording import Recording
+    from amiwarp.live.link.rotors import Rotor
+    from amiwarp.live.stream.emulated import EmulatedCamera
 
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"
 
-STEP_S, AFTER_S = 0.05, 1.0
-"""Between two looks at whether it is to end; and so long the controller goes on after the camera's last event."""
+STEP_S = 0.05
+"""Interval between two checks whether to end [s]."""
+AFTER_S = 1.0
+"""Time for which the controller continues after the camera's last event [s]."""
 LATE_US = 100_000
-"""From which on it is told that events were late."""
+"""Delay of the camera's events above which a message is printed [us]."""
+
+_CONTROLLER, _PLAYBACK = "Controller", "Playback"
+
+
+@dataclass(frozen=True)
+class ControllerOptions:
+    """Options for the emulated controller."""
+
+    counts_per_turn: Annotated[
+        int, typer.Option(min=1, max=1 << 24, help="Encoder counts per turn.", rich_help_panel=_CONTROLLER)
+    ] = 4096
+    rpm: Annotated[
+        float,
+        typer.Option(
+            min=-6000.0,
+            max=6000.0,
+            help="Speed at the start (turns/min); negative: backwards.",
+            rich_help_panel=_CONTROLLER,
+        ),
+    ] = 0.0
+    drift_ppm: Annotated[
+        float,
+        typer.Option(
+            min=-1e5,
+            max=1e5,
+            help="Frequency error of the controller's clock (ppm); positive: fast.",
+            rich_help_panel=_CONTROLLER,
+        ),
+    ] = 0.0
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Fault with its start and duration (s): garbage, truncate, crc, drop (bytes), missed-index, stall, "
+            "slip, reverse, reset, clock-jump or unplug. Can be repeated.",
+            metavar="NAME@SECONDS[+DURATION]",
+            rich_help_panel=_CONTROLLER,
+        ),
+    ] = None
+
+    def build(self, rotor: Rotor, seed: int) -> Controller:
+        """Return the controller of ``rotor``."""
+        return Controller(
+            rotor,
+            counts_per_turn=self.counts_per_turn,
+            drift_ppm=self.drift_ppm,
+            faults=[EmulatedFault.parse(text) for text in self.fault or ()],
+            seed=seed,
+        )
+
+
+@dataclass(frozen=True)
+class PlaybackOptions:
+    """Options for playing a recording instead of emulating a motor."""
+
+    recording: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recording to play: its prism rotation replaces the motor, its events are served at --camera.",
+            rich_help_panel=_PLAYBACK,
+        ),
+    ] = None
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of an emulated camera that serves the recording's events: tcp:HOST:PORT or unix:PATH. "
+            "Playing starts when the first client connects.",
+            metavar="ADDRESS",
+            rich_help_panel=_PLAYBACK,
+        ),
+    ] = None
+
+    def open(self) -> _Playback | None:
+        """Open the recording. Return None if none is given."""
+        if self.recording is None and self.camera is None:
+            return None
+        if self.recording is None or self.camera is None:
+            raise AmiwarpError("--recording and --camera belong together; give both or neither")
+        recording = open_recording(self.recording)
+        if recording.encoder is None:
+            raise AmiwarpError(f"{self.recording}: has no encoder samples; give a recording with an encoder")
+        return _Playback(recording, Played(recording.encoder), self.camera)
+
+
+@dataclass(frozen=True)
+class _Playback:
+    """Recording to play, its prism rotation, and the address that serves its events."""
+
+    recording: Recording
+    rotor: Played
+    address: str
+
+    def camera(self, controller: Controller, now_us: Callable[[], int]) -> EmulatedCamera:
+        from amiwarp.live.stream.emulated import EmulatedCamera
+
+        return EmulatedCamera(self.recording, self.rotor, controller, self.address, now_us)
 
 
 def run(
     *,
     link: Annotated[
         Path | None,
-        typer.Option(help="Link to the port: its name also after a fault 'unplug'. Default: none."),
+        typer.Option(help="Symbolic link to create for the port; valid again after a fault 'unplug'. Default: none."),
         NO_FILE,
     ] = None,
-    counts_per_turn: Annotated[int, typer.Option(min=1, max=1 << 24, help="Of the encoder.")] = 4096,
-    rpm: Annotated[float, typer.Option(min=-6000.0, max=6000.0, help="Speed to begin with (turns/min).")] = 0.0,
-    drift_ppm: Annotated[float, typer.Option(min=-1e5, max=1e5, help="By how much its clock is fast (ppm).")] = 0.0,
-    fault: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="From a time on, for a while (s); again for more. garbage, truncate, crc, drop (bytes), missed-index, "
-            "stall, slip, reverse, reset, clock-jump, unplug.",
-            metavar="NAME@SECONDS[+DURATION]",
-        ),
-    ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after so long. Default: by Ctrl-C.")] = None,
-    recording: Annotated[
-        Path | None,
-        typer.Option(help="Play this recording: its rotation in place of a motor's, its events at --camera."),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            help="Be the camera, too: serve its events at tcp:HOST:PORT or unix:PATH, once somebody connects.",
-            metavar="ADDRESS",
-        ),
+    options: ControllerOptions,
+    playback: PlaybackOptions,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after this time (s). Default: at Ctrl-C.")
     ] = None,
     common: Common,
 ) -> None:
-    """Be a controller with motor, encoder and index, for trying out without one, and with what goes wrong on demand."""
-    from amiwarp.live.stream.emulated import EmulatedCamera
+    """Emulate a prism controller with motor, encoder and index pulse, and inject faults on request.
 
-    if (recording is None) != (camera is None):
-        raise AmiwarpError("--recording and --camera go together: what is played, and where its events are served")
-    rotor: Motor | Played = Motor(rpm, seed=common.seed)
-    played = None if recording is None else _recording(recording)
-    if played is not None:
-        rotor = Played(played[1])
-    controller = Controller(
-        rotor,
-        counts_per_turn=counts_per_turn,
-        drift_ppm=drift_ppm,
-        faults=[Fault.parse(text) for text in fault or ()],
-        seed=common.seed,
-    )
+    Programs can be tried out against it without hardware.
+    """
+    played = playback.open()
+    rotor = Motor(options.rpm, seed=common.seed) if played is None else played.rotor
+    controller = options.build(rotor, common.seed)
     origin = monotonic_us()
 
     def now_us() -> int:
         return monotonic_us() - origin
 
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as resources:
         stop = threading.Event()
-        held.enter_context(stopped_by_interrupt(stop))
-        terminal = held.enter_context(PseudoTerminal(controller, link, now_us=now_us))
+        resources.enter_context(stopped_by_interrupt(stop))
+        terminal = resources.enter_context(PseudoTerminal(controller, link, now_us=now_us))
+        camera = None if played is None else resources.enter_context(played.camera(controller, now_us))
+        _print_names(terminal, camera, common)
+        _wait_for_end(stop, seconds, camera)
+        if camera is not None and camera.late_us > LATE_US:
+            late = f"events were sent up to {camera.late_us * 1e-6:.1f} s late, none was lost"
+            say(f"{late}: this machine or a receiver is slower than the recording")
+
+
+def _print_names(terminal: PseudoTerminal, camera: EmulatedCamera | None, common: Common) -> None:
+    """Print the port, the camera's address and a command to try next."""
+    if camera is None:
         hint = f"amiwarp motor status --port {terminal.name}"
-        data, lines = {"port": terminal.name, "try": hint}, [terminal.name, f"try: {hint}", "Ctrl-C ends it"]
-        served = None
-        if played is not None and camera is not None and isinstance(rotor, Played):
-            served = held.enter_context(EmulatedCamera(played[0], rotor, controller, camera, now_us))
-            hint = f"amiwarp live {served.address} --port {terminal.name} --calibration CALIBRATION"
-            data, lines = (
-                {**data, "camera": served.address, "try": hint},
-                [terminal.name, served.address, f"try: {hint}"],
-            )
-        report(common, data, lines)
-        end = math.inf if seconds is None else time.monotonic() + seconds
-        while not stop.wait(STEP_S) and time.monotonic() < end:
-            if served is not None and served.done.is_set():
-                stop.wait(AFTER_S)
-                break
-        if served is not None and served.late_us > LATE_US:
-            late = f"events were sent up to {served.late_us * 1e-6:.1f} s late, none lost"
-            say(f"{late}: this machine, or who listens, is slower than the recording")
+        data, lines = {"port": terminal.name, "try": hint}, [terminal.name, f"try: {hint}", "stop with Ctrl-C"]
+    else:
+        hint = f"amiwarp live {camera.address} --port {terminal.name} --calibration CALIBRATION"
+        data = {"port": terminal.name, "try": hint, "camera": camera.address}
+        lines = [terminal.name, camera.address, f"try: {hint}"]
+    report(common, data, lines)
 
 
-def _recording(path: Path) -> tuple[Recording, Encoder]:
-    opened = open_recording(path)
-    if opened.encoder is None:
-        raise AmiwarpError(f"{path}: has no encoder; give a recording that has")
-    return opened, opened.encoder
+def _wait_for_end(stop: threading.Event, seconds: float | None, camera: EmulatedCamera | None) -> None:
+    """Wait until ``stop`` is set, ``seconds`` have passed, or :data:`AFTER_S` after the camera's last event."""
+    end = math.inf if seconds is None else time.monotonic() + seconds
+    while not stop.wait(STEP_S) and time.monotonic() < end:
+        if camera is not None and camera.done.is_set():
+            stop.wait(AFTER_S)
+            return

@@ -1,4 +1,4 @@
-"""``amiwarp info``: what a recording is and holds."""
+"""``amiwarp info``: the content of a recording."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ if TYPE_CHECKING:
 EXAMPLE = "amiwarp info recording.h5"
 
 
-def run(
-    file: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")], common: Common
-) -> None:
-    """Say what a recording is: format, events, encoder, camera, prism, truth, repairs. Reads it once, in blocks."""
+def run(file: Annotated[Path, typer.Argument(help="Recording in any supported format.")], *, common: Common) -> None:
+    """Show a recording's format, events, encoder, camera, prism, ground truth and repairs.
+
+    The file is read once, in blocks.
+    """
     recording = open_recording(file)
     data = describe(recording, str(file))
     report(common, data, [table(_rows(data))])
 
 
 def describe(recording: Recording, file: str) -> dict[str, Any]:
-    """All there is to know, angles in degrees."""
+    """Return the description of a recording, with angles in degrees."""
     source = recording.events
     width, height = source.size
     data: dict[str, Any] = {
@@ -131,7 +132,7 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
                  f"cy {c['cy']:.6g} px, FOV {c['fov_deg']:.4g} deg, {lens}"))  # fmt: skip
     rows.append(("prism", _prism_text(p)))
     if d["truth"] is not None:
-        points = "with a point for each event" if d["truth_points"] else "without points"
+        points = "with the true position of each event" if d["truth_points"] else "without positions"
         shown = [f"{n} {v:.5g}" for n, v in d["truth"].items() if n in ("apex_deg", "phase_deg", "index")]
         rows.append(("truth", f"{', '.join(shown)}; {points}"))
     rows.append(("repairs", ", ".join(f"{name} {count:,}" for name, count in d["repairs"].items()) or "none"))

@@ -1,4 +1,4 @@
-"""From options to cameras, prisms and numbers with units."""
+"""Options and texts of the command line, converted to cameras, prisms and numbers with units."""
 
 from __future__ import annotations
 
@@ -25,69 +25,71 @@ _PRISM = "Prism"
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """The camera, where the recording does not tell."""
+    """Options for the camera. They override the camera in the recording."""
 
     fov_deg: Annotated[
         float | None,
-        typer.Option(help="Horizontal field of view of an ideal camera (deg).", rich_help_panel=_CAMERA),
+        typer.Option(help="Horizontal field of view of an ideal pinhole camera (deg).", rich_help_panel=_CAMERA),
     ] = None
     camera: Annotated[
         Path | None,
         typer.Option(
-            help="Intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration, or calib.txt "
-            "(fx fy cx cy k1 k2 p1 p2 k3).",
+            help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, or "
+            "calib.txt (fx fy cx cy k1 k2 p1 p2 k3).",
             rich_help_panel=_CAMERA,
         ),
     ] = None
 
     def build(self, width: int, height: int, *, fixed: bool = True) -> Camera | None:
-        """The camera that the options describe, or None.
+        """Return the camera that the options describe, or None if no option is given.
 
-        Raises :class:`AmiwarpError` for one of another size where that is ``fixed``.
+        ``width`` and ``height`` are the size of the events [px]. Raises :class:`AmiwarpError` if that size is ``fixed``
+        and the camera file has another one.
         """
         if self.camera is not None and self.fov_deg is not None:
-            raise AmiwarpError("--fov-deg and --camera both give a camera; give one of them")
+            raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
         if self.fov_deg is not None:
             return Camera.from_fov(width, height, math.radians(self.fov_deg))
         if self.camera is None:
             return None
         camera = read_camera(self.camera, width, height)
         if fixed and (camera.width, camera.height) != (width, height):
-            given = f"{camera.width}x{camera.height}, the events are {width}x{height}"
-            raise AmiwarpError(f"{self.camera}: is for {given}; give this camera's intrinsics")
+            sizes = f"{camera.width}x{camera.height} px, the events are {width}x{height} px"
+            raise AmiwarpError(f"{self.camera}: the intrinsics are for {sizes}; give the intrinsics of this camera")
         return camera
 
 
 def read_camera(path: Path, width: int, height: int) -> Camera:
-    """The camera of a JSON file, a calibration's included, or of a ``calib.txt``; the size is for the latter.
+    """Read a camera from a JSON file, a calibration file or ``calib.txt``.
 
-    Raises :class:`AmiwarpError` naming file and field.
+    ``width`` and ``height`` [px] are used for ``calib.txt`` only, which holds no size. Raises :class:`AmiwarpError`
+    naming file and field.
     """
     from amiwarp.calib.result import camera_from_json
 
     if path.suffix.lower() != ".json":
         return read_calib(path, width, height)
     data = read_json(path, "a camera")
-    with errors_name(path, lambda: "is no camera"):
+    with errors_name(path, lambda: "is not a camera file"):
         return camera_from_json(data["camera"], "camera") if "camera" in data else camera_from_json(data)
 
 
 @dataclass(frozen=True)
 class NominalPrismOptions:
-    """The prism as its data sheet has it."""
+    """Options for the prism as its data sheet describes it."""
 
     nominal_apex_deg: Annotated[
-        float | None, typer.Option(help="Apex angle that the data sheet gives (deg).", rich_help_panel=_PRISM)
+        float | None, typer.Option(help="Apex angle from the prism's data sheet (deg).", rich_help_panel=_PRISM)
     ] = None
-    index: Annotated[float | None, typer.Option(help="Refractive index.", rich_help_panel=_PRISM)] = None
-    flat_side: Annotated[FlatSide | None, typer.Option(help="Where the flat face looks.", rich_help_panel=_PRISM)] = (
-        None
-    )
+    index: Annotated[float | None, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = None
+    flat_side: Annotated[
+        FlatSide | None, typer.Option(help="Direction that the prism's flat face points to.", rich_help_panel=_PRISM)
+    ] = None
 
     def build(self, known: NominalPrism | None) -> NominalPrism | None:
-        """Return ``known`` with what is given over it; None where nothing is known or given.
+        """Return ``known`` with the given options replaced, or None if neither exists.
 
-        An apex that nobody gave stays unknown.
+        The apex stays unknown if neither ``known`` nor the options hold one.
         """
         given = {"index": self.index, "flat_side": self.flat_side}
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -98,9 +100,9 @@ class NominalPrismOptions:
 
 
 def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None) -> Recording:
-    """The recording with camera and prism as the options say; what they leave open stays as recorded.
+    """Return the recording with the camera and the prism that the options give.
 
-    An option wins over the file: whoever gives it knows better.
+    Options override the recording. Values without an option stay as recorded.
     """
     changes: dict[str, Any] = {"camera": camera.build(*recording.events.size) or recording.camera}
     if prism is not None:
@@ -120,7 +122,7 @@ SCALES = {
     "rad/s2": 1.0,
     "px": 1.0,
 }
-"""Suffixes of values on the command line; what they come to [rad, us, 1/min]."""
+"""Unit suffixes of values on the command line and their factors to [rad, us, 1/min, rad/s, rad/s2, px]."""
 FORMS = {
     "rad": (("deg", "rad"), "1.2deg or 0.02rad"),
     "us": (("us", "ms"), "250us or 0.25ms"),
@@ -130,13 +132,14 @@ FORMS = {
     "px": (("px",), "554px"),
     "1": ((), "1.5168"),
 }
-"""Of each unit the suffixes that fit, and an example."""
+"""For each unit of a parameter: the accepted suffixes and an example for error messages."""
 
 
 def number(text: str, unit: str, name: str) -> float:
-    """A value such as ``1.2deg``; angles other than 0 need their unit. Raises :class:`AmiwarpError`.
+    """Convert a text such as ``1.2deg`` to a value in ``unit``. Angles other than 0 need a suffix.
 
-    ``unit``: the parameter's own, as in ``amiwarp.calib.parameters.UNITS``.
+    ``unit`` is one of ``amiwarp.calib.parameters.UNITS``; ``name`` is the option for error messages. Raises
+    :class:`AmiwarpError` if the text is not such a value.
     """
     form, suffix = FORMS[unit][1], _suffix(text, unit)
     try:
@@ -149,13 +152,15 @@ def number(text: str, unit: str, name: str) -> float:
 
 
 def interval(text: str, unit: str, name: str) -> tuple[float, float]:
-    """``LOW:HIGH`` such as ``-10:10deg``: the lower end takes the unit of the upper one if it has none.
+    """Convert ``LOW:HIGH`` such as ``-10:10deg`` to two values. LOW takes the suffix of HIGH if it has none.
 
-    ``unit`` as of :func:`number`. Raises :class:`AmiwarpError`.
+    ``unit`` and ``name`` as for :func:`number`. Raises :class:`AmiwarpError` if the text is not an interval.
     """
     low, colon, high = text.partition(":")
     if not colon:
-        raise AmiwarpError(f"{name}: {text!r} has no colon; write LOW:HIGH, as 0:{FORMS[unit][1].partition(' ')[0]}")
+        raise AmiwarpError(
+            f"{name}: {text!r} has no colon; write LOW:HIGH, for example 0:{FORMS[unit][1].partition(' ')[0]}"
+        )
     shared = "" if _suffix(low, unit) else _suffix(high, unit)
     return number(low.strip() + shared, unit, name), number(high, unit, name)
 
@@ -165,7 +170,7 @@ def _suffix(text: str, unit: str) -> str:
 
 
 def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
-    """Values separated by commas. Raises :class:`AmiwarpError` unless there are ``count``."""
+    """Convert values separated by commas. Raises :class:`AmiwarpError` unless there are ``count``."""
     try:
         values = tuple(float(word) for word in text.split(","))
     except ValueError:
@@ -176,9 +181,10 @@ def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
 
 
 def span(text: str, first: int, last: int) -> tuple[int, int]:
-    """``START:END`` seconds after ``first`` as times on its clock [us]; either may be left out. ``last``: the end.
+    """Convert ``START:END`` [s after ``first``] to times on the clock of ``first`` and ``last`` [us].
 
-    Raises :class:`AmiwarpError` for what is no span of time.
+    START defaults to ``first``, END to just after ``last``. Raises :class:`AmiwarpError` if the text is not a time
+    span.
     """
     start, colon, end = text.partition(":")
     try:
@@ -187,5 +193,5 @@ def span(text: str, first: int, last: int) -> tuple[int, int]:
     except (ValueError, OverflowError):
         low, high = 0, 0
     if not colon or not low < high:
-        raise AmiwarpError(f"--window {text!r} is no span of time; write START:END in seconds, as 0.5:2")
+        raise AmiwarpError(f"--window {text!r} is not a time span; write START:END in seconds, for example 0.5:2")
     return low, high

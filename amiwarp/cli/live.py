@@ -1,4 +1,4 @@
-"""``amiwarp live``: compensates a stream as it comes."""
+"""``amiwarp live``: motion compensation of a live stream."""
 
 from __future__ import annotations
 
@@ -25,45 +25,56 @@ if TYPE_CHECKING:
 
     from amiwarp.calib import Calibration
     from amiwarp.compensation.streams import Compensated
-    from amiwarp.io.live_writer import LiveWriter
     from amiwarp.live.link.link import Link
+    from amiwarp.live.stream.consumers import RawConsumer
     from amiwarp.live.stream.packets import Source
-    from amiwarp.live.stream.session import Raw, Status
+    from amiwarp.live.stream.session import Session
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
     from amiwarp.live.stream.speed_control import SpeedKeeper
+    from amiwarp.live.stream.status import SessionStatus
     from amiwarp.optics.models import Model
 
 EXAMPLE = "amiwarp live dv --port find --calibration calibration.json --out compensated.h5"
 
-_ADAPTIVE = "Adaptive speed"
+_ADAPTIVE, _OUTPUTS = "Adaptive speed", "Outputs"
+START_RPM = 720.0
+"""Speed at which adaptive control begins [turns/min], limited to the speeds that the options allow."""
 
 
 @dataclass(frozen=True)
 class AdaptiveOptions:
-    """The prism's speed from the stream."""
+    """Options for setting the prism's speed from the stream."""
 
     adaptive: Annotated[
         bool,
         typer.Option(
             "--adaptive",
-            help="Set the prism's speed: as fast as the edges need, no faster.",
+            help="Set the prism's speed automatically: just fast enough to see the edges.",
             rich_help_panel=_ADAPTIVE,
         ),
     ] = False
-    least_rpm: Annotated[float, typer.Option(min=1.0, help="Not slower.", rich_help_panel=_ADAPTIVE)] = 120.0
-    limit_rpm: Annotated[float, typer.Option(min=1.0, help="Not faster.", rich_help_panel=_ADAPTIVE)] = 1440.0
+    least_rpm: Annotated[
+        float, typer.Option(min=1.0, help="Lowest speed allowed (turns/min).", rich_help_panel=_ADAPTIVE)
+    ] = 120.0
+    limit_rpm: Annotated[
+        float, typer.Option(min=1.0, help="Highest speed allowed (turns/min).", rich_help_panel=_ADAPTIVE)
+    ] = 1440.0
     most_mev_s: Annotated[
-        float | None, typer.Option(min=0.001, help="Largest event rate (million a second).", rich_help_panel=_ADAPTIVE)
+        float | None,
+        typer.Option(
+            min=0.001, help="Highest event rate allowed (million events/s). Default: any.", rich_help_panel=_ADAPTIVE
+        ),
     ] = None
 
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
+        """Set the motor's first speed and return the speed control, or None without ``--adaptive``."""
         from amiwarp.live.stream.speed_control import SpeedKeeper
 
         if not self.adaptive:
             return None
         if link is None:
             raise AmiwarpError("--adaptive sets the motor's speed; give the controller's --port")
-        rpm = min(max(720.0, self.least_rpm), self.limit_rpm)
+        rpm = min(max(START_RPM, self.least_rpm), self.limit_rpm)
         most = float("inf") if self.most_mev_s is None else self.most_mev_s
         orbit = prism_orbit(model)
         limits = SpeedController(orbit, rpm, least_rpm=self.least_rpm, most_rpm=self.limit_rpm, most_mev_s=most)
@@ -71,111 +82,194 @@ class AdaptiveOptions:
         return SpeedKeeper(model, limits, link.set_speed, say)
 
 
-def run(
-    source: Annotated[str, typer.Argument(help="dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")],
-    *,
-    calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
-    out: Annotated[Path | None, typer.Option(help="Compensated recording to write (.h5)."), OUTPUT] = None,
-    record: Annotated[Path | None, typer.Option(help="Recording of what comes in to write (.h5)."), OUTPUT] = None,
+@dataclass(frozen=True)
+class OutputOptions:
+    """Options for the files and addresses that receive events."""
+
+    out: Annotated[
+        Path | None, typer.Option(help="Compensated recording to write (.h5).", rich_help_panel=_OUTPUTS), OUTPUT
+    ] = None
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Recording of the uncompensated events to write (.h5).", rich_help_panel=_OUTPUTS),
+        OUTPUT,
+    ] = None
     to: Annotated[
         str | None,
         typer.Option(
-            help="Serve compensated packets at tcp:HOST:PORT or unix:PATH, or write them to -.", metavar="ADDRESS"
+            help="Address to serve compensated packets at: tcp:HOST:PORT, unix:PATH, or - for standard output.",
+            metavar="ADDRESS",
+            rich_help_panel=_OUTPUTS,
         ),
-    ] = None,
+    ] = None
     raw_to: Annotated[
         str | None,
-        typer.Option(help="Serve what comes in there, for 'amiwarp view --live', say.", metavar="ADDRESS"),
-    ] = None,
-    stream: SourceOptions,
+        typer.Option(
+            help="Address to serve the uncompensated packets at, for example for 'amiwarp view --live'.",
+            metavar="ADDRESS",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = None
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the recordings to write."""
+        return [str(path) for path in (self.record, self.out) if path is not None]
+
+    @property
+    def use_stdout(self) -> bool:
+        """Whether packets go to standard output."""
+        return "-" in (self.to, self.raw_to)
+
+
+@dataclass(frozen=True)
+class ProcessingOptions:
+    """Options for the compensation of the stream."""
+
     wait_ms: Annotated[
-        float, typer.Option(min=0.0, help="Longest wait for the encoder; then the angle is extrapolated (ms).")
-    ] = 10.0,
+        float,
+        typer.Option(min=0.0, help="Longest wait for encoder samples (ms); after it the angle is extrapolated."),
+    ] = 10.0
     policy: Annotated[
-        Policy, typer.Option(help="What happens to events that come faster than they can be worked through.")
-    ] = Policy.BLOCK,
+        Policy,
+        typer.Option(
+            help="Treatment of events that arrive faster than they are processed. block: the source waits; "
+            "drop-oldest: the oldest are dropped; thin: events are left out evenly."
+        ),
+    ] = Policy.BLOCK
     watch_s: Annotated[
-        float, typer.Option(min=0.0, help="Look for a change of the phase so often (s); 0: never.")
-    ] = 10.0,
+        float, typer.Option(min=0.0, help="Interval between checks of the calibrated phase (s); 0: no checks.")
+    ] = 10.0
+
+
+def run(
+    source: Annotated[
+        str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")
+    ],
+    *,
+    calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
+    outputs: OutputOptions,
+    stream: SourceOptions,
+    processing: ProcessingOptions,
     adaptive: AdaptiveOptions,
     common: Common,
 ) -> None:
-    """Compensate events as they come, with rate, latency, coverage and sharpness on one line; Ctrl-C ends it.
+    """Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.
 
-    A stream that breaks off ends it with exit code 1; what came is in the files.
+    Ctrl-C ends the command. If the stream breaks off, it exits with code 1 and keeps the events received so far.
 
-    Every event comes out once, in order, marked where it left the image or its angle had to be extrapolated.
+    Every event is written once, in order. Events outside the image and events with an extrapolated angle are marked.
     """
     from amiwarp.calib import Calibration
     from amiwarp.compensation.recordings import check_size
-    from amiwarp.live.stream.forward import Forward
-    from amiwarp.live.stream.session import Session
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as resources:
         stop = threading.Event()
-        line = held.enter_context(StatusLine(stop, stream.seconds))
-        link = held.enter_context(stream.link())
+        line = resources.enter_context(StatusLine(stop, stream.seconds))
+        link = resources.enter_context(stream.link())
         opened = stream.open(source, line.say)
         check_angles(opened, link)
         check_size(found, opened.size, opened.name)
-        raw: list[Raw] = []
-        if record is not None:
-            raw.append(
-                held.enter_context(
-                    _writer(record, opened, found, compensated=False, offset_us=clock_offset(opened, link))
-                )
-            )
-        handed = None if raw_to is None else _sink(raw_to, found, held, stop, line.say)
-        if handed is not None:
-            raw.append(Forward(handed))
-        written = None if out is None else held.enter_context(_writer(out, opened, found, compensated=True))
-        served = None if to is None else _sink(to, found, held, stop, line.say)
+        receivers = _Receivers(
+            outputs, opened, found, offset_us=clock_offset(opened, link), resources=resources, stop=stop, say=line.say
+        )
         keeper = adaptive.build(found.model, link, line.say)
-        held.enter_context(stopped_by_interrupt(stop))
-        session = Session(
-            opened, found, link=link, raw=raw, out=written,
-            sinks=() if served is None else (_sent(served),), watch_s=watch_s or None, keeper=keeper,
-            wait_us=round(1e3 * wait_ms), policy=policy, device=device, say=line.say,
-        )  # fmt: skip
-
-        def update(status: Status) -> None:
-            line.update(status)
-            if served is not None:
-                served.tick()
-
-        status = session.run(stop, update)
-        line.end(served, handed)
+        resources.enter_context(stopped_by_interrupt(stop))
+        session = _session(opened, found, receivers, processing, link=link, keeper=keeper, device=device, say=line.say)
+        status = _follow(session, stop, line, receivers)
     data: dict[str, Any] = {
-        "files": [str(path) for path in (record, out) if path is not None],
+        "files": outputs.files,
         **summary(status, opened),
         "latency_ms": status.latency_ms,
         "model": found.model_name,
         "device": device,
         "messages": list(line.messages),
     }
-    if "-" in (to, raw_to):  # standard output has packets
-        for text in _lines(data):
-            say(text)
-    else:
-        report(common, data, _lines(data))
+    _print_result(data, common, to_stderr=outputs.use_stdout)
     check_whole(opened, status)
 
 
-def _sink(
-    to: str, found: Calibration, held: contextlib.ExitStack, stop: threading.Event, say: Callable[[str], None]
-) -> SocketSink | PipeSink:
+class _Receivers:
+    """Writers and sinks of a session. ``resources`` closes them at the end."""
+
+    def __init__(
+        self, options: OutputOptions, source: Source, found: Calibration, *, offset_us: float,
+        resources: contextlib.ExitStack, stop: threading.Event, say: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        from amiwarp.live.stream.forward import Forward
+
+        def sink(address: str | None) -> SocketSink | PipeSink | None:
+            return None if address is None else _open_sink(address, found, resources, stop=stop, say=say)
+
+        self.raw: list[RawConsumer] = []
+        if options.record is not None:
+            writer = _writer(options.record, source, found, compensated=False, offset_us=offset_us)
+            self.raw.append(resources.enter_context(writer))
+        self.raw_sink = sink(options.raw_to)
+        if self.raw_sink is not None:
+            self.raw.append(Forward(self.raw_sink))
+        self.out = None
+        if options.out is not None:
+            self.out = resources.enter_context(_writer(options.out, source, found, compensated=True))
+        self.sink = sink(options.to)
+
+    @property
+    def sinks(self) -> tuple[Callable[[Compensated], None], ...]:
+        """Functions that take compensated packets."""
+        return () if self.sink is None else (_send_to(self.sink),)
+
+
+def _session(
+    source: Source, found: Calibration, receivers: _Receivers, options: ProcessingOptions, *, link: Link | None,
+    keeper: SpeedKeeper | None, device: str, say: Callable[[str], None],
+) -> Session:  # fmt: skip
+    from amiwarp.live.stream.session import Session
+
+    return Session(
+        source, found, link=link, raw=receivers.raw, out=receivers.out, sinks=receivers.sinks,
+        watch_s=options.watch_s or None, keeper=keeper, wait_us=round(1e3 * options.wait_ms), policy=options.policy,
+        device=device, say=say,
+    )  # fmt: skip
+
+
+def _follow(session: Session, stop: threading.Event, line: StatusLine, receivers: _Receivers) -> SessionStatus:
+    """Run the session to its end with its status on ``line``."""
+
+    def update(status: SessionStatus) -> None:
+        line.update(status)
+        if receivers.sink is not None:
+            receivers.sink.tick()
+
+    status = session.run(stop, update)
+    line.report_lost_packets(receivers.sink, receivers.raw_sink)
+    return status
+
+
+def _print_result(data: dict[str, Any], common: Common, *, to_stderr: bool) -> None:
+    """Print the result. If packets use standard output, print it as text on stderr."""
+    if not to_stderr:
+        report(common, data, _lines(data))
+        return
+    for text in _lines(data):
+        say(text)
+
+
+def _open_sink(
+    address: str, found: Calibration, resources: contextlib.ExitStack, *, stop: threading.Event,
+    say: Callable[[str], None],
+) -> SocketSink | PipeSink:  # fmt: skip
     from amiwarp.live.stream.packets import encode_hello
     from amiwarp.live.stream.sockets import open_sink
 
     hello = encode_hello(found.camera.width, found.camera.height, found.camera, found.prism)
-    sink = open_sink(to, hello, stop=stop, say=say)
-    held.push(sink)
+    sink = open_sink(address, hello, stop=stop, say=say)
+    resources.push(sink)
     return sink
 
 
-def _sent(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
+def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
     from amiwarp.live.stream.packets import encode_compensated
 
     return lambda packet: sink.send(encode_compensated(packet.events, packet.flags))
@@ -193,7 +287,10 @@ def _writer(path: Path, source: Source, found: Calibration, *, compensated: bool
 def _lines(d: dict[str, Any]) -> list[str]:
     marked = [f"{d[key]:,} {what}" for key, what in (
         ("outside", "outside the image"), ("extrapolated", "with an extrapolated angle"),
-        ("without_angle", "without any angle"), ("dropped", "dropped"), ("late", "late"),
+        ("without_angle", "without an angle"), ("dropped", "dropped"), ("late", "late"),
     ) if d[key]]  # fmt: skip
     speed = f"{d['seconds']:.1f} s, {d['mev_per_s']:.3g} Mev/s by the {d['model']} model on {d['device']}"
-    return [f"{d['compensated']:,} events ({', '.join(marked) or 'all with a place'}), {speed}", *d["files"]]
+    return [
+        f"{d['compensated']:,} events ({', '.join(marked) or 'all inside the image with a measured angle'}), {speed}",
+        *d["files"],
+    ]

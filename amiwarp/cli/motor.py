@@ -1,11 +1,11 @@
-"""``amiwarp motor``: what the prism's motor does, a speed for it, and rest."""
+"""``amiwarp motor``: status and speed of the prism's motor."""
 
 from __future__ import annotations
 
 import enum
 import math
 import time
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -15,18 +15,17 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import FAULTS, STATES
 
-if TYPE_CHECKING:
-    from amiwarp.live.link.link import Link
-
 EXAMPLE = "amiwarp motor set --port /dev/ttyACM0 --rpm 720"
 LIMIT_RPM = 3000.0
+"""Default of ``--limit-rpm`` [turns/min]."""
 WAIT_S = 2.5
-"""For the status, which comes once a second, and for the clocks."""
+"""Longest wait for the status, which the controller sends once a second, and for its clock [s]."""
 STEP_S = 0.02
+"""Interval between two readings of the link [s]."""
 
 
 class Action(enum.StrEnum):
-    """What to do."""
+    """Action of the command."""
 
     STATUS = "status"
     SET = "set"
@@ -34,27 +33,36 @@ class Action(enum.StrEnum):
 
 
 def run(
-    action: Annotated[Action, typer.Argument(help="status: look only; set: turn at --rpm; stop: come to rest.")],
+    action: Annotated[
+        Action, typer.Argument(help="status: print the status; set: turn at --rpm; stop: stop the motor.")
+    ],
     *,
     port: Annotated[
         str | None,
-        typer.Option(help="Name, or USB id VID:PID, or URL (socket://host:port). Default: the one that sends samples."),
+        typer.Option(
+            help="Serial port of the controller: name, USB id VID:PID or URL (socket://host:port). "
+            "Default: the port that sends encoder samples."
+        ),
     ] = None,
-    rpm: Annotated[float | None, typer.Option(help="Speed to set (turns/min), negative: backwards.")] = None,
+    rpm: Annotated[float | None, typer.Option(help="Speed to set (turns/min); negative: backwards.")] = None,
     ramp_rpm_s: Annotated[
-        float, typer.Option(min=0.001, help="How quickly the speed changes (turns/min each second).")
+        float, typer.Option(min=0.001, help="Largest change of the speed (turns/min per second).")
     ] = 500.0,
     limit_rpm: Annotated[
-        float, typer.Option(min=0.0, help="Speeds beyond it are refused: what prism, mount and bearing bear.")
+        float,
+        typer.Option(min=0.0, help="Largest speed accepted (turns/min): what the prism, mount and bearing can bear."),
     ] = LIMIT_RPM,
     common: Common,
 ) -> None:
-    """Drive the prism's motor, and see what its controller says. The motor goes on as told when this ends."""
+    """Set the speed of the prism's motor, stop it, or print the controller's status.
+
+    The motor keeps its last commanded speed after this command exits.
+    """
     if (rpm is None) == (action is Action.SET):
-        raise AmiwarpError("--rpm is the speed to set; 'amiwarp motor set' needs it and nothing else takes it")
+        raise AmiwarpError("'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it")
     if rpm is not None and not abs(rpm) <= limit_rpm:
         raise AmiwarpError(
-            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; --limit-rpm raises it where the prism bears it"
+            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if the prism bears it"
         )
     with Link(port) as link:
         messages: list[str] = []
@@ -70,13 +78,13 @@ def run(
 
 
 def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
-    """Until the status is known and names the target speed, and pings were answered; or for :data:`WAIT_S`."""
+    """Wait until the status reports the target speed and the controller's clock is known, or :data:`WAIT_S` passed."""
     end = time.monotonic() + WAIT_S
     while time.monotonic() < end:
         messages += link.poll().messages
         status = link.status
-        named = status is not None and (target is None or math.isclose(status.target_rpm, target, rel_tol=1e-6))
-        if named and link.clock() is not None:
+        reported = status is not None and (target is None or math.isclose(status.target_rpm, target, rel_tol=1e-6))
+        if reported and link.clock() is not None:
             return
         time.sleep(STEP_S)
 
@@ -84,8 +92,8 @@ def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
 def _described(link: Link, messages: list[str]) -> dict[str, Any]:
     status = link.status
     if status is None:
-        said = "; ".join([*messages, "docs/link-protocol.md says what it is to send"])
-        raise AmiwarpError(f"{link.name}: no status in {WAIT_S:g} s; {said}")
+        details = "; ".join([*messages, "docs/reference/link-protocol.md describes the messages it must send"])
+        raise AmiwarpError(f"{link.name}: no status in {WAIT_S:g} s; {details}")
     return {
         "port": link.name,
         "state": STATES[status.state] if status.state < len(STATES) else f"unknown ({status.state})",
@@ -100,14 +108,14 @@ def _described(link: Link, messages: list[str]) -> dict[str, Any]:
 
 def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     return [
-        ("port", d["port"] + ("" if d["answers"] else " (it sends, but does not answer)")),
+        ("port", d["port"] + ("" if d["answers"] else " (sends data, but does not answer commands)")),
         ("state", d["state"]),
         ("speed", f"{d['rpm']:.1f} rpm, set to {d['target_rpm']:g} rpm"),
-        ("encoder", f"{d['counts_per_turn']:,} counts a turn"),
+        ("encoder", f"{d['counts_per_turn']:,} counts per turn"),
         ("faults", ", ".join(d["faults"]) or "none"),
     ]
 
 
 def _hint(d: dict[str, Any]) -> list[str]:
-    """Nothing turns on in silence."""
-    return [f"it goes on turning; to end that: amiwarp motor stop --port {d['port']}"] if d["target_rpm"] else []
+    """Return how to stop the motor if it keeps turning."""
+    return [f"the motor keeps turning; to stop it: amiwarp motor stop --port {d['port']}"] if d["target_rpm"] else []

@@ -1,4 +1,4 @@
-"""``amiwarp reconstruct``: a picture, or a video, of the scene from a recording and its calibration."""
+"""``amiwarp reconstruct``: reconstruction of a picture or a video of the scene from events."""
 
 from __future__ import annotations
 
@@ -29,37 +29,46 @@ _WINDOW, _PICTURE = "Window", "Picture"
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """Which events."""
+    """Options for the events to use."""
 
     start: Annotated[
-        float | None, typer.Option(help="Start, from the first event (s). Default: 0.", rich_help_panel=_WINDOW)
+        float | None,
+        typer.Option(help="Start of the window (s from the first event). Default: 0.", rich_help_panel=_WINDOW),
     ] = None
     length: Annotated[
         float | None, typer.Option(min=1e-6, help="Length of the window (s).", rich_help_panel=_WINDOW)
     ] = None
     turns: Annotated[
         float | None,
-        typer.Option(min=0.01, help="Length in turns of the prism, from 0.25. Default: 1.", rich_help_panel=_WINDOW),
+        typer.Option(
+            min=0.01,
+            help="Length of the window (turns of the prism), at least 0.25. Default: 1.",
+            rich_help_panel=_WINDOW,
+        ),
     ] = None
     fps: Annotated[
         float | None,
-        typer.Option(min=0.01, max=100_000.0, help="Frames per second of an .mp4: 25.", rich_help_panel=_WINDOW),
+        typer.Option(
+            min=0.01, max=100_000.0, help="Frames per second of a video. Default: 25.", rich_help_panel=_WINDOW
+        ),
     ] = None
     omega: Annotated[
         str | None,
         typer.Option(
-            help="The camera's angular velocity about x, y, z (rad/s): 0,0.6,0. Default: what the calibration found.",
+            help="Angular velocity of the camera about its x, y and z axes (rad/s), such as 0,0.6,0. "
+            "Default: from the calibration.",
+            metavar="X,Y,Z",
             rich_help_panel=_WINDOW,
         ),
     ] = None
 
     def span(self, work: Reconstruction) -> tuple[int, int]:
-        """Start and length [us]."""
+        """Return the start and the length of the window [us]."""
         start = work.recording.events.t_first + round((self.start or 0.0) * 1e6)
         return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
 
     def camera_rotation(self) -> CameraRotation | None:
-        """The camera's rotation where it was given."""
+        """Return the camera's rotation, or None if it is not given."""
         if self.omega is None:
             return None
         x, y, z = numbers(self.omega, 3, "--omega")
@@ -68,46 +77,59 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """What the file shows."""
+    """Options for the content of the picture."""
 
     fill: Annotated[
         Fill,
         typer.Option(
-            help="Where events say nothing: none (black), smooth, or edge: flat with edges.", rich_help_panel=_PICTURE
+            help="Filling of pixels that no event determines. none: black; smooth: smooth surface; edge: flat areas "
+            "with sharp edges.",
+            rich_help_panel=_PICTURE,
         ),
     ] = Fill.SMOOTH
     tone: Annotated[
-        Tone, typer.Option(help="mapped: for the eye; linear: proportional to intensity.", rich_help_panel=_PICTURE)
+        Tone,
+        typer.Option(
+            help="Grey values. mapped: contrast stretched, gamma 2.2; linear: proportional to intensity.",
+            rich_help_panel=_PICTURE,
+        ),
     ] = Tone.MAPPED
-    bits: Annotated[int, typer.Option(help="8 or 16, of a .png; a .tif has 16.", rich_help_panel=_PICTURE)] = 8
+    bits: Annotated[
+        int, typer.Option(help="Bits per pixel of a .png: 8 or 16. A .tif has 16.", rich_help_panel=_PICTURE)
+    ] = 8
     contrast: Annotated[
         float,
         typer.Option(
             min=0.01, max=10.0, rich_help_panel=_PICTURE,
-            help="The sensor's ON threshold (log intensity): events tell brightness in units of it.",
+            help="ON threshold of the sensor (log intensity), which scales the brightness.",
         ),
     ] = CONTRAST  # fmt: skip
     mask: Annotated[
         Path | None,
         typer.Option(
-            help="Also write where events determine the picture (.png).", metavar="<path>", rich_help_panel=_PICTURE
+            help="Mask of the pixels that events determine, to write (.png).",
+            metavar="<path>",
+            rich_help_panel=_PICTURE,
         ),
         OUTPUT,
     ] = None
 
 
 def run(
-    recording: Annotated[Path, typer.Argument(help="Recording of any format that can be read.")],
-    out: Annotated[Path, typer.Argument(help="To write: .png, .tif (16 bit), .npy (log intensity) or .mp4."), OUTPUT],
+    recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    out: Annotated[
+        Path, typer.Argument(help="File to write: .png, .tif (16 bit), .npy (log intensity) or .mp4."), OUTPUT
+    ],
     *,
-    calibration: Annotated[Path, typer.Option(help="What 'amiwarp calibrate' wrote.")],
+    calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
     window: WindowOptions,
     picture: PictureOptions,
     common: Common,
 ) -> None:
-    """Solve for the picture behind the events of a window; as a video, for windows that slide.
+    """Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.
 
-    A picture needs a quarter turn or more. Intensity is relative: events tell no absolute brightness.
+    A window needs at least a quarter turn of the prism. Intensity is relative, because events do not hold absolute
+    brightness.
     """
     from amiwarp.calib import Calibration
     from amiwarp.reconstruction.export import VIDEO, check_path
@@ -116,9 +138,9 @@ def run(
     check_path(out)
     video = out.suffix.lower() == VIDEO
     if video and (picture.mask is not None or picture.bits != 8):
-        raise AmiwarpError("--mask and --bits go with a single picture; a video has neither")
+        raise AmiwarpError("--mask and --bits apply to a single picture; leave them out for a video")
     if not video and window.fps is not None:
-        raise AmiwarpError(f"{out}: --fps goes with a video; give a name that ends in {VIDEO}")
+        raise AmiwarpError(f"{out}: --fps applies to a video; give a name that ends in {VIDEO}")
     device = choose_device(common.device)
     work = Reconstruction(
         open_recording(recording), Calibration.load(calibration), camera_rotation=window.camera_rotation(),
@@ -177,4 +199,4 @@ def _line(d: dict[str, Any]) -> str:
     window = f"{d['length_us'] / 1e3:.1f} ms"
     if "fps" in d:
         return f"{d['file']}: {d['frames']} frames of {window} at {d['fps']:g}/s, {speed}"
-    return f"{d['file']}: {window}, {speed}; {100.0 * d['known']:.0f} % of the picture known from events"
+    return f"{d['file']}: {window}, {speed}; {100.0 * d['known']:.0f} % of the picture determined by events"

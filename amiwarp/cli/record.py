@@ -1,4 +1,4 @@
-"""``amiwarp record``: what camera and encoder give, into a recording that survives whatever happens."""
+"""``amiwarp record``: recording of a live camera and encoder to a file that survives crashes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
 
 def run(
-    source: Annotated[str, typer.Argument(help="dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")],
+    source: Annotated[
+        str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")
+    ],
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     stream: SourceOptions,
@@ -27,11 +29,12 @@ def run(
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
-    """Record events with the prism's angles, until the source ends, --seconds are over, or Ctrl-C.
+    """Record events and prism angles until the source ends, --seconds have passed, or Ctrl-C.
 
-    A stream that breaks off ends it with exit code 1; what came is in the file.
+    If the stream breaks off, the command exits with code 1 and keeps the events received so far.
 
-    The file can be opened at any moment, also after a crash: NAME.part.h5 then, without at most its last second.
+    During recording the file is called NAME.part.h5. It can be read at any time; after a crash it lacks at most the
+    last second.
     """
     from amiwarp.live.stream.session import Session
 
@@ -49,5 +52,9 @@ def run(
             status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
     data = {"file": str(out), **summary(status, opened), "messages": list(line.messages)}
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
-    report(common, data, [text, *([f"{status.late:,} events came late"] if status.late else [])])
+    report(
+        common,
+        data,
+        [text, *([f"{status.late:,} events arrived too late to be sorted by time"] if status.late else [])],
+    )
     check_whole(opened, status)

@@ -1,4 +1,4 @@
-"""Options of whatever makes recordings: camera, prism, its motion, its encoder, the sensor."""
+"""Options for simulated recordings: camera, prism, motion of the prism, encoder and sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.motion import EncoderModel, PrismMotion
     from amiwarp.simulation.simulator import SensorModel
 
 _CAMERA, _PRISM, _SENSOR, _ENCODER = "Camera", "Prism", "Sensor", "Encoder"
@@ -24,12 +23,12 @@ _CAMERA, _PRISM, _SENSOR, _ENCODER = "Camera", "Prism", "Sensor", "Encoder"
 
 @dataclass(frozen=True)
 class RigOptions:
-    """Camera and prism."""
+    """Options for the camera and the prism of a simulation."""
 
     size: Annotated[
         str | None,
         typer.Option(
-            help="Pixels of the camera. Default: 640x480, or those of a video.",
+            help="Size of the camera's image (px). Default: 640x480, or the size of the pictures to translate.",
             metavar="WIDTHxHEIGHT",
             rich_help_panel=_CAMERA,
         ),
@@ -37,61 +36,76 @@ class RigOptions:
     fov_deg: Annotated[
         float | None,
         typer.Option(
-            help="Horizontal field of view (deg). Default: 60, where --camera is not given.", rich_help_panel=_CAMERA
+            help="Horizontal field of view (deg). Default: 60 if --camera is not given.", rich_help_panel=_CAMERA
         ),
     ] = None
     camera: Annotated[
         Path | None,
-        typer.Option(help="Intrinsics: JSON, which has the size too, or calib.txt.", rich_help_panel=_CAMERA),
+        typer.Option(help="Camera intrinsics: JSON (including the size) or calib.txt.", rich_help_panel=_CAMERA),
     ] = None
-    apex_deg: Annotated[float, typer.Option(help="The prism's true apex angle (deg).", rich_help_panel=_PRISM)] = 1.0
+    apex_deg: Annotated[float, typer.Option(help="True apex angle of the prism (deg).", rich_help_panel=_PRISM)] = 1.0
     nominal_apex_deg: Annotated[
         float | None,
-        typer.Option(help="Apex angle that the recording names (deg). Default: the true one.", rich_help_panel=_PRISM),
+        typer.Option(
+            help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.",
+            rich_help_panel=_PRISM,
+        ),
     ] = None
-    index: Annotated[float, typer.Option(help="Refractive index.", rich_help_panel=_PRISM)] = 1.5168
-    flat_side: Annotated[FlatSide, typer.Option(help="Where the flat face looks.", rich_help_panel=_PRISM)] = (
-        FlatSide.SCENE
-    )
-    rpm: Annotated[float, typer.Option(help="Speed, negative backwards (turns/min).", rich_help_panel=_PRISM)] = 720.0
+    index: Annotated[float, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = 1.5168
+    flat_side: Annotated[
+        FlatSide, typer.Option(help="Direction that the prism's flat face points to.", rich_help_panel=_PRISM)
+    ] = FlatSide.SCENE
+    rpm: Annotated[
+        float, typer.Option(help="Speed of the prism (turns/min); negative: backwards.", rich_help_panel=_PRISM)
+    ] = 720.0
     speed: Annotated[
         Path | None,
-        typer.Option(help="Speed over time in place of --rpm: CSV, one 'seconds,rpm' a line.", rich_help_panel=_PRISM),
+        typer.Option(
+            help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.", rich_help_panel=_PRISM
+        ),
     ] = None
     phase_deg: Annotated[
-        float, typer.Option(help="Azimuth of the prism where its encoder says 0 (deg).", rich_help_panel=_PRISM)
+        float, typer.Option(help="Azimuth of the prism at encoder angle 0 (deg).", rich_help_panel=_PRISM)
     ] = 0.0
     tilt_deg: Annotated[
-        str, typer.Option(help="Tilt of the prism's axis (deg).", metavar="X,Y", rich_help_panel=_PRISM)
+        str,
+        typer.Option(
+            help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).",
+            metavar="X,Y",
+            rich_help_panel=_PRISM,
+        ),
     ] = "0,0"
 
     def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
-        """The camera; ``default``: its size where none is given."""
+        """Return the camera. ``default`` is its size [px] if no option gives one."""
         width, height = default if self.size is None else parse_size(self.size)
         if self.camera is None:
             return Camera.from_fov(width, height, math.radians(60.0 if self.fov_deg is None else self.fov_deg))
         if self.fov_deg is not None:
-            raise AmiwarpError("--fov-deg and --camera both give a camera; give one of them")
+            raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
         return read_camera(self.camera, width, height)
 
     def build_prism(self) -> Prism:
+        """Return the true prism."""
         return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
 
     def build_nominal(self) -> Prism:
+        """Return the nominal prism that the recording stores."""
         nominal = self.apex_deg if self.nominal_apex_deg is None else self.nominal_apex_deg
         return replace(self.build_prism(), apex=math.radians(nominal))
 
     def build_motion(self) -> PrismMotion:
+        """Return the prism's speed, phase and tilt."""
         x, y = (math.radians(v) for v in numbers(self.tilt_deg, 2, "--tilt-deg"))
         rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
         return PrismMotion(rpm, math.radians(self.phase_deg), (x, y))
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """``640x480`` as two numbers. Raises :class:`AmiwarpError`."""
+    """Convert a size such as ``640x480``. Raises :class:`AmiwarpError` if the text is not a size."""
     width, x, height = text.partition("x")
     if not (x and width.isdigit() and height.isdigit()):
-        raise AmiwarpError(f"--size {text!r} is no size; write it like 640x480")
+        raise AmiwarpError(f"--size {text!r} is not a size; write it like 640x480")
     return int(width), int(height)
 
 
@@ -109,23 +123,25 @@ def _sensor(text: str) -> Any:
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """The sensor's faults; what is left out takes the default of ``amiwarp.simulation.simulator.SensorModel``."""
+    """Options for the sensor's imperfections. Defaults are those of ``amiwarp.SensorModel``."""
 
     ideal: Annotated[
-        bool, typer.Option("--ideal", help="No noise, no mismatch, no latency.", rich_help_panel=_SENSOR)
+        bool,
+        typer.Option("--ideal", help="Simulate a sensor without noise, mismatch and latency.", rich_help_panel=_SENSOR),
     ] = False
-    contrast_on: Annotated[float | None, _sensor("Rise of log intensity of an ON event.")] = None
-    contrast_off: Annotated[float | None, _sensor("Fall of log intensity of an OFF event.")] = None
-    mismatch: Annotated[float | None, _sensor("Relative scatter of the thresholds over pixels.")] = None
-    refractory_us: Annotated[float | None, _sensor("Time for which a pixel is blind after an event.")] = None
-    latency_us: Annotated[float | None, _sensor("Mean latency.")] = None
-    latency_jitter_us: Annotated[float | None, _sensor("Its standard deviation.")] = None
-    leak_hz: Annotated[float | None, _sensor("Leak events per pixel and second.")] = None
-    shot_noise_hz: Annotated[float | None, _sensor("Random events per pixel and second.")] = None
-    hot_fraction: Annotated[float | None, _sensor("Share of hot pixels.")] = None
-    hot_hz: Annotated[float | None, _sensor("Additional events per hot pixel and second.")] = None
+    contrast_on: Annotated[float | None, _sensor("ON threshold: rise of log intensity.")] = None
+    contrast_off: Annotated[float | None, _sensor("OFF threshold: fall of log intensity.")] = None
+    mismatch: Annotated[float | None, _sensor("Relative standard deviation of the thresholds between pixels.")] = None
+    refractory_us: Annotated[float | None, _sensor("Refractory period (us).")] = None
+    latency_us: Annotated[float | None, _sensor("Mean latency of the time stamps (us).")] = None
+    latency_jitter_us: Annotated[float | None, _sensor("Standard deviation of the latency (us).")] = None
+    leak_hz: Annotated[float | None, _sensor("Rate of leak events per pixel (1/s).")] = None
+    shot_noise_hz: Annotated[float | None, _sensor("Rate of random events per pixel (1/s).")] = None
+    hot_fraction: Annotated[float | None, _sensor("Fraction of hot pixels (0 to 1).")] = None
+    hot_hz: Annotated[float | None, _sensor("Additional event rate of a hot pixel (1/s).")] = None
 
     def build(self) -> SensorModel:
+        """Return the sensor model."""
         from amiwarp.simulation.simulator import SensorModel
 
         given = {name: value for name, value in vars(self).items() if name != "ideal" and value is not None}
@@ -138,16 +154,21 @@ def _encoder(text: str) -> Any:
 
 @dataclass(frozen=True)
 class EncoderModelOptions:
-    """The encoder's faults; what is left out takes the default of ``amiwarp.simulation.motion.EncoderModel``."""
+    """Options for the encoder's imperfections. Defaults are those of ``amiwarp.EncoderModel``."""
 
-    counts_per_turn: Annotated[int | None, _encoder("Resolution; 0 for none.")] = None
-    rate_hz: Annotated[float | None, _encoder("Samples per second.")] = None
-    jitter_us: Annotated[float | None, _encoder("Scatter of the samples' times.")] = None
-    clock_offset_us: Annotated[float | None, _encoder("Encoder's clock minus the camera's; kept secret.")] = None
-    dropouts_hz: Annotated[float | None, _encoder("Drop-outs per second.")] = None
-    dropout_us: Annotated[float | None, _encoder("How long each loses all samples.")] = None
+    counts_per_turn: Annotated[int | None, _encoder("Counts per turn; 0: no rounding to counts.")] = None
+    rate_hz: Annotated[float | None, _encoder("Sample rate (Hz).")] = None
+    jitter_us: Annotated[float | None, _encoder("Standard deviation of the sample times (us).")] = None
+    clock_offset_us: Annotated[
+        float | None, _encoder("Encoder clock minus camera clock (us); stored in the ground truth only.")
+    ] = None
+    dropouts_hz: Annotated[float | None, _encoder("Rate of drop-outs (1/s).")] = None
+    dropout_us: Annotated[float | None, _encoder("Length of a drop-out, during which all samples are lost (us).")] = (
+        None
+    )
 
     def build(self) -> EncoderModel:
+        """Return the encoder model."""
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
         if self.counts_per_turn == 0:
             given["counts_per_turn"] = None

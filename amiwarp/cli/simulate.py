@@ -1,4 +1,4 @@
-"""``amiwarp simulate``: a recording of a picture, with its truth."""
+"""``amiwarp simulate``: simulated recording of a picture, with its ground truth."""
 
 from __future__ import annotations
 
@@ -25,22 +25,26 @@ EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --ap
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Where the picture is, and how the camera turns before it."""
+    """Options for the picture and the camera's rotation in front of it."""
 
     scene_fov_deg: Annotated[
         float | None,
         typer.Option(
-            help="Horizontal extent of the picture (deg). Default: it fills all that is ever seen.",
+            help="Horizontal extent of the picture (deg). Default: it fills the field of view at all times.",
             rich_help_panel="Scene",
         ),
     ] = None
     blur_px: Annotated[
-        float, typer.Option(help="Optical blur, standard deviation in the sensor's pixels.", rich_help_panel="Scene")
+        float, typer.Option(help="Standard deviation of the optical blur (px).", rich_help_panel="Scene")
     ] = 0.5
 
     rotate_deg_s: Annotated[
         str,
-        typer.Option(help="How the camera turns about its axes (deg/s).", metavar="X,Y,Z", rich_help_panel="Scene"),
+        typer.Option(
+            help="Angular velocity of the camera about its x, y and z axes (deg/s).",
+            metavar="X,Y,Z",
+            rich_help_panel="Scene",
+        ),
     ] = "0,0,0"
 
     @property
@@ -50,14 +54,14 @@ class SceneOptions:
 
     @property
     def fov(self) -> float | None:
-        """Extent [rad]."""
+        """Horizontal extent of the picture [rad], or None."""
         return None if self.scene_fov_deg is None else math.radians(self.scene_fov_deg)
 
 
 def run(
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
-    picture: Annotated[Path, typer.Option(help="Any picture: JPEG, PNG, TIFF ...")],
+    picture: Annotated[Path, typer.Option(help="Picture of the scene: JPEG, PNG, TIFF ...")],
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,
     scene: SceneOptions,
     rig: RigOptions,
@@ -65,7 +69,7 @@ def run(
     encoder: EncoderModelOptions,
     common: Common,
 ) -> None:
-    """Make a recording of a picture as an event camera behind the prism would see it; the truth is stored beside it."""
+    """Simulate the recording of a picture by an event camera behind the prism, and store its ground truth."""
     from amiwarp.simulation.simulator import Scene, Simulation
 
     device = choose_device(common.device)
@@ -86,7 +90,7 @@ def run(
 
 
 def write(simulation: Simulation, out: Path, common: Common) -> None:
-    """Runs a simulation into a file and says how that went."""
+    """Run a simulation, write its recording to ``out`` and print the result."""
     began = time.perf_counter()
     with progress("simulating") as advance:
         simulation.write(out, progress=advance)

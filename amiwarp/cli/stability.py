@@ -1,4 +1,4 @@
-"""``amiwarp stability``: where calibration works and how it fails, on simulated recordings with known truth."""
+"""``amiwarp stability``: limits and failures of the calibration, on simulated recordings with ground truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from amiwarp.studies.stability import Atlas, Axis, Method, Stored
 
 EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
-SEEDS, QUICK_SEEDS, QUICK_MINUTES = 20, 1, 9.0
+SEEDS, QUICK_SEEDS = 20, 1
+"""Recordings per value of an axis, by default and with ``--quick``."""
+QUICK_MINUTES = 9.0
+"""Time limit of ``--quick`` [min]."""
 
 
 def run(
@@ -35,34 +38,43 @@ def run(
         "amiwarp-atlas"
     ),
     quick: Annotated[
-        bool, typer.Option("--quick", help="Three values of each axis, three methods, one seed: within ten minutes.")
+        bool,
+        typer.Option("--quick", help="Use three values per axis, three methods and one seed: within ten minutes."),
     ] = False,
     axes: Annotated[
-        list[str] | None, typer.Option(help="Only this axis; can be given more than once.", metavar="NAME")
+        list[str] | None, typer.Option(help="Axis to vary. Can be repeated. Default: all axes.", metavar="NAME")
     ] = None,
     methods: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this method, the default and the paper's; can be given more than once.", metavar="NAME"
+            help="Method to run in addition to 'default' and 'paper'. Can be repeated. "
+            "Default: all methods, with --quick three.",
+            metavar="NAME",
         ),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(min=1, help=f"Recordings of each value. Default: {SEEDS}, quick {QUICK_SEEDS}.")
+        int | None, typer.Option(min=1, help=f"Recordings per value. Default: {SEEDS}, with --quick {QUICK_SEEDS}.")
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(min=0.0, help=f"End after so long; the same command goes on later. Quick: {QUICK_MINUTES:.0f}."),
+        typer.Option(
+            min=0.0,
+            help="Time limit (min). The same command continues later. "
+            f"Default: none, with --quick {QUICK_MINUTES:.0f}.",
+        ),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler. Default: a process on each core here.")
+        str | None, typer.Option(help="Address of a Dask scheduler. Default: one local process per core.")
     ] = None,
-    redraw: Annotated[bool, typer.Option("--redraw", help="Run nothing: figures and tables from the cells.")] = False,
+    redraw: Annotated[
+        bool, typer.Option("--redraw", help="Only draw figures and tables from the existing cells; run nothing.")
+    ] = False,
     common: Common,
 ) -> None:
-    """Calibrate simulated recordings along each axis that breaks calibration, and draw the atlas of failures.
+    """Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails.
 
-    Each cell, a recording and what the methods make of it, is kept in OUT/cells as it finishes: a run that was
-    stopped goes on with the same command, and a rerun does only what is missing.
+    Each axis varies one disturbance, such as noise. A cell holds one recording and the results of all methods on it.
+    Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells.
     """
     device = choose_device(common.device)
     from amiwarp.studies.stability import aggregate, draw, identity, load
@@ -70,7 +82,7 @@ def run(
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
     make_folder(cells_in)
-    earlier = any(cells_in.iterdir())  # then the atlas in this folder is an earlier one of these cells
+    earlier = any(cells_in.iterdir())  # the figures in this folder belong to these cells and may be replaced
     began = time.perf_counter()
     new = left = 0
     if redraw:
@@ -93,55 +105,59 @@ def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
     from amiwarp.studies.stability import AXES, quick_axes
 
     known = quick_axes() if quick else AXES
-    _check("axis", names, [a.name for a in known])
+    _check_known("axis", names, [a.name for a in known])
     return tuple(a for a in known if not names or a.name in names)
 
 
 def _methods(names: Sequence[str], quick: bool) -> tuple[Method, ...]:
     from amiwarp.studies.stability import METHODS, QUICK_METHODS, chosen
 
-    _check("method", names, [m.name for m in METHODS])
+    _check_known("method", names, [m.name for m in METHODS])
     return chosen(QUICK_METHODS if quick and not names else names)
 
 
-def _check(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+def _check_known(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise :class:`AmiwarpError` for a name that is not known."""
     for name in names:
         if name not in known:
-            raise AmiwarpError(f"no {what} {name!r} is here; choose among {', '.join(known)}")
+            raise AmiwarpError(f"unknown {what} {name!r}; choose among {', '.join(known)}")
 
 
 def _run(
     axes: Sequence[Axis], seeds: int, methods: Sequence[Method], folder: Path, device: str, scheduler: str | None,
     minutes: float | None, first: int,
 ) -> tuple[list[Stored], int]:  # fmt: skip
-    """All cells, and how many of them were not there before."""
+    """Run all missing cells. Return all cells and the number of new ones."""
     from amiwarp.studies.stability import run
 
     end = None if minutes is None else time.monotonic() + 60.0 * minutes
     new = 0
 
-    def tell(what: str, share: float) -> None:
+    def count(what: str, share: float) -> None:
         nonlocal new
         new += 1
         advance(what, share)
 
     try:
         with progress("starting workers") as advance, _executor(scheduler, device) as executor:
-            cells = run(axes, seeds, methods, folder, executor, device=device, first=first, progress=tell,
+            cells = run(axes, seeds, methods, folder, executor, device=device, first=first, progress=count,
                         until=None if end is None else lambda: time.monotonic() > end)  # fmt: skip
     except KeyboardInterrupt:
-        say(f"amiwarp: what is finished is kept in {folder}; the same command goes on from there")
+        say(f"amiwarp: finished cells are kept in {folder}; run the same command again to continue")
         raise
     return cells, new
 
 
 @contextlib.contextmanager
 def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
-    """Of the scheduler's workers, or of one process a core here. Raises :class:`AmiwarpError` where it is not there."""
+    """Yield an executor on the scheduler's workers, or on one local process per core.
+
+    Raises :class:`AmiwarpError` if Dask is not installed, the scheduler does not answer, or workers die.
+    """
     try:
-        distributed: Any = importlib.import_module("distributed")  # loaded only here, and without types
+        distributed: Any = importlib.import_module("distributed")  # has no type hints
     except ModuleNotFoundError as error:
-        raise AmiwarpError("the atlas runs on Dask, which is not installed; pip install 'amiwarp[cluster]'") from error
+        raise AmiwarpError("'amiwarp stability' needs Dask; run: pip install 'amiwarp[cluster]'") from error
     with contextlib.ExitStack() as stack:
         where: Any = scheduler
         if scheduler is None:
@@ -158,13 +174,13 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
         try:
             yield stack.enter_context(client.get_executor())
         except distributed.KilledWorker as error:
-            raise AmiwarpError(f"workers died over a cell ({error}): out of memory, or ended from outside; "
-                               "the same command goes on from there") from error  # fmt: skip
+            raise AmiwarpError(f"workers died while running a cell ({error}): out of memory, or killed; "
+                               "run the same command again to continue") from error  # fmt: skip
 
 
-def _prepare(device: str, here: bool) -> None:
-    """Of each worker: Warp quiet, and Ctrl-C left to the process that started it."""
-    if here:
+def _prepare(device: str, local: bool) -> None:
+    """Prepare a worker: silence Warp; a local worker leaves Ctrl-C to its parent process."""
+    if local:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     choose_device(device)
 
@@ -177,13 +193,13 @@ def _about(cells: Sequence[Stored]) -> dict[str, Any]:
 
 
 def lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, took: float) -> list[Any]:
-    """For people: where each method works, the aims, the files and the speed."""
+    """Return the results as tables and lines of text: where each method works, the aims, the files and the speed."""
     from amiwarp.studies.stability import summary
 
     shown: list[Any] = [table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
-    named = ("overview", "pages", "summary", "data", "table")
-    shown += [f"{name}: {files[name]}" for name in named]
-    speed = f"{new:,} cells in {took:,.0f} s, {new / took:.3g} a second; " if new else ""
+    listed = ("overview", "pages", "summary", "data", "table")
+    shown += [f"{name}: {files[name]}" for name in listed]
+    speed = f"{new:,} cells in {took:,.0f} s, {new / took:.3g} per second; " if new else ""
     if left:
-        shown.append(f"{left:,} cells are left, for want of time; the same command goes on from there")
+        shown.append(f"{left:,} cells remain after the time limit; run the same command again to continue")
     return [*shown, f"{speed}{atlas.cells:,} cells in all, in {files['data'].parent / 'cells'}"]

@@ -1,4 +1,4 @@
-"""What ``record`` and ``live`` share: the source, the link, the status line, and how they end."""
+"""Parts that ``record`` and ``live`` share: source, link to the controller, status line, end of a session."""
 
 from __future__ import annotations
 
@@ -20,54 +20,58 @@ from amiwarp.errors import AmiwarpError, printable
 from amiwarp.live.link.link import Link
 
 if TYPE_CHECKING:
-    from amiwarp.live.link.link import Link
     from amiwarp.live.stream.packets import Source
-    from amiwarp.live.stream.session import Status
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.status import SessionStatus
 
 _SOURCE = "Source"
 
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Where events and angles come from."""
+    """Options for the source of events and of prism angles."""
 
     port: Annotated[
         str | None,
         typer.Option(
-            help="Serial port of the prism's controller, its USB id VID:PID, or 'find'. Default: the source's own "
-            "encoder samples.",
+            help="Serial port of the prism's controller: name, USB id VID:PID, or 'find'. Default: none; the encoder "
+            "samples of the source are used.",
             rich_help_panel=_SOURCE,
         ),
     ] = None
     counts_per_turn: Annotated[
         int | None,
-        typer.Option(min=1, help="Of a controller that does not tell it (lines of text).", rich_help_panel=_SOURCE),
+        typer.Option(
+            min=1, help="Encoder counts per turn, if the controller sends lines of text.", rich_help_panel=_SOURCE
+        ),
     ] = None
     fast: Annotated[
-        bool, typer.Option("--fast", help="Replay a file as fast as it can be worked through.", rich_help_panel=_SOURCE)
+        bool,
+        typer.Option("--fast", help="Replay a file as fast as possible, not in real time.", rich_help_panel=_SOURCE),
     ] = False
     seconds: Annotated[
-        float | None, typer.Option(min=0.001, help="End after so long. Default: with the source, or by Ctrl-C.")
+        float | None,
+        typer.Option(min=0.001, help="Stop after this time (s). Default: at the end of the source or at Ctrl-C."),
     ] = None
 
     wait_for_source: Annotated[
         float,
         typer.Option(
             min=0.0,
-            help="When the stream of a socket breaks off, wait for its sender to return (s). Default: end.",
+            help="Longest wait for the sender to return after a socket's stream breaks off (s); 0: do not wait.",
             rich_help_panel=_SOURCE,
         ),
     ] = 0.0
 
     def open(self, spec: str, say: Callable[[str], None]) -> Source:
+        """Open the source named ``spec``. ``say`` gets its messages."""
         from amiwarp.live.stream.opening import open_source
 
         return open_source(spec, pace=None if self.fast else 1.0, wait_s=self.wait_for_source, say=say)
 
     @contextlib.contextmanager
     def link(self) -> Iterator[Link | None]:
-        """The controller, or None where no port was given."""
+        """Open the link to the controller for the duration of the context; None if no port is given."""
         if self.port is None:
             yield None
             return
@@ -77,7 +81,7 @@ class SourceOptions:
 
 @contextlib.contextmanager
 def stopped_by_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Let SIGINT (Ctrl-C) and SIGTERM set the event: once to finish what has come, twice to give up at once."""
+    """Let SIGINT (Ctrl-C) and SIGTERM set ``stop``; a second signal raises KeyboardInterrupt."""
 
     def interrupted(number: int, frame: Any) -> None:
         if stop.is_set():
@@ -93,14 +97,14 @@ def stopped_by_interrupt(stop: threading.Event) -> Iterator[None]:
 
 
 class StatusLine:
-    """One line on stderr that follows a session, messages above it; without a terminal messages alone."""
+    """Status of a session on one line of stderr, below its messages. Without a terminal only messages are printed."""
 
     def __init__(self, stop: threading.Event, seconds: float | None) -> None:
         self._stop, self._seconds = stop, seconds
         self._console = Console(stderr=True, highlight=False)
         self._live = Live(console=self._console, refresh_per_second=5, transient=True)
         self.messages: deque[str] = deque(maxlen=1000)
-        """The last ones said."""
+        """The most recent messages."""
 
     def __enter__(self) -> StatusLine:
         if self._console.is_terminal:
@@ -112,27 +116,29 @@ class StatusLine:
             self._live.stop()
 
     def say(self, message: str) -> None:
+        """Print a message above the status line and keep it in :attr:`messages`."""
         self.messages.append(message)
         if self._console.is_terminal:
             self._console.print(printable(message), markup=False)
         else:
             say(message)
 
-    def update(self, status: Status) -> None:
+    def update(self, status: SessionStatus) -> None:
+        """Show ``status``, and request the end of the session once ``seconds`` have passed."""
         if self._seconds is not None and status.seconds >= self._seconds:
             self._stop.set()
         if self._console.is_terminal:
             self._live.update(Text(describe(status), no_wrap=True, overflow="ellipsis"))
 
-    def end(self, *sinks: SocketSink | PipeSink | None) -> None:
-        """Say how much receivers did not get."""
-        for served in sinks:
-            if served is not None and served.lost:
-                self.say(f"{served.lost:,} packets were not sent: who listens is too slow")
+    def report_lost_packets(self, *sinks: SocketSink | PipeSink | None) -> None:
+        """Print for each sink how many packets its receivers missed."""
+        for sink in sinks:
+            if sink is not None and sink.lost:
+                self.say(f"{sink.lost:,} packets were not sent: a receiver is too slow")
 
 
-def describe(s: Status) -> str:
-    """The line."""
+def describe(s: SessionStatus) -> str:
+    """Return the text of the status line."""
     parts = [f"{s.seconds:.1f} s", f"{s.events:,} events", f"{s.rate_mev_s:.2f} Mev/s"]
     if s.done:
         parts.append(f"latency {s.latency_ms[0]:.1f} ms (p99 {s.latency_ms[1]:.1f})")
@@ -150,24 +156,24 @@ def describe(s: Status) -> str:
 
 
 def check_angles(source: Source, link: Link | None) -> None:
-    """Raises :class:`AmiwarpError` where nothing gives angles."""
+    """Raise :class:`AmiwarpError` if neither the source nor a controller provides prism angles."""
     if link is None and not source.has_encoder:
-        raise AmiwarpError(f"{source.name}: gives no encoder samples; give the controller's --port")
+        raise AmiwarpError(f"{source.name}: contains no encoder samples; give the controller's --port")
 
 
-def check_whole(source: Source, status: Status) -> None:
-    """Raises :class:`AmiwarpError` if the stream broke off: for when all that came is in the files."""
+def check_whole(source: Source, status: SessionStatus) -> None:
+    """Raise :class:`AmiwarpError` if the stream broke off. To be called after the files are complete."""
     problem = getattr(source, "problem", None)
     if problem is None:
         return
     socket = source.name.partition(":")[0].removesuffix("-listen") in ("tcp", "unix")
-    hint = "; --wait-for-source S waits for its sender to return" if socket and not hasattr(source, "returns") else ""
-    kept = f"the {status.events:,} events until then were kept"
+    hint = "; --wait-for-source S waits for the sender to return" if socket and not hasattr(source, "returns") else ""
+    kept = f"the {status.events:,} events received until then are kept"
     raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
 
 
-def summary(s: Status, source: Source) -> dict[str, Any]:
-    """For ``--json``."""
+def summary(s: SessionStatus, source: Source) -> dict[str, Any]:
+    """Return the counts of a session for ``--json``."""
     return {
         "seconds": s.seconds, "events": s.events, "mev_per_s": s.events / max(s.seconds, 1e-9) / 1e6,
         "compensated": s.done, "outside": s.outside, "extrapolated": s.guessed, "without_angle": s.unknown,

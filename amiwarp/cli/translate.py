@@ -1,4 +1,4 @@
-"""``amiwarp translate``: a video, or a folder of pictures, into the recording of a camera behind the prism."""
+"""``amiwarp translate``: conversion of a video or a folder of pictures to a simulated recording."""
 
 from __future__ import annotations
 
@@ -17,21 +17,28 @@ EXAMPLE = "amiwarp translate video.mp4 recording.h5 --apex-deg 1 --rpm 720"
 
 
 def run(
-    source: Annotated[Path, typer.Argument(help="Video, folder of pictures (times.csv: file, t_us) or .npy stack.")],
+    source: Annotated[
+        Path, typer.Argument(help="Video, folder of pictures (with times.csv: file, t_us) or .npy stack.")
+    ],
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     fps: Annotated[
-        float | None, typer.Option(help="Pictures per second, where the source does not tell or tells wrong.")
+        float | None,
+        typer.Option(
+            help="Pictures per second. Needed for a stack or a folder without times.csv; overrides the rate of a video."
+        ),
     ] = None,
-    duration: Annotated[float | None, typer.Option(help="Length (s). Default: that of the pictures.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of the recording (s). Default: length of the pictures.")
+    ] = None,
     rig: RigOptions,
     sensor: SensorOptions,
     encoder: EncoderModelOptions,
     common: Common,
 ) -> None:
-    """Make a recording of pictures in time as an event camera behind the prism would see them.
+    """Simulate the recording of a video or a picture sequence by an event camera behind the prism.
 
-    The camera has the pictures' size unless --size or --camera say otherwise.
+    The camera has the size of the pictures unless --size or --camera gives another one.
     """
     from amiwarp.simulation.translator import open_pictures, translation
 

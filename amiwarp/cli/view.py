@@ -27,158 +27,218 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
-_PICTURE = "Picture"
+_PICTURE, _SERVER = "Picture", "Server"
 LEAST_PX, MOST_PX = 100, 8000
+"""Smallest and largest side of a picture [px]."""
 
 
 @dataclass(frozen=True)
-class PictureOptions:
-    """Of a picture that is written in place of a page."""
+class ScreenshotOptions:
+    """Options for a picture that is written instead of opening the page."""
 
     screenshot: Annotated[
         Path | None,
-        typer.Option(help="Write a picture of both clouds (.png) and end.", rich_help_panel=_PICTURE),
+        typer.Option(help="Write a picture of both event clouds (.png) and exit.", rich_help_panel=_PICTURE),
         OUTPUT,
     ] = None
-    view: Annotated[View, typer.Option(help="Where the camera stands.", rich_help_panel=_PICTURE)] = View.FREE
-    colour: Annotated[Colour, typer.Option(help="What colours tell.", rich_help_panel=_PICTURE)] = Colour.POLARITY
+    view: Annotated[View, typer.Option(help="Viewpoint of the picture.", rich_help_panel=_PICTURE)] = View.FREE
+    colour: Annotated[Colour, typer.Option(help="Quantity shown by colour.", rich_help_panel=_PICTURE)] = (
+        Colour.POLARITY
+    )
     axis: Annotated[
-        Axis | None, typer.Option(help="Third axis. Default: the angle, where there is one.", rich_help_panel=_PICTURE)
+        Axis | None,
+        typer.Option(
+            help="Third axis of the plot. Default: the angle if known, otherwise time.", rich_help_panel=_PICTURE
+        ),
     ] = None
-    dark: Annotated[bool, typer.Option("--dark", help="On a dark ground.", rich_help_panel=_PICTURE)] = False
-    overlaid: Annotated[bool, typer.Option("--overlaid", help="Both in one frame.", rich_help_panel=_PICTURE)] = False
-    size: Annotated[str, typer.Option(help="Of the picture (px).", rich_help_panel=_PICTURE)] = "1400x620"
+    dark: Annotated[bool, typer.Option("--dark", help="Use a dark background.", rich_help_panel=_PICTURE)] = False
+    overlaid: Annotated[
+        bool, typer.Option("--overlaid", help="Draw both clouds in one frame.", rich_help_panel=_PICTURE)
+    ] = False
+    size: Annotated[
+        str, typer.Option(help="Size of the picture (px).", metavar="WIDTHxHEIGHT", rich_help_panel=_PICTURE)
+    ] = "1400x620"
 
-    def write(self, first: Inspector, path: Path) -> dict[str, Any]:
-        """What is drawn, for ``--json``. Raises :class:`AmiwarpError` for a format or a size that cannot be."""
+    def write(self, inspector: Inspector, path: Path) -> dict[str, Any]:
+        """Write the picture and return what it shows, for ``--json``.
+
+        Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
+        """
         from amiwarp.viewer.app import save_screenshot
         from amiwarp.viewer.scene import Look
 
         if path.suffix.lower() != ".png":
-            raise AmiwarpError(f"{path}: pictures are written as .png")
-        third = self.axis or (Axis.ANGLE if first.has_encoder or first.knobs.rpm else Axis.TIME)
+            raise AmiwarpError(f"{path}: pictures are written as .png; give a name that ends in .png")
+        third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
         width, height = parse_size(self.size)
         if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
-            raise AmiwarpError(f"--size {self.size!r}: pictures have {LEAST_PX} to {MOST_PX} pixels a side")
+            raise AmiwarpError(f"--size {self.size!r}: width and height must be {LEAST_PX} to {MOST_PX} px")
         look = Look(self.colour, third, dark=self.dark, overlaid=self.overlaid)
-        save_screenshot(first, path, view=self.view, look=look, size=(width, height))
-        shown = first.show()
+        save_screenshot(inspector, path, view=self.view, look=look, size=(width, height))
+        shown = inspector.show()
         return {
             "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
             "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
-            "notes": list(first.notes),
+            "notes": list(inspector.notes),
         }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """Options for following a live stream."""
+
+    live: Annotated[bool, typer.Option("--live", help="Show the last two seconds of a live stream.")] = False
+    controller: Annotated[
+        str | None,
+        typer.Option(
+            help="Serial port of the prism's controller for --live: name, USB id VID:PID, or 'find'. Default: none."
+        ),
+    ] = None
+
+    @contextlib.contextmanager
+    def follow(self, source: str) -> Iterator[Callable[[], Recording] | None]:
+        """Follow the stream; yield a function that returns its last seconds. Without ``--live`` yield None.
+
+        Waits until the stream holds one turn of the prism.
+        """
+        if not self.live:
+            yield None
+            return
+        from amiwarp.live.stream.opening import open_source
+        from amiwarp.live.stream.recent_events import RecentEvents, followed
+
+        with SourceOptions(port=self.controller).link() as link:
+            stream = open_source(source)
+            check_angles(stream, link)
+            recent = RecentEvents(stream)
+            with followed(stream, link, recent, say):
+                first = recent.recording()
+                assert first is not None
+                yield lambda: recent.recording() or first
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """Options for the page that shows the events."""
+
+    web: Annotated[
+        bool,
+        typer.Option("--web", help="Serve the page and print its address; open no window.", rich_help_panel=_SERVER),
+    ] = False
+    host: Annotated[
+        str,
+        typer.Option(
+            help="Network address to serve on. The printed URL holds a secret token.", rich_help_panel=_SERVER
+        ),
+    ] = "127.0.0.1"
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port to serve on; 0: any free port.", rich_help_panel=_SERVER)
+    ] = 0
+    out_dir: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the files that the page exports. Default: the recording's folder; for a stream the "
+            "current folder.",
+            rich_help_panel=_SERVER,
+        ),
+        OUTPUT_FOLDER,
+    ] = None
+
+    def show(self, new_inspector: Callable[[], Inspector], *, name: str, folder: Path, common: Common) -> None:
+        """Show the page in a window, or serve it for a browser, until it is closed or interrupted."""
+        from amiwarp.viewer.app import has_display, open_window, serve_panel
+
+        in_browser = self.web or not has_display()
+
+        def ready(url: str) -> None:
+            if in_browser and (text := warning(self.host)) is not None:
+                say(text)
+            report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
+
+        if in_browser:
+            serve_panel(new_inspector, folder, host=self.host, port=self.port, ready=ready)
+        else:
+            open_window(new_inspector, folder, ready)
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    """Options for what the page shows first."""
+
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")] = None
+    window: Annotated[
+        str | None,
+        typer.Option(
+            help="Time window to show (s from the first event). Default: one turn in the middle of the recording.",
+            metavar="START:END",
+        ),
+    ] = None
+    model: Annotated[
+        str | None,
+        typer.Option(help="Prism model: circle, exact, radial or ellipse. Default: the calibrated model, or exact."),
+    ] = None
+
+    def build(self, recording: Recording, device: str, latest: Callable[[], Recording] | None) -> Inspector:
+        """Return an inspector of the recording. ``latest`` returns the present end of a stream."""
+        from amiwarp.calib import Calibration
+        from amiwarp.viewer.inspector import Inspector
+
+        found = None if self.calibration is None else Calibration.load(self.calibration)
+        inspector = Inspector(recording, found, device=device, latest=latest)
+        if self.model is not None:
+            inspector.set(replace(inspector.knobs, model=_checked_model(self.model)))
+        if self.window is not None:
+            events = inspector.recording.events
+            low, high = span(self.window, events.t_first, events.t_last)
+            inspector.window = low, high - low
+        return inspector
+
+
+def _checked_model(name: str) -> str:
+    from amiwarp.optics.models import MODELS
+
+    if name not in MODELS:
+        raise AmiwarpError(f"--model {name!r} is unknown; choose among {', '.join(MODELS)}")
+    return name
 
 
 def run(
     recording: Annotated[
-        Path,
-        typer.Argument(help="Recording of any format that can be read; with --live a source as of 'amiwarp live'."),
+        Path, typer.Argument(help="Recording in any supported format. With --live: a source as for 'amiwarp live'.")
     ],
     *,
-    live: Annotated[bool, typer.Option("--live", help="Follow a stream: its last two seconds.")] = False,
-    controller: Annotated[
-        str | None,
-        typer.Option(help="With --live: serial port of the prism's controller, USB id, or 'find'. Default: none."),
-    ] = None,
-    calibration: Annotated[Path | None, typer.Option(help="What 'amiwarp calibrate' wrote.")] = None,
-    web: Annotated[bool, typer.Option("--web", help="Serve the page and print its address; open no window.")] = False,
-    host: Annotated[str, typer.Option(help="Interface to serve on; the address carries a secret token.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve on; 0: a free one.")] = 0,
-    out_dir: Annotated[
-        Path | None,
-        typer.Option(help="Folder of what the page exports. Default: the recording's, of a stream the current one."),
-        OUTPUT_FOLDER,
-    ] = None,
-    window: Annotated[
-        str | None,
-        typer.Option(help="Only these seconds of the recording. Default: one turn in its middle.", metavar="START:END"),
-    ] = None,
-    model: Annotated[
-        str | None, typer.Option(help="circle, exact, radial or ellipse. Default: as calibrated, or exact.")
-    ] = None,
-    picture: PictureOptions,
+    stream: StreamOptions,
+    start: StartOptions,
+    page: PageOptions,
+    picture: ScreenshotOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
-    """Look at events in x, y and prism angle, as recorded and compensated, and turn the prism's knobs."""
-    from amiwarp.viewer.app import export_folder, has_display, open_window, serve_panel
+    """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
+    from amiwarp.viewer.app import export_folder
     from amiwarp.viewer.scene import check_display
 
     device = choose_device(common.device)
     check_display()
 
-    with contextlib.ExitStack() as held:
-        latest = held.enter_context(_following(str(recording), controller)) if live else None
+    with stream.follow(str(recording)) as latest:
 
-        def make() -> Inspector:
-            return inspector(recording, calibration, window, model, camera, prism, device, latest)
+        def new_inspector() -> Inspector:
+            opened = open_recording(recording) if latest is None else latest()
+            return start.build(complete(opened, camera, prism), device, latest)
 
-        waiting = [make()]  # what is wrong is said here, not in the page
+        waiting = [new_inspector()]  # reports bad input before the page opens
         if picture.screenshot is not None:
             data = {**picture.write(waiting[0], picture.screenshot), "device": device}
             report(common, data, _lines(data))
             return
-        folder, in_browser = export_folder(None if live else recording, out_dir), web or not has_display()
+        folder = export_folder(None if stream.live else recording, page.out_dir)
 
-        def ready(url: str) -> None:
-            if in_browser and (text := warning(host)) is not None:
-                say(text)
-            report(common, {"url": url}, [f"{recording.name}: {url}", "Ctrl-C ends it"])
+        def inspector_of_tab() -> Inspector:
+            return waiting.pop() if waiting else new_inspector()
 
-        def tab() -> Inspector:
-            return waiting.pop() if waiting else make()
-
-        if in_browser:
-            serve_panel(tab, folder, host=host, port=port, ready=ready)
-        else:
-            open_window(tab, folder, ready)
-
-
-def inspector(
-    path: Path,
-    calibration: Path | None,
-    window: str | None,
-    model: str | None,
-    camera: CameraOptions,
-    prism: NominalPrismOptions,
-    device: str,
-    latest: Callable[[], Recording] | None = None,
-) -> Inspector:
-    """The recording with what the options add, at its first window."""
-    from amiwarp.calib import Calibration
-    from amiwarp.optics.models import MODELS
-    from amiwarp.viewer.inspector import Inspector
-
-    found = None if calibration is None else Calibration.load(calibration)
-    opened = open_recording(path) if latest is None else latest()
-    made = Inspector(complete(opened, camera, prism), found, device=device, latest=latest)
-    if model is not None:
-        if model not in MODELS:
-            raise AmiwarpError(f"--model {model!r} is unknown; choose among {', '.join(MODELS)}")
-        made.set(replace(made.knobs, model=model))
-    if window is not None:
-        first, last = made.recording.events.t_first, made.recording.events.t_last
-        low, high = span(window, first, last)
-        made.window = low, high - low
-    return made
-
-
-@contextlib.contextmanager
-def _following(spec: str, controller: str | None) -> Iterator[Callable[[], Recording]]:
-    """What a stream's last seconds are by now; waits for the first turn."""
-    from amiwarp.live.stream.opening import open_source
-    from amiwarp.live.stream.recent_events import RecentEvents, followed
-
-    with SourceOptions(port=controller).link() as link:
-        source = open_source(spec)
-        check_angles(source, link)
-        ring = RecentEvents(source)
-        with followed(source, link, ring, say):
-            recording = ring.recording()
-            assert recording is not None
-            yield lambda: ring.recording() or recording
+        page.show(inspector_of_tab, name=recording.name, folder=folder, common=common)
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The kernel that takes a prism out of events, and what it is launched with."""
+"""The compensation kernel and its launch arguments."""
 
 from __future__ import annotations
 
@@ -15,31 +15,36 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 
-class Placing:
-    """A model on a device, for events that are placed there."""
+class LaunchPlan:
+    """Kernel and arguments that compensate events by one model on one device."""
 
     def __init__(self, model: Model, device: Any) -> None:
-        """``device``: a ``wp.Device``. The kernel is loaded here, before threads would each try."""
+        """Load the kernel here, so that threads do not each try. ``device``: a ``wp.Device``."""
         name = str(device)
         self.size = model.camera.width, model.camera.height
+        """Sensor width and height [px]."""
         self.kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
         self.block = int(kernels.BLOCK) if device.is_cpu else 1
-        """Events of a kernel's thread: columns are filled up to a multiple of it."""
+        """Events per thread of the kernel; columns are padded to a multiple of it."""
         self._camera = camera_params(model.camera, name)
         self._pinhole = pinhole_params(model.camera) or self._camera
         self._model, self._limits, self._azimuths = model.params(name), wp.vec2(*self.size), azimuths(name)
         load(self.kernel, device)
 
     def padded(self, n: int) -> int:
-        """Events that a column for ``n`` has room for."""
+        """Return the length of a column for ``n`` events."""
         return -(-n // self.block) * self.block
 
-    def strays(self, most_x: int, most_y: int) -> bool:
-        """Whether events up to there lie outside the image [px]."""
-        return most_x >= self.size[0] or most_y >= self.size[1]
+    def any_outside(self, max_x: int, max_y: int) -> bool:
+        """Return whether events with these largest coordinates [px] reach outside the sensor."""
+        return max_x >= self.size[0] or max_y >= self.size[1]
 
-    def inputs(self, encoder: Any, columns: Any, *, strays: bool) -> list[Any]:
-        """Of the kernel, less the first block. ``encoder``: ``EncoderParams``; ``columns``: ``Columns``."""
-        # The quick way of placing takes an event's pixel from the image's tables without a look.
-        camera = self._camera if strays else self._pinhole
+    def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:
+        """Return the kernel's inputs, except the first block.
+
+        ``encoder``: ``EncoderParams``. ``columns``: ``Columns``. ``outside``: whether pixels may lie outside the
+        sensor. If not, the pinhole camera is used where the lens has no distortion: its kernel is faster, but reads
+        the ellipse model's per-pixel table without a bounds check.
+        """
+        camera = self._camera if outside else self._pinhole
         return [self._model, camera, self._limits, encoder, self._azimuths, columns]

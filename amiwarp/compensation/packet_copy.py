@@ -1,39 +1,73 @@
-"""Packets of events put together to long columns, by threads of native code."""
+"""Copying of event packets into long columns, by threads of native code."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from ctypes import c_uint64
-from typing import Any
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from amiwarp.compensation.pointers import FindPointers, Pointers, fastest
 from amiwarp.events.events import Events
 from amiwarp.kernels.launch import Recorded, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
 
-PIECE, THREADS, OURS = 1 << 17, 2, 8
-"""Of more events than that, an eighth of the packets is put together by the caller and the rest by two threads beside:
-while it copies, they get Python's lock and begin. Otherwise they would wait until the caller waits for them."""
+PIECE = 1 << 17
+"""Number of events from which several threads copy a batch, and largest number of events per row of the table."""
+THREADS = 2
+"""Threads that copy a long batch together with the calling thread."""
+CALLER_SHARE = 8
+"""The calling thread copies one packet in this many.
+
+While its native code runs, the other threads can take Python's lock and start. Without a share of its own, the caller
+would keep the lock, and the threads would only start once the caller waits for them.
+"""
 WIDTHS = (2, 2, 8, 1)
-"""Bytes of x, y, t, p of an event."""
-HEAD = object.__basicsize__
-"""Bytes of an array's object before the address of its values, in NumPy's C interface (``PyArrayObject_fields``): to
-ask NumPy for the address takes 1.5 us, of 100 packets' columns nearly as long as to copy them."""
+"""Bytes per event of x, y, t and p."""
+
+
+class ColumnCheck(NamedTuple):
+    """Properties of copied packets that the copy finds in passing."""
+
+    unsorted: bool
+    """Whether the times of any packet decrease."""
+    max_x: int
+    """Largest x [px]."""
+    max_y: int
+    """Largest y [px]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CopyInProgress:
+    """A copy on which threads work."""
+
+    jobs: list[Future[None]]
+    found: NDArray[np.int32]
+    """Results of the threads, shape (packets, 3): unsorted, largest x, largest y."""
+    sources: list[Pointers]
+    """Keep the packets' memory alive: the threads only have addresses."""
+
+    def wait(self) -> ColumnCheck:
+        """Wait for the copy and return what it found."""
+        for job in self.jobs:
+            job.result()
+        unsorted, max_x, max_y = self.found.max(axis=0).tolist()
+        return ColumnCheck(bool(unsorted), max_x, max_y)
 
 
 class PacketCopier:
-    """Puts packets together by several threads, see :mod:`amiwarp.kernels.packet_copy`."""
+    """Copier of many packets by several threads, see :mod:`amiwarp.kernels.packet_copy`. One copy at a time."""
 
-    def __init__(self) -> None:
-        probe = np.zeros(1)
-        if c_uint64.from_address(id(probe) + HEAD).value != address(probe):
-            raise RuntimeError(f"NumPy {np.__version__} keeps its arrays' addresses elsewhere; use NumPy 2")
-        self._make(64)
+    def __init__(self, find_pointers: FindPointers | None = None) -> None:
+        """``find_pointers``: see :mod:`amiwarp.compensation.pointers`; by default the fastest that works."""
+        self._find_pointers = find_pointers or fastest()
+        self._allocate(64)
 
-    def _make(self, rows: int) -> None:
+    def _allocate(self, rows: int) -> None:
+        """Allocate the table of packets with ``rows`` rows."""
         table, found = (
             wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
             wp.zeros(rows * FOUND, dtype=int, device="cpu"),
@@ -41,61 +75,48 @@ class PacketCopier:
         self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
         self._commands = [Recorded(gather_parts, [table, found], [], device="cpu") for _ in range(1 + THREADS)]
 
-    def __call__(
-        self, parts: list[Events], n: int, to: list[int], *, with_p: bool
-    ) -> Callable[[], tuple[bool, int, int]]:
-        """Copies ``n`` events of the parts to where the addresses ``to`` say: of x, y, t and, if it is asked for, p.
+    def __call__(self, parts: list[Events], n: int, to: list[int], *, with_p: bool) -> CopyInProgress:
+        """Start to copy all ``n`` events of ``parts`` to the addresses ``to`` of x, y, t and p (only if ``with_p``).
 
-        What it returns waits for it, and tells whether any part is unsorted, and the largest x and y. Not before that
-        may this be called again.
+        Call ``wait`` of the result before the next copy.
         """
-        goes_on: Any = 0  # whether a row's first event follows the last of the row before in memory
+        follows: Any = 0  # whether a row's first event directly follows the last of the row before in memory
         counts = np.array([part.t.size for part in parts])
         if counts.max() > PIECE:
-            parts, goes_on = _cut(parts)
+            parts, follows = _cut(parts)
             counts = np.array([part.t.size for part in parts])
-        columns = [_plain([getattr(part, name) for part in parts]) for name in ("x", "y", "t", "p")]
-        places = np.concatenate([[0], np.cumsum(counts)[:-1]])
         if len(parts) > len(self._table):
-            self._make(2 * len(parts))
+            self._allocate(2 * len(parts))
+        columns = [_contiguous([getattr(part, name) for part in parts]) for name in ("x", "y", "t", "p")]
+        sources = [self._find_pointers(column) for column in columns]
         table = self._table[: len(parts)]
-        for k, (column, start, width) in enumerate(zip(columns, to, WIDTHS, strict=True)):
-            table[:, k] = list(map(id, column))
-            table[:, 4 + k] = start + width * places if k < 3 or with_p else 0
-        table[:, :4] += np.uint64(HEAD)
-        table[:, 8], table[:, 9] = counts, goes_on
-        threads = THREADS if n > PIECE else 0
-        ours = len(parts) // OURS if threads else len(parts)
-        edges = [0, *(ours + (len(parts) - ours) * k // max(threads, 1) for k in range(threads + 1))]
+        offsets = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        for k, (source, start, width) in enumerate(zip(sources, to, WIDTHS, strict=True)):
+            table[:, k] = source.at
+            table[:, 4 + k] = start + width * offsets if k < 3 or with_p else 0
+        table[:, 8], table[:, 9] = counts, follows
+        return CopyInProgress(self._run(len(parts), THREADS if n > PIECE else 0), self._found[: len(parts)], sources)
+
+    def _run(self, rows: int, threads: int) -> list[Future[None]]:
+        """Copy the caller's share, while the other threads start on theirs."""
+        ours = rows // CALLER_SHARE if threads else rows
+        edges = [0, *(ours + (rows - ours) * k // max(threads, 1) for k in range(threads + 1))]
 
         def run(k: int) -> None:
             self._commands[k](edges[k], edges[k + 1] - edges[k])
 
         jobs = [pool().submit(run, k) for k in range(1, threads + 1)]
         run(0)
-
-        def found(_held: object = columns) -> tuple[bool, int, int]:
-            """The columns are held until all was copied: of the arrays only the addresses are with the threads."""
-            for job in jobs:
-                job.result()
-            unsorted, most_x, most_y = self._found[: len(parts)].max(axis=0).tolist()
-            return bool(unsorted), most_x, most_y
-
-        return found
+        return jobs
 
 
 def _cut(parts: list[Events]) -> tuple[list[Events], list[int]]:
-    """Parts in pieces of :data:`PIECE` at most, and which of them go on where the one before ended."""
-    whole = [Events(*_plain([part.x, part.y, part.t, part.p])) for part in parts]
+    """Cut parts into pieces of at most :data:`PIECE`; 1 for each piece that continues the one before."""
+    whole = [Events(*_contiguous([part.x, part.y, part.t, part.p])) for part in parts]
     cut = [(part[k : k + PIECE], int(k > 0)) for part in whole for k in range(0, len(part), PIECE)]
-    return [piece for piece, _ in cut], [goes_on for _, goes_on in cut]
+    return [piece for piece, _ in cut], [follows for _, follows in cut]
 
 
-def _plain(columns: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Without gaps."""
+def _contiguous(columns: list[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Copy the columns that have gaps in memory."""
     return [column if column.flags.c_contiguous else np.ascontiguousarray(column) for column in columns]
-
-
-def address(array: NDArray[Any]) -> int:
-    """Of its first value."""
-    return int(array.__array_interface__["data"][0])

@@ -1,4 +1,4 @@
-"""Compensation of recordings: every event moved to where it would be without the prism."""
+"""Motion compensation of recordings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.compensation.launch_plan import Placing
+from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.events import Events, check_sensor
@@ -34,88 +34,122 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import MetadataValue, Recording
     from amiwarp.optics.models import Model
 
-BLOCK = 1 << 20
-"""Events of a block where nothing else is asked for."""
+DEFAULT_BLOCK = 1 << 20
+"""Number of events per block if the caller gives no size."""
 PIECE = 2 * CHUNK
-"""Events that a thread works on at a time, from the file and back: few, so that they stay in its core's cache."""
-
-"""Called with events done and all."""
+"""Number of events per thread and piece, from file to file: few enough to stay in the core's cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompensationSummary:
-    """What a compensation did."""
+    """Result of a compensation.
+
+    Examples
+    --------
+    >>> amiwarp.CompensationSummary(events=2_000_000, outside=150, seconds=0.5).mev_per_s
+    4.0
+    """
 
     events: int
+    """Number of compensated events."""
     outside: int
-    """Events kept, and marked, whose place lies outside the image or that have none (NaN)."""
+    """Number of events outside the image or without coordinates (NaN). They are kept and marked."""
     seconds: float
-    """Whole time, reading and writing included."""
+    """Duration, including reading and writing [s]."""
 
     @property
     def mev_per_s(self) -> float:
-        """Million events a second."""
+        """Million events per second."""
         return self.events / max(self.seconds, 1e-9) / 1e6
 
 
-class Mover:
-    """Moves events to where they are without the prism: a model and an encoder on a device, for any thread.
-
-    Raises :class:`AmiwarpError` where the encoder does not cover the times ``t_first`` .. ``t_last`` [us].
-    """
+class BlockCompensator:
+    """Compensation of blocks of events by one model and one encoder on a device. Any thread may call it."""
 
     def __init__(self, model: Model, encoder: Encoder, t_first: int, t_last: int, device: Any) -> None:
+        """Copy model and encoder to the device.
+
+        Raises :class:`AmiwarpError` if the encoder does not cover the times ``t_first`` .. ``t_last`` [us].
+        """
         self._device = wp.get_device(device)
-        self._placing = Placing(model, self._device)
+        self._plan = LaunchPlan(model, self._device)
         self._encoder = encoder_params(encoder, t_first, t_last, str(self._device))
-        # Warp's CUDA side keeps its books for one thread at a time
-        self._alone = contextlib.nullcontext() if self._device.is_cpu else threading.Lock()
+        # Warp's bookkeeping on CUDA allows one thread at a time
+        self._one_thread = contextlib.nullcontext() if self._device.is_cpu else threading.Lock()
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
-        """The events moved (NaN: nowhere), and 1 for each that lies on a pixel of the image, shape ``(n,)``."""
+        """Return the compensated events (NaN for no coordinates), and 1 for each inside the image, shape ``(n,)``."""
         check_sensor(events)
         if not len(events):
             return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
-        with self._alone:
-            x, y, inside = self._move(events, all_cores)
+        with self._one_thread:
+            x, y, inside = self._compensate(events, all_cores)
         return Events(x, y, events.t, events.p), inside
 
-    def _move(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
-        placing, n = self._placing, len(events)
-        padded = placing.padded(n)
+    def _compensate(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
+        plan, n = self._plan, len(events)
+        padded = plan.padded(n)
         c = Columns()
-        c.x, c.y = (_on(self._device, values, wp.uint16, padded) for values in (events.x, events.y))
-        c.t = _on(self._device, events.t, wp.int64, padded)
+        c.x, c.y = (_column(self._device, values, wp.uint16, padded) for values in (events.x, events.y))
+        c.t = _column(self._device, events.t, wp.int64, padded)
         c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=self._device) for _ in range(2))
         c.inside = wp.empty(padded, dtype=wp.uint8, device=self._device)
-        inputs = placing.inputs(self._encoder, c, strays=placing.strays(events.x.max(), events.y.max()))
-        blocks = padded // placing.block
+        inputs = plan.inputs(self._encoder, c, outside=plan.any_outside(events.x.max(), events.y.max()))
+        blocks = padded // plan.block
         if all_cores:
-            launch(placing.kernel, blocks, inputs, [], device=self._device, smallest=512)
+            launch(plan.kernel, blocks, inputs, [], device=self._device, smallest=512)
         else:
-            wp.launch(placing.kernel, dim=blocks, inputs=[*inputs, 0], device=self._device)
+            wp.launch(plan.kernel, dim=blocks, inputs=[*inputs, 0], device=self._device)
         return [values.numpy()[:n] for values in (c.out_x, c.out_y, c.inside)]
 
 
-def _on(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
-    """A column on the device, without a copy on CPUs where that can be."""
+def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
+    """Return a padded column on the device, on CPUs without a copy if possible."""
     if len(values) < padded:
         values = np.concatenate([values, np.zeros(padded - len(values), values.dtype)])
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
 
 
 def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = "cpu") -> NDArray[np.float32]:
-    """Places of the events without the prism [px], shape (n, 2); NaN where there is none.
+    """Compensate events.
 
-    ``events`` come from a sensor (uint16). Raises :class:`AmiwarpError` where the encoder does not cover them.
+    Parameters
+    ----------
+    events : Events
+        Events with the whole pixel coordinates of a sensor (uint16).
+    model : Model
+        Optical model of the prism.
+    encoder : Encoder
+        Encoder that covers the events.
+    device : str or warp.Device, optional
+        Device to compute on.
+
+    Returns
+    -------
+    ndarray
+        Coordinates without the prism [px], float32, shape ``(n, 2)``; NaN for events without a solution.
+
+    Raises
+    ------
+    AmiwarpError
+        If the encoder does not cover the events, or their coordinates are not whole pixels.
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    >>> model = amiwarp.CircleModel.from_prism(camera, amiwarp.Prism(0.02), 0.3)
+    >>> events = amiwarp.Events.from_arrays([10, 20], [30, 40], [0, 1000], [0, 1])
+    >>> encoder = amiwarp.Encoder.constant_speed(720.0, 0, 2000)
+    >>> amiwarp.compensate_events(events, model, encoder).shape
+    (2, 2)
     """
     first, last = (int(events.t.min()), int(events.t.max())) if len(events) else encoder.coverage
-    moved, _inside = Mover(model, encoder, first, last, device)(events, all_cores=True)
-    return np.stack([moved.x, moved.y], axis=1)
+    compensated, _inside = BlockCompensator(model, encoder, first, last, device)(events, all_cores=True)
+    return np.stack([compensated.x, compensated.y], axis=1)
 
 
 def inside_image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np.bool_]:
-    """Which points (n, 2) lie on a pixel of the image; NaN lies on none."""
+    """Return which points (n, 2) lie on a pixel of the image; NaN does not."""
     x, y = xy[:, 0], xy[:, 1]
     return (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
 
@@ -123,13 +157,13 @@ def inside_image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np
 def compensated_blocks(
     recording: Recording, model: Model, encoder: Encoder, *, device: Any = "cpu", **blocks: int
 ) -> Iterator[Events]:
-    """The recording's events, compensated, block by block (``count=`` or ``duration_us=``), in order, none dropped."""
+    """Yield all events of the recording in order, compensated, in blocks of ``count=`` events or ``duration_us=``."""
     source = recording.events
     if not len(source):
         return
-    mover = Mover(model, encoder, source.t_first, source.t_last, device)
-    for block in source.blocks(**(blocks or {"count": BLOCK})):
-        yield mover(block, all_cores=True)[0]
+    compensator = BlockCompensator(model, encoder, source.t_first, source.t_last, device)
+    for block in source.blocks(**(blocks or {"count": DEFAULT_BLOCK})):
+        yield compensator(block, all_cores=True)[0]
 
 
 def compensate(
@@ -142,12 +176,51 @@ def compensate(
     on_block: Callable[[Events], None] | None = None,
     overwrite: bool = False,
 ) -> CompensationSummary:
-    """Writes the compensated recording: sub-pixel float32 coordinates; time, polarity and order kept.
+    """Compensate a recording and write the result to a file.
 
-    In blocks, in constant memory. Events that leave the image are kept and marked (``events/inside``). ``on_block``
-    sees each compensated block. Raises :class:`AmiwarpError` for a camera of another size, an encoder that does not
-    cover the events, or an output that cannot be written, is the recording, or exists (unless ``overwrite``); nothing
-    is left behind then.
+    Events keep their time, polarity and order; coordinates become sub-pixel float32 values. Events outside the image
+    are kept, and marked in ``events/inside``. Memory use is constant.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording to compensate.
+    calibration : Calibration
+        Calibration of the same camera and prism.
+    out_path : str or os.PathLike
+        Path of the new recording.
+    device : str or warp.Device, optional
+        Device to compute on.
+    progress : Progress, optional
+        Called with the finished share.
+    on_block : callable, optional
+        Called with each block of compensated events, in order.
+    overwrite : bool, optional
+        Replace an existing file.
+
+    Returns
+    -------
+    CompensationSummary
+        Number of events, and duration.
+
+    Raises
+    ------
+    AmiwarpError
+        If the calibration is for another sensor size, the encoder does not cover the events, or the output cannot be
+        written, is the recording itself, or exists. No partial file remains.
+
+    Examples
+    --------
+    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.02)
+    >>> events = amiwarp.Events.from_arrays([10, 20], [12, 14], [0, 1000], [0, 1])
+    >>> encoder = amiwarp.Encoder.constant_speed(720.0, 0, 2000)
+    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 32, 24), camera, encoder, prism)
+    >>> calibration = amiwarp.Calibration(
+    ...     model_name="circle", camera=camera, prism=prism, parameters={"deflection": 0.01, "phase": 0.3},
+    ...     uncertainty={}, free=(), sharpness_name="variance", sharpness_before=1.0, sharpness_after=2.0,
+    ...     stages=(), events=2, seconds=0.0)
+    >>> amiwarp.compensate(recording, calibration, "compensated.h5").events
+    2
     """
     began = time.perf_counter()
     width, height = recording.events.size
@@ -175,29 +248,29 @@ def compensate(
     ) as writer:  # fmt: skip
         if encoder is not None and n:
             first, last = recording.events.t_first, recording.events.t_last
-            mover = Mover(calibration.model, encoder, first, last, device)
-            writer.fill(moved_pieces(recording.events, mover), t_first=first, done=count)
+            compensator = BlockCompensator(calibration.model, encoder, first, last, device)
+            writer.fill(compensated_pieces(recording.events, compensator), t_first=first, done=count)
     return CompensationSummary(done, outside, time.perf_counter() - began)
 
 
-def moved_pieces(source: EventSource, mover: Mover) -> Iterator[Callable[[], tuple[Events, NDArray[np.uint8]]]]:
-    """The recording, moved, in pieces: threads read them where the file lets them, and move them."""
+def compensated_pieces(
+    source: EventSource, compensator: BlockCompensator
+) -> Iterator[Callable[[], tuple[Events, NDArray[np.uint8]]]]:
+    """Yield functions that return compensated pieces of the recording. Threads read native files in parallel."""
     if isinstance(source, NativeEvents):
         for read in source.pieces(PIECE):
-            yield partial(_read_and_move, read, mover)
+            yield partial(_read_and_compensate, read, compensator)
     else:
         for events in source.blocks(count=PIECE):
-            yield partial(mover, events)
+            yield partial(compensator, events)
 
 
-def _read_and_move(read: Callable[[], Events], mover: Mover) -> tuple[Events, NDArray[np.uint8]]:
-    return mover(read())
+def _read_and_compensate(read: Callable[[], Events], compensator: BlockCompensator) -> tuple[Events, NDArray[np.uint8]]:
+    return compensator(read())
 
 
-def check_size(calibration: Calibration, size: tuple[int, int], name: str) -> None:
-    """Raises :class:`AmiwarpError` where a calibration belongs to a camera of another size than ``name``'s."""
-    width, height = calibration.camera.width, calibration.camera.height
+def check_size(fitted: Calibration | Model, size: tuple[int, int], name: str, *, what: str = "calibration") -> None:
+    """Raise :class:`AmiwarpError` if a calibration or model is for another sensor size [px] than that of ``name``."""
+    width, height = fitted.camera.width, fitted.camera.height
     if size != (width, height):
-        raise AmiwarpError(
-            f"{name}: is {size[0]}x{size[1]}, the calibration is for {width}x{height}; calibrate this camera"
-        )
+        raise AmiwarpError(f"{name}: is {size[0]}x{size[1]}, the {what} is for {width}x{height}; calibrate this camera")

@@ -1,4 +1,4 @@
-"""Compensation of streams: packets of events and encoder samples in, compensated events and a running image out."""
+"""Motion compensation of streams of events and encoder samples."""
 
 from __future__ import annotations
 
@@ -10,55 +10,99 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import warp as wp
 
-from amiwarp.compensation.batches import Batches, BatchInFlight, Started
+from amiwarp.compensation.batches import BatchInFlight, BatchPipeline, StagedBatch
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, check_sensor
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events.encoder import EncoderStream
+    from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.optics.models import Model
 
 OUTSIDE, EXTRAPOLATED, NO_ANGLE = 1, 2, 4
-"""Flags of an event: its place lies outside the image; no encoder sample came in time, so its angle goes on at constant
-speed; there is no angle at all, and so no place (NaN)."""
-MANY = 2
-"""Batches that a call gives at least before it leaves those that a GPU works on to the next."""
+"""Flags of an event, which add up.
+
+OUTSIDE: the coordinates are outside the image. EXTRAPOLATED: no encoder sample arrived in time, so the prism angle is
+extrapolated at constant speed. NO_ANGLE: no prism angle is known, so the coordinates are NaN.
+"""
+LEAST_RETURNED = 2
+"""Number of batches after which :meth:`Compensator.take` leaves those in flight on a GPU to the next call."""
 AHEAD_US = 100_000
-"""Of encoder samples that are put on the device at once, where there are so many [us]."""
+"""Span of encoder samples that is copied to the device at once, if available [us]."""
 OVERHEAD = 1024
-"""Bytes that a packet counts for beyond its arrays: the Python objects that hold them."""
-Waiting: TypeAlias = tuple[Events, int, int, int]
-"""A packet, its last time, when it was put, and when it had come [us]."""
+"""Memory of a packet beyond its arrays: the Python objects that hold them [bytes]."""
+QueuedPacket: TypeAlias = tuple[Events, int, int, int]
+"""A packet, its last time, the time when it was put, and the time when it arrived [us]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compensated:
-    """Events as they come out: a packet, or several that were ready together."""
+    """Compensated events of one packet, or of several that were ready together.
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    >>> model = amiwarp.CircleModel.from_prism(camera, amiwarp.Prism(0.02), 0.3)
+    >>> compensator = amiwarp.Compensator(model, amiwarp.EncoderStream(), start_us=0)
+    >>> compensator.put(amiwarp.Events.from_arrays([10], [20], [0], [1]), now_us=0)
+    >>> [packet] = compensator.take(now_us=0)
+    >>> packet.flags  # outside the image, because no prism angle is known
+    array([5], dtype=uint8)
+    """
 
     events: Events
-    """Places without the prism, float32 [px], NaN where there is none; times and polarities as they were put."""
+    """Coordinates without the prism, float32 [px], NaN if there are none; times and polarities are unchanged."""
     flags: NDArray[np.uint8]
-    """Shape ``(n,)``: sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED`, :data:`NO_ANGLE`."""
+    """Sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED` and :data:`NO_ANGLE` for each event, shape ``(n,)``."""
     arrived_us: int = 0
-    """When the first of them came, by the caller's clock [us]."""
+    """Arrival time of the first packet, by the caller's clock [us]."""
 
 
 def held_bytes(events: Events) -> int:
-    """Return the memory that a waiting packet of events takes [bytes], its Python objects included."""
+    """Return the memory of a waiting packet of events [bytes], including its Python objects."""
     return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
 
 
 class Compensator:
-    """Compensates a stream: put packets and encoder samples as they come, take what is ready.
+    """Motion compensation of a stream: put packets as they arrive, take those that are ready.
 
-    A packet waits until the encoder covers it, at most ``wait_us`` by the caller's clock, or ``start_us`` while the
-    encoder has given no two samples yet; past that, or while more than ``most_waiting`` events or ``most_bytes`` wait,
-    its angles are guessed and marked. Everything comes out once, in the order it was put. ``encoder``: the caller
-    appends its samples.
+    A packet waits until the encoder samples cover it. If it has waited for too long, or if too much waits, its prism
+    angles are extrapolated and flagged. Every event comes out exactly once, in the order of input. Buffers are
+    allocated once. Use one compensator from one thread only.
 
-    Buffers are allocated once, for ``batch`` events: what is ready is worked through so many at a time. For one thread.
+    Parameters
+    ----------
+    model : Model
+        Optical model of the prism.
+    encoder : EncoderStream
+        Encoder samples; the caller appends to it.
+    wait_us : int, optional
+        Longest wait of a packet, by the caller's clock [us].
+    start_us : int, optional
+        The same while fewer than two encoder samples have arrived [us].
+    most_waiting : int, optional
+        Largest number of events that wait.
+    most_bytes : int, optional
+        Largest memory of waiting packets [bytes].
+    batch : int, optional
+        Largest number of events compensated at a time. By default 65,536 on a CPU and 1,048,576 on CUDA.
+    device : str or warp.Device, optional
+        Device to compute on.
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    >>> model = amiwarp.CircleModel.from_prism(camera, amiwarp.Prism(0.02), 0.3)
+    >>> encoder = amiwarp.EncoderStream()
+    >>> compensator = amiwarp.Compensator(model, encoder)
+    >>> compensator.put(amiwarp.Events.from_arrays([10, 20], [20, 20], [100, 900], [1, 0]), now_us=0)
+    >>> len(compensator.take(now_us=0))  # the packet waits for encoder samples
+    0
+    >>> _ = encoder.append([0, 1000], [0.0, 0.0754])
+    >>> [packet] = compensator.take(now_us=500)
+    >>> packet.events.t, packet.flags
+    (array([100, 900]), array([0, 0], dtype=uint8))
     """
 
     def __init__(
@@ -78,30 +122,42 @@ class Compensator:
         self.most_waiting, self.most_bytes = most_waiting, most_bytes
         self._device = wp.get_device(device)
         self.batch = batch or (1 << 16 if self._device.is_cpu else 1 << 20)
-        self._work = Batches(model, self.batch, self._device)
-        self._many = MANY if self._device.is_cuda else math.inf
-        self._queue: deque[Waiting] = deque()
+        self._pipeline = BatchPipeline(model, self.batch, self._device)
+        self._least_returned = LEAST_RETURNED if self._device.is_cuda else math.inf
+        self._queue: deque[QueuedPacket] = deque()
         self.waiting = 0
-        """Events put that are not worked on yet."""
+        """Number of events in the queue."""
         self.waiting_bytes = 0
-        """Memory that these take [bytes], see :func:`held_bytes`."""
-        self._started: Started | None = None
-        self._begun: tuple[BatchInFlight, NDArray[np.bool_] | None] | None = None
+        """Memory of the packets in the queue [bytes], see :func:`held_bytes`."""
+        self._staged: StagedBatch | None = None
+        self._in_flight: tuple[BatchInFlight, NDArray[np.bool_] | None] | None = None
         self._t_last = -(2**62)
         self._covered: tuple[int, int] | None = None
 
     def put(self, events: Events, now_us: int, *, arrived_us: int | None = None) -> None:
-        """A packet, now: uint16 pixels, sorted, not before the last one; kept, not copied. It waits from now on.
+        """Queue a packet. The packet is kept, not copied.
 
-        ``arrived_us``: when it came, if that was earlier, for :attr:`Compensated.arrived_us`.
-        Raises :class:`AmiwarpError` for other pixels or a packet that begins before the last; nothing was put then.
+        Parameters
+        ----------
+        events : Events
+            Events with whole pixel coordinates (uint16), sorted by time, not earlier than those before.
+        now_us : int
+            Current time of the caller's clock [us], from which the packet waits.
+        arrived_us : int, optional
+            Arrival time of the packet for :attr:`Compensated.arrived_us`, if it is earlier than ``now_us`` [us].
+
+        Raises
+        ------
+        AmiwarpError
+            If the coordinates are not whole pixels, or the packet starts before the end of the last. Nothing is queued
+            then.
         """
         check_sensor(events)
         t = events.t
         if not t.size:
             return
         if t.item(0) < self._t_last:
-            raise AmiwarpError(f"a packet from {t[0]} us comes after one to {self._t_last} us; sort it first")
+            raise AmiwarpError(f"a packet starts at {t[0]} us, the last one ended at {self._t_last} us; sort it first")
         parts = [events]
         if t.size > self.batch:
             if (t[self.batch :: self.batch] < t[self.batch - 1 : -1 : self.batch]).any():
@@ -114,40 +170,69 @@ class Compensator:
         self._queue.extend((part, part.t.item(-1), now_us, arrived) for part in parts)
 
     def take(self, now_us: int) -> list[Compensated]:
-        """What is ready at ``now_us``, in the order it was put, packets that are ready together joined to a batch.
+        """Return the compensated events that are ready.
 
-        Of many batches a GPU may work on the last still: they come with the next call, or with :meth:`flush`.
-        Raises :class:`AmiwarpError` for a packet that is not sorted; what was ready with it, and what was under way, is
-        lost.
+        Packets that are ready together are joined to a batch. After several batches, a GPU may still work on the last
+        ones; they are returned by the next call, or by :meth:`flush`.
+
+        Parameters
+        ----------
+        now_us : int
+            Current time of the caller's clock [us].
+
+        Returns
+        -------
+        list of Compensated
+            Compensated events, in the order of input.
+
+        Raises
+        ------
+        AmiwarpError
+            If a packet is not sorted. The batches that were ready or in flight are lost.
         """
         out: list[Compensated] = []
         while True:
-            # while one batch is put together, a GPU works on that before it, and the one before that is fetched
-            packets = self._ready(now_us)
-            if not packets and len(out) >= self._many:
+            # three batches overlap: one is copied together, a GPU works on the one before, and a third is fetched
+            packets = self._pop_ready(now_us)
+            if not packets and len(out) >= self._least_returned:
                 return out
-            started, self._started = self._started, self._start(packets) if packets else None
-            begun, self._begun = self._begun, None
-            if started is not None:
-                self._begun = self._begin(started)
-            if begun is not None:
-                out.append(self._end(*begun))
-            if self._started is None and self._begun is None:
+            staged, self._staged = self._staged, self._stage(packets) if packets else None
+            in_flight, self._in_flight = self._in_flight, None
+            if staged is not None:
+                self._in_flight = self._submit(staged)
+            if in_flight is not None:
+                out.append(self._finish(*in_flight))
+            if self._staged is None and self._in_flight is None:
                 return out
 
     def flush(self) -> list[Compensated]:
-        """All that still waits, its angles guessed where they must be: at the end of a stream."""
+        """Return everything that still waits, with extrapolated prism angles if necessary.
+
+        Call it at the end of a stream.
+
+        Returns
+        -------
+        list of Compensated
+            Compensated events, in the order of input.
+        """
         out: list[Compensated] = []
         while more := self.take(2**62):
             out += more
         return out
 
     def image(self) -> NDArray[np.float32]:
-        """Image of the events worked on since the last call, shape (height, width)."""
-        return self._work.image()
+        """Return the image of all events that were compensated since the last call.
 
-    def _ready(self, now_us: int) -> list[Waiting]:
-        packets: list[Waiting] = []
+        Returns
+        -------
+        ndarray
+            Events per pixel, float32, shape ``(height, width)``.
+        """
+        return self._pipeline.image()
+
+    def _pop_ready(self, now_us: int) -> list[QueuedPacket]:
+        """Remove the packets of the next batch from the queue: those that are covered, or have waited for too long."""
+        packets: list[QueuedPacket] = []
         count, covered = 0, self.encoder.last
         patience = self.start_us if covered is None else self.wait_us
         while self._queue:
@@ -162,34 +247,34 @@ class Compensator:
             self.waiting_bytes -= held_bytes(events)
         return packets
 
-    def _start(self, packets: list[Waiting]) -> Started:
-        return self._work.start([events for events, *_ in packets], packets[0][3])
+    def _stage(self, packets: list[QueuedPacket]) -> StagedBatch:
+        return self._pipeline.stage([events for events, *_ in packets], packets[0][3])
 
-    def _begin(self, started: Started) -> tuple[BatchInFlight, NDArray[np.bool_] | None]:
-        """With which of its events have a guessed angle, None for none: by the samples there are now."""
-        parts, n = started.parts, started.end - started.at
+    def _submit(self, staged: StagedBatch) -> tuple[BatchInFlight, NDArray[np.bool_] | None]:
+        """Submit a batch; also return which of its events have an extrapolated angle, None for none."""
+        parts, n = staged.parts, staged.end - staged.at
         first, last = int(parts[0].t[0]), int(parts[-1].t[-1])
-        begins, ends = self.encoder.first, self.encoder.last
-        if begins is None or ends is None:
+        first_known, last_known = self.encoder.first, self.encoder.last
+        if first_known is None or last_known is None:
             unknown = n
         else:
-            unknown = 0 if first >= begins else sum(int(np.searchsorted(part.t, begins)) for part in parts)
+            unknown = 0 if first >= first_known else sum(int(np.searchsorted(part.t, first_known)) for part in parts)
             if unknown < n:
-                self._cover(max(first, begins), last, ends)
-        begun = self._work.begin(started, unknown)
-        return begun, None if self.encoder.knows(first, last) else self.encoder.guessed(begun.t)
+                self._set_encoder(max(first, first_known), last, last_known)
+        in_flight = self._pipeline.submit(staged, unknown)
+        return in_flight, None if self.encoder.knows(first, last) else self.encoder.guessed(in_flight.t)
 
-    def _end(self, begun: BatchInFlight, guessed: NDArray[np.bool_] | None) -> Compensated:
-        x, y, flags = self._work.end(begun)
-        if guessed is not None:
-            flags[guessed] |= EXTRAPOLATED
-        flags[: begun.unknown] = OUTSIDE | NO_ANGLE
-        return Compensated(Events(x, y, begun.t, begun.p), flags, begun.arrived_us)
+    def _finish(self, in_flight: BatchInFlight, extrapolated: NDArray[np.bool_] | None) -> Compensated:
+        x, y, flags = self._pipeline.finish(in_flight)
+        if extrapolated is not None:
+            flags[extrapolated] |= EXTRAPOLATED
+        flags[: in_flight.unknown] = OUTSIDE | NO_ANGLE
+        return Compensated(Events(x, y, in_flight.t, in_flight.p), flags, in_flight.arrived_us)
 
-    def _cover(self, first: int, last: int, ends: int) -> None:
-        """Puts the encoder over a span of event times [us] on the device, where it is not there yet."""
+    def _set_encoder(self, first: int, last: int, last_known: int) -> None:
+        """Copy the encoder over a span of event times [us] to the device, unless it is there already."""
         if self._covered is None or first < self._covered[0] or last > self._covered[1]:
-            until = max(last, min(ends, last + AHEAD_US))
-            self._work.set_encoder(self.encoder.over(first, until), first, until)
-            # what was guessed for the end of it may be known the next time
-            self._covered = (first, until) if until <= ends else None
+            until = max(last, min(last_known, last + AHEAD_US))
+            self._pipeline.set_encoder(self.encoder.over(first, until), first, until)
+            # angles past the last sample are extrapolated; newer samples may cover them next time
+            self._covered = (first, until) if until <= last_known else None

@@ -1,4 +1,4 @@
-"""Parameters of an encoder on a device, for the kernels."""
+"""Encoder parameters on a device, for kernels."""
 
 import math
 from functools import lru_cache
@@ -15,20 +15,23 @@ if TYPE_CHECKING:
 
 @lru_cache(maxsize=4)
 def azimuths(device: str) -> wp.array:
-    """Cosine and sine of 65,536 angles of a turn, flat: from NumPy in float64, so the same bits on every device."""
+    """Return cosine and sine of 65,536 angles of a turn, interleaved, float32.
+
+    They are computed by NumPy in float64, so that every device has the same bits.
+    """
     angle = np.arange(1 << 16) * (2.0 * math.pi / (1 << 16))
     table = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
     return wp.array(table.ravel(), dtype=float, device=device)
 
 
 def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -> EncoderParams:
-    """The samples about the events of ``t_first`` .. ``t_last`` [us] on ``device``, for ``kernels.encoder.angle_at``.
+    """Return the samples around the event times ``t_first`` .. ``t_last`` [us], for ``kernels.encoder.angle_at``.
 
-    Raises :class:`AmiwarpError` as :meth:`Encoder.angle_at` does, where the encoder does not cover that span.
+    Raises :class:`AmiwarpError` if the encoder does not cover that span.
     """
     encoder.angle_at(np.array([t_first, t_last], np.int64))
     origin, start, angle, slope = encoder_pieces(encoder, t_first, t_last)
-    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1  # a bucket is no longer than pieces are on average
+    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1  # a bucket is at most as long as an average piece
     edges = np.arange((int(start[-1]) >> shift) + 1, dtype=np.int64) << shift
     first = np.append(np.searchsorted(start, edges, side="right") - 1, start.size - 1)
     p = EncoderParams()
@@ -41,8 +44,9 @@ def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -
 
 
 def encoder_pieces(encoder: "Encoder", t_first: int, t_last: int) -> tuple[int, Any, Any, Any]:
-    """Origin, starts, angles and slopes of :class:`EncoderParams`, of an encoder that covers the span."""
-    # Whole and fractional offset: a piece starts at the first whole event time at or after its sample.
+    """Return origin, starts, angles and slopes of :class:`EncoderParams`. The encoder must cover the span."""
+    # The clock offset is split into its whole and its fractional part. A piece starts at the first whole event time
+    # at or after its sample.
     whole = math.floor(encoder.clock_offset_us)
     begins = encoder.t - whole
     low = min(max(int(np.searchsorted(begins, t_first, side="right")) - 1, 0), begins.size - 2)
@@ -55,6 +59,6 @@ def encoder_pieces(encoder: "Encoder", t_first: int, t_last: int) -> tuple[int, 
 
 
 def _wrapped(turns: Any) -> Any:
-    """Turns, whole ones left out, in 2**-64 turn, uint64."""
+    """Return turns as uint64 in units of 2**-64 turn, without the whole turns."""
     part = np.maximum(turns - np.floor(turns + 0.5), -0.5)
     return np.ldexp(part, 64).astype(np.int64).view(np.uint64)

@@ -1,7 +1,7 @@
 """Events and their sources.
 
-Times are int64 microseconds, pixels as in :mod:`amiwarp.optics.camera`. A source returns blocks, so that a recording
-of any length is processed in constant memory.
+Times are int64 microseconds. Pixel coordinates are defined in :class:`amiwarp.Camera`. A source returns events in
+blocks, so that recordings of any length are processed in constant memory.
 """
 
 from __future__ import annotations
@@ -15,26 +15,34 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import TIME_LIMIT, as_coordinate, as_polarity, as_times, check_events, check_sensor
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import array as as_numbers
 from amiwarp.validation import instance, whole
 
+__all__ = [
+    "DEFAULT_BLOCK", "TIME_LIMIT", "EventSource", "Events", "MemoryEvents", "as_times", "check_events", "check_sensor",
+    "regroup",
+]  # fmt: skip
+
 DEFAULT_BLOCK = 1 << 20
-"""Events per block where nothing else is asked for."""
-
-TIME_LIMIT = 2**62
-"""Times of events, encoder samples and index pulses lie within this, either way [us]: 146,000 years.
-
-The difference and the sum of any two then stay within int64.
-"""
-
-SENSOR = np.dtype(np.uint16)
-"""Type of a sensor's pixels."""
+"""Default number of events per block."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Events:
-    """A block of events. Raises :class:`AmiwarpError` where the arrays' lengths or types disagree."""
+    """A block of events as four arrays.
+
+    Raises
+    ------
+    AmiwarpError
+        If the arrays differ in length, or have other types than those below.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[10, 11], y=[5, 5], t=[0, 100], p=[1, -1])
+    >>> len(events), events.p.tolist()
+    (2, [1, 0])
+    """
 
     x: NDArray[Any]
     """Column [px], shape ``(n,)``: uint16 from a sensor, float32 once compensated."""
@@ -60,23 +68,56 @@ class Events:
 
     @classmethod
     def from_arrays(cls, x: ArrayLike, y: ArrayLike, t: ArrayLike, p: ArrayLike) -> Events:
-        """Convert arrays of any numeric type: floating x, y become float32, integers uint16; times are rounded.
+        """Create events from arrays of any numeric type.
 
-        Polarity is ON where ``p`` is above 0 (or true), else OFF: 0 and 1 as well as -1 and 1. NaN in ``x`` or ``y``
-        marks a compensated event without a place. Raises :class:`AmiwarpError` where an integer coordinate does not fit
-        uint16 or a floating one float32, a time is not finite or not within :data:`TIME_LIMIT`, or a polarity is NaN.
+        Parameters
+        ----------
+        x, y : array_like
+            Pixel coordinates [px], shape (n,). Integers become uint16. Floating values become float32 and mark
+            compensated events; NaN marks a compensated event without a position.
+        t : array_like
+            Times [us], shape (n,), rounded to int64.
+        p : array_like
+            Polarities, shape (n,): ON if above 0 or true, else OFF. Both 0/1 and -1/1 are understood.
+
+        Returns
+        -------
+        Events
+            The events.
+
+        Raises
+        ------
+        AmiwarpError
+            If a coordinate does not fit its type, a time is not finite or beyond 2**62 us, or a polarity is NaN.
         """
-        return cls(_coordinate("x", x), _coordinate("y", y), as_times(t), _polarity(p))
+        return cls(as_coordinate("x", x), as_coordinate("y", y), as_times(t), as_polarity(p))
 
     @classmethod
     def empty(cls) -> Events:
-        """No events, with a sensor's types."""
+        """Return a block without events, with the types of a sensor.
+
+        Returns
+        -------
+        Events
+            Zero events.
+        """
         none = np.zeros(0, np.uint16)
         return cls(none, none, np.zeros(0, np.int64), np.zeros(0, np.uint8))
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Events]) -> Events:
-        """Join blocks in the order given; a single block is returned as it is."""
+        """Join blocks in the given order.
+
+        Parameters
+        ----------
+        blocks : sequence of Events
+            The blocks. A single block is returned without a copy.
+
+        Returns
+        -------
+        Events
+            All events.
+        """
         if len(blocks) == 1:
             return blocks[0]
         if not blocks:
@@ -88,138 +129,115 @@ class Events:
         return int(self.t.size)
 
     def __getitem__(self, which: slice | NDArray[Any]) -> Events:
-        """Events at a slice (views) or at an index or boolean array (copies)."""
+        """Return the events at a slice (views), or at an index or boolean array (copies)."""
         return Events(self.x[which], self.y[which], self.t[which], self.p[which])
-
-
-def _coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
-    array = as_numbers(values, f"events' {name}")
-    if not array.size:
-        return array.astype(array.dtype if array.dtype in (np.uint16, np.float32) else np.uint16)
-    if array.dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            short = array.astype(np.float32, copy=False)
-        if np.isinf(short).any():
-            raise AmiwarpError(f"events' {name} holds a coordinate that float32 cannot hold; drop that event")
-        return short
-    if array.dtype == np.uint16:
-        return array
-    if array.size and not (array.min() >= 0 and array.max() <= 65535):
-        raise AmiwarpError(f"events' {name} spans {array.min()} .. {array.max()}; expected pixels in 0 .. 65535")
-    return array.astype(np.uint16)
-
-
-def _polarity(values: ArrayLike) -> NDArray[np.uint8]:
-    array = as_numbers(values, "events' p", "iufb")
-    if array.dtype.kind == "f" and np.isnan(array).any():
-        raise AmiwarpError("events' p holds NaN; expected 1 for ON, 0 or -1 for OFF")
-    return (array > 0).astype(np.uint8)
-
-
-def as_times(values: ArrayLike) -> NDArray[np.int64]:
-    """Times of any numeric type as int64 [us], rounded.
-
-    Raises :class:`AmiwarpError` for a time that is not finite or not within :data:`TIME_LIMIT`.
-    """
-    array = as_numbers(values, "times")
-    if array.size and not (array.min() > -TIME_LIMIT and array.max() < TIME_LIMIT):
-        raise AmiwarpError(f"times span {array.min()} .. {array.max()} us: not finite or beyond int64")
-    return np.asarray(np.rint(array) if array.dtype.kind == "f" else array, np.int64)
-
-
-def check_sensor(events: Events) -> None:
-    """Raises :class:`AmiwarpError` for events that are no sensor's (uint16): compensated ones."""
-    if events.x.dtype != SENSOR:
-        raise AmiwarpError(
-            f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-        )
-
-
-def check_events(
-    events: Events,
-    width: int,
-    height: int,
-    *,
-    where: str,
-    first_index: int = 0,
-    allow_nan: bool = False,
-    after_t: int | None = None,
-) -> None:
-    """Check one block: in the frame (uint16), finite (float32), sorted, within :data:`TIME_LIMIT`, p in {0, 1}.
-
-    ``allow_nan`` takes NaN, not infinity, for compensated events without a place. Compensated (float32) coordinates may
-    lie outside the frame. ``after_t`` is the time of the event before the block.
-    Raises :class:`AmiwarpError` naming ``where`` and the index of the first bad event (``first_index`` + its place).
-    """
-    if not len(events):
-        return
-
-    def fail(bad: NDArray[np.bool_], what: str) -> None:
-        index = int(np.argmax(bad))
-        x, y, t = events.x[index], events.y[index], events.t[index]
-        raise AmiwarpError(f"{where}: event {first_index + index} (x={x}, y={y}, t={t} us) {what}")
-
-    if events.x.dtype == np.uint16:
-        if int(events.x.max()) >= width or int(events.y.max()) >= height:
-            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; check the size")
-    elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
-        fail(np.isinf(events.x) | np.isinf(events.y), "has a coordinate that is infinite; drop it")
-    elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
-        fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
-    if bool((events.t[1:] < events.t[:-1]).any()):
-        fail(np.concatenate([[False], events.t[1:] < events.t[:-1]]), "is earlier than the one before; sort by time")
-    if after_t is not None and events.t[0] < after_t:
-        fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
-    if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # they are sorted
-        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; it is damaged")
-    if int(events.p.max()) > 1:
-        fail(events.p > 1, "has a polarity that is neither 0 nor 1")
 
 
 @runtime_checkable
 class EventSource(Protocol):
-    """Where events come from: memory, a file, a stream that was scanned. Times never decrease."""
+    """Source of sorted events: memory, a file, or a scanned stream."""
 
     def __len__(self) -> int: ...
 
     @property
     def t_first(self) -> int:
-        """Time of the first event [us]; :class:`AmiwarpError` where there is none."""
+        """Time of the first event [us]. Raises :class:`AmiwarpError` if there are no events."""
 
     @property
     def t_last(self) -> int:
-        """Time of the last event [us]; :class:`AmiwarpError` where there is none."""
+        """Time of the last event [us]. Raises :class:`AmiwarpError` if there are no events."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Sensor's (width, height) [px]."""
+        """Sensor size (width, height) [px]."""
 
     def slice(self, start: int, stop: int) -> Events:
-        """Events ``start <= index < stop``, clipped to those there are."""
+        """Return the events with ``start <= index < stop``.
+
+        Parameters
+        ----------
+        start, stop : int
+            First index, and index after the last. Both are clipped to the existing events.
+
+        Returns
+        -------
+        Events
+            The events.
+        """
 
     def find(self, t: int) -> int:
-        """Index of the first event at or after ``t`` [us]; ``len`` where there is none."""
+        """Return the index of the first event at or after a time.
+
+        Parameters
+        ----------
+        t : int
+            Time [us].
+
+        Returns
+        -------
+        int
+            The index, or the number of events if none is that late.
+        """
 
     def between(self, t_start: int, t_end: int) -> Events:
-        """Events with ``t_start <= t < t_end`` [us]."""
+        """Return the events with ``t_start <= t < t_end``.
+
+        Parameters
+        ----------
+        t_start, t_end : int
+            Start and end of the window [us].
+
+        Returns
+        -------
+        Events
+            The events.
+        """
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """All events in order: ``count`` at a time (default ``1 << 20``), or by windows of ``duration_us``.
+        """Return all events in order, in blocks of equal count or equal duration.
 
-        Windows start at ``t_first + k * duration_us``; those without events are left out.
+        Parameters
+        ----------
+        count : int, optional
+            Events per block; ``1 << 20`` by default.
+        duration_us : int, optional
+            Length of a block's window [us]. Windows start at ``t_first + k * duration_us``. Empty windows are left out.
+
+        Returns
+        -------
+        iterator of Events
+            The blocks.
         """
 
 
 class MemoryEvents:
-    """Events in memory as a source.
+    """Source of events that are held in memory.
 
-    Raises :class:`AmiwarpError` where they fail :func:`check_events`, or for a size not in 1 .. 65536 pixels.
+    Parameters
+    ----------
+    events : Events
+        The events, sorted by time.
+    width, height : int
+        Sensor size [px].
+
+    Raises
+    ------
+    AmiwarpError
+        If an event lies outside the frame, is out of order or has an unusable value, or if the size is not in
+        1 .. 65536 px.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2, 3], y=[0, 0, 0], t=[0, 10, 20], p=[1, 0, 1])
+    >>> source = amiwarp.MemoryEvents(events, width=4, height=4)
+    >>> source.between(5, 20).x.tolist()
+    [2]
     """
 
     def __init__(self, events: Events, width: int, height: int) -> None:
         instance(events, Events, "events in memory")
         width, height = (whole(size, "frame size", 1, LARGEST_SIZE, " pixels") for size in (width, height))
-        # NaN marks compensated events without a place; only they are float32.
+        # NaN marks compensated events without a position. Only compensated events are float32.
         check_events(events, width, height, where="events in memory", allow_nan=True)
         self._events = events
         self._size = (width, height)
@@ -239,39 +257,85 @@ class MemoryEvents:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Sensor's (width, height) [px]."""
+        """Sensor size (width, height) [px]."""
         return self._size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Events ``start <= index < stop``, as views."""
+        """Return the events with ``start <= index < stop``, as views.
+
+        Parameters
+        ----------
+        start, stop : int
+            First index, and index after the last. Both are clipped to the existing events.
+
+        Returns
+        -------
+        Events
+            The events.
+        """
         return self._events[max(start, 0) : max(stop, 0)]
 
     def find(self, t: int) -> int:
-        """See :meth:`EventSource.find`."""
+        """Return the index of the first event at or after a time.
+
+        Parameters
+        ----------
+        t : int
+            Time [us].
+
+        Returns
+        -------
+        int
+            The index, or the number of events if none is that late.
+        """
         return int(np.searchsorted(self._events.t, t))
 
     def between(self, t_start: int, t_end: int) -> Events:
-        """Events with ``t_start <= t < t_end`` [us], as views."""
+        """Return the events with ``t_start <= t < t_end``, as views.
+
+        Parameters
+        ----------
+        t_start, t_end : int
+            Start and end of the window [us].
+
+        Returns
+        -------
+        Events
+            The events.
+        """
         start, stop = np.searchsorted(self._events.t, [t_start, t_end])
         return self._events[start:stop]
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """See :meth:`EventSource.blocks`."""
+        """Return all events in order, in blocks of equal count or equal duration.
+
+        Parameters
+        ----------
+        count : int, optional
+            Events per block; ``1 << 20`` by default.
+        duration_us : int, optional
+            Length of a block's window [us]. Windows start at ``t_first + k * duration_us``. Empty windows are left out.
+
+        Returns
+        -------
+        iterator of Events
+            The blocks.
+        """
         return regroup([self._events], count=count, duration_us=duration_us)
 
     def _nonempty(self) -> Events:
         if not len(self._events):
-            raise AmiwarpError("the recording holds no events, so it has no first or last time")
+            raise AmiwarpError("the recording holds no events, so it has no first or last time; check len() first")
         return self._events
 
 
 def regroup(chunks: Iterable[Events], *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-    """Cut sequential chunks anew, by count or by duration; at most one block is held.
+    """Return sequential chunks as blocks of equal count or equal duration, with at most one block in memory.
 
-    Raises :class:`AmiwarpError` where both are given or one is below 1.
+    Raises :class:`AmiwarpError` if both are given or one is below 1.
     """
     if count is not None and duration_us is not None:
-        raise AmiwarpError("blocks are cut by count or by duration_us; give one of them")
+        raise AmiwarpError("blocks have both count and duration_us; give one of them")
     if duration_us is not None:
         if duration_us < 1:
             raise AmiwarpError(f"blocks of duration_us = {duration_us}; expected at least 1 us")

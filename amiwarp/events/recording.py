@@ -1,4 +1,4 @@
-"""The recording: events with their encoder, camera, prism and, if simulated, their truth."""
+"""A recording: events with their encoder, camera, prism and, if simulated, their ground truth."""
 
 from __future__ import annotations
 
@@ -16,43 +16,70 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 MetadataValue: TypeAlias = str | int | float | bool
+"""A value of a recording's metadata."""
 
 
 class PointStore(Protocol):
-    """Anything that gives an ``(n, 2)`` float32 array for a slice: an array, or a lazily read file."""
+    """Array of points that is indexed by slices: an array in memory, or a file that is read on demand."""
 
-    def __getitem__(self, which: slice, /) -> NDArray[np.float32]: ...
+    def __getitem__(self, which: slice, /) -> NDArray[np.float32]:
+        """Return the points of a slice [px], shape ``(n, 2)``, float32."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What made a synthetic recording."""
+    """Ground truth of a synthetic recording.
+
+    Examples
+    --------
+    >>> amiwarp.Truth({"apex": 0.03, "phase": 0.5}).points(0, 10) is None
+    True
+    """
 
     parameters: dict[str, float] = field(default_factory=dict)
-    """True values: apex, phase, tilt_x, tilt_y [rad], index, clock_offset_us [us], and others by name."""
+    """True parameters by name: apex, phase, tilt_x, tilt_y [rad], index, clock_offset_us [us], and others."""
     stored_points: PointStore | None = None
-    """Per event, in the events' order, its scene point's pixel without the prism, as ``(n, 2)`` float32 [px]."""
+    """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``, float32, or None."""
 
     def points(self, start: int, stop: int) -> NDArray[np.float32] | None:
-        """Points of the events ``start <= index < stop``, shape ``(n, 2)`` [px], or None if they are not stored."""
+        """Return the true points of the events with ``start <= index < stop``.
+
+        Parameters
+        ----------
+        start, stop : int
+            First index, and index after the last.
+
+        Returns
+        -------
+        numpy.ndarray or None
+            Pixels without the prism [px], shape (n, 2), or None if they are not stored.
+        """
         return None if self.stored_points is None else self.stored_points[max(start, 0) : max(stop, 0)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """Events with all that is known about how they came to be."""
+    """Events with the encoder, camera and prism that recorded them.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
+    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4), name="example")
+    >>> len(recording.events), recording.camera
+    (2, None)
+    """
 
     events: EventSource
     """The events."""
     camera: Camera | None = None
-    """The camera, where known."""
+    """The camera, or None if unknown."""
     encoder: Encoder | None = None
-    """The prism's angle over time, where known."""
+    """The prism angle over time, or None if unknown."""
     prism: NominalPrism | None = None
-    """The nominal prism: what the hardware's sheet says, not what calibration found; its apex may be unknown."""
+    """The nominal prism of the data sheet, not the calibrated one, or None if unknown. Its apex may be unknown."""
     truth: Truth | None = None
-    """What made the recording, where it is synthetic."""
+    """Ground truth of a synthetic recording, else None."""
     metadata: dict[str, MetadataValue] = field(default_factory=dict)
-    """Whatever else is known: format, repairs made while reading, the simulator's seed."""
+    """Other information, such as the format, repairs made while reading, and the simulator's seed."""
     name: str = "recording"
-    """Short name for messages and titles: the file's name without its ending."""
+    """Short name for messages and titles: the file name without its extension."""

@@ -1,7 +1,8 @@
-"""Unwrap an encoder's counts and angles: find the period at which they wrap, and refuse samples that do not tell it.
+"""Unwrap an encoder's counts and angles: find the period at which they wrap, and reject ambiguous samples.
 
-A step between neighbouring samples is compared with the one that the speed just before predicts. At the right period
-the two agree at every wrap; a period that is wrong by more than the noise shows in their mean difference.
+Each step between neighbouring samples is compared with the step that the preceding speed predicts. The difference is
+the step's residual. With the right period the residuals are small at every wrap. A period that is wrong by more than
+the noise shows in the mean residual at the wraps.
 """
 
 from __future__ import annotations
@@ -16,37 +17,40 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 WIDTHS = tuple(range(8, 33))
-"""Widths of hardware counters that are recognised [bits]."""
+"""Widths of hardware counters that are recognised automatically [bits]."""
 WIDEST = 64
+"""Largest width of a counter that may be given [bits]."""
 ONCE_A_TURN = 0
-"""As a counter's width: it starts anew each turn."""
+"""Value of ``counter_bits`` for a counter that restarts each turn."""
 SHORTEST_PERIOD = 3
-"""Of a counter that wraps [counts]: with fewer states the direction cannot be seen."""
-BEFORE = 5
-"""Steps whose median speed predicts the next."""
+"""Shortest period of a counter that wraps [counts]. With fewer states the direction is unobservable."""
+SPEED_STEPS = 5
+"""Number of steps whose median speed predicts another step."""
 FEWEST_SAMPLES = 20
-"""From fewer, no width of a counter is found: a swinging prism could make the same counts."""
+"""Fewest samples from which a counter's width is found. A swinging prism could give fewer ones."""
 GAP = 3.0
 """Intervals longer than this multiple of the typical one are gaps."""
-LARGEST_SURPRISE = 0.25
-"""Of the period: a step that differs from its prediction by more could belong to another number of wraps."""
-CLEARLY = 3.0
-"""Factor by which the differences from the prediction must be smaller for one period than without it."""
-GRAIN = 2.0
-"""Difference from the prediction that rounding to whole counts explains [counts]."""
-GRAIN_TURNS = 1.0 / 64.0
-"""The same of angles [turns]."""
+LARGEST_RESIDUAL = 0.25
+"""Largest residual as a fraction of the period. With a larger one the number of wraps is ambiguous."""
+DECISIVE_RATIO = 3.0
+"""Factor by which unwrapping must reduce the residuals for a period to be accepted."""
+ROUNDING_COUNTS = 2.0
+"""Residual that rounding to whole counts explains [counts]."""
+ROUNDING_TURNS = 1.0 / 64.0
+"""Residual that the resolution of angles explains [turns]."""
 
 
 class UnwrapError(AmiwarpError):
-    """Samples that cannot be unwrapped: ``sample`` is the first that shows it, ``problem`` says why."""
+    """Error for samples that cannot be unwrapped."""
 
     sample: int = 0
+    """Index of the first sample that shows the problem."""
     problem: str = ""
+    """Description of the problem and its remedy."""
 
     @classmethod
     def at(cls, sample: int, problem: str) -> UnwrapError:
-        """The error of one sample."""
+        """Return the error for one sample."""
         error = cls(f"encoder sample {sample}: {problem}")
         error.sample, error.problem = sample, problem
         return error
@@ -57,53 +61,60 @@ class _Steps:
     """Steps between neighbouring samples, unwrapped by one period."""
 
     period: float
-    """0: not unwrapped."""
+    """Period in the samples' unit; 0 without unwrapping."""
     step: NDArray[np.float64]
+    """Unwrapped steps, shape ``(m - 1,)``."""
     wraps: NDArray[np.float64]
-    """Periods added to each step."""
+    """Number of periods added to each step."""
     expected: NDArray[np.float64]
-    """Each step as the speed before predicts it."""
+    """Steps that the preceding speed predicts."""
 
     @property
-    def off(self) -> NDArray[np.float64]:
-        """Each step less its prediction."""
+    def residual(self) -> NDArray[np.float64]:
+        """Each step minus its prediction."""
         return np.asarray(self.step - self.expected)
 
     @property
-    def surprise(self) -> float:
-        """Sum of the differences from the prediction."""
-        return float(np.abs(self.off).sum())
+    def cost(self) -> float:
+        """Sum of the absolute residuals."""
+        return float(np.abs(self.residual).sum())
 
 
 @dataclass(frozen=True)
-class _Log:
-    """Samples to unwrap, with the words for their errors."""
+class _Samples:
+    """Samples to unwrap, with the words for error messages."""
 
     t: NDArray[np.int64]
+    """Sample times [us]."""
     value: NDArray[np.float64]
+    """Counts, or angles [rad]."""
     turn: float
-    """One turn in the values' unit."""
-    grain: float
+    """One turn in the unit of ``value``."""
+    rounding: float
+    """Residual that rounding explains, in the unit of ``value``."""
     noun: str
+    """Name of the values in messages."""
     unit: float
-    """The values' unit over that of messages."""
+    """Factor from the unit of ``value`` to that of messages."""
     remedy: str
+    """What the user can do."""
 
     @property
     def interval(self) -> NDArray[np.float64]:
+        """Times between samples [us]."""
         return np.diff(self.t).astype(np.float64)
 
     @property
     def gap(self) -> NDArray[np.bool_]:
-        """Which intervals are gaps."""
+        """Whether each interval is a gap."""
         return np.asarray(self.interval > GAP * np.median(self.interval))
 
     def shown(self, value: float) -> str:
-        """A value in the unit of messages."""
+        """Format a value in the unit of messages."""
         return f"{value * self.unit:,.6g}"
 
     def steps(self, period: float) -> _Steps:
-        """Steps unwrapped by ``period``: each the one nearest to what the median speed predicts."""
+        """Return the steps unwrapped by ``period``, each nearest to what the median speed predicts."""
         raw = np.diff(self.value)
         step = raw
         if period:
@@ -117,169 +128,181 @@ class _Log:
 def unwrap_counts(
     t: NDArray[np.int64], count: NDArray[np.float64], counts_per_turn: int, counter_bits: int | None = None
 ) -> NDArray[np.float64]:
-    """Unwrap counts that run on, start anew each turn, or wrap at the width of a hardware counter.
+    """Return unwrapped counts. The counter may keep counting, restart each turn, or wrap at its width.
 
-    ``counter_bits``: that width; 0 for a counter that starts anew each turn; None to find it in the samples.
-    Raises :class:`UnwrapError` for samples from which the rotation cannot be told.
+    ``counter_bits`` is that width, 0 for a counter that restarts each turn, or None to find it from the samples.
+    Raises :class:`UnwrapError` for samples that do not determine the rotation.
     """
-    remedy = "give the counter's width as counter_bits (--counter-bits; 0: it starts anew each turn)"
-    log = _Log(t, count, float(counts_per_turn), GRAIN, "count", 1.0, remedy)
+    remedy = "give the counter's width as counter_bits (--counter-bits; 0 if it restarts each turn)"
+    samples = _Samples(t, count, float(counts_per_turn), ROUNDING_COUNTS, "count", 1.0, remedy)
     if counter_bits is not None and counter_bits != ONCE_A_TURN and not WIDTHS[0] <= counter_bits <= WIDEST:
         raise AmiwarpError(f"counter_bits = {counter_bits}; give {WIDTHS[0]} to {WIDEST}, or 0 for one turn")
-    if not _can_wrap(log):
+    if not _can_wrap(samples):
         return count
     if counter_bits is None:
-        return _accumulate(log, _find(log, _count_periods(log)))
+        return _accumulate(samples, _find(samples, _count_periods(samples)))
     period = float(counts_per_turn if counter_bits == ONCE_A_TURN else 2**counter_bits)
     if not _fits(count, period, signed=counter_bits != ONCE_A_TURN):
         low, high = int(np.argmin(count)), int(np.argmax(count))
-        what = f"counts {log.shown(count[low])} .. {log.shown(count[high])} do not fit in {_named(log, period)}"
-        raise UnwrapError.at(max(low, high), f"{what}; {log.remedy}")
-    return _accumulate(log, _checked(log, log.steps(period)))
+        span = f"counts {samples.shown(count[low])} .. {samples.shown(count[high])}"
+        what = f"{span} do not fit in {_period_name(samples, period)}"
+        raise UnwrapError.at(max(low, high), f"{what}; {samples.remedy}")
+    return _accumulate(samples, _checked(samples, samples.steps(period)))
 
 
 def unwrap_angles(t: NDArray[np.int64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unwrap angles [rad] that run on, or wrap at a turn or at a whole number of turns.
+    """Return unwrapped angles [rad]. The angles may be unwrapped already, or wrap at a whole number of turns.
 
-    Raises :class:`UnwrapError` for samples from which the rotation cannot be told.
+    Raises :class:`UnwrapError` for samples that do not determine the rotation.
     """
     turn = 2.0 * math.pi
     remedy = "sample the encoder more often, or unwrap the angles beforehand"
-    log = _Log(t, angle, turn, GRAIN_TURNS * turn, "angle", 180.0 / math.pi, remedy)
-    if not _can_wrap(log):
+    samples = _Samples(t, angle, turn, ROUNDING_TURNS * turn, "angle", 180.0 / math.pi, remedy)
+    if not _can_wrap(samples):
         return angle
-    turns = {1, max(1, round(float(np.abs(log.steps(0.0).off).max()) / turn))}
-    return _accumulate(log, _find(log, [k * turn for k in turns if np.ptp(angle) <= k * turn * (1.0 + 1e-9)]))
+    turns = {1, max(1, round(float(np.abs(samples.steps(0.0).residual).max()) / turn))}
+    return _accumulate(samples, _find(samples, [k * turn for k in turns if np.ptp(angle) <= k * turn * (1.0 + 1e-9)]))
 
 
 def expected_steps(step: NDArray[np.float64], interval: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each step as the median speed of the steps before predicts it, or, for the first ones, of those after."""
+    """Return the steps predicted by the median speed of the steps before, or of those after for the first steps."""
     speed = step / interval
     n = speed.size
-    if n < 2 * BEFORE:
+    if n < 2 * SPEED_STEPS:
         others = [np.median(np.delete(speed, k)) if n > 1 else speed[0] for k in range(n)]
         return np.asarray(np.array(others) * interval)
     from scipy.ndimage import median_filter
 
-    middle = median_filter(speed, size=BEFORE, mode="nearest")
-    away = BEFORE // 2 + 1
+    middle = median_filter(speed, size=SPEED_STEPS, mode="nearest")
+    away = SPEED_STEPS // 2 + 1
     at = np.arange(n)
-    return np.asarray(middle[np.where(at < BEFORE, at + away, at - away)] * interval)
+    return np.asarray(middle[np.where(at < SPEED_STEPS, at + away, at - away)] * interval)
 
 
-def _can_wrap(log: _Log) -> bool:
-    """Whether there is a step to judge; raises for shapes that differ and values that are not finite."""
-    if log.value.shape != log.t.shape or log.value.ndim != 1:
-        raise AmiwarpError(f"encoder t has shape {log.t.shape}, its values {log.value.shape}; expected one length")
-    if not np.isfinite(log.value).all():
-        at = int(np.argmin(np.isfinite(log.value)))
-        raise AmiwarpError(f"encoder sample {at} is {log.value[at]}; expected a finite number")
-    # samples out of order are named by Encoder's own check
-    return log.value.size > 1 and bool((log.interval > 0).all())
+def _can_wrap(samples: _Samples) -> bool:
+    """Return whether there is a step to unwrap. Raises :class:`AmiwarpError` for bad shapes and values."""
+    if samples.value.shape != samples.t.shape or samples.value.ndim != 1:
+        raise AmiwarpError(
+            f"encoder t has shape {samples.t.shape}, its values {samples.value.shape}; expected one length"
+        )
+    if not np.isfinite(samples.value).all():
+        at = int(np.argmin(np.isfinite(samples.value)))
+        raise AmiwarpError(f"encoder sample {at} is {samples.value[at]}; expected a finite number")
+    # Encoder checks the order of the samples itself.
+    return samples.value.size > 1 and bool((samples.interval > 0).all())
 
 
-def _count_periods(log: _Log) -> Iterator[float]:
-    """Periods that the range of the counts allows."""
-    if log.turn >= SHORTEST_PERIOD and np.ptp(log.value) <= log.turn:
-        yield log.turn
-    yield from (2.0**bits for bits in WIDTHS if _fits(log.value, 2.0**bits, signed=True))
+def _count_periods(samples: _Samples) -> Iterator[float]:
+    """Yield the periods that the range of the counts allows."""
+    if samples.turn >= SHORTEST_PERIOD and np.ptp(samples.value) <= samples.turn:
+        yield samples.turn
+    yield from (2.0**bits for bits in WIDTHS if _fits(samples.value, 2.0**bits, signed=True))
 
 
 def _fits(count: NDArray[np.float64], period: float, *, signed: bool) -> bool:
+    """Return whether the range of the counts fits into a period."""
     low, high = float(count.min()), float(count.max())
     if not signed:
         return high - low <= period
     return (low >= 0.0 and high < period) or (low >= -period / 2.0 and high < period / 2.0)
 
 
-def _named(log: _Log, period: float) -> str:
-    if period == log.turn:
+def _period_name(samples: _Samples, period: float) -> str:
+    """Describe a period for messages."""
+    if period == samples.turn:
         return "one turn"
     bits = math.log2(period)
-    return f"{bits:.0f} bits" if log.noun == "count" and bits.is_integer() else f"{period / log.turn:.6g} turns"
+    return f"{bits:.0f} bits" if samples.noun == "count" and bits.is_integer() else f"{period / samples.turn:.6g} turns"
 
 
-def _find(log: _Log, periods: Iterable[float]) -> _Steps:
-    """The steps under the one period that agrees with them; as they are if nothing wraps."""
-    plain = log.steps(0.0)
-    wrapped = [found for found in map(log.steps, sorted({*periods})) if found.wraps.any()]
-    best = min([plain, *wrapped], key=lambda found: found.surprise)
+def _find(samples: _Samples, periods: Iterable[float]) -> _Steps:
+    """Return the steps unwrapped by the only period that fits, or the plain steps if nothing wraps."""
+    plain = samples.steps(0.0)
+    wrapped = [found for found in map(samples.steps, sorted({*periods})) if found.wraps.any()]
+    best = min([plain, *wrapped], key=lambda found: found.cost)
     if best is not plain:
         at = best.wraps != 0.0
-        few = best.period % log.turn and log.value.size < FEWEST_SAMPLES
-        if few or not np.abs(plain.off[at]).sum() > CLEARLY * np.abs(best.off[at]).sum() + log.grain:
-            raise UnwrapError.at(int(np.argmax(at)) + 1, _maybe(log, best))
-        _check_period(log, best, [found.period for found in wrapped])
-        return _checked(log, best)
-    rival = next((found for found in wrapped if found.surprise <= CLEARLY * plain.surprise + log.grain), None)
+        few = best.period % samples.turn and samples.value.size < FEWEST_SAMPLES
+        cost, best_cost = np.abs(plain.residual[at]).sum(), np.abs(best.residual[at]).sum()
+        if few or not cost > DECISIVE_RATIO * best_cost + samples.rounding:
+            raise UnwrapError.at(int(np.argmax(at)) + 1, _ambiguous(samples, best))
+        _check_period(samples, best, [found.period for found in wrapped])
+        return _checked(samples, best)
+    rival = next((found for found in wrapped if found.cost <= DECISIVE_RATIO * plain.cost + samples.rounding), None)
     if rival is not None:
         at = int(np.argmax(rival.wraps != 0.0)) + 1
-        raise UnwrapError.at(at, _maybe(log, rival))
-    # a wrap leads from one end of the range to the other; a step of the prism does not
-    least = min(log.turn, 2.0 ** WIDTHS[0]) / 2.0
-    plausible = np.maximum(max(0.5 * float(np.ptp(log.value)), least), np.where(log.gap, np.abs(plain.expected), 0.0))
-    jump = np.abs(plain.off) > plausible
+        raise UnwrapError.at(at, _ambiguous(samples, rival))
+    # A wrap jumps from one end of the range to the other. A step of the prism does not.
+    least = min(samples.turn, 2.0 ** WIDTHS[0]) / 2.0
+    largest = max(0.5 * float(np.ptp(samples.value)), least)
+    plausible = np.maximum(largest, np.where(samples.gap, np.abs(plain.expected), 0.0))
+    jump = np.abs(plain.residual) > plausible
     if jump.any():
         at = int(np.argmax(jump))
-        raise UnwrapError.at(at + 1, f"{_jump(log, plain, at)}, at no known period; {log.remedy}")
+        raise UnwrapError.at(at + 1, f"{_jump(samples, plain, at)}, at no known period; {samples.remedy}")
     return plain
 
 
-def _maybe(log: _Log, found: _Steps) -> str:
-    return f"the {log.noun} may have wrapped here, at {_named(log, found.period)}, or not; {log.remedy}"
+def _ambiguous(samples: _Samples, found: _Steps) -> str:
+    """Describe a wrap that is neither certain nor excluded."""
+    period = _period_name(samples, found.period)
+    return f"the {samples.noun} may have wrapped here, at {period}, or not; {samples.remedy}"
 
 
-def _jump(log: _Log, found: _Steps, at: int) -> str:
-    step, expected = log.shown(float(found.step[at])), log.shown(float(found.expected[at]))
-    return f"the {log.noun} changes by {step} where about {expected} was expected"
+def _jump(samples: _Samples, found: _Steps, at: int) -> str:
+    """Describe a step that differs from its prediction."""
+    step, expected = samples.shown(float(found.step[at])), samples.shown(float(found.expected[at]))
+    return f"the {samples.noun} changes by {step} where about {expected} was expected"
 
 
-def _check_period(log: _Log, best: _Steps, periods: list[float]) -> None:
-    """Refuse a period that the mean difference at the wraps contradicts, or does not tell from another."""
-    if best.period < 8.0 * log.grain:
+def _check_period(samples: _Samples, best: _Steps, periods: list[float]) -> None:
+    """Reject a period that the mean residual at the wraps contradicts, or cannot distinguish from another."""
+    if best.period < 8.0 * samples.rounding:
         return
-    many = float((best.wraps**2).sum())
-    error = float((best.wraps * best.off).sum()) / many
-    scatter = float(np.sqrt(np.mean((best.off - error * best.wraps) ** 2)))
-    # the rounding of the speed adds up over a gap
-    grain = log.grain * np.maximum(1.0, log.interval / np.median(log.interval))
-    tolerance = float((np.abs(best.wraps) * grain).sum()) / many + 3.0 * scatter / math.sqrt(many)
+    weight = float((best.wraps**2).sum())
+    error = float((best.wraps * best.residual).sum()) / weight
+    scatter = float(np.sqrt(np.mean((best.residual - error * best.wraps) ** 2)))
+    # The rounding of the speed accumulates over a gap.
+    rounding = samples.rounding * np.maximum(1.0, samples.interval / np.median(samples.interval))
+    tolerance = float((np.abs(best.wraps) * rounding).sum()) / weight + 3.0 * scatter / math.sqrt(weight)
     at = int(np.argmax(best.wraps != 0.0)) + 1
     seen = best.period - error
-    if abs(error) > tolerance or tolerance > LARGEST_SURPRISE * best.period:
-        what = f"the {log.noun} wraps by about {log.shown(seen)}, which is no known period"
-        raise UnwrapError.at(at, f"{what}; {log.remedy}")
+    if abs(error) > tolerance or tolerance > LARGEST_RESIDUAL * best.period:
+        what = f"the {samples.noun} wraps by about {samples.shown(seen)}, which is no known period"
+        raise UnwrapError.at(at, f"{what}; {samples.remedy}")
     others = [p for p in periods if p != best.period and abs(p - seen) <= 2.0 * tolerance]
     if others:
-        what = f"the {log.noun} may wrap at {log.shown(best.period)} or at {log.shown(others[0])}"
-        raise UnwrapError.at(at, f"{what}; {log.remedy}")
+        what = f"the {samples.noun} may wrap at {samples.shown(best.period)} or at {samples.shown(others[0])}"
+        raise UnwrapError.at(at, f"{what}; {samples.remedy}")
 
 
-def _checked(log: _Log, found: _Steps) -> _Steps:
-    """Refuse steps that could as well belong to another number of wraps.
+def _checked(samples: _Samples, found: _Steps) -> _Steps:
+    """Return the steps, or raise if a step fits another number of wraps as well.
 
-    Whole turns more or less in a gap change no angle outside of it, so gaps are bridged by the speed if the period is
-    a whole number of turns.
+    If the period is a whole number of turns, steps in gaps are not checked: additional turns in a gap change no angle
+    outside it.
     """
-    whole = found.period % log.turn == 0.0 or log.noun == "angle"
-    judged = ~log.gap if whole else np.ones_like(log.gap)
-    most = max(LARGEST_SURPRISE * found.period, min(1.0, log.grain))
-    bad = judged & ((np.abs(found.off) > most) | (np.abs(found.off) >= 0.5 * found.period))
+    whole = found.period % samples.turn == 0.0 or samples.noun == "angle"
+    checked = ~samples.gap if whole else np.ones_like(samples.gap)
+    largest = max(LARGEST_RESIDUAL * found.period, min(1.0, samples.rounding))
+    bad = checked & ((np.abs(found.residual) > largest) | (np.abs(found.residual) >= 0.5 * found.period))
     if bad.any():
         at = int(np.argmax(bad))
-        raise UnwrapError.at(at + 1, f"{_jump(log, found, at)}, wrapping at {_named(log, found.period)}; {log.remedy}")
-    slow = judged & (np.abs(found.expected) >= 0.5 * found.period)
+        what = f"{_jump(samples, found, at)}, wrapping at {_period_name(samples, found.period)}"
+        raise UnwrapError.at(at + 1, f"{what}; {samples.remedy}")
+    slow = checked & (np.abs(found.expected) >= 0.5 * found.period)
     if slow.any() and not whole:
         at = int(np.argmax(slow))
-        what = f"the counter of {_named(log, found.period)} may have wrapped more than once"
+        what = f"the counter of {_period_name(samples, found.period)} may have wrapped more than once"
         raise UnwrapError.at(
-            at + 1, f"{what} in the {log.interval[at] / 1e3:.6g} ms since the sample before; sample it more often"
+            at + 1, f"{what} in the {samples.interval[at] / 1e3:.6g} ms since the sample before; sample it more often"
         )
     return found
 
 
-def _accumulate(log: _Log, found: _Steps) -> NDArray[np.float64]:
+def _accumulate(samples: _Samples, found: _Steps) -> NDArray[np.float64]:
+    """Return the unwrapped values of the samples."""
     if not found.wraps.any():
-        return log.value
-    # whole periods added to the samples themselves: no rounding adds up
-    return np.asarray(log.value + found.period * np.concatenate([[0.0], np.cumsum(found.wraps)]))
+        return samples.value
+    # Whole periods are added to the samples themselves, so that rounding does not accumulate.
+    return np.asarray(samples.value + found.period * np.concatenate([[0.0], np.cumsum(found.wraps)]))

@@ -1,36 +1,56 @@
-"""The closed sets of choices for images of warped events."""
+"""Choices for images of warped events: how to vote, what to do with polarity, which sharpness to measure."""
 
 import enum
 
 
 class Vote(enum.StrEnum):
-    """How an event's vote is shared among pixels."""
+    """How an event's vote is shared among pixels.
+
+    Examples
+    --------
+    >>> amiwarp.Vote("nearest")
+    <Vote.NEAREST: 'nearest'>
+    """
 
     NEAREST = "nearest"
+    """The whole vote goes to the nearest pixel."""
     BILINEAR = "bilinear"
+    """The vote is shared among the four nearest pixels, by bilinear weights."""
 
 
 class Layers(enum.StrEnum):
-    """What becomes of polarity."""
+    """How polarity appears in an image of warped events.
+
+    Examples
+    --------
+    >>> [layers.value for layers in amiwarp.Layers]
+    ['merged', 'signed', 'polarity']
+    """
 
     MERGED = "merged"
-    """All events count alike: (height, width)."""
+    """Number of events of both polarities, shape ``(height, width)``."""
     SIGNED = "signed"
-    """ON minus OFF: (height, width)."""
+    """Number of ON events minus number of OFF events, shape ``(height, width)``."""
     POLARITY = "polarity"
-    """OFF, then ON: (2, height, width)."""
+    """Number of OFF events, then number of ON events, shape ``(2, height, width)``."""
 
 
 class Sharpness(enum.StrEnum):
-    """What is measured; higher is sharper for each."""
+    """Sharpness measures of an image of warped events. For each of them, higher is sharper.
+
+    Examples
+    --------
+    >>> amiwarp.Sharpness("variance")
+    <Sharpness.VARIANCE: 'variance'>
+    """
 
     VARIANCE = "variance"
-    """Variance over mean: 1 for events scattered at random, more where they gather."""
+    """Variance over mean: 1 for events at random pixels, higher where events gather."""
     GRADIENT = "gradient"
     """Mean squared gradient over mean."""
     LAPLACIAN = "laplacian"
     """Mean squared Laplacian over mean."""
     PAPER_J = "paper_j"
-    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)); ``docs/calibration.md`` says where it fails."""
+    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)). It fails as ``docs/explanation/calibration.md`` shows."""
     ENTROPY = "entropy"
-    """Minus the entropy of the votes' distribution over pixels [nat]."""
+    """Minus the entropy of the distribution of votes over pixels [nat]."""

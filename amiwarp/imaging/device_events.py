@@ -1,4 +1,4 @@
-"""Events on a device, with the prism's angle at each."""
+"""Events on a device, with the prism angle of each event."""
 
 from __future__ import annotations
 
@@ -30,30 +30,35 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events
 
 TURNS = 1 << 16
-"""Angles of the prism that are told apart: 0.0055 deg, 0.0005 px on an orbit of 10 px."""
+"""Number of distinct prism angles per turn. One step is 0.0055 deg, or 0.0005 px on an orbit of 10 px."""
 LARGEST_FOLD = 1 << 16
+"""Largest number of angle bins per turn for folding."""
 LARGEST_WEIGHT = 63
-"""Events that a point stands for at most, see :mod:`amiwarp.kernels.tiles`."""
+"""Largest number of events that one point may represent, see :mod:`amiwarp.kernels.tiles`."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceEvents:
-    """Events with their angles on a device; see :func:`upload_events`."""
+    """Events with their prism angles on a device; made by :func:`upload_events`."""
 
     arrays: Any
-    """``amiwarp.kernels.votes.EventArrays``: OFF goes to the first image, ON to the second, or both to the only one."""
+    """Struct ``amiwarp.kernels.votes.EventArrays``.
+
+    Its layer is the image of each event: OFF goes to the first and ON to the second, or both to the only one.
+    """
     count: int
+    """Number of events, without padding."""
     base: Any
-    """Angles without drift, where there is a slope."""
+    """Prism angles [1/65536 turn] without drift, or None if there is no slope."""
     slope: Any
     """Change of the angles [1/65536 turn] per unit of the drifting parameter, or None."""
 
     def drift(self, value: float) -> None:
-        """Sets the angles to what they are where the drifting parameter has ``value``."""
+        """Set the prism angles to those at the value ``value`` of the drifting parameter."""
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:
-        """The same events, each going to the image of its part, and there of its polarity."""
+        """Return the same events split over ``parts`` images, or over ``parts`` pairs (OFF, ON) of images."""
         a, e = self.arrays, EventArrays()
         e.x, e.y, e.turn, e.azimuths, e.time, e.weight = a.x, a.y, a.turn, a.azimuths, a.time, a.weight
         e.layer = wp.empty_like(a.layer)
@@ -71,12 +76,34 @@ def upload_events(
     middle_us: int | None = None,
     fold: int = 0,
 ) -> DeviceEvents:
-    """Events and their angles on ``device``: an encoder's, or given [rad]; pixels must be whole (uint16).
+    """Copy events to ``device`` and attach a prism angle to each.
 
-    ``slope``: change of the angles [rad] per unit of a drifting parameter. ``middle_us``: where given, the events get
-    their times from it, so that the camera's turning can be taken back. ``fold``: of a still scene, events of one pixel
-    and polarity become one point for each of so many bins of a turn, in its middle, with their number for a weight;
-    without slope and times. Raises :class:`AmiwarpError` where the encoder does not cover the events.
+    Parameters
+    ----------
+    events : Events
+        Events with whole pixel coordinates (uint16).
+    angles : Encoder or ndarray
+        Encoder from which the angles are interpolated, or one angle per event [rad], shape ``(n,)``.
+    device : str or warp.Device
+        Device to copy to.
+    slope : ndarray, optional
+        Change of each angle [rad] per unit of a drifting parameter, shape ``(n,)``.
+    middle_us : int, optional
+        Reference time [us]. If it is given, the event times relative to it are stored too, so that the camera rotation
+        can be compensated.
+    fold : int, optional
+        Number of angle bins per turn, for a still scene; 0 disables folding. All events of one pixel, polarity and bin
+        become one weighted point at the middle of the bin. Cannot be combined with ``slope`` and ``middle_us``.
+
+    Returns
+    -------
+    DeviceEvents
+        The events on the device.
+
+    Raises
+    ------
+    AmiwarpError
+        If the encoder does not cover the events, or ``fold`` is out of range.
     """
     check_sensor(events)
     n, device = len(events), wp.get_device(device)
@@ -110,11 +137,12 @@ def upload_events(
 
 
 def _padded(n: int, device: Any) -> int:
-    """CPUs vote whole blocks."""
+    """Return the length of a column of ``n`` events: CPU kernels process whole blocks."""
     return -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
 
 
 def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
+    """Copy values to the device, padded with zeros."""
     n = len(values)
     if _padded(n, device) == n:
         return wp.array(values, dtype=dtype, device=device)
@@ -124,17 +152,20 @@ def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
 
 
 def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
-    """Equal keys of pixel, polarity and bin, sorted and counted on the device; by bin first, so that angles repeat."""
+    """Merge events of equal pixel, polarity and angle bin into weighted points, sorted and counted on the device.
+
+    Keys are sorted by bin first, so that neighbouring points share an angle.
+    """
     device = e.x.device
     if not 1 <= bins <= LARGEST_FOLD:
-        raise AmiwarpError(f"fold = {bins} angles a turn; give 1 .. {LARGEST_FOLD}, or 0 for none")
+        raise AmiwarpError(f"fold = {bins} angles a turn; give 1 .. {LARGEST_FOLD}, or 0 to disable folding")
     keys, unused = wp.empty(2 * n, dtype=wp.int64, device=device), wp.zeros(2 * n, dtype=int, device=device)
     launch(fold_keys, n, [e.x, e.y, e.layer, e.turn, bins], [keys], device=device)
     wp.utils.radix_sort_pairs(keys, unused, n)
     every = keys[:n].numpy()
     first = np.flatnonzero(np.concatenate([[True], every[1:] != every[:-1]])[:n])
     key, count = every[first], np.diff(np.append(first, n))
-    times = -(-count // LARGEST_WEIGHT)  # points that stand for too many events come more than once
+    times = -(-count // LARGEST_WEIGHT)  # more than LARGEST_WEIGHT events need several points
     key, weight = np.repeat(key, times), np.minimum(np.repeat(count, times), LARGEST_WEIGHT)
     last = np.cumsum(times) - 1
     weight[last] = count - (times - 1) * LARGEST_WEIGHT

@@ -1,4 +1,7 @@
-"""Images of warped events into files, from blocks that go by: whole or by windows of time, in constant memory."""
+"""Write images of warped events to files, from a stream of event blocks: one image, or one per time window.
+
+Memory use is constant.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Layers
+from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.warped_image import PIECE, CanvasShape, Votes
 from amiwarp.io.output import NewFile, allocate, check_output
 from amiwarp.validation import choice
@@ -24,25 +28,25 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events, EventSource
 
 PERCENTILE = 99.5
-"""Of the pixels with events: what is as bright as this, or brighter, is white."""
+"""Percentile of the non-empty pixels that is shown as white."""
 GAMMA = 0.5
-"""Counts span decades; their square root shows weak edges beside strong ones."""
-OFF_COLOUR, ON_COLOUR = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)
-"""Blue and orange: told apart by all common kinds of colour vision."""
+"""Display gamma. Counts span decades; their square root keeps weak edges visible next to strong ones."""
 MOST_WINDOWS = 100_000
+"""Largest number of time windows."""
 
 
 def tone(counts: NDArray[Any]) -> NDArray[np.float32]:
-    """Counts, zero or more, to 0 .. 1 for the eye: gamma :data:`GAMMA` up to the :data:`PERCENTILE`."""
+    """Return brightness 0 .. 1 for counts of zero or more: the :data:`PERCENTILE` is 1, with gamma :data:`GAMMA`."""
     positive = counts[counts > 0]
     top = float(np.percentile(positive, PERCENTILE)) if positive.size else 1.0
     return np.asarray(np.clip(counts / top, 0.0, 1.0) ** GAMMA, np.float32)
 
 
 def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
-    """8-bit picture of an image: grey, or (height, width, 3) where it has polarities.
+    """Return an image of events as an 8-bit picture, shape ``(height, width)``; with polarities ``(height, width, 3)``.
 
-    Merged: black to white. Signed: grey is zero, white ON, black OFF. Polarity: blue is OFF, orange ON.
+    Merged: no events is black, many are white. Signed: zero is grey, ON is white, OFF is black. Polarity: OFF is blue,
+    ON is orange.
     """
     shown: NDArray[Any]
     layers = choice(Layers, layers, "layers")
@@ -52,18 +56,18 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
         shown = 0.5 + 0.5 * np.sign(image) * tone(np.abs(image))
     else:
         bright = tone(image)
-        shown = bright[0][..., None] * np.array(OFF_COLOUR) + bright[1][..., None] * np.array(ON_COLOUR)
+        shown = bright[0][..., None] * np.array(OFF_ON_BLACK) + bright[1][..., None] * np.array(ON_ON_BLACK)
     return np.asarray(np.rint(np.clip(shown, 0.0, 1.0) * 255.0), np.uint8)
 
 
 def save_png(path: Path, picture: Any, *, overwrite: bool = False) -> None:
-    """Write an 8-bit picture, an array or Pillow's, whole or not at all."""
+    """Write an 8-bit picture (an array or a Pillow image) as a complete PNG file, or no file."""
     with NewFile(path, overwrite=overwrite) as new:
         encode_png(new.part, picture)
 
 
 def encode_png(path: Path, picture: Any) -> None:
-    """Write an 8-bit picture, an array or Pillow's, to an unfinished file."""
+    """Write an 8-bit picture (an array or a Pillow image) to a temporary file that is not yet renamed."""
     from PIL import Image
 
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
@@ -71,22 +75,28 @@ def encode_png(path: Path, picture: Any) -> None:
 
 
 def encode_image(path: Path, image: Any, kind: str, **options: Any) -> None:
-    """Write Pillow's image to an unfinished file. Raises OSError on a full disk, where Pillow itself may not notice."""
+    """Write a Pillow image to a temporary file. Raises OSError on a full disk, which Pillow itself may miss."""
     buffer = io.BytesIO()
     image.save(buffer, format=kind, **options)
     path.write_bytes(buffer.getbuffer())
 
 
 class IweFiles:
-    """Collects blocks into images and writes them; a ``with`` block: its files appear when it ends without an error."""
+    """Writer that accumulates event blocks into images and saves them.
+
+    Use it in a ``with`` block: the files appear when the block ends without an error.
+    """
 
     def __init__(
         self, paths: Sequence[Path], source: EventSource, *, window_us: int | None, layers: Layers, device: Any
     ) -> None:
-        """``window_us`` None makes one image of all. Raises :class:`AmiwarpError` for other endings than .png, .npy."""
+        """Check the output paths. ``window_us`` is the length of a window [us]; None makes one image of all events.
+
+        Raises :class:`AmiwarpError` for an ending other than .png or .npy, and for too many windows.
+        """
         for path in paths:
             if path.suffix.lower() not in (".png", ".npy"):
-                raise AmiwarpError(f"{path}: images of events are written as .png or .npy")
+                raise AmiwarpError(f"{path}: images of events are written as .png or .npy; give such an ending")
         self.written: list[Path] = []
         self._layers = layers = choice(Layers, layers, "layers")
         width, height = source.size
@@ -96,11 +106,13 @@ class IweFiles:
         duration = source.t_last - self._first + 1 if len(source) else 1
         self._count = 1 if window_us is None else -(-duration // window_us)
         if self._count > MOST_WINDOWS:
-            raise AmiwarpError(f"{self._count} windows are more than {MOST_WINDOWS}; give a longer --iwe-window-ms")
-        self._at = 0
+            raise AmiwarpError(
+                f"{self._count} windows exceed the limit of {MOST_WINDOWS}; give a longer --iwe-window-ms"
+            )
+        self._window = 0
         self._paths = paths
         self._check_outputs()
-        self._new: list[NewFile] = []
+        self._unfinished: list[NewFile] = []
         self._stacks: dict[Path, Any] = {}
 
     def __enter__(self) -> IweFiles:
@@ -114,17 +126,18 @@ class IweFiles:
                 self._finish()
         finally:
             self._stacks.clear()
-            for new in self._new:
+            for new in self._unfinished:
                 new.discard()
 
     def add(self, events: Events) -> None:
-        """Votes compensated events, which follow in time on those before."""
+        """Vote compensated events. Blocks must be in time order."""
         for window, piece in self._pieces(events):
-            while self._at < window:
-                self._put()
-            self._votes.add_as_they_are(piece)
+            while self._window < window:
+                self._write_window()
+            self._votes.add_unmoved(piece)
 
     def _pieces(self, events: Events) -> Iterator[tuple[int, Events]]:
+        """Yield the index of the time window and a piece of the events, each piece within one window."""
         edges = {0, len(events), *range(0, len(events), PIECE)}
         window = np.zeros(len(events), np.int64)
         if self._window_us is not None:
@@ -134,36 +147,38 @@ class IweFiles:
         for start, stop in itertools.pairwise(cuts):
             yield int(window[start]), events[start:stop]
 
-    def _put(self) -> None:
-        """The window is complete: its image goes to each of the files."""
+    def _write_window(self) -> None:
+        """Write the image of the current window, which is complete, to each path."""
         votes = self._votes.take()
         image = votes if self._layers is Layers.POLARITY else votes[0]
         if self._layers is Layers.SIGNED:
             image = votes[1] - votes[0]
         for path in self._paths:
             if path.suffix.lower() == ".npy":
-                self._stack(path, image.shape)[self._at] = image
+                self._stack(path, image.shape)[self._window] = image
             else:
-                encode_png(self._begin(self._numbered(path, self._at)), to_picture(image, self._layers))
-        self._at += 1
+                encode_png(self._begin_file(self._numbered(path, self._window)), to_picture(image, self._layers))
+        self._window += 1
 
     def _stack(self, path: Path, shape: tuple[int, ...]) -> Any:
+        """Return the memory-mapped array of a .npy output; create it at the first call."""
         if path not in self._stacks:
-            part = self._begin(path)
+            part = self._begin_file(path)
             full = (self._count, *shape)
             flat = np.lib.format.open_memmap(
                 part, mode="w+", dtype=np.float32, shape=shape if self._window_us is None else full
             )
-            with open(part, "r+b") as file:  # a full disk would end the process when its pages are written
+            with open(part, "r+b") as file:  # reserve the space: writing a mapped page to a full disk kills the process
                 allocate(file.fileno(), 0, os.path.getsize(part))
             self._stacks[path] = flat.reshape(full)
         return self._stacks[path]
 
     def _numbered(self, path: Path, at: int) -> Path:
+        """Return the path of one window's image."""
         return path if self._window_us is None else path.with_name(f"{path.stem}_{at:05d}{path.suffix}")
 
     def _check_outputs(self) -> None:
-        """Raise AmiwarpError before the work if an image cannot be written at its end."""
+        """Raise :class:`AmiwarpError` before any work if an output cannot be written."""
         for path in self._paths:
             count = self._count if path.suffix.lower() == ".png" else 1
             check_output(self._numbered(path, 0) if count > 1 else path)
@@ -172,17 +187,19 @@ class IweFiles:
                 if name.name in there:
                     check_output(name)
 
-    def _begin(self, path: Path) -> Path:
-        self._new.append(NewFile(path))
-        return self._new[-1].part
+    def _begin_file(self, path: Path) -> Path:
+        """Open an unfinished file and return its temporary path."""
+        self._unfinished.append(NewFile(path))
+        return self._unfinished[-1].part
 
     def _finish(self) -> None:
-        while self._at < self._count:
-            self._put()
+        """Write the remaining windows and rename all files to their final names."""
+        while self._window < self._count:
+            self._write_window()
         for stack in self._stacks.values():
             stack.flush()
         self._stacks.clear()
-        for new in self._new:
+        for new in self._unfinished:
             new.commit()
             self.written.append(new.path)
 

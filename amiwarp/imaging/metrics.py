@@ -1,4 +1,4 @@
-"""How good a compensation or a picture is: blur across edges, contrast, entropy, error against the truth."""
+"""Quality metrics of compensation and of pictures: edge blur, contrast, entropy, error against ground truth."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
     from amiwarp.optics.prism import FlatSide
 
-ACROSS = 3.0
-"""Half width of the strip about an edge whose events are counted to it [px]."""
+STRIP_HALF_WIDTH = 3.0
+"""Half width of the strip along an edge in which events count as belonging to it [px]."""
 RIDGE_SCALE = 1.0
-"""Standard deviation of the derivatives that find edges [px]."""
-WEAKEST = 0.3
-"""Edges weaker than this share of the strong ones (the 95th percentile) are left out: noise has ridges too."""
-RANGE = (0.5, 99.5)
-"""Percentiles of a true picture between which its range lies, to which PSNR is relative."""
+"""Standard deviation of the Gaussian derivatives that find edges [px]."""
+WEAKEST_EDGE = 0.3
+"""Smallest strength of an edge, relative to the 95th percentile of all edges. Weaker ridges are mostly noise."""
+TRUTH_PERCENTILES = (0.5, 99.5)
+"""Percentiles that define the range of a true picture. PSNR is relative to this range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +40,19 @@ class Edges:
     """Sub-pixel edge points of an IWE: its ridges."""
 
     xy: NDArray[np.float64]
-    """Places [px], shape (n, 2)."""
+    """Positions [px], shape (n, 2)."""
     normal: NDArray[np.float64]
     """Unit vectors across the edge, shape (n, 2)."""
     label: NDArray[np.int64]
-    """For each pixel the index of the nearest edge point, shape (height, width)."""
+    """Index of the nearest edge point for each pixel, shape (height, width)."""
 
 
 def find_edges(image: NDArray[np.float32]) -> Edges:
-    """Ridges of an image of events: where the second derivative across is most negative and the first one vanishes.
+    """Find the ridges of an IWE.
 
-    Steger, "An unbiased detector of curvilinear structures", PAMI 1998. Those under :data:`WEAKEST` are left out.
-    Raises :class:`AmiwarpError` where the image has none.
+    On a ridge, the second derivative across it is most negative and the first derivative across it is zero. Source:
+    Steger, "An unbiased detector of curvilinear structures", PAMI 1998. Ridges weaker than :data:`WEAKEST_EDGE` are
+    left out. Raises :class:`AmiwarpError` if the image has no ridge.
     """
 
     def derivative(y: int, x: int) -> NDArray[np.float64]:
@@ -63,14 +64,14 @@ def find_edges(image: NDArray[np.float32]) -> Edges:
     root = np.hypot(half, hxy)
     across = 0.5 * (hxx + hyy) - root  # the smaller eigenvalue
     along = across + 2.0 * root
-    angle = 0.5 * np.arctan2(hxy, half) + np.pi / 2  # of its eigenvector
+    angle = 0.5 * np.arctan2(hxy, half) + np.pi / 2  # direction of its eigenvector
     nx, ny = np.cos(angle), np.sin(angle)
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = -(gx * nx + gy * ny) / across
     ridge = (across < 0.0) & (np.abs(offset) <= 0.6) & (np.abs(along) < 0.5 * np.abs(across))
     if not ridge.any():
-        raise AmiwarpError("the image of events has no edges to measure blur at")
-    ridge &= across <= WEAKEST * np.quantile(across[ridge], 0.05)
+        raise AmiwarpError("the image of events has no edges, so blur cannot be measured; give more or sharper events")
+    ridge &= across <= WEAKEST_EDGE * np.quantile(across[ridge], 0.05)
     rows, cols = np.nonzero(ridge)
     points = np.stack([cols + offset[ridge] * nx[ridge], rows + offset[ridge] * ny[ridge]], axis=1)
     nearest = ndimage.distance_transform_edt(~ridge, return_distances=False, return_indices=True)
@@ -82,13 +83,39 @@ def find_edges(image: NDArray[np.float32]) -> Edges:
 def edge_blur(
     sharp_xy: NDArray[np.float32], width: int, height: int, *, of: NDArray[np.float32] | None = None
 ) -> float:
-    """Standard deviation of events across edges [px], the paper's compensation error.
+    """Compute the standard deviation of events across edges [px], the paper's compensation error.
 
-    Edges are found in the IWE of ``sharp_xy`` (n, 2), and each event within :data:`ACROSS` px of one belongs to it,
-    with the probability that it is not of the even background that noise and neighbouring texture lay over the edge.
-    Measured are the same events at ``of`` (n, 2), by default at ``sharp_xy`` itself: give the raw places there to
-    learn the blur before compensation. Pixel quantisation alone leaves 0.29 px.
-    Raises :class:`AmiwarpError` where there are no edges.
+    Parameters
+    ----------
+    sharp_xy : ndarray
+        Event coordinates from which edges are found [px], shape ``(n, 2)``.
+    width, height : int
+        Sensor size [px].
+    of : ndarray, optional
+        Coordinates of the same events at which the blur is measured [px], shape ``(n, 2)``; by default ``sharp_xy``.
+        Give the raw coordinates here to measure the blur before compensation.
+
+    Returns
+    -------
+    float
+        Standard deviation across edges [px]. Pixel quantisation alone gives 0.29 px.
+
+    Raises
+    ------
+    AmiwarpError
+        If the IWE has no edges, or no event is near an edge.
+
+    Notes ----- Edges are the ridges of the IWE of ``sharp_xy`` (Steger, PAMI 1998). An event belongs to an edge if it
+    is within 3 px. Each event is weighted by the probability that it is not part of the uniform background, which
+    consists of noise and neighbouring texture.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> x, y = 20.0 + rng.normal(0.0, 0.5, 20_000), rng.uniform(0.0, 39.0, 20_000)
+    >>> round(amiwarp.edge_blur(np.stack([x, y], axis=1).astype(np.float32), 40, 40), 1)
+    0.5
     """
     none = np.zeros(len(sharp_xy), np.uint8)
     edges = find_edges(iwe(Events(sharp_xy[:, 0], sharp_xy[:, 1], none.astype(np.int64), none), width, height))
@@ -102,23 +129,24 @@ def edge_blur(
     away = sharp - edges.xy[label]
     across = np.sum(away * normal, axis=1)
     along = away[:, 0] * normal[:, 1] - away[:, 1] * normal[:, 0]
-    near = (np.abs(across) < ACROSS) & (np.abs(along) <= 1.0)
+    near = (np.abs(across) < STRIP_HALF_WIDTH) & (np.abs(along) <= 1.0)
     moved = across if of is None else np.sum((np.asarray(of, np.float64)[inside] - edges.xy[label]) * normal, axis=1)
     near &= np.isfinite(moved)
-    weight = _belonging(across[near])
+    weight = _edge_probability(across[near])
     if not weight.sum() > 0.0:
-        raise AmiwarpError("no event lies near an edge")
+        raise AmiwarpError("no event is near an edge, so blur cannot be measured; give more events")
     mean = np.average(moved[near], weights=weight)
     return float(np.sqrt(np.average((moved[near] - mean) ** 2, weights=weight)))
 
 
-def _belonging(across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Probability of each event, by its distance across the edge, not to be of the even background.
+def _edge_probability(across: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probability that each event belongs to the edge rather than to the uniform background.
 
-    The density over all edges is counted in bins of 0.1 px; the background is its level in the outermost sixth.
+    ``across``: signed distances from the edge [px]. The density over all edges is counted in bins of 0.1 px. The
+    background is the mean density in the outermost sixth of the strip.
     """
-    bins = np.clip(((across + ACROSS) * 10.0).astype(np.int64), 0, round(20 * ACROSS) - 1)
-    density = np.bincount(bins, minlength=round(20 * ACROSS)).astype(np.float64)
+    bins = np.clip(((across + STRIP_HALF_WIDTH) * 10.0).astype(np.int64), 0, round(20 * STRIP_HALF_WIDTH) - 1)
+    density = np.bincount(bins, minlength=round(20 * STRIP_HALF_WIDTH)).astype(np.float64)
     margin = len(density) // 12
     background = np.concatenate([density[:margin], density[-margin:]]).mean()
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -127,40 +155,86 @@ def _belonging(across: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def contrast(image: NDArray[np.float32]) -> float:
-    """Variance over mean of an IWE (height, width): 1 for events strewn at random, more the sharper it is."""
+    """Return the variance over mean of an IWE: 1 for events at random pixels, higher for sharper images."""
     return sharpness(image, Sharpness.VARIANCE)
 
 
 def entropy(image: NDArray[np.float32]) -> float:
-    """Entropy of the events' distribution over the pixels of an IWE (height, width) [nat]: less the sharper it is."""
+    """Return the entropy of the events' distribution over the pixels of an IWE [nat]: lower for sharper images."""
     return -sharpness(image, Sharpness.ENTROPY)
 
 
 def truth_model(camera: Camera, truth: Truth, flat_side: FlatSide) -> ExactModel:
-    """The generating model of a simulated recording."""
+    """Return the optical model that generated a simulated recording.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera of the recording.
+    truth : Truth
+        Ground truth of the recording.
+    flat_side : FlatSide
+        Side of the prism that is perpendicular to the axis of rotation.
+
+    Returns
+    -------
+    ExactModel
+        The true model.
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    >>> truth = amiwarp.Truth({"apex": 0.02, "index": 1.5, "phase": 0.3})
+    >>> amiwarp.truth_model(camera, truth, amiwarp.FlatSide.CAMERA).phase
+    0.3
+    """
     p = truth.parameters
     prism = Prism(p["apex"], p["index"], flat_side)
     return ExactModel(camera, prism, p["phase"], (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)))
 
 
 def model_error(model: Model, truth: ExactModel) -> ModelError:
-    """Distance between the fitted displacement field and the generating one: rms and worst [px] over image and turn.
+    """Compute the distance between the displacement fields of a fitted model and the true one.
 
-    The constant lag is removed first: events lag their edge, which no model can know.
+    Parameters
+    ----------
+    model : Model
+        Fitted model.
+    truth : ExactModel
+        Model that generated the recording, see :func:`truth_model`.
+
+    Returns
+    -------
+    ModelError
+        Root mean square and largest distance [px] over the image and one turn.
+
+    Notes
+    -----
+    The constant lag is removed first: events lag the edges that cause them, and no model can observe that lag.
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    >>> truth = amiwarp.ExactModel.from_prism(camera, amiwarp.Prism(0.02), 0.3)
+    >>> amiwarp.model_error(truth, truth).rms < 1e-3
+    True
     """
     return predicted_error(model, truth, remove_lag=True)
 
 
 @dataclass(frozen=True, slots=True)
 class PictureQuality:
-    """How near a picture comes to the truth once the gain and the offset that events do not tell are fitted."""
+    """Similarity of a picture to the truth after fitting gain and offset, which events do not determine."""
 
     correlation: float
-    """Pearson's, of log intensity: -1 .. 1; negative for an inverted picture."""
+    """Pearson correlation of log intensity, -1 .. 1; negative for an inverted picture."""
     psnr_db: float
-    """Of log intensity after the fit [dB], relative to the truth's range over :data:`RANGE`; inf without any error."""
+    """PSNR of log intensity after the fit [dB], relative to the truth's range over :data:`TRUTH_PERCENTILES`.
+
+    Infinite if there is no error.
+    """
     gain: float
-    """Log intensity of the truth per unit of the picture: the ON threshold, where it is in units of that."""
+    """Log intensity of the truth per unit of the picture. If that unit is the ON threshold: the threshold."""
     offset: float
     """Log intensity of the truth where the picture is 0."""
 
@@ -168,25 +242,26 @@ class PictureQuality:
 def picture_quality(
     log: NDArray[np.floating[Any]], truth: NDArray[np.floating[Any]], where: NDArray[np.bool_] | None = None
 ) -> PictureQuality:
-    """Correlation and PSNR of a picture of log intensity, gain and offset fitted first by least squares.
+    """Compute correlation and PSNR of a picture of log intensity, after a least-squares fit of gain and offset.
 
-    ``log``: the picture in any unit, shape (height, width), may be NaN where it is not judged; ``truth``: the true
-    natural log intensity, same shape; ``where``: the pixels that are fitted and judged, same shape, all by default.
-    The truth's range is that of all its pixels, so that PSNRs over different pixels can be compared.
-    Raises :class:`AmiwarpError` for shapes that differ, values that are not finite, and where the pixels judged, or
-    the truth's range, are constant.
+    ``log``: the picture in any unit, shape (height, width); may be NaN outside ``where``. ``truth``: the true natural
+    log intensity, same shape. ``where``: pixels to fit and to judge, same shape, by default all. The truth's range is
+    that of all its pixels, so that PSNRs over different pixels can be compared.
+    Raises :class:`AmiwarpError` for different shapes, values that are not finite, and a constant picture or truth.
     """
     if where is None:
         where = np.ones(np.shape(truth), np.bool_)
     if not np.shape(log) == np.shape(truth) == where.shape:
         shapes = f"{np.shape(log)}, {np.shape(truth)} and {where.shape}"
-        raise AmiwarpError(f"picture, truth and pixels to judge are of shapes {shapes}; give all of one shape")
+        raise AmiwarpError(f"picture, truth and `where` have shapes {shapes}; expected equal shapes")
     a, b = log[where].astype(np.float64), truth[where].astype(np.float64)
-    span = float(np.ptp(np.percentile(truth, RANGE)))
+    span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))
     if not (np.isfinite(a).all() and np.isfinite(b).all() and math.isfinite(span)):
-        raise AmiwarpError("picture or truth: not finite in some pixels; leave these out with `where`")
+        raise AmiwarpError("picture or truth is not finite in some pixels; exclude them with `where`")
     if not (a.size and np.ptp(a) > 0.0 and np.ptp(b) > 0.0 and span > 0.0):
-        raise AmiwarpError(f"picture or truth: constant over the {a.size} pixels judged; there is no gain to fit")
+        raise AmiwarpError(
+            f"picture or truth is constant over the {a.size} pixels of `where`, so no gain can be fitted"
+        )
     da, db = a - a.mean(), b - b.mean()
     gain = float(da @ db / (da @ da))
     error = float(np.mean((db - gain * da) ** 2))

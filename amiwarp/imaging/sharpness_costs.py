@@ -1,4 +1,4 @@
-"""Sharpness of an image of warped events: five costs under one signature, all the higher the sharper."""
+"""Sharpness of an image of warped events: five measures with one signature. For all of them, higher is sharper."""
 
 from __future__ import annotations
 
@@ -20,25 +20,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PAPER_ETA = 1.0
-"""η of the paper's J [events]; He et al. give none."""
-
-
+"""η of the paper's J [events]; He et al. do not state theirs."""
 LARGEST_SMOOTHING = 1000.0
 """Largest standard deviation of a Gaussian [px]."""
 FEW_SUMS = 256
-"""Sums that are left for the host to add."""
+"""Number of partial sums per layer that the host adds up."""
 
 
 class SharpnessMeter:
-    """Smooths and measures images of one canvas; owns its buffers."""
+    """Smooth images of one canvas and measure their sharpness; owns its buffers."""
 
     def __init__(self, canvas: CanvasShape, kind: Sharpness, *, smoothing: float, device: Any) -> None:
-        """``smoothing``: standard deviation of the Gaussian in canvas pixels; 0 for none."""
+        """Allocate buffers. ``smoothing``: standard deviation of the Gaussian [canvas px]; 0 disables smoothing."""
         weights = gaussian(smoothing)
         self.kind = choice(Sharpness, kind, "sharpness")
         self.device = wp.get_device(device)
         self.image = Image(canvas, len(weights), self.device)
-        """Where the image to measure is put [events]."""
+        """Image to measure [events]; the caller writes it."""
         self._weights = wp.array(weights, dtype=float, device=device)
         self._half, self._smooth = (wp.zeros_like(self.image.pixels) for _ in range(2))
         layers, rows, columns = canvas.shape
@@ -51,8 +49,7 @@ class SharpnessMeter:
         self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=self.device.is_cuda)
 
     def launch(self) -> None:
-        """Measures :attr:`image` on the device, without waiting for it."""
-
+        """Measure :attr:`image` on the device without waiting for the result."""
         smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
         if len(self._weights) > 1:
             for step, out in ((1, self._half), (frame.stride, self._smooth)):
@@ -66,18 +63,19 @@ class SharpnessMeter:
         wp.copy(self._host, self._few)
 
     def results(self) -> list[float]:
-        """Sharpness of each part of the image that was measured last."""
+        """Wait, and return the sharpness of each part of the last measured image."""
         if self.device.is_cuda:
             wp.synchronize_stream(self.device)
         sums = self._host.numpy().reshape(self._parts, -1, 2).sum(axis=1)
         return [self._score(float(total), float(terms)) for total, terms in sums]
 
     def measure(self) -> float:
-        """Sharpness of :attr:`image`, of one part."""
+        """Return the sharpness of :attr:`image`, which has one part."""
         self.launch()
         return self.results()[0]
 
     def _score(self, total: float, terms: float) -> float:
+        """Return the sharpness from the sum of the image and the sum of the measure's terms."""
         if total <= 0.0:
             return 0.0
         if self.kind is Sharpness.VARIANCE:
@@ -90,7 +88,7 @@ class SharpnessMeter:
 
 
 def gaussian(sigma: float) -> NDArray[np.float32]:
-    """Weights of a Gaussian at 0, 1, … 3 sigma, the full symmetric kernel summing to 1; just [1] for sigma 0."""
+    """Return weights of a Gaussian at 0, 1, … 3 sigma; the full symmetric kernel sums to 1. Just [1] for sigma 0."""
     sigma = real(sigma, "smoothing", 0.0, LARGEST_SMOOTHING, " px, a standard deviation")
     if sigma == 0.0:
         return np.ones(1, dtype=np.float32)
@@ -106,9 +104,37 @@ def sharpness(
     smoothing: float = 0.0,
     device: Any = "cpu",
 ) -> float:
-    """Sharpness of an image [events per pixel] of shape (height, width) or (layers, height, width).
+    """Compute the sharpness of an image of warped events.
 
-    ``smoothing``: standard deviation [px].
+    Parameters
+    ----------
+    image : ndarray
+        Image [events per pixel], shape ``(height, width)`` or ``(2, height, width)``.
+    kind : Sharpness, optional
+        Sharpness measure.
+    smoothing : float, optional
+        Standard deviation of a Gaussian applied first [px]; 0 disables it.
+    device : str or warp.Device, optional
+        Device to compute on.
+
+    Returns
+    -------
+    float
+        Sharpness. Higher is sharper; 0 for an image without events.
+
+    Raises
+    ------
+    AmiwarpError
+        If the image has another shape or holds values that are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> edge = np.zeros((8, 8), np.float32)
+    >>> edge[:, 3] = 8.0
+    >>> even = np.ones((8, 8), np.float32)
+    >>> amiwarp.sharpness(edge), amiwarp.sharpness(even)
+    (7.0, 0.0)
     """
     image = array(image, "image")
     if image.ndim not in (2, 3) or not image.size:

@@ -1,4 +1,4 @@
-"""Events prepared for being voted many times on CUDA, under several candidates for the parameters a pass."""
+"""Events prepared for repeated voting on CUDA, for several candidate parameter sets per pass."""
 
 from __future__ import annotations
 
@@ -23,15 +23,19 @@ if TYPE_CHECKING:
 
 
 class TileVotes:
-    """Events sorted by image tile, and the images of a few candidates; buffers are allocated once.
+    """Events sorted by image tile, and the vote images of a few candidates. Buffers are allocated once.
 
-    ``launch`` only launches: it can be captured in a CUDA graph. Parameters are read from device memory when it runs.
+    ``launch`` only launches kernels, so it can be captured in a CUDA graph. Kernels read the parameters from device
+    memory when they run.
     """
 
     def __init__(
         self, image: Image, canvas: CanvasShape, events: DeviceEvents, like: Model, *, candidates: int = 1
     ) -> None:
-        """``image``: of the canvas, to be read into; ``like``: a model of the kind and camera of the candidates."""
+        """Sort the events. ``image`` is an image of the canvas, into which votes are read later.
+
+        ``like`` is a model with the type and camera of the candidates.
+        """
         device = self.device = image.device
         self.canvas, self.candidates = canvas, candidates
         still = len(events.arrays.time) == 0 and events.slope is None
@@ -39,7 +43,7 @@ class TileVotes:
         self._camera = (pinhole_params(like.camera) if still else None) or model_camera(like, self.device)
         self._arrays = self._sort(events)
         self.votes = wp.zeros((candidates, len(image.pixels)), dtype=wp.int64, device=device)
-        """Votes of each candidate in 1/256, laid out as the image."""
+        """Votes of each candidate [1/256 event], in the memory layout of the image."""
         frame, self._layout = image.frame, kernels.Layout()
         self._layout.stride, self._layout.layer, self._layout.first = frame.stride, frame.layer, frame.first
         self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
@@ -49,12 +53,13 @@ class TileVotes:
             for dtype in (kind, float, CameraRotationParams)
         ]
         self._drifts = self._host[1].numpy()
-        self._there = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
+        self._on_device = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
         motion = kernels.Motion()
-        motion.drift, motion.camera_rotation = self._there[1:]
+        motion.drift, motion.camera_rotation = self._on_device[1:]
         self._motion = kernels.Still() if still else motion
 
     def _sort(self, events: DeviceEvents) -> Any:
+        """Sort the events by tile and pack them."""
         a, n, device = events.arrays, events.count, self.device
         layers = self.canvas.shape[0]
         size = min(kernels.TILE, max(1, int(kernels.TILE / self.canvas.scale)))
@@ -74,7 +79,7 @@ class TileVotes:
         return out
 
     def _chunks(self, counts: Any, size: int, across: int, down: int) -> Any:
-        """Runs of at most CHUNK events, one tile and layer each, the window centred on the tile."""
+        """Return runs of at most CHUNK events of one tile and layer, each with its window centred on the tile."""
         stops = np.cumsum(counts)
         pieces = [
             (start, min(start + kernels.CHUNK, stop), key)
@@ -93,7 +98,7 @@ class TileVotes:
         return chunks
 
     def set(self, k: int, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
-        """Parameters of candidate ``k`` for the next :meth:`launch`, which must not be under way."""
+        """Set the parameters of candidate ``k`` for the next :meth:`launch`. No launch may be in progress."""
         self._drifts[k] = drift
         for array, struct in (
             (self._host[0], model.params(self.device)),
@@ -103,14 +108,14 @@ class TileVotes:
             ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)
 
     def launch(self) -> None:
-        """Votes all events under all candidates."""
-        for host, there in zip(self._host, self._there, strict=True):
+        """Vote all events for all candidates."""
+        for host, there in zip(self._host, self._on_device, strict=True):
             wp.copy(there, host)
         self.votes.zero_()
         blocks = len(self._arrays.chunks) * -(-self.candidates // int(AT_ONCE))
-        inputs = [self._there[0], self._camera, self._arrays, self._motion, self._params, self._layout]
+        inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
         wp.launch(vote_tiles, (blocks, int(THREADS)), inputs, [self.votes], device=self.device, block_dim=int(THREADS))
 
     def read(self, k: int, image: Image) -> None:
-        """Writes candidate ``k``'s image [events]."""
+        """Write the image of candidate ``k`` [events] to ``image``."""
         wp.launch(read_tiles, len(image.pixels), [self.votes[k], 0], [image.pixels], device=self.device)

@@ -1,4 +1,4 @@
-"""The image of warped events (IWE): events voted into pixels after compensation, or as they are."""
+"""The image of warped events (IWE): events voted into pixels, with or without motion compensation."""
 
 from __future__ import annotations
 
@@ -40,34 +40,38 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 PIECE = 1 << 22
-"""Events that are put on the device at a time."""
-PROBE, BATCH = 1 << 21, 1 << 27
-"""Events that are voted at a time without a look at what their words held: on CUDA the words are emptied between. At
-first few; then as many as the fullest word has room for, at most :data:`BATCH`. Where some were lost, and fewer at
-once, every event looks."""
-FILL = 600
-"""Events that the fullest word of a batch should get: it has room for 1,023."""
+"""Number of events copied to the device at a time."""
+FIRST_BATCH, LARGEST_BATCH = 1 << 21, 1 << 27
+"""Sizes of the first and the largest batch of the fast vote on CUDA [events].
+
+The fast vote does not check whether a word of the image overflows; words are cleared after each batch. The first batch
+is small. Later ones have a size that fills the fullest word to about :data:`TARGET_FILL`. If a word overflowed, or if
+there are fewer events than the first batch, the exact vote is used, which checks every addition.
+"""
+TARGET_FILL = 600
+"""Number of events that the fullest word should receive per batch; a word holds up to 1,023."""
 
 
 @dataclass(frozen=True, slots=True)
 class CanvasShape:
-    """Where votes go: the sensor's image grown by ``pad`` px on each side, then scaled."""
+    """Shape of a vote image: the sensor's image, extended by ``pad`` px on each side, then scaled."""
 
     width: int
     """Sensor width [px]."""
     height: int
     """Sensor height [px]."""
     pad: int = 0
-    """Border [sensor px] so that no event leaves the image."""
+    """Border [sensor px] that keeps displaced events inside the image."""
     scale: float = 1.0
     """Canvas pixels per sensor pixel."""
     per_polarity: bool = False
-    """Two layers, OFF then ON, in place of one."""
+    """Use two layers, OFF then ON, instead of one."""
     vote: Vote = Vote.BILINEAR
+    """How a vote is shared among pixels."""
     parts: int = 1
-    """Disjoint parts of the events, every so manieth, with images of their own."""
+    """Number of disjoint subsets of the events with separate images; event k belongs to subset ``k % parts``."""
     dither: bool = False
-    """Put each event somewhere in its pixel, not at its centre: nothing is won then by events on the pixel grid."""
+    """Put each event at a pseudo-random place in its pixel: at the centres, the pixel grid would add sharpness."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vote", choice(Vote, self.vote, "vote"))
@@ -77,17 +81,18 @@ class CanvasShape:
 
     @property
     def layers(self) -> int:
-        """Images: parts, and in each OFF and ON where these are apart."""
+        """Number of layers: one per part, or two per part with separate polarities."""
         return self.parts * (2 if self.per_polarity else 1)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(layers, rows, columns)."""
+        """Shape of the image: (layers, rows, columns)."""
         rows = max(1, round((self.height + 2 * self.pad) * self.scale))
         columns = max(1, round((self.width + 2 * self.pad) * self.scale))
         return (self.layers, rows, columns)
 
     def params(self) -> Any:
+        """Return the canvas as the kernels' struct."""
         c = Canvas()
         c.pad, c.scale = float(self.pad), self.scale
         c.nearest, c.dither = int(self.vote is Vote.NEAREST), float(self.dither)
@@ -97,10 +102,10 @@ class CanvasShape:
 
 
 class Image:
-    """An image of a canvas on a device, zeros around it so that kernels need not look for its border."""
+    """Image of a canvas on a device, padded with zeros so that kernels need not test for the border."""
 
     def __init__(self, canvas: CanvasShape, radius: int, device: Any) -> None:
-        """``radius``: how far kernels look [px]."""
+        """Allocate the image. ``radius``: how far from a pixel kernels read [px]."""
         self.shape = canvas.shape
         self.device = wp.get_device(device)
         self.width = CPU_WIDTH if self.device.is_cpu else 1
@@ -115,26 +120,27 @@ class Image:
         self.pixels = wp.zeros(f.first + layers * f.layer + f.stride, dtype=float, device=device)
 
     def _view(self, flat: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the pixels inside the padding."""
         layers, rows, columns = self.shape
         end = self.frame.first + layers * self.frame.layer
         stacked = flat[self.frame.first : end].reshape(layers, -1, self.frame.stride)
         return np.asarray(stacked[:, :rows, :columns])
 
     def numpy(self) -> NDArray[np.float32]:
-        """A copy, shape (layers, rows, columns)."""
+        """Return a copy, shape (layers, rows, columns)."""
         return self._view(self.pixels.numpy()).copy()
 
     def write(self, image: NDArray[np.float32]) -> None:
-        """Sets all pixels; shape (layers, rows, columns)."""
+        """Set all pixels from an array of shape (layers, rows, columns)."""
         flat = np.zeros(len(self.pixels), np.float32)
         self._view(flat)[...] = image
         wp.copy(self.pixels, wp.array(flat, dtype=float, device="cpu"))
 
 
 class Votes:
-    """Vote buffers of a canvas on a device, allocated once: one image per CPU slice, one on CUDA.
+    """Vote buffers of a canvas on a device, allocated once: one image per CPU slice, one image on CUDA.
 
-    No vote is lost, however many events meet in a pixel. On CUDA events must stay as they are until :meth:`take`.
+    No vote is lost, even if very many events fall on one pixel. On CUDA, do not change the events before :meth:`take`.
     """
 
     def __init__(self, canvas: CanvasShape, device: Any) -> None:
@@ -152,30 +158,32 @@ class Votes:
             cells = Cells()
             cells.words, cells.totals, cells.spilled = self._words[k], self._totals[k], self._spilled[k]
             self._cells.append(cells)
-        self._batches: list[tuple[list[Any], int, int]] = []  # of the fast way, not settled yet
-        self._quick: bool | None = None if self.device.is_cuda else False
+        self._batches: list[tuple[list[Any], int, int]] = []  # voted by the fast kernel, not verified yet
+        self._batches_fit: bool | None = None if self.device.is_cuda else False
         if self.device.is_cuda:
-            self._make_fast()
+            self._make_fast_buffers()
 
-    def _make_fast(self) -> None:
+    def _make_fast_buffers(self) -> None:
+        """Allocate the buffers of the fast vote on CUDA and record its launches."""
         self._counts = wp.zeros((64, 1024), dtype=wp.int64, device=self.device)
         self._fullest = wp.zeros(1, dtype=int, device=self.device)
-        self._batch = PROBE
+        self._batch = FIRST_BATCH
         fast = self._fast = Cells()
         fast.words = wp.zeros_like(self._words[0])
         fast.totals, fast.spilled = wp.zeros_like(self._totals[0]), self._spilled[0]
-        self._empty = wp.launch(
+        self._clear_words = wp.launch(
             empty_words, len(fast.words), [self._params, fast, 0], [self._counts, self._fullest], device=self.device,
             record_cmd=True,
         )  # fmt: skip
         inputs = [fast.totals, self._counts.flatten()]
         n = max(len(fast.totals), self._counts.size)
-        self._keep = wp.launch(add_totals, n, inputs, [self._totals[0]], device=self.device, record_cmd=True)
-        self._recorded: tuple[list[Any], Any] | None = None  # what was voted last, and how to vote it again
+        self._add_fast_totals = wp.launch(add_totals, n, inputs, [self._totals[0]], device=self.device, record_cmd=True)
+        self._recorded: tuple[list[Any], Any] | None = None  # inputs of the last fast vote, and its recorded launch
         self._read: tuple[Image, Any] | None = None
 
     def clear(self) -> None:
-        self._forget()
+        """Discard all votes."""
+        self._discard_batches()
         self._words.zero_()
         if self._any_total:
             self._totals.zero_()
@@ -183,14 +191,15 @@ class Votes:
 
     @property
     def _any_total(self) -> bool:
+        """Whether any word overflowed into the totals."""
         return bool(self.device.is_cuda or self._spilled.numpy().any())
 
     def add_events(
         self, model: Model, events: DeviceEvents, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None
     ) -> None:
-        """Votes events on the same device after compensation by ``model``.
+        """Compensate events on the same device by ``model`` and vote them.
 
-        ``turning`` is taken back where the events were given their times.
+        ``drift``: value of the drifting parameter. ``camera_rotation`` is compensated if the events have times.
         """
         if events.slope is not None:
             events.drift(drift)
@@ -198,61 +207,65 @@ class Votes:
         inputs = [params, camera or model_camera(model, self.device), events.arrays, self._params]
         if camera_rotation is not None and events.arrays.time.shape[0]:
             inputs = [params, model_camera(model, self.device), *inputs[2:], camera_rotation.params()]
-            self._exactly(vote_turning, inputs, events.count)
+            self._vote_exactly(vote_turning, inputs, events.count)
         elif self.device.is_cuda and not len(events.arrays.weight):
-            self._in_batches(inputs, events.count)
+            self._vote_in_batches(inputs, events.count)
         elif self.device.is_cpu and camera is not None:
             blocks = -(-events.count // int(BLOCK))
             launch_slices(vote_blocks, blocks, [*inputs, events.count], self._cells, device=self.device, smallest=512)
         else:
-            self._exactly(vote_events, inputs, events.count)
+            self._vote_exactly(vote_events, inputs, events.count)
 
     def add_points(self, x: Any, y: Any, layer: Any, count: int | None = None) -> None:
-        """Votes points as they are: ``x``, ``y`` Warp arrays of float [px], ``layer`` of uint8, the image each goes to.
+        """Vote points without moving them.
 
-        ``count``: so many of them, all without.
+        ``x``, ``y``: Warp arrays of float [px]. ``layer``: Warp array of uint8, the index of each point's layer.
+        ``count``: number of points to vote; None for all.
         """
         inputs, count = [x, y, layer, self._params], len(x) if count is None else count
         blocks = count // int(BLOCK) if self.device.is_cpu else 0
         launch_slices(vote_point_blocks, blocks, inputs, self._cells, device=self.device, smallest=8192)
-        self._exactly(vote_points, inputs, count - blocks * int(BLOCK), blocks * int(BLOCK))
+        self._vote_exactly(vote_points, inputs, count - blocks * int(BLOCK), blocks * int(BLOCK))
 
-    def stretches(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
-        """For points of long-lived arrays: votes some from one on, on a CPU in blocks of 64 and by one thread."""
+    def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
+        """Return a function that votes ``count`` points from index ``first`` on, for long-lived arrays of points.
+
+        On a CPU, indices count blocks of 64 points, and one thread votes.
+        """
         kernel = vote_point_blocks if self.device.is_cpu else vote_points
         return Recorded(kernel, [x, y, layer, self._params], [self._cells[0]], device=self.device)
 
-    def add_as_they_are(self, events: Events) -> None:
-        """Votes events where they are, raw or compensated before; NaN coordinates vote nowhere."""
+    def add_unmoved(self, events: Events) -> None:
+        """Vote events at their coordinates, raw or already compensated. Events with NaN coordinates are not voted."""
         x, y = (wp.array(v.astype(np.float32), dtype=float, device=self.device) for v in (events.x, events.y))
         self.add_points(x, y, wp.array(events.p, dtype=wp.uint8, device=self.device))
 
-    def _exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
-        """Every event looks at what its word held."""
+    def _vote_exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
+        """Vote with a check for overflow at every addition."""
         launch_slices(kernel, count, inputs, self._cells, device=self.device, first=first)
 
-    def _in_batches(self, inputs: list[Any], count: int) -> None:
-        """On CUDA: fast, then checked; where words overflow, and for few events, exactly at once."""
+    def _vote_in_batches(self, inputs: list[Any], count: int) -> None:
+        """Vote on CUDA by the fast kernel and verify later; few events, or crowded words, are voted exactly at once."""
         start, vote = 0, None
         while start < count:
             batch = min(count - start, self._batch)
-            if self._quick is False or batch < PROBE:
-                self._exactly(vote_events, inputs, count - start, start)
+            if self._batches_fit is False or batch < FIRST_BATCH:
+                self._vote_exactly(vote_events, inputs, count - start, start)
                 return
-            vote = vote or self._recording(inputs)
+            vote = vote or self._recorded_vote(inputs)
             vote.set_dim(batch)
             vote.set_param_at_index(len(inputs) + 1, start)
             vote.launch()
-            self._empty.set_param_at_index(2, len(self._batches))
-            self._empty.launch()
+            self._clear_words.set_param_at_index(2, len(self._batches))
+            self._clear_words.launch()
             self._fast.words.zero_()
             self._batches.append((inputs, batch, start))
-            if self._quick is None or len(self._batches) == len(self._counts):
-                self._settle()
+            if self._batches_fit is None or len(self._batches) == len(self._counts):
+                self._verify_batches()
             start += batch
 
-    def _recording(self, inputs: list[Any]) -> Any:
-        """The launch of a batch's votes, kept: to launch again what was recorded takes a tenth of the time."""
+    def _recorded_vote(self, inputs: list[Any]) -> Any:
+        """Return the recorded launch of the fast vote. Launching it again takes a tenth of the time of a new launch."""
         if self._recorded is not None:
             before, vote = self._recorded
             if type(inputs[0]) is type(before[0]) and all(a is b for a, b in zip(inputs[1:], before[1:], strict=True)):
@@ -264,31 +277,34 @@ class Votes:
         self._recorded = inputs, vote
         return vote
 
-    def _settle(self) -> None:
-        """Keeps what was voted fast, or votes it again, exactly, where words overflowed."""
+    def _verify_batches(self) -> None:
+        """Keep the fast votes if no word overflowed; otherwise vote their events again, exactly."""
         if not self._batches:
             return
         counts = self._counts[: len(self._batches)].numpy().sum(axis=1)
-        if self._quick is None:
-            self._batch = min(max(PROBE * FILL // max(int(self._fullest.numpy()[0]), 1), PROBE), BATCH)
-        self._quick = bool((counts == [count for _, count, _ in self._batches]).all())
-        if self._quick:
-            self._keep.launch()
+        if self._batches_fit is None:
+            self._batch = min(
+                max(FIRST_BATCH * TARGET_FILL // max(int(self._fullest.numpy()[0]), 1), FIRST_BATCH), LARGEST_BATCH
+            )
+        self._batches_fit = bool((counts == [count for _, count, _ in self._batches]).all())
+        if self._batches_fit:
+            self._add_fast_totals.launch()
             self._batches.clear()
             return
         for inputs, count, first in self._batches:
-            self._exactly(vote_events, inputs, count, first)
-        self._forget()
+            self._vote_exactly(vote_events, inputs, count, first)
+        self._discard_batches()
 
-    def _forget(self) -> None:
+    def _discard_batches(self) -> None:
+        """Discard the fast votes that are not verified yet."""
         if self._batches:
             self._fast.totals.zero_()
             self._counts.zero_()
             self._batches.clear()
 
     def read(self, image: Image) -> None:
-        """Writes the image so far [events]; the votes stay."""
-        self._settle()
+        """Write the current image [events] to ``image``; the votes are kept."""
+        self._verify_batches()
         kernel = read_votes(image.width)
         inputs = [self._words, self._totals, int(self._any_total), self._params, image.frame]
         if self.device.is_cpu:
@@ -300,7 +316,7 @@ class Votes:
         self._read[1].launch()
 
     def take(self) -> NDArray[np.float32]:
-        """The image so far [events], shape (layers, rows, columns); the canvas is empty afterwards."""
+        """Return the current image [events], shape (layers, rows, columns), and clear the votes."""
         self.read(self._image)
         self.clear()
         return self._image.numpy()
@@ -319,14 +335,51 @@ def iwe(
     vote: Vote = Vote.BILINEAR,
     device: Any = "cpu",
 ) -> NDArray[np.float32]:
-    """Image of warped events [events per pixel].
+    """Compute the image of warped events (IWE).
 
-    With ``model`` and ``encoder`` the events are compensated on the way, and the camera's ``turning`` is taken back if
-    it is given; without, they are voted where they are.
-    Shape (height + 2 pad, width + 2 pad), or (2, …) with OFF then ON where ``per_polarity``.
+    With ``model`` and ``encoder``, the events are compensated first. Without them, they are voted at their coordinates.
+
+    Parameters
+    ----------
+    events : Events
+        Events to vote.
+    width, height : int
+        Sensor size [px].
+    model : Model, optional
+        Optical model of the prism. Requires ``encoder``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Requires ``model``.
+    camera_rotation : CameraRotation, optional
+        The camera's own rotation, compensated together with the prism.
+    pad : int, optional
+        Border added on each side [px].
+    per_polarity : bool, optional
+        Return separate images for OFF and ON.
+    vote : Vote, optional
+        How a vote is shared among pixels.
+    device : str or warp.Device, optional
+        Device to compute on.
+
+    Returns
+    -------
+    ndarray
+        Events per pixel, float32, shape ``(height + 2 * pad, width + 2 * pad)``. With ``per_polarity``, shape
+        ``(2, height + 2 * pad, width + 2 * pad)``: OFF, then ON.
+
+    Raises
+    ------
+    AmiwarpError
+        If only one of ``model`` and ``encoder`` is given, or the encoder does not cover the events.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> amiwarp.iwe(events, 4, 2)
+    array([[0., 2., 0., 0.],
+           [0., 0., 1., 0.]], dtype=float32)
     """
     if (model is None) != (encoder is None):
-        raise AmiwarpError("give both a model and an encoder to compensate the events, or neither")
+        raise AmiwarpError("only one of model and encoder is given; give both a model and an encoder, or neither")
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)
     for start in range(0, len(events), PIECE):
         piece = events[start : start + PIECE]
@@ -335,6 +388,6 @@ def iwe(
             arrays = upload_events(piece, encoder, device, middle_us=middle)
             votes.add_events(model, arrays, camera_rotation=camera_rotation)
         else:
-            votes.add_as_they_are(piece)
+            votes.add_unmoved(piece)
     image = votes.take()
     return image if per_polarity else image[0]

@@ -1,4 +1,7 @@
-"""Recordings in and out: :func:`open_recording` reads every format, :class:`RecordingWriter` writes the native one."""
+"""Readers and writers of recordings.
+
+:func:`open_recording` reads every format. :class:`RecordingWriter` writes the native format.
+"""
 
 from amiwarp.io.conversion import ConversionSummary, convert
 from amiwarp.io.encoder_csv import read_encoder_csv

@@ -1,7 +1,7 @@
-"""iniVation's AEDAT 4.0 through faery: the first stream of events; frames, IMU and triggers are left out.
+"""Reader of iniVation's AEDAT 4.0 files, with faery: the first stream of events. Frames, IMU and triggers are ignored.
 
-The decoder trusts the file's frame (text that is not UTF-8 ends the process), so header and packet sizes are checked
-first.
+The decoder does not check the file's structure: text that is not UTF-8 ends the process. Therefore the header and the
+packet sizes are checked first.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from amiwarp.io.scan import FileEvents, Packet
 from amiwarp.regular_file import check_regular
 
 MAGIC = b"#!AER-DAT4.0\r\n"
+"""First bytes of an AEDAT 4.0 file."""
 
 
 def open_aedat4(path: Path) -> Recording:
@@ -38,18 +39,20 @@ def open_aedat4(path: Path) -> Recording:
 
 
 def _check_frame(path: Path, file: BinaryIO) -> None:
-    """Check the header's text and that each packet ends within the file; raises naming the first bad byte."""
+    """Check the header, and that each packet ends within the file. Raises :class:`AmiwarpError` with the bad byte."""
     file_bytes = path.stat().st_size
     head = file.read(len(MAGIC) + 4)
     if not head.startswith(MAGIC) or len(head) < len(MAGIC) + 4:
-        raise AmiwarpError(f"{path}: byte 0: is not the head of an AEDAT 4.0 file")
+        raise AmiwarpError(f"{path}: byte 0: is not the header of an AEDAT 4.0 file; give another file")
     (header_bytes,) = struct.unpack_from("<I", head, len(MAGIC))
     at = len(head) + header_bytes
     if at > file_bytes:
-        raise AmiwarpError(f"{path}: byte {len(head)}: header ends beyond the file; it is truncated")
+        raise AmiwarpError(f"{path}: byte {len(head)}: the header ends beyond the file, which is truncated")
     table = _check_header(path, file.read(header_bytes))
     if table > file_bytes:
-        raise AmiwarpError(f"{path}: its table should be at byte {table}, beyond the file; it is truncated")
+        raise AmiwarpError(
+            f"{path}: its table should be at byte {table}, beyond the end of the file, which is truncated"
+        )
     end = table if table > 0 else file_bytes
     while at < end:
         file.seek(at)
@@ -57,15 +60,15 @@ def _check_frame(path: Path, file: BinaryIO) -> None:
         size = struct.unpack("<ii", packet)[1] if len(packet) == 8 else -1
         if size < 0 or at + 8 + size > end:
             raise AmiwarpError(
-                f"{path}: byte {at}: packet ends beyond the file or its table; it is truncated or damaged"
+                f"{path}: byte {at}: a packet ends beyond the file or its table; the file is truncated or damaged"
             )
         at += 8 + size
 
 
 def _check_header(path: Path, header: bytes) -> int:
-    """Check the header's XML; returns the position of the file's table, not positive where there is none.
+    """Check the header's XML, and return the position of the file's table, which is not positive without a table.
 
-    The header is a FlatBuffer: a table of compression, table's position and the XML text.
+    The header is a FlatBuffer with the compression, the position of the table and the XML text.
     """
     try:
         (root,) = struct.unpack_from("<I", header)
@@ -74,26 +77,26 @@ def _check_header(path: Path, header: bytes) -> int:
         start = root + text + struct.unpack_from("<I", header, root + text)[0]
         (length,) = struct.unpack_from("<I", header, start)
         if min(fields, text) <= 0 or start + 4 + length > len(header):
-            raise ValueError("text lies outside it")
+            raise ValueError("its text lies outside it")
         ElementTree.fromstring(header[start + 4 : start + 4 + length].decode("utf-8"))
         return int(struct.unpack_from("<q", header, root + position)[0]) if position else 0
     except (struct.error, ValueError, ElementTree.ParseError) as error:
-        raise AmiwarpError(f"{path}: header is damaged: {error}") from error
+        raise AmiwarpError(f"{path}: the header is damaged: {error}") from error
 
 
 def read_head(path: str) -> Reply:
-    """Read width, height and number of the first stream of events; for the reading process."""
+    """Return width, height and number of the first stream of events. Runs in the reading process."""
     from faery.extension import aedat
 
     with aedat.Decoder(path) as decoder:
         for track in decoder.tracks():
             if track.data_type == "events" and track.dimensions is not None:
                 return (int(track.dimensions[0]), int(track.dimensions[1]), track.id), []
-    raise AmiwarpError("has no stream of events")
+    raise AmiwarpError("has no stream of events; give a file with events")
 
 
 def read_packets(notes: dict[str, int], path: str, number: int) -> Iterator[Packet]:
-    """Decode a stream of events; for the reading process."""
+    """Yield the packets of a stream of events. Runs in the reading process."""
     from faery.extension import aedat
 
     with aedat.Decoder(path) as decoder:

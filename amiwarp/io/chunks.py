@@ -1,6 +1,6 @@
-"""Chunks of the native layout, coded here in place of inside HDF5: there one thread at a time works, here all do.
+"""Encoder and decoder of the chunks of native recordings, in parallel threads. HDF5 itself uses one thread at a time.
 
-A stored chunk is a Blosc frame (version 1, as HDF5's filter 32001 keeps it) followed by HDF5's Fletcher-32 of it.
+A stored chunk is a Blosc frame (version 1, as written by HDF5's filter 32001) followed by its Fletcher-32 checksum.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from amiwarp.kernels.cores import cpu_threads
 Result = TypeVar("Result")
 
 CHUNK = 1 << 18
-"""Events per HDF5 chunk. With Blosc's LZ4 and bit shuffle it writes and reads faster than no compression does."""
+"""Events per HDF5 chunk. With Blosc's LZ4 and bit shuffle, writing and reading are faster than uncompressed."""
 
 BLOSC, FLETCHER32 = 32001, 3
-"""Numbers of the filters in HDF5."""
+"""Filter numbers in HDF5."""
 
-BLOSC_HEAD = 16
-"""Bytes of a Blosc frame's header."""
+BLOSC_HEADER_BYTES = 16
+"""Size of the header of a Blosc frame [bytes]."""
 
-MOST_THREADS = 16
-"""More would wait for each other in Python, and each holds events in memory."""
+MAX_THREADS = 16
+"""Largest number of threads. More would wait for Python's lock, and each holds events in memory."""
 
-AHEAD = 4
-"""Jobs beyond one a thread that may be done or under way: what was done out of turn waits in memory."""
+EXTRA_JOBS = 4
+"""Number of jobs in flight in addition to one per thread. Their results wait in memory for their turn."""
 
-ROW = 256
-"""Words of a checksum that are summed at a time."""
+CHECKSUM_ROW = 256
+"""Number of 16-bit words that a checksum sums at a time."""
 
 
 def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, None]:
-    """Run jobs on all cores, a bounded number ahead; their results come in the order of the jobs.
+    """Run jobs in parallel threads, and yield their results in the order of the jobs.
 
-    A job's exception is raised in its place. When the iterator is closed, jobs that wait are dropped and those that run
-    are waited for.
+    A bounded number of jobs is in flight. The exception of a job is raised when its result is due. When the generator
+    is closed, waiting jobs are dropped and running jobs are completed.
     """
-    threads = min(cpu_threads(), MOST_THREADS)
+    threads = min(cpu_threads(), MAX_THREADS)
     waiting: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(threads, thread_name_prefix="amiwarp-io")
     try:
         for job in jobs:
             waiting.append(pool.submit(job))
-            if len(waiting) > threads + AHEAD:
+            if len(waiting) > threads + EXTRA_JOBS:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -66,67 +66,69 @@ def _blosc() -> Any:
 
 
 def encode(values: NDArray[Any]) -> bytes:
-    """A chunk's stored bytes; a shorter array is filled up with zeros, as HDF5 does."""
+    """Return the stored bytes of a chunk. A shorter array is padded with zeros, as HDF5 does."""
     whole = values if values.size == CHUNK else np.concatenate([values, np.zeros(CHUNK - values.size, values.dtype)])
     frame = _blosc().encode(np.ascontiguousarray(whole))
     return b"".join((frame, checksum(frame).to_bytes(4, "little")))
 
 
 def decode(stored: bytes, out: NDArray[Any]) -> bool:
-    """Whether the stored bytes are sound; ``out``, a chunk long, then holds what they say."""
-    if len(stored) < BLOSC_HEAD + 4:
+    """Decode stored bytes into ``out``, which is one chunk long. Return whether they are undamaged."""
+    if len(stored) < BLOSC_HEADER_BYTES + 4:
         return False
     frame = memoryview(stored)[:-4]
-    # Blosc's header: four bytes, then the bytes before and after compression; it would read and write as told.
+    # After four bytes, the header holds the sizes before and after compression. Blosc itself would trust them.
     sizes = [int.from_bytes(frame[at : at + 4], "little") for at in (4, 12)]
     if sizes != [out.nbytes, len(frame)] or checksum(frame).to_bytes(4, "little") != stored[-4:]:
         return False
     try:
         _blosc().decode(frame, out=out)
-    except RuntimeError:  # what Blosc raises for a frame that it cannot decode
+    except RuntimeError:  # raised by Blosc for a frame that it cannot decode
         return False
     return True
 
 
 def checksum(data: bytes | memoryview) -> int:
-    """Fletcher-32 as HDF5 computes it: big-endian 16-bit words, modulo 65535; a last odd byte is a word's upper half.
+    """Return the Fletcher-32 checksum as HDF5 computes it.
 
-    Words are summed as little-endian ones: modulo 65535, to swap a word's bytes is to multiply it by 256.
+    HDF5 sums big-endian 16-bit words modulo 65535. A last odd byte is the upper half of a word. Here the words are
+    summed as little-endian: modulo 65535, swapping the bytes of a word multiplies it by 256.
     """
     count = len(data) // 2
     words = np.frombuffer(data, np.dtype("<u2"), count)
-    table = words[: count - count % ROW].reshape(-1, ROW).astype(np.uint32)
-    # Word i counts once in the first sum and count - i times in the second.
+    table = words[: count - count % CHECKSUM_ROW].reshape(-1, CHECKSUM_ROW).astype(np.uint32)
+    # Word i is counted once in the first sum, and count - i times in the second.
     columns, rows = table.sum(axis=0, dtype=np.uint32), table.sum(axis=1, dtype=np.uint32)
-    rest = words[count - count % ROW :].astype(np.int64)
+    rest = words[count - count % CHECKSUM_ROW :].astype(np.int64)
     first = int(columns.sum(dtype=np.int64))
-    second = count * first - _moment(columns) - ROW * _moment(rows) + int(rest @ np.arange(rest.size, 0, -1))
+    second = count * first - _moment(columns) - CHECKSUM_ROW * _moment(rows) + int(rest @ np.arange(rest.size, 0, -1))
     first, second = 256 * (first + int(rest.sum())), 256 * second
     if len(data) % 2:
         first += data[-1] << 8
         second += first
-    return _folded(second) << 16 | _folded(first)
+    return _fold_carries(second) << 16 | _fold_carries(first)
 
 
 def _moment(sums: NDArray[np.uint32]) -> int:
+    """Return the sum of each value times its index."""
     return int(sums.astype(np.int64) @ np.arange(sums.size))
 
 
-def _folded(total: int) -> int:
-    """Modulo 65535, with 65535 in place of 0 for all but 0: so do sums whose carries are added back end."""
+def _fold_carries(total: int) -> int:
+    """Return a sum modulo 65535 as end-around carry gives it: a multiple of 65535 is 65535, except 0."""
     return (total - 1) % 65535 + 1 if total else 0
 
 
 class StoredColumn:
-    """A dataset of the native layout whose chunks threads read past HDF5, each on its own."""
+    """A dataset of the native layout. Threads read its chunks in parallel, without HDF5."""
 
     def __init__(self, handle: int, dtype: np.dtype[Any], count: int, places: Sequence[Sequence[int]]) -> None:
-        """``handle``: of the open file. ``places``: offset and size of each chunk [bytes]."""
+        """Take the handle of the open file, and ``places``: the offset and size of each chunk [bytes]."""
         self._handle, self._dtype, self._count, self._places = handle, dtype, count, places
         self._last: tuple[int, NDArray[Any]] | None = None
 
     def read(self, start: int, stop: int) -> NDArray[Any] | None:
-        """Elements ``start <= index < stop``, at least one; None where a chunk is damaged."""
+        """Return the elements with ``start <= index < stop``, at least one, or None if a chunk is damaged."""
         first, last = start // CHUNK, (stop - 1) // CHUNK
         if first == last and (stop - start < CHUNK and stop != self._count):
             chunk = self._chunk(first)
@@ -138,7 +140,7 @@ class StoredColumn:
         return out[start - first * CHUNK : stop - first * CHUNK]
 
     def _chunk(self, at: int) -> NDArray[Any] | None:
-        """A whole chunk; the last one is kept, because a search reads many times within one."""
+        """Return a whole chunk, or None if it is damaged. The latest chunk is kept, for searches within it."""
         if self._last is not None and self._last[0] == at:
             return self._last[1]
         out = np.empty(CHUNK, self._dtype)
@@ -153,6 +155,6 @@ class StoredColumn:
 
 
 def append_chunk(dataset: Any, start: int, stored: bytes, count: int) -> None:
-    """Add a chunk of ``count`` elements, encoded, to a dataset of ``start``, a whole number of chunks."""
+    """Append an encoded chunk of ``count`` elements to a dataset of ``start`` elements, a whole number of chunks."""
     dataset.id.set_extent((start + count,))
     dataset.id.write_direct_chunk((start,), stored)

@@ -1,4 +1,4 @@
-"""Any recording into a native one, with its encoder, camera and prism put in."""
+"""Conversion of a recording of any format to the native one, with its encoder, camera and prism."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import EventSource
+from amiwarp.io.copying import copy_events
 from amiwarp.io.formats import open_recording
-from amiwarp.io.native_writer import RecordingWriter, copy_events
+from amiwarp.io.native_writer import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
 
@@ -19,31 +20,40 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 GAP_INTERVALS = 5
-"""Neighbouring encoder samples more than so many median intervals apart are reported as a gap."""
+"""Encoder samples further apart than this number of median intervals are reported as a gap."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConversionSummary:
-    """What a conversion did."""
+    """Summary of a conversion.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
+    >>> amiwarp.save_recording("in.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4)))
+    >>> summary = amiwarp.convert("in.h5", "out.h5")
+    >>> summary.events, summary.width, summary.encoder_covers
+    (2, 4, None)
+    """
 
     events: int
-    """Events written."""
+    """Number of events written."""
     t_first: int | None
-    """Time of the first event [us], None without events."""
+    """Time of the first event [us], or None without events."""
     t_last: int | None
-    """Time of the last event [us], None without events."""
+    """Time of the last event [us], or None without events."""
     width: int
-    """Sensor's width [px]."""
+    """Sensor width [px]."""
     height: int
-    """Sensor's height [px]."""
+    """Sensor height [px]."""
     repairs: dict[str, int]
-    """Counts of what was repaired or noticed while reading."""
+    """Number of repairs and other findings while reading, by name."""
     encoder_covers: bool | None
-    """Whether the encoder has an angle for every event; None without an encoder."""
+    """Whether the encoder has an angle for every event, or None without an encoder."""
     encoder_gaps: tuple[tuple[int, int], ...]
-    """Pairs of sample times [us] between which encoder samples are missing."""
+    """Gaps in the encoder samples: the sample times before and after each [us]."""
     index_slip: float | None
-    """Largest angle at an index pulse [rad]; None without pulses. More than a count tells of lost counts."""
+    """Largest angle error at an index pulse [rad], or None without pulses. More than one count means lost counts."""
 
 
 def convert(
@@ -56,11 +66,42 @@ def convert(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> ConversionSummary:
-    """Convert a recording to the native format in constant memory; what is given replaces what the file holds.
+    """Convert a recording to the native format, in constant memory.
 
-    Where the file does not tell the sensor's size, the camera's is taken. Raises :class:`AmiwarpError` for what cannot
-    be read or written, for an output that is the input, and for one that exists unless ``overwrite``; nothing is left
-    behind then.
+    Parameters
+    ----------
+    source_path : str or path-like
+        The recording to read, in any format of :class:`Format`.
+    out_path : str or path-like
+        The native HDF5 file to write.
+    encoder : Encoder, optional
+        Replaces the encoder of the file.
+    camera : Camera, optional
+        Replaces the camera of the file. Gives the sensor size if the file does not store it.
+    prism : Prism or UnsizedPrism, optional
+        Replaces the nominal prism of the file.
+    progress : callable, optional
+        Called with the name of the step and the finished fraction of the task, 0 to 1.
+    overwrite : bool, default False
+        Whether an existing output may be replaced.
+
+    Returns
+    -------
+    ConversionSummary
+        What was converted.
+
+    Raises
+    ------
+    AmiwarpError
+        If the input cannot be read or the output cannot be written, if both are the same file, or if the output exists
+        without ``overwrite``. Then no output remains.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
+    >>> amiwarp.save_recording("in.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4)))
+    >>> amiwarp.convert("in.h5", "out.h5", prism=amiwarp.Prism(apex=0.03)).events
+    2
     """
     recording = open_recording(source_path)
     source = recording.events

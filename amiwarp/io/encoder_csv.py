@@ -1,4 +1,4 @@
-"""Encoder logs as comma-separated text: columns ``t_us``, ``angle_deg`` or ``count``, optionally ``index`` (0 or 1)."""
+"""Reader of encoder logs in CSV: columns ``t_us``, ``angle_deg`` or ``count``, and optionally ``index`` (0 or 1)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ def read_encoder_csv(
     counter_bits: int | None = None,
     direction: int = 1,
 ) -> Encoder:
-    """Read an encoder log; its header names the columns, in any order.
+    """Return the encoder of a CSV log, whose header names the columns in any order.
 
-    ``t_us``: time [us], strictly increasing. ``angle_deg``: angle [deg], wrapped or not; or ``count``: the counter,
-    which needs ``counts_per_turn``, and its width in ``counter_bits`` if its wraps do not tell it (see
-    :meth:`Encoder.from_counts`). ``index``: 1 in the samples at the index pulse, which becomes angle 0.
-    ``direction`` -1 turns the sign. Raises :class:`AmiwarpError` naming the file and line for anything else.
+    - ``t_us``: time [us], strictly increasing.
+    - ``angle_deg``: angle [deg], wrapped or not; or ``count``: encoder count. Counts need ``counts_per_turn``, and
+      ``counter_bits`` if the width of the counter is ambiguous (see :meth:`Encoder.from_counts`).
+    - ``index``: 1 in the samples at the index pulse, where the angle is 0.
+
+    ``direction`` -1 negates the angle. Raises :class:`AmiwarpError` with the file and line for anything else.
     """
     path = Path(path)
     check_regular(path)
@@ -40,16 +42,18 @@ def read_encoder_csv(
             line = lines[int(late[0]) + 1]
             raise AmiwarpError(f"{path}: line {line}: t_us is not later than in the line before; sort and deduplicate")
         try:
-            encoder = _encoder(path, columns, t, counts_per_turn, counter_bits, direction)
+            encoder = _encoder(
+                path, columns, t, counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
+            )
         except UnwrapError as error:
             raise AmiwarpError(f"{path}: line {lines[error.sample]}: {error.problem}") from error
         if "index" not in columns:
             return encoder
         bad = np.flatnonzero((columns["index"] != 0) & (columns["index"] != 1))
         if bad.size:
-            raise AmiwarpError(f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1")
+            raise AmiwarpError(f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1; correct it")
         pulses = columns["index"] == 1
-        # A pulse that stays high over several samples is one pulse, at its first sample.
+        # A pulse that stays high over several samples is one pulse at its first sample.
         rising = pulses & ~np.concatenate([[False], pulses[:-1]])
         return encoder.with_index(t[rising]) if rising.any() else encoder
 
@@ -58,10 +62,12 @@ def _encoder(
     path: Path,
     columns: dict[str, NDArray[np.float64]],
     t: NDArray[np.int64],
+    *,
     counts_per_turn: int | None,
     counter_bits: int | None,
     direction: int,
 ) -> Encoder:
+    """Return the encoder of the log's columns."""
     if "count" in columns:
         if counts_per_turn is None:
             raise AmiwarpError(f"{path}: holds counts; give counts_per_turn")
@@ -69,14 +75,14 @@ def _encoder(
             t, columns["count"], counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
         )
     if counter_bits is not None:
-        raise AmiwarpError(f"{path}: holds angles, which no counter_bits apply to; leave counter_bits out")
+        raise AmiwarpError(f"{path}: holds angles, which have no counter_bits; leave counter_bits out")
     if direction not in (1, -1):
         raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
     return Encoder.from_angles(t, direction * np.radians(columns["angle_deg"]))
 
 
 def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
-    """Column names, values of shape ``(rows, columns)`` and the line number of each row."""
+    """Return column names, values of shape ``(rows, columns)`` and the line number of each row."""
     text = path.read_text(encoding="utf-8-sig")
     rows = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if not rows:
@@ -94,13 +100,14 @@ def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
         table = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
     except ValueError:
         table = np.zeros((0, 0))
-    # Beyond 2**53 a float64 no longer holds whole microseconds.
+    # From 2**53 on, float64 cannot represent every whole microsecond.
     if table.shape != (len(lines), len(names)) or not (np.abs(table) < 2.0**53).all():
-        raise AmiwarpError(f"{path}: {_first_bad(numbers, lines, len(names))}")
+        raise AmiwarpError(f"{path}: {_first_bad_line(numbers, lines, len(names))}")
     return names, table, numbers
 
 
-def _first_bad(numbers: list[int], lines: list[str], width: int) -> str:
+def _first_bad_line(numbers: list[int], lines: list[str], width: int) -> str:
+    """Describe the first line that does not hold ``width`` finite numbers."""
     for number, line in zip(numbers, lines, strict=True):
         try:
             values = np.array([float(word) for word in line.split(",")])

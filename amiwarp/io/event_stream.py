@@ -1,4 +1,4 @@
-"""Event Stream (.es) through faery: DVS files, and the change events of ATIS files."""
+"""Reader of Event Stream files (.es), with faery: events of DVS files, and change detections of ATIS files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from amiwarp.regular_file import check_regular
 
 
 def open_es(path: Path) -> Recording:
-    """Open an Event Stream file; its rows count from the bottom and are turned."""
+    """Open an Event Stream file. Its rows count from the bottom and are flipped."""
     check_regular(path)
     with errors_name(path, lambda: "reading the header"):
         width, height = run("amiwarp.io.event_stream:read_head", os.path.abspath(path))
@@ -27,7 +27,7 @@ def open_es(path: Path) -> Recording:
 
 
 def read_head(path: str) -> Reply:
-    """Read width and height; for the reading process."""
+    """Return width and height. Runs in the reading process."""
     from faery.extension import es
 
     with es.Decoder(path, 0) as decoder:
@@ -38,7 +38,7 @@ def read_head(path: str) -> Reply:
 
 
 def read_packets(notes: dict[str, int], path: str, height: int) -> Iterator[Packet]:
-    """Decode events; for the reading process."""
+    """Yield packets of events. Runs in the reading process."""
     from faery.extension import es
 
     with es.Decoder(path, 0) as decoder:

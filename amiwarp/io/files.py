@@ -1,4 +1,4 @@
-"""What all readers share: errors with a place, and which files are inputs that no writer may touch."""
+"""Shared code of the readers: errors that name the file, and a register of the inputs that no writer may replace."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError, printable
 
 _sources: weakref.WeakKeyDictionary[object, tuple[Path, ...]] = weakref.WeakKeyDictionary()
+"""Files of the open event sources."""
 _noted: set[Path] | None = None
+"""Files that the running command has read, or None if no command runs."""
 
 
 def register_reader(source: object, *paths: Path) -> None:
-    """Remember that ``source`` reads from ``paths`` for as long as it lives."""
+    """Register the files that ``source`` reads, until it is garbage-collected."""
     _sources[source] = paths
 
 
 def note_input(path: Path) -> None:
-    """Remember a file that is read at once as an input of the command that runs, if one does."""
+    """Register a file that was read as an input of the running command, if any."""
     if _noted is not None:
         _noted.add(path.absolute())
 
 
 @contextlib.contextmanager
 def inputs_noted(paths: Iterable[Path]) -> Iterator[None]:
-    """Count ``paths``, and all that :func:`note_input` names within the block, as inputs."""
+    """Treat ``paths``, and the files given to :func:`note_input` within the block, as inputs."""
     global _noted
     before, _noted = _noted, {path.absolute() for path in paths}
     try:
@@ -37,12 +39,12 @@ def inputs_noted(paths: Iterable[Path]) -> Iterator[None]:
 
 
 def inputs_in_use() -> tuple[Path, ...]:
-    """Return the files that open sources read, and those that the running command has read."""
+    """Return the files of the open sources and those that the running command has read."""
     return (*(path for paths in list(_sources.values()) for path in paths), *(_noted or ()))
 
 
 def same_file(first: Path, second: Path) -> bool:
-    """Whether two paths lead to one existing file."""
+    """Return whether two paths lead to the same existing file."""
     with contextlib.suppress(OSError):
         return os.path.samefile(first, second)
     return False
@@ -50,9 +52,9 @@ def same_file(first: Path, second: Path) -> bool:
 
 @contextlib.contextmanager
 def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
-    """Turn whatever a library raises into one :class:`AmiwarpError` line with the file and the ``place``.
+    """Turn any exception of a library into an :class:`AmiwarpError` with the file and the ``place`` in it.
 
-    Panics of compiled decoders derive from BaseException only, hence the broad net.
+    Panics of compiled decoders derive from BaseException, so BaseException is caught.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Opening a recording of any format: the file's content decides which, its ending only where the content cannot."""
+"""Formats of recordings, detected from the file's content, and the function that opens all of them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from amiwarp.validation import choice
 
 
 class Format(enum.StrEnum):
-    """Formats that can be read."""
+    """Formats of recordings that can be read."""
 
     HDF5 = "hdf5"
-    """Native recording, or DSEC's events."""
+    """Native recording, or event file of DSEC."""
     EVT = "evt"
     """Prophesee RAW, EVT 2.0 and 3.0."""
     DAT = "dat"
@@ -28,18 +28,18 @@ class Format(enum.StrEnum):
     ES = "es"
     """Event Stream."""
     TEXT = "text"
-    """Event Camera Dataset: lines ``t x y p``, seconds."""
+    """Text of the Event Camera Dataset: lines ``t x y p``, with t in seconds."""
     NPZ = "npz"
-    """NumPy archive of arrays x, y, t, p."""
+    """NumPy archive with the arrays x, y, t and p."""
 
 
 def detect_format(path: Path) -> Format:
-    """Tell a file's format from its first bytes. Raises :class:`AmiwarpError` where it is none of them."""
+    """Return the format of a file from its first bytes. Raises :class:`AmiwarpError` for an unknown format."""
     check_regular(path)
     with errors_name(path, lambda: "opening"), path.open("rb") as file:
         head = file.read(4096)
     if not head:
-        raise AmiwarpError(f"{path}: is empty")
+        raise AmiwarpError(f"{path}: is empty; give a recording")
     for magic, found in (
         (b"\x89HDF\r\n\x1a\n", Format.HDF5),
         (b"#!AER-DAT4", Format.AEDAT4),
@@ -55,7 +55,7 @@ def detect_format(path: Path) -> Format:
     if _looks_like_text(head):
         return Format.TEXT
     known = ", ".join(member.value for member in Format)
-    raise AmiwarpError(f"{path}: content is of no known format ({known})")
+    raise AmiwarpError(f"{path}: content is of no known format; expected one of {known}")
 
 
 def _is_evt(head: bytes) -> bool:
@@ -72,10 +72,35 @@ def _looks_like_text(head: bytes) -> bool:
 
 
 def open_recording(path: str | os.PathLike[str], *, format: Format | str | None = None) -> Recording:
-    """Open a recording; ``format`` overrides what its content says.
+    """Open a recording of any supported format.
 
-    Formats without an index are passed through once, to count, check and repair; ``metadata`` tells what was repaired.
-    Raises :class:`AmiwarpError` naming the file and the place for whatever cannot be read.
+    Formats without an index are read once to count, check and repair their events. The recording's ``metadata`` lists
+    the repairs.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    format : Format or str, optional
+        The format. By default it is detected from the content.
+
+    Returns
+    -------
+    Recording
+        The recording. Its events are read on demand.
+
+    Raises
+    ------
+    AmiwarpError
+        If the file cannot be read. The message gives the file and the position.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> np.savez("short.npz", x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0], width=4, height=4)
+    >>> recording = amiwarp.open_recording("short.npz")
+    >>> len(recording.events), recording.metadata["format"]
+    (2, 'npz')
     """
     path = Path(path)
     chosen = detect_format(path) if format is None else choice(Format, format, f"{path}: format")
@@ -83,7 +108,8 @@ def open_recording(path: str | os.PathLike[str], *, format: Format | str | None 
 
 
 def _opener(chosen: Format) -> Callable[[Path], Recording]:
-    # Each reader's library is loaded with it, so that no reader costs those who do not use it.
+    """Return the function that opens a format."""
+    # Each reader is imported on use, because its library takes time to load.
     if chosen is Format.HDF5:
         from amiwarp.io.native import open_native as opener
     elif chosen is Format.EVT:

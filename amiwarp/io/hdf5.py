@@ -1,7 +1,7 @@
-"""HDF5 files of events, as the rest reads them: opened by the reading process, chunks of our own layout read here.
+"""Access to HDF5 files of events, which the reading process opens.
 
-What amiwarp wrote carries checksums on each chunk: it is read and decoded here, on all cores. Other layouts and filters
-are read by HDF5 in the reading process, as is all that is read once, when a file is opened.
+Files of amiwarp have a checksum on each chunk. Their chunks are read and decoded in this process, on all cores. HDF5 in
+the reading process reads files of other layouts or filters, and everything that is read once when a file is opened.
 """
 
 from __future__ import annotations
@@ -21,24 +21,26 @@ from amiwarp.io.chunks import StoredColumn
 from amiwarp.io.reading_process import ReadingProcess, borrow, give_back
 
 PIECE = 1 << 20
-"""Elements that the reading process reads at once."""
+"""Number of elements that the reading process reads per request."""
 
-LATER = ("events/", "truth/", "ms_to_idx")
-"""Data sets that are read after a file was opened."""
+READ_ON_DEMAND = ("events/", "truth/", "ms_to_idx")
+"""Prefixes of the datasets that are still read after a file was opened."""
 
 SERVER = "amiwarp.io.hdf5_server"
+"""Module that runs in the reading process."""
 
 
 class Hdf5File:
-    """An open file of events. Threads may read its columns at once.
+    """An open HDF5 file of events. Threads may read its columns in parallel.
 
-    Raises :class:`AmiwarpError` for what cannot be opened, refers to other files, or declares what it cannot hold.
+    Raises :class:`AmiwarpError` for a file that cannot be opened, refers to other files, or declares more data than it
+    holds.
     """
 
     def __init__(self, path: Path) -> None:
         self._absolute = os.path.abspath(path)
         self._lock = threading.Lock()
-        self._process: list[ReadingProcess] = []  # one, or none that is needed; shared with the finalizer
+        self._process: list[ReadingProcess] = []  # at most one; the finalizer has the same list
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         self.close = weakref.finalize(self, _close, handle, self._process)
         found = os.fstat(handle)
@@ -50,23 +52,23 @@ class Hdf5File:
             raise
         self._attributes = about["attributes"]
         self.unfinished = bool(about["unfinished"])
-        """Whether its writer is at work, or was cut off."""
+        """Whether the file is still being written, or its writer was interrupted."""
         self.columns = {name: Column(self, handle, name, column) for name, column in about["columns"].items()}
-        """Data sets by name. They refer to the file weakly: who reads them keeps it."""
+        """Datasets by name. They refer to the file weakly, so the reader must keep it."""
 
     def attributes(self, group: str) -> Mapping[str, Any] | None:
-        """Attributes of a group, None if the file has no such group."""
+        """Return the attributes of a group, or None if the file has no such group."""
         found: Mapping[str, Any] | None = self._attributes.get(group)
         return found
 
     def settle(self) -> None:
-        """End the opening: from now on only events and truth are read. Give the process back if they need no HDF5."""
-        if all(column.is_stored for name, column in self.columns.items() if name.startswith(LATER)):
+        """End the opening. Give the reading process back if the datasets that are read on demand do not need it."""
+        if all(column.is_stored for name, column in self.columns.items() if name.startswith(READ_ON_DEMAND)):
             with self._lock:
                 _give_back(self._process)
 
     def ask(self, function: str, *arguments: Any) -> list[NDArray[Any]]:
-        """Call the reading process, which is started again after Ctrl-C and in a fork of this process."""
+        """Call a function in the reading process, which is restarted after Ctrl-C and in a fork of this process."""
         with self._lock:
             if not self._process or not self._process[0].usable:
                 self._start()
@@ -81,7 +83,7 @@ class Hdf5File:
 
 
 class Column:
-    """A one-dimensional data set."""
+    """A one-dimensional dataset."""
 
     def __init__(self, file: Hdf5File, handle: int, name: str, about: Mapping[str, Any]) -> None:
         self._file = weakref.proxy(file)
@@ -97,17 +99,19 @@ class Column:
 
     @property
     def is_stored(self) -> bool:
-        """Whether it is read without HDF5."""
+        """Whether the dataset is read without HDF5."""
         return self._stored is not None
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Elements ``start <= index < stop``, within the column. Raises :class:`AmiwarpError` for damaged ones."""
+        """Return the elements with ``start <= index < stop``. Raises :class:`AmiwarpError` for damaged data."""
         if start >= stop:
             return np.empty(0, self.dtype)
         if self._stored is not None:
             values = self._stored.read(start, stop)
             if values is None:
-                raise AmiwarpError(f"dataset '{self._name}' has a damaged chunk: its checksum is wrong; copy the file")
+                raise AmiwarpError(
+                    f"dataset '{self._name}' has a damaged chunk: its checksum is wrong; copy the file again"
+                )
             return values
         parts = [self._ask(at, min(at + PIECE, stop)) for at in range(start, stop, PIECE)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -1,4 +1,4 @@
-"""JSON from files that anyone may have written: bounded, strict, and turned into dataclasses field by field."""
+"""Reader of untrusted JSON files: limited in size, strict, and converted to dataclasses field by field."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from amiwarp.validation import real, shown, whole
 Made = TypeVar("Made")
 
 MOST_BYTES = 64 << 20
-"""Largest JSON file that is read; a calibration with all points of its search takes about 1 MB."""
+"""Largest JSON file that is read [bytes]. A calibration with all points of its search takes about 1 MB."""
 LARGEST_INTEGER = 2**62
-"""Largest magnitude of a whole number: that of times, see :data:`amiwarp.events.events.TIME_LIMIT`."""
+"""Largest magnitude of a whole number, equal to :data:`amiwarp.events.checks.TIME_LIMIT`."""
 
 
 def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
@@ -29,16 +29,21 @@ def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    path : path
-        A file of at most :data:`MOST_BYTES`, in UTF-8.
+    path : str or path-like
+        A file in UTF-8 of at most :data:`MOST_BYTES`.
     what : str
-        What the file should be, for messages: "a calibration".
+        What the file should contain, for messages, such as "a calibration".
+
+    Returns
+    -------
+    dict
+        The object.
 
     Raises
     ------
     AmiwarpError
-        For a file that cannot be read, is larger, is no JSON, nests too deeply, is no object, or holds a number that is
-        not finite or has thousands of digits.
+        If the file cannot be read, is larger, is not a JSON object, is nested too deeply, or holds a number that is not
+        finite or has thousands of digits.
     """
     path = Path(path)
     with errors_name(path, lambda: f"cannot be read as {what}"):
@@ -54,7 +59,7 @@ def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
 
 
 def parse_json(text: bytes) -> Any:
-    """Return JSON's value; :class:`AmiwarpError` for what is no JSON, and for numbers that are not finite."""
+    """Return the value of JSON text. Raises :class:`AmiwarpError` for invalid JSON and non-finite numbers."""
     try:
         return json.loads(text.decode("utf-8"), parse_constant=_refuse, parse_float=_finite)
     except AmiwarpError:
@@ -62,16 +67,18 @@ def parse_json(text: bytes) -> Any:
     except RecursionError as error:
         raise AmiwarpError("the JSON nests too deeply") from error
     except UnicodeDecodeError as error:
-        raise AmiwarpError(f"byte {error.start} is no UTF-8") from error
+        raise AmiwarpError(f"byte {error.start} is not UTF-8") from error
     except ValueError as error:
-        raise AmiwarpError(f"is no JSON: {error}") from error
+        raise AmiwarpError(f"is not JSON: {error}") from error
 
 
 def _refuse(word: str) -> NoReturn:
+    """Raise for the words NaN and Infinity."""
     raise AmiwarpError(f"the JSON holds {word}; expected finite numbers")
 
 
 def _finite(digits: str) -> float:
+    """Return a finite number from its digits."""
     value = float(digits)
     if not math.isfinite(value):
         raise AmiwarpError(f"the JSON holds {shown(digits)}, beyond the largest float64")
@@ -79,16 +86,17 @@ def _finite(digits: str) -> float:
 
 
 def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a JSON object with all ``needed`` fields and none but the ``optional`` ones besides.
+    """Return a JSON object after checking that it has all ``needed`` fields and otherwise only ``optional`` ones.
 
-    ``where`` names the object for messages; empty for the whole file. Raises :class:`AmiwarpError` naming the field.
+    ``where`` names the object for messages; it is empty for the whole file. Raises :class:`AmiwarpError`, which names
+    the field.
     """
     if not isinstance(data, dict):
         raise AmiwarpError(f"field {where} is {shown(data)}; expected an object")
     prefix = f"{where}." if where else ""
     for name in needed:
         if name not in data:
-            raise AmiwarpError(f"field {prefix}{name} is missing")
+            raise AmiwarpError(f"field {prefix}{name} is missing; add it")
     for name in data:
         if name not in needed and name not in optional:
             raise AmiwarpError(
@@ -98,10 +106,10 @@ def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = (
 
 
 def build(kind: type[Made], data: Any, where: str) -> Made:
-    """Return a dataclass from a JSON object, each field checked against its annotation.
+    """Return a dataclass made from a JSON object, with each field checked against its annotation.
 
-    Fields with a default may be missing. Takes str, bool, int, float, None, dataclasses, and lists, tuples and mappings
-    of these. Raises :class:`AmiwarpError` naming the field.
+    Fields with a default may be missing. Supported types are str, bool, int, float, None, dataclasses, and lists,
+    tuples and mappings of these. Raises :class:`AmiwarpError`, which names the field.
     """
     hints = get_type_hints(kind)
     known: tuple[Any, ...] = dataclasses.fields(kind)  # type: ignore[arg-type]
@@ -116,7 +124,7 @@ def build(kind: type[Made], data: Any, where: str) -> Made:
 
 
 def _value(kind: Any, value: Any, where: str) -> Any:
-    """One value of an annotated type."""
+    """Return a value as its annotated type."""
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         return build(kind, value, where)
     if get_origin(kind) is types.UnionType:
@@ -132,11 +140,11 @@ def _value(kind: Any, value: Any, where: str) -> Any:
                 f"field {where} is {shown(value)}; expected {'text' if kind is str else 'true or false'}"
             )
         return value
-    return _several(kind, value, where)
+    return _container(kind, value, where)
 
 
-def _several(kind: Any, value: Any, where: str) -> Any:
-    """A list, a tuple or a mapping of an annotated type."""
+def _container(kind: Any, value: Any, where: str) -> Any:
+    """Return a list, a tuple or a mapping as its annotated type."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (dict, Mapping):
         given = value if isinstance(value, dict) else fields_of(value, where)

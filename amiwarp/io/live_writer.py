@@ -1,8 +1,8 @@
-"""Writing a native recording that grows: readable at any moment, and all but its last second whatever ends its writer.
+"""Writer of a live recording, which stays readable at any time and loses at most its last second in a crash.
 
-HDF5's single-writer mode orders what reaches the file so that it is sound after every write. The last chunk, which is
-not full, is written anew with each flush, to another place: what a reader, or the file left by a crash, refers to
-stays. HDF5 does not survive a full disk: room to finish the file is taken before any event is.
+HDF5's single-writer mode orders all writes so that the file is consistent after each. The last chunk is usually not
+full. Every flush writes it again at another place, so that the version which a reader or a crashed file refers to
+stays intact. HDF5 fails badly on a full disk, so the space to finish the file is reserved before events are accepted.
 """
 
 from __future__ import annotations
@@ -27,15 +27,8 @@ from amiwarp.events.recording import MetadataValue
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.files import errors_name
 from amiwarp.io.native import open_native
-from amiwarp.io.native_writer import (
-    Columns,
-    check_frame,
-    check_lengths,
-    make_dataset,
-    ms_entries,
-    save_recording,
-    write_header,
-)
+from amiwarp.io.native_layout import Columns, check_frame, check_lengths, make_dataset, ms_entries, write_header
+from amiwarp.io.native_writer import save_recording
 from amiwarp.io.output import allocate, check_output, put_in_place
 from amiwarp.optics.camera import Camera
 
@@ -43,32 +36,34 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 SMALL_CHUNK = 4096
-"""Elements of a chunk of the small datasets: stored plain, so that they grow in place."""
+"""Elements per chunk of the small datasets. They are not compressed, so that they grow in place."""
 
-END_AT = 28
-"""Where the beginning of an HDF5 file of this kind tells its end: what is beyond was taken and not used."""
+END_ADDRESS_OFFSET = 28
+"""Offset of the end-of-file address in an HDF5 file's header [bytes]. Bytes after that address are unused."""
 
-SPARE = 1 << 19
-"""Bytes that finishing a file takes beyond its data: for HDF5's own use, and for chunks that are not full."""
+FINISH_BYTES = 1 << 19
+"""Bytes that are reserved to finish a file in addition to its data: for HDF5's structures and partial chunks."""
 
 MOST_WAITING = 1 << 24
-"""Bytes of encoder samples that wait for the next flush; more of them are written at once."""
+"""Largest amount of encoder samples that wait for the next flush [bytes]. Beyond it they are written immediately."""
 
 MOST_PULSES = 1 << 16
-"""Index pulses that wait for the encoder's samples; of more the last ones are kept."""
+"""Largest number of index pulses that wait for encoder samples. Beyond it the oldest ones are dropped."""
 
-WASTE = 1 << 24
-"""Bytes of chunks written anew that are left in a finished file in any case; a copy without them would gain little."""
+MAX_WASTE_BYTES = 1 << 24
+"""Superseded chunks that a finished file may contain [bytes]. With more the file is copied without them."""
 
 
 class LiveWriter:
-    """Streams a recording into ``NAME.part.h5`` beside ``path``, which takes the place of ``path`` at the end.
+    """Writer that streams a live recording into ``NAME.part.h5`` next to ``path``, and renames it to ``path``.
 
-    So it does at any end: after an exception what was appended is kept as well, and when the disk is full; the error
-    tells how much. ``compensated`` recordings hold float32 coordinates and flags. Every ``flush_s`` [s] all is in the
-    file, if :meth:`append` or :meth:`tick` is called as often. For one thread.
-    Raises :class:`AmiwarpError` for a path that cannot be written or exists (unless ``overwrite``), a part left over
-    from before, and for events that are unsorted or out of the frame; the recording can go on after these.
+    The file is finished and renamed in every case: after an exception and on a full disk it keeps the events appended
+    so far, and the error gives their number. ``compensated`` recordings hold float32 coordinates and flags. All events
+    are in the file after ``flush_s`` [s] at the latest, if :meth:`append` or :meth:`tick` is called that often. Use it
+    in one thread.
+
+    Raises :class:`AmiwarpError` for a path that cannot be written or exists (unless ``overwrite``), for an existing
+    part file, and for events that are unsorted or outside the frame. After bad events the recording can continue.
     """
 
     def __init__(
@@ -85,7 +80,7 @@ class LiveWriter:
         flush_s: float = 0.5,
         overwrite: bool = False,
     ) -> None:
-        """``clock_offset_us``: of the encoder that is written, see :class:`Encoder`; its samples are moved by it."""
+        """Prepare the writer. The times of written encoder samples are shifted by ``clock_offset_us``."""
         self.path, self._overwrite = Path(path), overwrite
         check_frame(self.path, width, height, camera)
         self.part = self.path.resolve().with_name(f"{self.path.stem}.part.h5")
@@ -94,13 +89,13 @@ class LiveWriter:
         self._compensated, self._flush_s, self._clock_offset_us = compensated, flush_s, clock_offset_us
         self._file: Any = None
         self._columns: dict[str, Any] = {}
-        self._small: dict[str, _Growing] = {}
+        self._small: dict[str, _GrowingDataset] = {}
         self._pending: list[Columns] = []
         self._pending_count = 0
-        self._written = 0
-        self._stored = 0
-        self._flushed_at = 0.0
-        self._reserved = 0
+        self._written = 0  # events in full chunks
+        self._stored = 0  # events in the file, those of the last chunk included
+        self._flushed_at = 0.0  # [s], monotonic
+        self._reserved = 0  # [bytes]
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
@@ -119,16 +114,16 @@ class LiveWriter:
             with open(self.part, "xb") as file:
                 allocate(file.fileno(), 0, self._to_finish())
         except FileExistsError as error:
-            what = "is being written, or was left by a recording that was cut off; it opens like any other"
-            raise AmiwarpError(f"{self.part}: {what}: rename or delete it") from error
+            what = "is being written, or was left by an interrupted recording; it can be opened like any recording"
+            raise AmiwarpError(f"{self.part}: {what}; rename or delete it") from error
         except OSError as error:
             self.part.unlink(missing_ok=True)
-            raise AmiwarpError(f"{self.path}: cannot be begun: {error.strerror}; choose another place") from error
+            raise AmiwarpError(f"{self.path}: cannot be created: {error.strerror}; choose another place") from error
         try:
             with errors_name(self.path, lambda: "making the file"):
                 self._file = h5py.File(self.part, "w", libver=("v110", "v110"))
                 self._reserve()
-                self._make()
+                self._create_datasets()
                 self._file.swmr_mode = True
         except BaseException:
             self._close()
@@ -137,11 +132,11 @@ class LiveWriter:
         self._flushed_at = time.monotonic()
         return self
 
-    def _make(self) -> None:
-        """All there will be: in single-writer mode nothing can be added."""
-        file, place = self._file, np.float32 if self._compensated else np.uint16
+    def _create_datasets(self) -> None:
+        """Create all datasets. In single-writer mode none can be added later."""
+        file, coordinate = self._file, np.float32 if self._compensated else np.uint16
         write_header(file, self._size, self._camera, self._prism, self._metadata)
-        dtypes = {"x": place, "y": place, "p": np.uint8, "t": np.int64}
+        dtypes = {"x": coordinate, "y": coordinate, "p": np.uint8, "t": np.int64}
         if self._compensated:
             dtypes |= {"inside": np.uint8, "extrapolated": np.uint8}
         self._columns = {
@@ -151,20 +146,20 @@ class LiveWriter:
         small = {"ms_to_idx": np.int64, "encoder/t": np.int64, "encoder/angle": np.float64, "encoder/index_t": np.int64}
         for name, kind in small.items():
             dataset = file.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(SMALL_CHUNK,), dtype=kind)
-            self._small[name] = _Growing(dataset)
+            self._small[name] = _GrowingDataset(dataset)
         file["encoder"].attrs["clock_offset_us"] = self._clock_offset_us
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._file is None:  # it could not be written any further
+        if self._file is None:  # writing failed before, and the file is finished
             return
         self._finish(tidy=True)
         if error is not None:
-            error.add_note(f"{self.path}: holds the {len(self)} events up to then")
+            error.add_note(f"{self.path}: holds the {len(self)} events before the error")
 
     def append(self, events: Events, *, inside: ArrayLike | None = None, extrapolated: ArrayLike | None = None) -> None:
-        """Add events; compensated ones with flags ``(n,)``: whether on the picture, by an angle beyond the samples."""
+        """Append events. Compensated ones need the flags ``inside`` and may have ``extrapolated``, shape ``(n,)``."""
         self._check_open("append")
         with errors_name(self.path, lambda: f"after {len(self)} events"):
             columns = self._as_columns(events, inside, extrapolated)
@@ -182,7 +177,7 @@ class LiveWriter:
         self.tick()
 
     def _accept(self, columns: Columns) -> None:
-        """Take events of one chunk, and write it if they fill it."""
+        """Add events to the current chunk, and write it if it is full."""
         t = columns["events/t"]
         for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
             self._small["ms_to_idx"].add(entries)
@@ -194,28 +189,32 @@ class LiveWriter:
             self._write()
 
     def append_encoder(self, t_us: ArrayLike, angle: ArrayLike, index_t_us: ArrayLike = ()) -> None:
-        """Add encoder samples on the events' clock [us], angles unwrapped [rad], and times of index pulses [us].
+        """Append encoder samples: times on the events' clock [us], unwrapped angles [rad], and index pulses [us].
 
-        Pulses before the first sample are left out. Raises :class:`AmiwarpError` for samples that are not later than
+        Pulses before the first sample are dropped. Raises :class:`AmiwarpError` for samples that are not later than
         those before, or not finite.
         """
         self._check_open("append_encoder")
-        late = round(self._clock_offset_us)
-        t, angles = np.atleast_1d(as_times(t_us)) + late, np.atleast_1d(np.asarray(angle, np.float64))
+        offset = round(self._clock_offset_us)
+        t, angles = np.atleast_1d(as_times(t_us)) + offset, np.atleast_1d(np.asarray(angle, np.float64))
         if t.shape != angles.shape or t.ndim != 1 or not np.isfinite(angles).all():
             shapes = f"t {t.shape}, angle {angles.shape}"
-            raise AmiwarpError(f"{self.path}: encoder samples {shapes}; expected one length and finite angles")
+            raise AmiwarpError(
+                f"{self.path}: encoder samples have shapes {shapes}; expected one length and finite angles"
+            )
         if t.size:
             first, last = self._encoder_span or (int(t[0]), int(t[0]) - 1)
             if t[0] <= last or (t[1:] <= t[:-1]).any():
-                raise AmiwarpError(f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {last} us")
+                raise AmiwarpError(
+                    f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {last} us; append them in order"
+                )
             self._reserve(2 * t.nbytes)
             self._small["encoder/t"].add(t)
             self._small["encoder/angle"].add(angles)
             self._encoder_span = first, int(t[-1])
         if self._encoder_span is not None:
             first, last = self._encoder_span
-            pulses = np.append(self._pulses, as_times(index_t_us) + late)
+            pulses = np.append(self._pulses, as_times(index_t_us) + offset)
             self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
             self._pulses = pulses[pulses > last][-MOST_PULSES:]
         if sum(small.waiting_bytes for small in self._small.values()) > MOST_WAITING:
@@ -224,25 +223,29 @@ class LiveWriter:
         self.tick()
 
     def set_encoder(self, encoder: Encoder) -> None:
-        """The encoder that takes the place of all appended samples at the end."""
+        """Set the encoder that replaces all appended samples when the file is finished."""
         self._encoder = encoder
 
     def tick(self) -> None:
-        """Write what came, if it is time to: for moments in which nothing is appended."""
+        """Flush if the interval has passed. Call it while no events arrive."""
         if self._file is not None and time.monotonic() - self._flushed_at >= self._flush_s:
             with errors_name(self.path, lambda: f"after {len(self)} events"):
                 self._flush()
 
     def _check_open(self, what: str) -> None:
         if self._file is None:
-            raise AmiwarpError(f"{self.path}: {what} outside the writer's with block, or after it failed")
+            raise AmiwarpError(
+                f"{self.path}: {what} outside the writer's with block, or after it failed; use a new writer"
+            )
 
     def _as_columns(self, events: Events, inside: ArrayLike | None, extrapolated: ArrayLike | None) -> Columns:
         if len(events) and events.x.dtype != self._columns["events/x"].dtype:
             wanted = self._columns["events/x"].dtype
-            raise AmiwarpError(f"{self.path}: events come with {events.x.dtype}, it was opened for {wanted}")
+            raise AmiwarpError(f"{self.path}: events come with {events.x.dtype} coordinates; expected {wanted}")
         if (inside is not None) != self._compensated or (extrapolated is not None and not self._compensated):
-            raise AmiwarpError(f"{self.path}: compensated events come with inside, a sensor's with neither flag")
+            raise AmiwarpError(
+                f"{self.path}: compensated events come with inside; give events from a sensor without flags"
+            )
         columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
         if self._compensated:
             columns["events/inside"] = np.asarray(inside).astype(np.uint8)
@@ -252,12 +255,17 @@ class LiveWriter:
         return columns
 
     def _to_finish(self) -> int:
-        """Bytes that the file may take before it is finished: a whole chunk, and what waits."""
+        """Return the space that finishing the file may take [bytes]: one whole chunk and the waiting samples."""
         event = 19 if self._compensated else 13
-        return SPARE + event * CHUNK + event * CHUNK // 64 + sum(small.waiting_bytes for small in self._small.values())
+        return (
+            FINISH_BYTES
+            + event * CHUNK
+            + event * CHUNK // 64
+            + sum(small.waiting_bytes for small in self._small.values())
+        )
 
     def _reserve(self, extra: int = 0) -> None:
-        """Take room to finish with ``extra`` bytes more; without it the file is finished, and an error raised."""
+        """Reserve the space to finish the file and ``extra`` bytes. If there is none, finish the file and raise."""
         end = self._file.id.get_filesize() + self._to_finish() + extra
         if end <= self._reserved:
             return
@@ -265,18 +273,18 @@ class LiveWriter:
             allocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
         except OSError as error:
             self._finish(tidy=False)
-            what = f"{error.strerror} after {len(self)} events; it holds these"
+            what = f"{error.strerror} after {len(self)} events, which the file holds"
             raise AmiwarpError(f"{self.path}: {what}; make room, or write to another disk") from error
         self._reserved = end
 
     def _write(self) -> None:
-        """Write the pending events, from their chunk's beginning; a whole chunk is done with then."""
+        """Write the pending events of the current chunk. Start a new chunk if it is full."""
         count = self._pending_count
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
         with contextlib.closing(in_order(partial(encode, column[:count]) for column in joined.values())) as encoded:
             for name, stored in zip(joined, encoded, strict=True):
                 append_chunk(self._columns[name], self._written, stored, count)
-        # In one go: Ctrl-C comes before or after it.
+        # One statement, so that Ctrl-C cannot interrupt it halfway.
         if count == CHUNK:
             self._written, self._pending, self._pending_count = self._written + count, [], 0
         self._pending = [joined] if self._pending_count else []
@@ -291,7 +299,7 @@ class LiveWriter:
         self._flushed_at = time.monotonic()
 
     def _finish(self, *, tidy: bool) -> None:
-        """Write the rest; the part becomes ``path``, or does a copy without what was written anew, if that is much."""
+        """Write the rest and rename the part to ``path``, or copy it there if it has many superseded chunks."""
         with errors_name(self.path, lambda: f"finishing after {len(self)} events; {self.part} holds all but the last"):
             if tidy and self._encoder is not None:
                 self._replace_encoder(self._encoder)
@@ -301,10 +309,10 @@ class LiveWriter:
             stored += sum(small.stored_bytes for small in self._small.values())
             self._close()
             with open(self.part, "r+b") as file:
-                file.seek(END_AT)
+                file.seek(END_ADDRESS_OFFSET)
                 file.truncate(int.from_bytes(file.read(8), "little"))
-            if tidy and os.path.getsize(self.part) > 2 * stored + WASTE:
-                with contextlib.suppress(AmiwarpError):  # of a full disk: the part will do
+            if tidy and os.path.getsize(self.part) > 2 * stored + MAX_WASTE_BYTES:
+                with contextlib.suppress(AmiwarpError):  # if the disk is full, the part itself is renamed
                     tidied = dataclasses.replace(open_native(self.part), metadata=self._metadata)
                     save_recording(self.path, tidied, overwrite=self._overwrite)
                     self.part.unlink()
@@ -325,8 +333,8 @@ class LiveWriter:
             file.close()
 
 
-class _Growing:
-    """A small dataset; values wait in memory until it is written."""
+class _GrowingDataset:
+    """A small dataset whose new values wait in memory until they are written."""
 
     def __init__(self, dataset: Any) -> None:
         self._dataset = dataset

@@ -1,4 +1,7 @@
-"""Reading the native HDF5 recording and the DSEC event files whose layout it extends (docs/recording-format.md)."""
+"""Reader of native HDF5 recordings, and of DSEC event files, whose layout the native format extends.
+
+The format is described in ``docs/reference/recording-format.md``.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +22,20 @@ from amiwarp.io.attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order
 from amiwarp.io.files import errors_name, register_reader
 from amiwarp.io.hdf5 import Column, Hdf5File
-from amiwarp.io.native_writer import FORMAT, FORMAT_VERSION
+from amiwarp.io.native_layout import FORMAT, FORMAT_VERSION
 from amiwarp.io.scan import smallest_sensor
+from amiwarp.optics.camera import check_size
 from amiwarp.regular_file import check_regular
 
 DSEC_SIZE = (640, 480)
-"""Size of DSEC's sensors [px]; its files do not tell."""
+"""Size of DSEC's sensors [px], which its files do not store."""
 
 
 class NativeEvents:
-    """Events of an HDF5 recording, read only where asked for. Raises :class:`AmiwarpError` for a damaged file."""
+    """Events of an HDF5 recording, read on demand. Raises :class:`AmiwarpError` for a damaged file."""
 
     def __init__(self, path: Path, file: Hdf5File) -> None:
-        """Of an ``unfinished`` file the events that are whole now are taken."""
+        """Take the events that are complete now, if the file is unfinished."""
         self.path = path
         self._file = file
         self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
@@ -40,22 +44,22 @@ class NativeEvents:
                 self._columns[name] = file.columns[f"events/{name}"]
         lengths = {name: len(column) for name, column in self._columns.items()}
         if len(set(lengths.values())) != 1 and not file.unfinished:
-            raise AmiwarpError(f"{path}: events differ in length: {lengths}; the file is damaged")
+            raise AmiwarpError(f"{path}: datasets of events differ in length: {lengths}; the file is damaged")
         self._count = min(lengths.values())
         offset = file.columns.get("t_offset")
         self._offset = 0 if offset is None else as_times(offset.read(0, 1)).item()
-        # Of an unfinished file it may end anywhere: bisection does without.
+        # The index of an unfinished file may be incomplete. Bisection is used instead.
         self._ms_to_idx = None if file.unfinished else file.columns.get("ms_to_idx")
         self._size = self._find_size()
         self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
         register_reader(self, self.path)
 
     def _find_size(self) -> tuple[int, int]:
+        """Return the stored sensor size, or else the smallest known sensor that holds all events [px]."""
         attributes = self._file.attributes("/") or {}
         if "width" in attributes and "height" in attributes:
             width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
-            if not (1 <= width <= 65536 and 1 <= height <= 65536):
-                raise AmiwarpError(f"{self.path}: size {width}x{height}; expected 1 .. 65536 pixels each way")
+            check_size(width, height, self.path)
             return width, height
         largest = [0, 0]
         for start in range(0, self._count, DEFAULT_BLOCK):
@@ -85,11 +89,11 @@ class NativeEvents:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Sensor's (width, height) [px]."""
+        """Sensor size (width, height) [px]."""
         return self._size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Events ``start <= index < stop``; they are checked as they are read. Threads may call it at once."""
+        """Return the events with ``start <= index < stop``, and check them. Threads may call it in parallel."""
         start, stop = max(start, 0), min(max(stop, start, 0), self._count)
         with errors_name(self.path, lambda: f"events {start} .. {stop}"):
             x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
@@ -99,11 +103,11 @@ class NativeEvents:
         return events
 
     def inside(self, start: int, stop: int) -> NDArray[np.bool_] | None:
-        """Of compensated events, which lie on the picture: shape ``(n,)``, or None where the file does not tell."""
+        """Return whether each compensated event lies inside the image, shape ``(n,)``, or None if not stored."""
         return self._flags("inside", start, stop)
 
     def extrapolated(self, start: int, stop: int) -> NDArray[np.bool_] | None:
-        """Of events compensated live, which had an angle beyond the encoder's samples, as :meth:`inside`."""
+        """Return whether the angle of each event was extrapolated, shape ``(n,)``, or None if not stored."""
         return self._flags("extrapolated", start, stop)
 
     def _flags(self, name: str, start: int, stop: int) -> NDArray[np.bool_] | None:
@@ -113,7 +117,7 @@ class NativeEvents:
             return np.asarray(self._read(name, max(start, 0), min(max(stop, 0), self._count)), np.bool_)
 
     def find(self, t: int) -> int:
-        """See :meth:`amiwarp.events.events.EventSource.find`; the file's millisecond index helps."""
+        """Return the index of the first event at or after ``t`` [us], found with the file's millisecond index."""
         if not self._count or t <= self.t_first:
             return 0
         if t > self.t_last:
@@ -122,20 +126,22 @@ class NativeEvents:
         at = low + int(np.searchsorted(self._times(low, high), t))
         around = self._times(at - 1, at + 1) if 0 < at < self._count else np.zeros(0, np.int64)
         if around.size != 2 or not around[0] < t <= around[1]:
-            raise AmiwarpError(f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it")
+            raise AmiwarpError(
+                f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it; the file is damaged"
+            )
         return at
 
     def between(self, t_start: int, t_end: int) -> Events:
-        """Events with ``t_start <= t < t_end`` [us]; the file's millisecond index finds them."""
+        """Return the events with ``t_start <= t < t_end`` [us], found with the file's millisecond index."""
         with errors_name(self.path, lambda: f"events between {t_start} and {t_end} us"):
             return self.slice(self.find(t_start), self.find(t_end))
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """See :meth:`amiwarp.events.events.EventSource.blocks`."""
+        """Return all events in blocks, as :meth:`amiwarp.EventSource.blocks`."""
         return regroup(self._pieces_in_order(), count=count, duration_us=duration_us)
 
     def pieces(self, count: int) -> Iterator[Callable[[], Events]]:
-        """The same, each yet to be read, by any thread; ``count`` is best a number of whole chunks."""
+        """Yield functions that read ``count`` events each, in any thread. Whole chunks are read fastest."""
         for start in range(0, self._count, count):
             yield partial(self.slice, start, start + count)
 
@@ -150,7 +156,7 @@ class NativeEvents:
         return self._columns[name].read(start, stop)
 
     def _bracket(self, t: int) -> tuple[int, int]:
-        """A short range of indices in which ``t`` falls: from the index, or by bisection without one."""
+        """Return a short range of event indices around ``t``, from the millisecond index or by bisection."""
         ms = (t - self._offset) // 1000
         if self._ms_to_idx is not None and 0 <= ms < len(self._ms_to_idx):
             ends = self._ms_to_idx.read(ms, min(ms + 2, len(self._ms_to_idx))).tolist()
@@ -165,7 +171,7 @@ class NativeEvents:
 
 
 class _StoredPoints:
-    """truth/x and truth/y as one ``(n, 2)`` array, read where asked for."""
+    """The datasets truth/x and truth/y as one ``(n, 2)`` array [px], read on demand."""
 
     def __init__(self, path: Path, file: Hdf5File) -> None:
         self._path, self._file = path, file
@@ -178,7 +184,7 @@ class _StoredPoints:
 
 
 def open_native(path: Path) -> Recording:
-    """Open a native recording or a DSEC event file. Raises :class:`AmiwarpError` for anything else."""
+    """Open a native recording or a DSEC event file. Raises :class:`AmiwarpError` for other files."""
     check_regular(path)
     with errors_name(path, lambda: "opening HDF5"):
         file = Hdf5File(path)
@@ -203,7 +209,9 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
     camera, prism = file.attributes("camera"), file.attributes("prism")
     found = None if camera is None else read_camera(camera, f"{path}: /camera")
     if found is not None and (found.width, found.height) != events.size:
-        raise AmiwarpError(f"{path}: camera is {found.width}x{found.height}, events are {events.size}; give one size")
+        raise AmiwarpError(
+            f"{path}: camera is {found.width}x{found.height}, events are {events.size}; both must have one size"
+        )
     recording = Recording(
         events=events,
         camera=found,
@@ -237,7 +245,7 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
         count = min(t.size, angle.size)
         t, angle = t[:count], angle[:count]
         index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])] if index_t is not None and count else None
-    # A live recording has room for an encoder before it is known whether there is one.
+    # A live recording has datasets for an encoder before it is known whether an encoder is connected.
     if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
         return None
     offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
@@ -251,5 +259,5 @@ def _read_truth(path: Path, file: Hdf5File, count: int) -> Truth:
         return Truth(parameters)
     x, y = (_column(file, f"truth/{name}") for name in ("x", "y"))
     if len(x) != count or len(y) != count:
-        raise AmiwarpError(f"{path}: truth has {len(x)} and {len(y)} points for {count} events")
+        raise AmiwarpError(f"{path}: truth has {len(x)} and {len(y)} points for {count} events; the file is damaged")
     return Truth(parameters, _StoredPoints(path, file))

@@ -1,10 +1,13 @@
-"""Writing the native HDF5 recording of docs/recording-format.md: streamed, in constant memory, all or nothing."""
+"""Writer of native HDF5 recordings: streams events in constant memory, and writes a whole file or none.
+
+The format is described in ``docs/reference/recording-format.md``.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -17,36 +20,67 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, check_events
 from amiwarp.events.recording import MetadataValue, Recording
-from amiwarp.io.attributes import camera_attributes, prism_attributes
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
+from amiwarp.io.copying import copy_events
 from amiwarp.io.files import errors_name
+from amiwarp.io.native_layout import (
+    Columns,
+    check_frame,
+    check_lengths,
+    chunks_of,
+    describe_columns,
+    make_dataset,
+    ms_entries,
+    write_header,
+)
 from amiwarp.io.output import NewFile
 from amiwarp.optics.camera import Camera
-from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
-FORMAT = "amiwarp-recording"
-FORMAT_VERSION = 1
-
-"""Called with the number of events done and of all, or None where that is not known."""
-
-Columns: TypeAlias = dict[str, NDArray[Any]]
-"""Events as the file has them, by the dataset's name."""
-
-Marked: TypeAlias = tuple[Events, NDArray[np.uint8]]
-"""Compensated events and, shape ``(n,)``, 1 where one lies on the picture."""
-
-MAX_MS = 100_000_000
-"""Longest recording [ms], 28 h: beyond it a timestamp is damaged, and the index would swell with it."""
+FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8]]
+"""Compensated events, and flags of shape ``(n,)``: 1 if the event lies inside the image."""
 
 
 class RecordingWriter:
-    """Streams a recording into a file that appears, whole, when the ``with`` block ends without an exception.
+    """Writer that streams a recording into a native HDF5 file.
 
-    Raises :class:`AmiwarpError` for a path that cannot be written, is being read, or exists (unless ``overwrite``), and
-    for events that are unsorted or out of the frame; then nothing is left behind.
+    Use it in a ``with`` block. The file appears under its name when the block ends without an exception. After an
+    exception nothing remains.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file to write.
+    width, height : int
+        Sensor size [px].
+    camera : Camera, optional
+        The camera, of the same size.
+    prism : Prism or UnsizedPrism, optional
+        The nominal prism.
+    encoder : Encoder, optional
+        The encoder. :meth:`set_encoder` can replace it later.
+    truth_parameters : mapping of str to float, optional
+        True parameters of a synthetic recording.
+    metadata : mapping, optional
+        Other information: text, numbers and truth values by name.
+    overwrite : bool, default False
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    AmiwarpError
+        If the path cannot be written, is being read, or exists without ``overwrite``; or if events are unsorted or
+        outside the frame.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
+    >>> with amiwarp.RecordingWriter("short.h5", width=4, height=4) as writer:
+    ...     writer.append(events)
+    >>> len(amiwarp.open_recording("short.h5").events)
+    2
     """
 
     def __init__(
@@ -90,7 +124,7 @@ class RecordingWriter:
         self._new = NewFile(self.path, overwrite=self._overwrite)
         try:
             with errors_name(self.path, lambda: "making the file"):
-                # Since HDF5 1.10 the file's structure carries checksums: damage is noticed, not followed.
+                # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
                 self._file = h5py.File(self._new.part, "x", libver=("v110", "v110"))
                 self._write_header()
         except BaseException:
@@ -121,13 +155,26 @@ class RecordingWriter:
         inside: ArrayLike | None = None,
         extrapolated: ArrayLike | None = None,
     ) -> None:
-        """Add events, with their scene points ``(n, 2)`` [px] and their flags ``(n,)`` where the first call had them.
+        """Append events. All calls must give the same optional arrays.
 
-        ``inside`` tells of compensated (float32) events whether they still lie on the picture; NaN needs it.
-        ``extrapolated`` tells whether the prism's angle was one beyond the encoder's samples.
+        Parameters
+        ----------
+        events : Events
+            The events, not earlier than those before.
+        truth_points : array_like, optional
+            Pixels of the scene points without the prism [px], shape (n, 2).
+        inside : array_like, optional
+            For compensated events: whether each lies inside the image, shape (n,). Required if coordinates are NaN.
+        extrapolated : array_like, optional
+            For compensated events: whether the prism angle was extrapolated beyond the encoder's samples, shape (n,).
+
+        Raises
+        ------
+        AmiwarpError
+            If events are unsorted or outside the frame, or the arrays differ from those of the first call.
         """
         if self._file is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block")
+            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
         check_events(
             events,
             *self._size,
@@ -147,21 +194,37 @@ class RecordingWriter:
             self._flush(whole=self._pending_count - self._pending_count % CHUNK)
 
     def fill(
-        self, pieces: Iterable[Callable[[], Marked]], *, t_first: int, done: Callable[[Events, NDArray[np.uint8]], None]
+        self,
+        pieces: Iterable[Callable[[], FlaggedEvents]],
+        *,
+        t_first: int,
+        done: Callable[[Events, NDArray[np.uint8]], None],
     ) -> None:
-        """Write a whole recording, the first event at ``t_first`` [us], piece by piece, made on all cores.
+        """Write a whole recording of compensated events, with pieces computed in parallel on all cores.
 
-        Threads call the pieces, each of whole chunks (the last one may end within), and encode what they return.
-        ``done`` sees it, once it is written, in order and in the calling thread.
+        Parameters
+        ----------
+        pieces : iterable of callable
+            Functions that return events and their ``inside`` flags, in order. Threads call them. Each piece except the
+            last must hold whole chunks.
+        t_first : int
+            Time of the first event [us].
+        done : callable
+            Called with each written piece, in order and in the calling thread.
+
+        Raises
+        ------
+        AmiwarpError
+            If other events were written before, or events are unsorted or outside the frame.
         """
         if self._file is None or len(self):
             raise AmiwarpError(f"{self.path}: fill outside the writer's with block or after other events")
         self._t_offset = t_first
-        with contextlib.closing(in_order(partial(self._made, piece) for piece in pieces)) as made:
-            for events, inside, columns, encoded in made:
+        with contextlib.closing(in_order(partial(self._compute, piece) for piece in pieces)) as computed:
+            for events, inside, columns, encoded in computed:
                 with errors_name(self.path, lambda: f"after {len(self)} events"):
                     if self._written % CHUNK:
-                        raise AmiwarpError("a piece that is not the last ends within a chunk")
+                        raise AmiwarpError("a piece before the last ends within a chunk; give whole chunks")
                     check_events(events, *self._size, where=str(self.path), first_index=len(self), allow_nan=True,
                                  after_t=self._t_last)  # fmt: skip
                     self._index(events.t)
@@ -169,15 +232,21 @@ class RecordingWriter:
                     self._written += len(events)
                 done(events, inside)
 
-    def _made(self, piece: Callable[[], Marked]) -> tuple[Events, NDArray[np.uint8], Columns, list[bytes]]:
-        """All that can be done of a piece on a thread of its own."""
+    def _compute(self, piece: Callable[[], FlaggedEvents]) -> tuple[Events, NDArray[np.uint8], Columns, list[bytes]]:
+        """Compute and encode a piece. Runs in a thread."""
         events, inside = piece()
         columns = {"events/x": events.x, "events/y": events.y, "events/t": events.t - self._t_offset}
         columns |= {"events/p": events.p, "events/inside": inside}
         return events, inside, columns, [encode(part) for part in chunks_of(columns)]
 
     def set_encoder(self, encoder: Encoder) -> None:
-        """Set or replace the encoder that is written at the end."""
+        """Set or replace the encoder, which is written at the end.
+
+        Parameters
+        ----------
+        encoder : Encoder
+            The encoder.
+        """
         self._encoder = encoder
 
     def _as_columns(
@@ -198,11 +267,12 @@ class RecordingWriter:
             self._columns = dtypes
             self._t_offset = int(events.t[0])
         elif dtypes != self._columns:
-            raise AmiwarpError(f"events come with {_listed(dtypes)}, those before with {_listed(self._columns)}")
+            given = f"events come with {describe_columns(dtypes)}"
+            raise AmiwarpError(f"{given}, those before with {describe_columns(self._columns)}; give the same arrays")
         return columns
 
     def _index(self, t: NDArray[np.int64]) -> None:
-        """Extend ms_to_idx: entry m is the first event at or after m milliseconds."""
+        """Extend ms_to_idx, whose entry m is the index of the first event at or after m milliseconds."""
         for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
             self._ms.append(entries)
             self._ms_count += entries.size
@@ -216,19 +286,19 @@ class RecordingWriter:
             self._ms, self._ms_count = [], 0
 
     def _flush(self, whole: int) -> None:
-        """Write the first ``whole`` pending events; whole chunks are compressed once only."""
+        """Write the first ``whole`` pending events. Each chunk is compressed once."""
         if not whole:
             return
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
-        begun = {name: column[:whole] for name, column in joined.items()}
-        with contextlib.closing(in_order(partial(encode, part) for part in chunks_of(begun))) as encoded:
-            self._store(begun, encoded)
+        complete = {name: column[:whole] for name, column in joined.items()}
+        with contextlib.closing(in_order(partial(encode, part) for part in chunks_of(complete))) as encoded:
+            self._store(complete, encoded)
         self._written += whole
         self._pending_count -= whole
         self._pending = [{name: column[whole:] for name, column in joined.items()}] if self._pending_count else []
 
     def _store(self, columns: Columns, encoded: Iterable[bytes]) -> None:
-        """Write columns from their encoded chunks, which follow what was written before."""
+        """Append encoded chunks of columns to their datasets."""
         stored = iter(encoded)
         for name, column in columns.items():
             dataset = self._dataset(name, column.dtype)
@@ -236,7 +306,7 @@ class RecordingWriter:
                 append_chunk(dataset, self._written + at, next(stored), min(CHUNK, column.size - at))
 
     def _extend(self, name: str, values: NDArray[Any]) -> None:
-        """Add to a dataset through HDF5: for those that are small or grow by parts of chunks."""
+        """Append values to a small dataset through HDF5."""
         dataset = self._dataset(name, values.dtype)
         start = dataset.shape[0]
         dataset.resize(start + values.size, axis=0)
@@ -271,89 +341,36 @@ class RecordingWriter:
 
     def _discard(self) -> None:
         if self._file is not None:
-            # A full disk makes closing fail as well; the file goes either way.
+            # Closing fails too if the disk is full. The file is removed in any case.
             with contextlib.suppress(Exception):
                 self._file.close()
         if self._new is not None:
             self._new.discard()
 
 
-def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
-    """Raises :class:`AmiwarpError` for a size that no sensor has, or that is not the camera's."""
-    if not (1 <= width <= 65536 and 1 <= height <= 65536):
-        raise AmiwarpError(f"{path}: size {width}x{height}; expected 1 .. 65536 pixels each way")
-    if camera is not None and (camera.width, camera.height) != (width, height):
-        given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
-        raise AmiwarpError(f"{path}: {given}; give both one size")
-
-
-def check_lengths(columns: Columns, count: int) -> None:
-    """Raises :class:`AmiwarpError` for a column that has not one element per event."""
-    for name, column in columns.items():
-        if column.shape != (count,):
-            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
-
-
-def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) -> Iterator[NDArray[np.int64]]:
-    """Entries of ms_to_idx, from ``first_ms`` on, that events at ``t`` [us] tell, which follow ``before`` others."""
-    last_ms = (int(t[-1]) - t_offset) // 1000
-    if last_ms > MAX_MS:
-        span = f"{t_offset} .. {int(t[-1])} us"
-        raise AmiwarpError(f"events span {span}, beyond {MAX_MS // 3_600_000} h; a timestamp is damaged")
-    for first in range(first_ms, last_ms + 1, 1 << 20):
-        ms = np.arange(first, min(first + (1 << 20), last_ms + 1), dtype=np.int64)
-        yield np.searchsorted(t, ms * 1000 + t_offset) + before
-
-
-def chunks_of(columns: Columns) -> Iterator[NDArray[Any]]:
-    """All chunks of the first column, then of the next."""
-    for column in columns.values():
-        for at in range(0, column.size, CHUNK):
-            yield column[at : at + CHUNK]
-
-
-def _listed(columns: Mapping[str, np.dtype[Any]]) -> str:
-    return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
-
-
-def make_dataset(file: Any, name: str, dtype: Any) -> Any:
-    """A dataset without elements yet, of the native layout."""
-    import hdf5plugin
-
-    # The checksum lies on the compressed bytes: it costs nothing measurable and LZ4 alone misses most damage.
-    return file.create_dataset(
-        name,
-        shape=(0,),
-        maxshape=(None,),
-        chunks=(CHUNK,),
-        dtype=dtype,
-        fletcher32=True,
-        compression=hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
-    )
-
-
-def write_header(
-    file: Any,
-    size: tuple[int, int],
-    camera: Camera | None,
-    prism: NominalPrism | None,
-    metadata: Mapping[str, MetadataValue],
-) -> None:
-    """All that is known before the first event."""
-    file.attrs["format"] = FORMAT
-    file.attrs["format_version"] = FORMAT_VERSION
-    file.attrs["width"], file.attrs["height"] = size
-    if camera is not None:
-        file.create_group("camera").attrs.update(camera_attributes(camera))
-    if prism is not None:
-        file.create_group("prism").attrs.update(prism_attributes(prism))
-    group = file.create_group("metadata")
-    for name, item in metadata.items():
-        group.attrs[name] = item
-
-
 def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwrite: bool = False) -> None:
-    """Write a recording, block by block, with all it holds. Raises :class:`AmiwarpError` as the writer does."""
+    """Write a recording to a native HDF5 file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file to write.
+    recording : Recording
+        The recording.
+    overwrite : bool, default False
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    AmiwarpError
+        If the path cannot be written, is being read, or exists without ``overwrite``.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
+    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4))
+    >>> amiwarp.save_recording("short.h5", recording)
+    """
     source = recording.events
     width, height = source.size
     with RecordingWriter(
@@ -368,18 +385,3 @@ def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwr
         overwrite=overwrite,
     ) as writer:
         copy_events(recording, writer)
-
-
-def copy_events(recording: Recording, writer: RecordingWriter, progress: Progress | None = None) -> None:
-    """Append all events with the points and flags that belong to them."""
-    source, truth = recording.events, recording.truth
-    flags = {name: getattr(source, name, None) for name in ("inside", "extrapolated")}
-    start = 0
-    for block in source.blocks():
-        stop = start + len(block)
-        points = None if truth is None else truth.points(start, stop)
-        marks = {name: None if flag is None else flag(start, stop) for name, flag in flags.items()}
-        writer.append(block, truth_points=points, **marks)
-        start = stop
-        if progress is not None:
-            progress("writing events", start / len(source))

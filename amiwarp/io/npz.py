@@ -1,7 +1,7 @@
-"""NumPy archives with arrays x, y [px], t [us] and p (1 is ON, 0 or -1 OFF), all integers of one length.
+"""Reader of NumPy archives with the integer arrays x, y [px], t [us] and p (1 is ON, 0 or -1 is OFF).
 
-Optional numbers ``width`` and ``height`` give the sensor's size; else it is the smallest sensor in use that holds all.
-The arrays are read piece by piece: what an archive unpacks to, or says that it does, takes no memory.
+The optional numbers ``width`` and ``height`` give the sensor size. Otherwise it is the smallest known sensor that holds
+all events. Arrays are read in pieces, so that memory does not depend on the size that an archive declares.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from amiwarp.io.scan import FileEvents, Packet
 from amiwarp.regular_file import check_regular
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""What NumPy writes; other compressions may take any amount of memory."""
+"""Compression methods that NumPy writes. Others are refused, because they may take any amount of memory."""
 
 
 def open_npz(path: Path) -> Recording:
-    """Open an archive of events; its arrays are read in pieces, and anew each time if they are too large to keep."""
+    """Open an archive of events. Arrays are read in pieces, and read again for each use if too large to keep."""
     check_regular(path)
     with errors_name(path, lambda: "reading width and height"), zipfile.ZipFile(path) as archive:
         size = None
@@ -41,7 +41,7 @@ def open_npz(path: Path) -> Recording:
 
 @contextlib.contextmanager
 def _array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], tuple[int, ...], np.dtype[np.generic]]]:
-    """An array's bytes, shape and type; its header must agree with the archive's directory."""
+    """Open an array of the archive: its bytes, shape and type. Its header must agree with the archive's directory."""
     about = archive.getinfo(f"{name}.npy")
     if about.compress_type not in PACKED:
         raise AmiwarpError(f"array {name} is compressed by method {about.compress_type}; save it with numpy.savez")
@@ -51,7 +51,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], tup
         if read is None:
             raise AmiwarpError(f"array {name} has a header of version {version}; expected 1.0 or 2.0")
         shape, _, dtype = read(stream)
-        # Floating times could be seconds or microseconds: guessing wrong would go unnoticed. Objects would be pickles.
+        # Floating times could be in seconds or in microseconds. Object arrays would be unpickled, which is unsafe.
         if dtype.kind not in "iub":
             raise AmiwarpError(f"array {name} is {dtype}; expected integers (t in microseconds), no pickled objects")
         if math.prod(shape) * dtype.itemsize != about.file_size - stream.tell():
@@ -60,6 +60,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], tup
 
 
 def _number(archive: zipfile.ZipFile, name: str) -> int:
+    """Return the single number of an array."""
     with _array(archive, name) as (stream, shape, dtype):
         if math.prod(shape) != 1:
             raise AmiwarpError(f"{name} has shape {shape}; expected one number")

@@ -1,4 +1,7 @@
-"""The one place that puts files under their names: whole or not at all, over no input, over nothing else unasked."""
+"""Writing of files: each appears under its name complete or not at all.
+
+No input is overwritten, and other files only on request. All writers of the package use this module.
+"""
 
 from __future__ import annotations
 
@@ -22,33 +25,36 @@ from amiwarp.io.files import inputs_in_use, inputs_noted, same_file
 from amiwarp.regular_file import KINDS
 
 HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:32]
-"""Names the machine in the names of unfinished files: process ids mean nothing on another one."""
+"""Name of this machine, in the names of unfinished files. Process ids are valid on one machine only."""
 
 UNFINISHED = re.compile(r"\..+\.(?P<host>\w+)-(?P<pid>\d+)-[0-9a-f]{8}\.part")
-"""What the name of an unfinished file looks like."""
+"""Pattern of the names of unfinished files."""
 
 
 @dataclass
-class _Run:
-    """What one run of a command may replace."""
+class _Permissions:
+    """Files that the running command may replace."""
 
     overwrite: bool = False
+    """Whether all existing files may be replaced."""
     folders: list[Path] = field(default_factory=list)
+    """Folders whose files may be replaced."""
 
 
-_run = _Run()
+_permissions = _Permissions()
 _unfinished: set[Path] = set()
+"""Unfinished files and scratch folders of this process."""
 
 
 @contextlib.contextmanager
 def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool) -> Iterator[None]:
-    """Guard a whole command: none of its ``inputs`` is written, and what exists only if ``overwrite``.
+    """Protect files during a command: ``inputs`` are not overwritten, existing files only with ``overwrite``.
 
-    Raises :class:`AmiwarpError` at once if one of the ``outputs`` is an input, is named twice, exists or cannot be
-    written. At the end nothing unfinished is left, whatever happened.
+    Raises :class:`AmiwarpError` immediately if one of the ``outputs`` is an input, is given twice, exists or cannot be
+    written. At the end all unfinished files are removed.
     """
-    global _run
-    before, _run = _run, _Run(overwrite)
+    global _permissions
+    before, _permissions = _permissions, _Permissions(overwrite)
     try:
         with inputs_noted(inputs):
             targets: set[Path] = set()
@@ -59,26 +65,26 @@ def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool)
                 targets.add(target)
             yield
     finally:
-        _run = before
+        _permissions = before
         _discard_unfinished()
 
 
 @contextlib.contextmanager
 def own_folder(path: Path) -> Iterator[None]:
-    """Let files in a folder be replaced that holds nothing but what the same job wrote before."""
+    """Allow the replacement of files in a folder that holds only files of the same job."""
     folder = path.resolve()
-    _run.folders.append(folder)
+    _permissions.folders.append(folder)
     try:
         yield
     finally:
-        _run.folders.remove(folder)
+        _permissions.folders.remove(folder)
 
 
 def check_output(path: Path, *, overwrite: bool = False) -> Path:
-    """Return the file that writing to ``path`` makes or replaces: ``path`` itself, or what a symbolic link leads to.
+    """Return the file that writing to ``path`` creates or replaces: ``path`` itself, or the target of a symbolic link.
 
-    Raises :class:`AmiwarpError` if it is a file that is read in this run, exists and may not be replaced, is no
-    regular file, or if its folder does not exist.
+    Raises :class:`AmiwarpError` if the file is read in this run, exists and must not be replaced, or is not a regular
+    file; and if its folder does not exist or is not writable.
     """
     try:
         target = path.resolve()
@@ -86,12 +92,12 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
     except (OSError, RuntimeError) as error:  # a loop of links
         raise AmiwarpError(f"{path}: cannot be written: {_reason(error)}; give another name") from error
     if mode is not None and not stat.S_ISREG(mode):
-        what = KINDS.get(stat.S_IFMT(mode), "no regular file")
+        what = KINDS.get(stat.S_IFMT(mode), "not a regular file")
         raise AmiwarpError(f"{path}: is {what}; give the name of a file")
     if not target.parent.is_dir():
         raise AmiwarpError(f"{path}: its folder {target.parent} does not exist; make it first")
     if not os.access(target.parent, os.W_OK):
-        raise AmiwarpError(f"{path}: nothing may be written in its folder {target.parent}; choose another place")
+        raise AmiwarpError(f"{path}: its folder {target.parent} is not writable; choose another place")
     if mode is not None:
         if any(same_file(read, target) for read in inputs_in_use()):
             raise AmiwarpError(f"{path}: is read in this run and would be lost; write to another file")
@@ -101,14 +107,15 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
 
 
 def _may_replace(target: Path, overwrite: bool) -> bool:
-    return overwrite or _run.overwrite or target.parent in _run.folders
+    """Return whether an existing file may be replaced."""
+    return overwrite or _permissions.overwrite or target.parent in _permissions.folders
 
 
 class NewFile:
-    """A file that is written next to ``path`` and takes that name when it is whole.
+    """A file that is written next to ``path`` and renamed to it when it is complete.
 
-    In a ``with`` block it does so at the end, and is gone after an exception. Raises :class:`AmiwarpError` as
-    :func:`check_output` does, when it begins and once more before it takes its name.
+    A ``with`` block renames it at the end, and removes it after an exception. Raises :class:`AmiwarpError` as
+    :func:`check_output` does, at the start and again before renaming.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -117,7 +124,7 @@ class NewFile:
         target = check_output(self.path, overwrite=overwrite)
         remove_abandoned(target.parent)
         self.part = _unfinished_name(target)
-        """Where to write."""
+        """Path of the unfinished file, to which the caller writes."""
         _unfinished.add(self.part)
 
     def __enter__(self) -> NewFile:
@@ -135,17 +142,17 @@ class NewFile:
             self.discard()
 
     def commit(self) -> None:
-        """Give the file its name."""
+        """Rename the file to its final name."""
         put_in_place(self.part, self.path, overwrite=self._overwrite)
         _unfinished.discard(self.part)
 
     def discard(self) -> None:
-        """Remove what was written, if it has not got its name."""
+        """Remove the file if it is unfinished."""
         _remove(self.part)
 
 
 def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
-    """Rename ``part`` to what ``path`` leads to. Raises :class:`AmiwarpError`, and leaves it, if that may not be."""
+    """Rename ``part`` to the target of ``path``. Raises :class:`AmiwarpError` and keeps it if that is not allowed."""
     target = check_output(path, overwrite=overwrite)
     try:
         if not _may_replace(target, overwrite):
@@ -155,13 +162,13 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
             shutil.copymode(target, part)
         os.replace(part, target)
     except FileExistsError as error:
-        raise AmiwarpError(f"{path}: was made by another program meanwhile; give another name") from error
+        raise AmiwarpError(f"{path}: was created by another program meanwhile; give another name") from error
     except OSError as error:
         raise AmiwarpError(f"{path}: cannot be written: {_reason(error)}; choose another place") from error
 
 
 def _link(part: Path, target: Path) -> None:
-    """Rename without replacing: renaming itself would replace what another program made a moment ago."""
+    """Rename without replacing a file that another program has just created, which os.replace would do."""
     try:
         os.link(part, target)
     except FileExistsError:
@@ -173,7 +180,7 @@ def _link(part: Path, target: Path) -> None:
 
 
 def allocate(handle: int, start: int, count: int) -> None:
-    """Take room on the disk for bytes of a file; OSError if there is none. Systems that cannot do so are left out."""
+    """Reserve disk space for a file. Raises OSError if the disk is full. Systems without this function do nothing."""
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(handle, start, count)
@@ -184,7 +191,7 @@ def allocate(handle: int, start: int, count: int) -> None:
 
 @contextlib.contextmanager
 def scratch_folder(folder: Path) -> Iterator[Path]:
-    """Make a folder for temporary files; it is removed at the end, or by the next run if this one is killed."""
+    """Create a folder for temporary files. It is removed at the end, or by the next run if this one is killed."""
     remove_abandoned(folder.resolve())
     made = _unfinished_name(folder.resolve() / "scratch")
     _unfinished.add(made)
@@ -196,17 +203,18 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
 
 
 def _unfinished_name(target: Path) -> Path:
+    """Return a new name for the unfinished version of a file."""
     return target.with_name(f".{target.name[:40]}.{HOST}-{os.getpid()}-{secrets.token_hex(4)}.part")
 
 
 def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
-    """Write a text file, whole or not at all. Raises :class:`AmiwarpError` as :class:`NewFile` does."""
+    """Write a text file, complete or not at all. Raises :class:`AmiwarpError` as :class:`NewFile` does."""
     with NewFile(path, overwrite=overwrite) as new:
         new.part.write_text(text)
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it. Raises :class:`AmiwarpError` if that cannot be done."""
+    """Create a folder and its parents. Raises :class:`AmiwarpError` if that fails."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -215,7 +223,7 @@ def make_folder(path: Path) -> None:
 
 @cache
 def remove_abandoned(folder: Path) -> None:
-    """Remove, once a process, the unfinished files that killed processes of this machine left in ``folder``."""
+    """Remove unfinished files in ``folder`` of killed processes of this machine. Done once per process."""
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             found = UNFINISHED.fullmatch(entry.name)
@@ -224,7 +232,7 @@ def remove_abandoned(folder: Path) -> None:
 
 
 def _is_alive(pid: int) -> bool:
-    if os.name != "posix":  # asking would end the process
+    if os.name != "posix":  # on Windows, os.kill would end the process
         return True
     try:
         os.kill(pid, 0)
@@ -235,7 +243,7 @@ def _is_alive(pid: int) -> bool:
 
 @atexit.register
 def _discard_unfinished() -> None:
-    """Remove what this process, not one that it was forked from, has begun and not finished."""
+    """Remove the unfinished files of this process, but not those of a process that it was forked from."""
     for part in list(_unfinished):
         if f"-{os.getpid()}-" in part.name:
             _remove(part)
@@ -243,7 +251,7 @@ def _discard_unfinished() -> None:
 
 
 def _remove(unfinished: Path) -> None:
-    """Remove an unfinished file, or a folder of them, if it is there."""
+    """Remove an unfinished file or scratch folder, if it exists."""
     with contextlib.suppress(OSError):
         if unfinished.is_dir() and not unfinished.is_symlink():
             shutil.rmtree(unfinished)

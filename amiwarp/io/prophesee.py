@@ -1,4 +1,4 @@
-"""Prophesee's files: RAW (EVT 2.0 and 3.0) through faery, DAT by NumPy."""
+"""Readers of Prophesee's files: RAW (EVT 2.0 and 3.0) with faery, and DAT with NumPy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from amiwarp.io.scan import FileEvents, Packet
 from amiwarp.regular_file import check_regular
 
 WIDEST = (2048, 2048)
-"""What EVT's coordinates can hold [px]: for the decoder where the header tells no size, so that it refuses nothing."""
+"""Largest size that EVT coordinates can represent [px]. The decoder gets it, so that it accepts all events."""
 
 GENERATIONS = {
     "gen3": (640, 480),
@@ -28,11 +28,11 @@ GENERATIONS = {
     "gen41": (1280, 720),
     "imx636": (1280, 720),
 }
-"""Sizes by the sensor's name in headers that tell no geometry."""
+"""Sensor sizes [px] by name, for headers without a geometry."""
 
 
 def _read_header(path: Path) -> tuple[dict[str, str], int]:
-    """The ``% key value`` lines, keys in small letters, and the offset of the first byte after them."""
+    """Return the ``% key value`` lines with lower-case keys, and the offset of the first byte after them."""
     check_regular(path)
     with errors_name(path, lambda: "reading the header"), path.open("rb") as file:
         fields: dict[str, str] = {}
@@ -48,7 +48,7 @@ def _read_header(path: Path) -> tuple[dict[str, str], int]:
 
 
 def open_evt(path: Path) -> Recording:
-    """Open a RAW file. The decoder holds each time at the largest so far, without telling how often."""
+    """Open a RAW file. The decoder raises each time to the largest so far, without reporting how often."""
     fields, offset = _read_header(path)
     version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
     word = {"2.0": 4, "2": 4, "3.0": 2, "3": 2}.get(version)
@@ -62,6 +62,7 @@ def open_evt(path: Path) -> Recording:
 
 
 def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
+    """Return the sensor size of a header [px], or None if it has none."""
     if match := re.fullmatch(r"(\d+)x(\d+)", fields.get("geometry", "")):
         return int(match[1]), int(match[2])
     parts = dict(part.partition("=")[::2] for part in fields.get("format", "").split(";") if "=" in part)
@@ -74,7 +75,7 @@ def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
 
 
 def read_evt_packets(notes: dict[str, int], path: str) -> Iterator[Packet]:
-    """Decode events of a RAW file; for the reading process."""
+    """Yield packets of events of a RAW file. Runs in the reading process."""
     from faery.extension import evt
 
     notes["triggers"] = 0
@@ -87,17 +88,19 @@ def read_evt_packets(notes: dict[str, int], path: str) -> Iterator[Packet]:
 
 
 def open_dat(path: Path) -> Recording:
-    """Open a DAT file of 2D or CD events, version 1 or 2; 32-bit times that wrap around, after 71 min, run on."""
+    """Open a DAT file of 2D or CD events, version 1 or 2. Its 32-bit times, which wrap after 71 min, are unwrapped."""
     fields, offset = _read_header(path)
     with errors_name(path, lambda: "reading the header"), path.open("rb") as file:
         file.seek(offset)
         kind = file.read(2)
-    # 0x00: 2D events, 0x0c: CD events; both are 8 bytes.
+    # 0x00: 2D events; 0x0c: CD events. Both have 8 bytes.
     if len(kind) < 2 or kind[0] not in (0x00, 0x0C) or kind[1] != 8:
-        raise AmiwarpError(f"{path}: byte {offset}: {kind.hex() or 'nothing'} is not a DAT event type (0008 or 0c08)")
+        raise AmiwarpError(
+            f"{path}: byte {offset}: {kind.hex() or 'nothing'} is not a DAT event type; expected 0008 or 0c08"
+        )
     version = fields.get("version", "2")
     if version not in ("1", "2"):
-        raise AmiwarpError(f"{path}: DAT version '{version[:40]}' is not 1 or 2")
+        raise AmiwarpError(f"{path}: DAT version is '{version[:40]}'; expected 1 or 2")
     width, height = fields.get("width", ""), fields.get("height", "")
     size = (int(width), int(height)) if width.isdecimal() and height.isdecimal() else None
     events = FileEvents(path, partial(_dat_packets, path, offset + 2, version), size=size)
@@ -105,9 +108,9 @@ def open_dat(path: Path) -> Recording:
 
 
 def _dat_packets(path: Path, offset: int, version: str, notes: dict[str, int]) -> Iterator[Packet]:
-    # Bits of the second word, from Prophesee's description of the format.
+    # Bits of the second word, according to Prophesee's documentation of the format.
     bits, y_shift, p_shift = ((9, 8), 9, 17) if version == "1" else ((14, 14), 14, 28)
-    turns, last = 0, None
+    wrapped, last = 0, None
     with path.open("rb") as file:
         file.seek(offset)
         while data := file.read(8 * DEFAULT_BLOCK):
@@ -117,10 +120,10 @@ def _dat_packets(path: Path, offset: int, version: str, notes: dict[str, int]) -
             low, rest = words[:, 0].astype(np.int64), words[:, 1]
             if not low.size:
                 return
-            # A fall by more than half the range is the counter's wrap, a smaller one an event out of order.
+            # A decrease by more than half the range is a wrap of the counter. A smaller one is an event out of order.
             step = np.diff(low, prepend=low[0] if last is None else last)
-            wraps = turns + np.cumsum((step < -(1 << 31)).astype(np.int64) - (step > 1 << 31))
-            turns, last = int(wraps[-1]), int(low[-1])
+            wraps = wrapped + np.cumsum((step < -(1 << 31)).astype(np.int64) - (step > 1 << 31))
+            wrapped, last = int(wraps[-1]), int(low[-1])
             t = low + (wraps << 32)
             x = rest & ((1 << bits[0]) - 1)
             y = (rest >> y_shift) & ((1 << bits[1]) - 1)

@@ -1,9 +1,9 @@
-"""Reading files in a process of its own: a damaged file that crashes a decoder, or hangs it, costs one error.
+"""Separate process that reads files, so that a damaged file which crashes or hangs a decoder causes only an error.
 
-HDF5 with its filters and the compiled decoders of other formats follow what a file says. The process that runs them is
+HDF5 with its filters and the compiled decoders of other formats trust a file's content. The process that runs them is
 started by ``subprocess``, not ``multiprocessing``, so that a user's script is not imported again. It runs functions of
-amiwarp that return a JSON value and arrays; both travel through pipes. See :mod:`amiwarp.io.reading_server` for what
-runs in it.
+amiwarp that return a JSON value and arrays, which are sent through pipes. :mod:`amiwarp.io.reading_server` is the part
+that runs in the process.
 """
 
 from __future__ import annotations
@@ -27,27 +27,28 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 CPU_SECONDS = 30
-"""Processor time [s] of one request beyond which a decoder hangs. A busy machine does not use it up faster."""
+"""Limit of the processor time of one request [s]. Unlike elapsed time, it does not depend on the machine's load."""
 
 MEMORY_BYTES = 1 << 30
-"""Memory that one request may take beyond what the process had before it."""
+"""Limit of the additional memory of one request [bytes]."""
 
 PIPE_BYTES = 1 << 20
-"""Size of the pipe from the process, where the system lets it be set: fewer turns between writer and reader."""
+"""Size of the pipe from the process [bytes], if the system supports it. A larger pipe needs fewer process switches."""
 
 START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_server import serve; serve()"
+"""Program of the process."""
 
 
 class ReadingProcess:
-    """A process that serves one reader at a time. Not for several threads at once."""
+    """A process that serves one reader at a time. Only one thread may use it at a time."""
 
     def __init__(self) -> None:
         """Start the process. Raises :class:`OSError` if it cannot be started."""
         root = str(Path(__file__).resolve().parents[2])
-        # The module path is handed over, so that the process imports what this one does, without site's start-up time.
+        # The process gets this module path, so that it imports the same modules without the start-up time of site.
         paths = [root, *(os.path.abspath(path) for path in sys.path if path != root)]
         self.owner = os.getpid()
-        # Its own session: Ctrl-C reaches this process only, which then ends the other.
+        # A new session, so that Ctrl-C reaches only this process, which then ends the other.
         self._child = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", START, *paths],
             stdin=subprocess.PIPE,
@@ -67,16 +68,16 @@ class ReadingProcess:
 
     @property
     def usable(self) -> bool:
-        """Whether the process lives and belongs to this one, which a fork of its owner does not have."""
+        """Whether the process is alive and was started by this process. It is not usable in a fork of its owner."""
         return self.close.alive and self.owner == os.getpid() and self._child.poll() is None
 
     def call(self, function: str, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
-        """Run ``module:function`` of amiwarp; returns its JSON value and its arrays, each of shape ``(n,)``.
+        """Run ``module:function`` of amiwarp, and return its JSON value and its arrays, each of shape ``(n,)``.
 
         Raises
         ------
         AmiwarpError
-            If the function raises anything, or if the process crashes or exceeds :data:`CPU_SECONDS`.
+            If the function raises, or if the process crashes or exceeds :data:`CPU_SECONDS`.
         """
         self.send(function, *arguments)
         return self.receive()
@@ -92,7 +93,7 @@ class ReadingProcess:
             raise self._ended() from error
 
     def receive(self) -> tuple[Any, list[NDArray[Any]]]:
-        """Wait for the result of the call that was sent."""
+        """Wait for the result of the call that :meth:`send` started."""
         try:
             (length,) = struct.unpack("<I", self._fill(bytearray(4)))
             reply = json.loads(self._fill(bytearray(length)))
@@ -101,7 +102,7 @@ class ReadingProcess:
                 if array.size:
                     self._fill(array.view(np.uint8).data)
         except BaseException:
-            self.close()  # what is still in the pipe belongs to no later call
+            self.close()  # the rest of this reply must not be taken for the next one
             raise
         if "error" in reply:
             raise AmiwarpError(reply["error"])
@@ -113,17 +114,18 @@ class ReadingProcess:
         return buffer
 
     def _ended(self) -> AmiwarpError:
+        """Return the error for a process that has ended."""
         code = self._child.wait()
         self.close()
         if code == -getattr(signal, "SIGXCPU", 0):
             return AmiwarpError(f"reading took over {CPU_SECONDS} s of processor time; the file is damaged")
         if code < 0:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
-        return AmiwarpError(f"the process that reads ended with code {code}; check that '{sys.executable}' is Python")
+        return AmiwarpError(f"the reading process ended with code {code}; check that '{sys.executable}' is Python")
 
 
 def _end(child: subprocess.Popen[bytes], owner: int) -> None:
-    """End a process, which has nothing to lose; a fork of its owner leaves it alone."""
+    """Kill a process, which holds no state worth saving. A fork of its owner does nothing."""
     if owner == os.getpid():
         child.kill()
         child.wait()
@@ -133,7 +135,8 @@ def _end(child: subprocess.Popen[bytes], owner: int) -> None:
 
 
 _idle: list[ReadingProcess] = []
-_idle_lock = threading.RLock()  # the collector may run a finalizer, which gives back, at any point
+"""At most one process that waits for the next reader."""
+_idle_lock = threading.RLock()  # garbage collection may run a finalizer that gives back a process at any point
 
 
 def borrow() -> ReadingProcess:
@@ -146,7 +149,7 @@ def borrow() -> ReadingProcess:
 
 
 def give_back(process: ReadingProcess) -> None:
-    """Keep one usable process for the next reader; starting one takes some 0.3 s."""
+    """Keep the process for the next reader, or close it. Starting one takes about 0.3 s."""
     if process.usable:
         with contextlib.suppress(AmiwarpError):
             process.call("amiwarp.io.reading_server:forget")
@@ -158,7 +161,7 @@ def give_back(process: ReadingProcess) -> None:
 
 
 def run(function: str, *arguments: Any) -> Any:
-    """Run one function in a process; returns its JSON value."""
+    """Run one function in a reading process, and return its JSON value."""
     process = borrow()
     try:
         return process.call(function, *arguments)[0]
@@ -167,10 +170,10 @@ def run(function: str, *arguments: Any) -> Any:
 
 
 def packets(function: str, *arguments: Any) -> Iterator[Any]:
-    """Yield what a generator ``module:function`` yields in a process: tuples of arrays, put together to large ones.
+    """Yield the packets of a generator ``module:function`` that runs in a reading process.
 
-    The process decodes one packet ahead. The last argument is a dictionary of counts; it is updated from the one that
-    the generator is given first.
+    A packet is a tuple of arrays. Small packets are joined to larger ones. The process decodes one packet ahead. The
+    last argument is a dictionary of counts, which is updated from the dictionary that the generator gets first.
     """
     *given, notes = arguments
     process = borrow()

@@ -1,4 +1,4 @@
-"""What runs in the process of :mod:`amiwarp.io.reading_process`: it reads requests, runs functions, sends results."""
+"""Server in the process of :mod:`amiwarp.io.reading_process`: reads requests, runs functions and sends results."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 PACKET = 1 << 17
-"""Events that are put together before they are sent."""
+"""Number of events that are joined to one packet before it is sent."""
 
 Reply = tuple[Any, list[NDArray[Any]]]
 """A JSON value and arrays of shape ``(n,)``."""
 
 _state: dict[str, Any] = {}
+"""Values that are kept between requests."""
 
 
 def serve() -> None:
-    """Serve requests until the other side closes its pipe or dies."""
+    """Serve requests until the other process closes its pipe or ends."""
     requests = sys.stdin.buffer
     replies = os.fdopen(os.dup(1), "wb")
-    # What a library prints must not get between the replies.
+    # Text that a library prints must not mix with the replies.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     with contextlib.suppress(BrokenPipeError):
         while line := requests.readline():
@@ -45,6 +46,7 @@ def serve() -> None:
 
 
 def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Run the function of a request, and return its result or its error."""
     module, _, name = request["function"].partition(":")
     try:
         result, arrays = getattr(importlib.import_module(module), name)(*request["arguments"])
@@ -54,12 +56,12 @@ def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]
         return {"error": str(error)}, []
     except MemoryError:
         return {"error": f"needs over {request['memory_bytes'] >> 20} MiB of memory at once; the file is damaged"}, []
-    except BaseException as error:  # panics of compiled decoders derive from it only
+    except BaseException as error:  # panics of compiled decoders derive from BaseException
         return {"error": " ".join(str(error).split())[:300] or type(error).__name__}, []
 
 
 def _limit(cpu_s: int, memory_bytes: int) -> None:
-    """Limit what one request may use; on systems without such limits it may use anything."""
+    """Limit processor time and memory of one request, if the system supports it."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -76,17 +78,17 @@ def _limit(cpu_s: int, memory_bytes: int) -> None:
 
 
 def keep(name: str, value: Any) -> None:
-    """Keep a value between requests, until :func:`forget`."""
+    """Keep a value between requests, until :func:`forget` is called."""
     _state[name] = value
 
 
 def kept(name: str) -> Any:
-    """Return a value that was kept."""
+    """Return a value that :func:`keep` stored."""
     return _state[name]
 
 
 def forget() -> Reply:
-    """Close and drop all that was kept for a reader."""
+    """Close and drop all values that were kept for a reader."""
     for value in _state.values():
         with contextlib.suppress(Exception):
             value.close()
@@ -95,7 +97,7 @@ def forget() -> Reply:
 
 
 def begin(function: str, *arguments: Any) -> Reply:
-    """Start a generator of packets; it is given a dictionary for counts first."""
+    """Start a generator of packets. Its first argument is a dictionary for counts."""
     module, _, name = function.partition(":")
     notes: dict[str, int] = {}
     keep("notes", notes)
@@ -104,15 +106,15 @@ def begin(function: str, *arguments: Any) -> Reply:
 
 
 def advance() -> Reply:
-    """Return the counts and the next packets put together; no array at the end."""
+    """Return the counts and the next packets, joined. At the end there are no arrays."""
     found: list[tuple[NDArray[Any], ...]] = []
-    for packet in _some(kept("packets")):
+    for packet in _next_packets(kept("packets")):
         found.append(packet)
     return kept("notes"), [np.concatenate(parts) for parts in zip(*found, strict=True)]
 
 
-def _some(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[NDArray[Any], ...]]:
-    """Yield packets until there are :data:`PACKET` events; a single packet may hold more."""
+def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield packets until they hold at least :data:`PACKET` events."""
     count = 0
     for packet in source:
         count += len(packet[0])

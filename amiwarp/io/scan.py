@@ -1,8 +1,8 @@
-"""Files without an index as event sources: one pass to count, check and repair, then packets again for every reading.
+"""Event source for files without an index: a first pass counts, checks and repairs, and every use reads again.
 
-Two faults that real recordings have are repaired and counted, in each format alike: an event earlier than one before it
-is moved to the largest time so far, an event outside the frame is dropped. Where over 1 % of the events need either,
-the file is refused: then the format, the size or the order is wrong, not the event.
+Two faults of real recordings are repaired and counted, in all formats alike. An event that is earlier than one before
+it is moved to the largest time so far. An event outside the frame is dropped. If more than 1 % of the events have one
+of these faults, the file is refused, because then its format, size or order must be wrong.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, regroup
 from amiwarp.io.files import errors_name, register_reader
+from amiwarp.optics.camera import LARGEST_SIZE, check_size
 
 Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
-"""x, y [px], t [us] and p (non-zero is ON) as the file has them, integers or booleans of one shape ``(n,)``."""
+"""Arrays x, y [px], t [us] and p (ON if positive) as stored in the file: integers or booleans of one shape ``(n,)``."""
 
-KEEP = 1 << 22
-"""Recordings of up to so many events (55 MB) stay in memory after the first pass."""
+KEEP_EVENTS = 1 << 22
+"""Largest recording that stays in memory after the first pass [events], 55 MB."""
 
 SENSORS = ((128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480), (1280, 720))
-"""Sizes of sensors in use, for files that do not tell theirs."""
+"""Sizes of known sensors [px], for files without a size."""
 
 
 def smallest_sensor(x_max: int, y_max: int) -> tuple[int, int]:
-    """Size of the smallest sensor in use that has pixel (x_max, y_max), or that pixel's own frame beyond them."""
+    """Return the size of the smallest known sensor with pixel (x_max, y_max), or the smallest frame that holds it."""
     for width, height in SENSORS:
         if x_max < width and y_max < height:
             return width, height
@@ -38,28 +39,36 @@ def smallest_sensor(x_max: int, y_max: int) -> tuple[int, int]:
 
 
 @dataclass(slots=True)
-class Tally:
-    """What a pass over a file has met so far."""
+class PassCounts:
+    """Counts of a pass over a file so far."""
 
     count: int = 0
+    """Events that were kept."""
     t_first: int = 0
+    """Time of the first event [us]."""
     t_last: int = 0
+    """Time of the latest event [us]."""
     x_max: int = 0
+    """Largest column [px]."""
     y_max: int = 0
+    """Largest row [px]."""
     late: int = 0
+    """Events that were out of order and moved to a later time."""
     outside: int = 0
+    """Events outside the frame, which were dropped."""
     notes: dict[str, int] = field(default_factory=dict)
+    """Other findings of the format's reader, by name."""
 
-    def place(self) -> str:
-        """Where the pass is, for a message."""
+    def position(self) -> str:
+        """Return the current position of the pass, for messages."""
         return f"after {self.count} events (t = {self.t_last} us)" if self.count else "before the first event"
 
 
 class FileEvents:
-    """Events of a file that can only be read from its beginning; opening it makes the first pass.
+    """Events of a file that can be read only from its beginning. The constructor makes the first pass.
 
-    ``slice`` and ``between`` of more than :data:`KEEP` events scan the file each time; converting it once to the native
-    format makes them fast. Raises :class:`AmiwarpError` for a damaged file and for one without events.
+    If the file has more than :data:`KEEP_EVENTS` events, every ``slice`` and ``between`` reads it again. Conversion to
+    the native format makes them fast. Raises :class:`AmiwarpError` for a damaged file and for one without events.
     """
 
     def __init__(
@@ -69,60 +78,61 @@ class FileEvents:
         *,
         size: tuple[int, int] | None,
     ) -> None:
-        """``packets`` starts a new pass and counts oddities into the dictionary given; ``size`` None is found out."""
-        if size is not None and not (1 <= size[0] <= 65536 and 1 <= size[1] <= 65536):
-            raise AmiwarpError(f"{path}: tells a size of {size[0]}x{size[1]}; expected 1 .. 65536 pixels each way")
+        """Make the first pass. ``packets`` starts a pass and gets a dictionary for counts. ``size`` may be unknown."""
+        if size is not None:
+            check_size(*size, path)
         self.path = path
         self._packets = packets
         self._size = size
         self.size_is_known = size is not None
-        """Whether the file told the sensor's size; else it is the smallest in use that holds all events."""
+        """Whether the file stores the sensor size. Otherwise the smallest known sensor with all events is taken."""
         self._kept: list[Events] | None = []
-        self._tally = Tally()
-        for block in self._pass(self._tally):
+        self._counts = PassCounts()
+        for block in self._pass(self._counts):
             if self._kept is not None:
                 self._kept.append(block)
-                self._kept = self._kept if self._tally.count <= KEEP else None
-        self._judge()
-        self._size = size or smallest_sensor(self._tally.x_max, self._tally.y_max)
+                self._kept = self._kept if self._counts.count <= KEEP_EVENTS else None
+        self._check_counts()
+        self._size = size or smallest_sensor(self._counts.x_max, self._counts.y_max)
         register_reader(self, self.path)
 
-    def _judge(self) -> None:
-        tally = self._tally
-        for bad, what in ((tally.outside, f"lie outside the frame {self._size}"), (tally.late, "are out of order")):
-            if bad * 100 > tally.count + tally.outside:
-                total = tally.count + tally.outside
+    def _check_counts(self) -> None:
+        """Raise :class:`AmiwarpError` for too many faulty events, and for none at all."""
+        counts = self._counts
+        for bad, what in ((counts.outside, f"lie outside the frame {self._size}"), (counts.late, "are out of order")):
+            if bad * 100 > counts.count + counts.outside:
+                total = counts.count + counts.outside
                 raise AmiwarpError(f"{self.path}: {bad} of {total} events {what}; the file is damaged or mislabelled")
-        if not tally.count:
-            raise AmiwarpError(f"{self.path}: holds no events")
+        if not counts.count:
+            raise AmiwarpError(f"{self.path}: holds no events; give another recording")
 
     @property
     def repairs(self) -> dict[str, int]:
-        """Counts of what was repaired or noticed, by name; nothing where there was nothing."""
-        counts = {"repaired_time_events": self._tally.late, "dropped_outside_events": self._tally.outside}
-        return {name: count for name, count in {**counts, **self._tally.notes}.items() if count}
+        """Number of repairs and other findings by name, without zeros."""
+        repairs = {"repaired_time_events": self._counts.late, "dropped_outside_events": self._counts.outside}
+        return {name: count for name, count in {**repairs, **self._counts.notes}.items() if count}
 
     def __len__(self) -> int:
-        return self._tally.count
+        return self._counts.count
 
     @property
     def t_first(self) -> int:
         """Time of the first event [us]."""
-        return self._tally.t_first
+        return self._counts.t_first
 
     @property
     def t_last(self) -> int:
         """Time of the last event [us]."""
-        return self._tally.t_last
+        return self._counts.t_last
 
     @property
     def size(self) -> tuple[int, int]:
-        """Sensor's (width, height) [px]."""
+        """Sensor size (width, height) [px]."""
         assert self._size is not None
         return self._size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Events ``start <= index < stop``."""
+        """Return the events with ``start <= index < stop``."""
         found: list[Events] = []
         seen = 0
         for block in self._all():
@@ -133,7 +143,7 @@ class FileEvents:
         return Events.concatenate([block for block in found if len(block)])
 
     def find(self, t: int) -> int:
-        """See :meth:`amiwarp.events.events.EventSource.find`."""
+        """Return the index of the first event at or after ``t`` [us]."""
         seen = 0
         for block in self._all():
             if block.t[-1] >= t:
@@ -142,7 +152,7 @@ class FileEvents:
         return seen
 
     def between(self, t_start: int, t_end: int) -> Events:
-        """Events with ``t_start <= t < t_end`` [us]."""
+        """Return the events with ``t_start <= t < t_end`` [us]."""
         found: list[Events] = []
         for block in self._all():
             if block.t[0] >= t_end:
@@ -153,36 +163,36 @@ class FileEvents:
         return Events.concatenate(found)
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """See :meth:`amiwarp.events.events.EventSource.blocks`."""
+        """Return all events in blocks, as :meth:`amiwarp.EventSource.blocks`."""
         return regroup(self._all(), count=count, duration_us=duration_us)
 
     def _all(self) -> Iterator[Events]:
-        return iter(self._kept) if self._kept is not None else self._pass(Tally())
+        return iter(self._kept) if self._kept is not None else self._pass(PassCounts())
 
-    def _pass(self, tally: Tally) -> Iterator[Events]:
-        with errors_name(self.path, tally.place):
-            for packet in self._packets(tally.notes):
-                # Cut large packets, so that one array of a whole file still goes through in bounded copies.
+    def _pass(self, counts: PassCounts) -> Iterator[Events]:
+        with errors_name(self.path, counts.position):
+            for packet in self._packets(counts.notes):
+                # Large packets are cut, so that copies stay small even if one packet holds the whole file.
                 for start in range(0, len(packet[2]), DEFAULT_BLOCK):
                     x, y, t, p = (array[start : start + DEFAULT_BLOCK] for array in packet)
-                    block = self._repair(x, y, t, p, tally)
+                    block = self._repair(x, y, t, p, counts)
                     if len(block):
                         yield block
 
-    def _repair(self, x: NDArray[Any], y: NDArray[Any], t: NDArray[Any], p: NDArray[Any], tally: Tally) -> Events:
-        # Sensors' pixels fit 16 bits: anything else would wrap around when stored.
-        width, height = self._size or (65536, 65536)
+    def _repair(self, x: NDArray[Any], y: NDArray[Any], t: NDArray[Any], p: NDArray[Any], counts: PassCounts) -> Events:
+        # Sensor coordinates are uint16. Larger values would wrap around.
+        width, height = self._size or (LARGEST_SIZE, LARGEST_SIZE)
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         if not inside.all():
-            tally.outside += int(inside.size - np.count_nonzero(inside))
+            counts.outside += int(inside.size - np.count_nonzero(inside))
             x, y, t, p = x[inside], y[inside], t[inside], p[inside]
         if not t.size:
             return Events.empty()
         times = as_times(t)
-        floor = tally.t_last if tally.count else int(times[0])
+        floor = counts.t_last if counts.count else int(times[0])
         ordered = np.maximum(np.maximum.accumulate(times), floor)
-        tally.late += int(np.count_nonzero(ordered != times))
-        tally.t_first = tally.t_first if tally.count else int(ordered[0])
-        tally.t_last, tally.count = int(ordered[-1]), tally.count + ordered.size
-        tally.x_max, tally.y_max = max(tally.x_max, int(x.max())), max(tally.y_max, int(y.max()))
+        counts.late += int(np.count_nonzero(ordered != times))
+        counts.t_first = counts.t_first if counts.count else int(ordered[0])
+        counts.t_last, counts.count = int(ordered[-1]), counts.count + ordered.size
+        counts.x_max, counts.y_max = max(counts.x_max, int(x.max())), max(counts.y_max, int(y.max()))
         return Events(x.astype(np.uint16), y.astype(np.uint16), ordered, (p > 0).astype(np.uint8))

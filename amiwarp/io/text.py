@@ -1,8 +1,8 @@
-"""Text of the Event Camera Dataset: one event per line, ``t x y p``, t in seconds, p 1 or 0.
+"""Reader of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
 
-A first line ``width height`` gives the sensor's size, as some exporters write it. Without one it is the smallest sensor
-in use that holds all events (240x180 for that data set). A ``calib.txt`` beside the file gives the camera:
-``fx fy cx cy k1 k2 p1 p2 k3``. Empty lines and those with ``#`` in front are passed over.
+A first line ``width height``, which some exporters write, gives the sensor size. Otherwise it is that of the smallest
+known sensor that holds all events (240x180 for that dataset). A ``calib.txt`` in the same folder gives the camera as
+``fx fy cx cy k1 k2 p1 p2 k3``. Empty lines and lines that start with ``#`` are ignored.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from amiwarp.optics.lens import RadialTangential
 from amiwarp.regular_file import check_regular
 
 READ_BYTES = 1 << 22
-"""Text that is parsed at once: some 200,000 events."""
+"""Amount of text that is parsed at once [bytes]: about 200,000 events."""
 
 LONGEST_LINE = 1000
-"""Characters beyond which a line is none of an event."""
+"""Longest line that is accepted [characters]."""
 
 
 def open_text(path: Path) -> Recording:
-    """Open a text recording, with the camera of the ``calib.txt`` beside it where there is one."""
+    """Open a text recording, with the camera of ``calib.txt`` in the same folder if that file exists."""
     check_regular(path)
     with errors_name(path, lambda: "line 1"), path.open("rb") as file:
         size, _ = _read_size(path, file)
@@ -42,7 +42,7 @@ def open_text(path: Path) -> Recording:
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
-    """The camera of a ``calib.txt``. Raises :class:`AmiwarpError` where it does not hold nine finite numbers."""
+    """Return the camera of a ``calib.txt``. Raises :class:`AmiwarpError` unless it holds nine finite numbers."""
     note_input(path)
     check_regular(path)
     with errors_name(path, lambda: "reading the calibration"):
@@ -56,7 +56,7 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
 
 
 def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]:
-    """The size in a first line of two numbers and the number of lines it took; the file is left after it."""
+    """Return the size from a first line of two numbers, and the number of lines read; else None and 0."""
     words = file.readline(LONGEST_LINE).split()
     if len(words) != 2:
         file.seek(0)
@@ -84,6 +84,7 @@ def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
 
 
 def _parse(path: Path, lines: list[bytes], line_number: int) -> Packet:
+    """Return the events of some lines that follow line ``line_number``."""
     kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
     if not kept:
         nothing = np.zeros(0, np.int64)
@@ -93,19 +94,23 @@ def _parse(path: Path, lines: list[bytes], line_number: int) -> Packet:
     except ValueError:
         table = np.zeros((0, 0))
     if table.shape != (len(kept), 4) or not _plausible(table).all():
-        raise AmiwarpError(f"{path}: {_first_bad(lines, line_number)}; expected 't x y p' with t in seconds, p 0 or 1")
+        raise AmiwarpError(
+            f"{path}: {_first_bad_line(lines, line_number)}; expected 't x y p' with t in seconds, p 0 or 1"
+        )
     t, x, y, p = table.T
     return x.astype(np.int64), y.astype(np.int64), np.rint(t * 1e6).astype(np.int64), p.astype(np.int64)
 
 
 def _plausible(table: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which rows ``t x y p`` hold usable numbers."""
     t, x, y, p = table.T
-    # Pixels are whole and fit 32 bits (those outside the frame are dropped later); NaN fails every comparison.
+    # Pixels must be whole and fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
     whole: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31) & (np.floor(x) == x) & (np.floor(y) == y)
     return np.asarray((np.abs(t) < 2**62 / 1e6) & whole & ((p == 0) | (p == 1) | (p == -1)))
 
 
-def _first_bad(lines: list[bytes], line_number: int) -> str:
+def _first_bad_line(lines: list[bytes], line_number: int) -> str:
+    """Describe the first line that does not hold an event."""
     for number, line in enumerate(lines, line_number + 1):
         if not line.strip() or line.lstrip().startswith(b"#"):
             continue

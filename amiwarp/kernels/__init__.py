@@ -1,1 +1,1 @@
-"""Private: Warp structs, device functions and kernels. Users call the modules above, never these."""
+"""Warp structs, device functions and kernels. Private: users call the modules of the rooms above."""

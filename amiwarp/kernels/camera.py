@@ -1,4 +1,4 @@
-"""Device side of the camera: pixel to bearing and back, with OpenCV's two distortion models."""
+"""Camera on the device: pixel to unit bearing and back, with OpenCV's two distortion models."""
 
 import warp as wp
 
@@ -9,13 +9,15 @@ RADIAL_TANGENTIAL = wp.constant(1)
 FISHEYE = wp.constant(2)
 
 NEWTON_STEPS = wp.constant(12)
-RESIDUAL = wp.constant(1.0e-6)  # of a converged inverse, relative to 1 + radius: 1e-3 px at f = 1000 px
+LARGEST_RESIDUAL = wp.constant(
+    1.0e-6
+)  # largest error of a converged inverse relative to 1 + radius: 1e-3 px at f = 1000 px
 NAN = wp.constant(float("nan"))
 
 
 @wp.struct
 class CameraParams:
-    """A camera on the device. ``k`` holds k1 k2 p1 p2 k3 (radial-tangential) or k1 .. k4 (fisheye)."""
+    """Camera parameters. ``k`` holds k1 k2 p1 p2 k3 (radial-tangential) or k1 .. k4 (fisheye)."""
 
     fx: float
     fy: float
@@ -25,13 +27,13 @@ class CameraParams:
     height: int
     kind: int
     k: wp.types.vector(length=5, dtype=float)
-    limit: float  # largest tan (radial-tangential) or angle (fisheye) up to which the distortion is one-to-one
-    rays: wp.array2d(dtype=wp.vec3)  # bearing of each pixel centre; NaN where there is none; empty for a pinhole
+    limit: float  # largest tangent (radial-tangential) or angle (fisheye) with one-to-one distortion
+    rays: wp.array2d(dtype=wp.vec3)  # bearing of each pixel centre, NaN if invalid; empty for a pinhole
 
 
 @wp.struct
 class PinholeParams:
-    """A camera without distortion, for kernels without branches."""
+    """Camera without distortion, for kernels without branches. All values in [px], the inverses in [1/px]."""
 
     fx: float
     fy: float
@@ -43,17 +45,19 @@ class PinholeParams:
 
 @wp.func
 def invalid_pixel() -> wp.vec2:
+    """Return the invalid pixel, NaN."""
     return wp.vec2(NAN, NAN)
 
 
 @wp.func
 def invalid_ray() -> wp.vec3:
+    """Return the invalid bearing, NaN."""
     return wp.vec3(NAN, NAN, NAN)
 
 
 @wp.func
 def distort_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.vec2:
-    """OpenCV's model: normalised (tan) coordinates, undistorted to distorted."""
+    """Distort normalised (tangent) coordinates by OpenCV's radial-tangential model."""
     r2 = wp.dot(p, p)
     radial = 1.0 + r2 * (c.k[0] + r2 * (c.k[1] + r2 * c.k[4]))
     x = p[0] * radial + 2.0 * c.k[2] * p[0] * p[1] + c.k[3] * (r2 + 2.0 * p[0] * p[0])
@@ -63,6 +67,7 @@ def distort_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.vec2:
 
 @wp.func
 def jacobian_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.mat22:
+    """Return the Jacobian of :func:`distort_radial_tangential`."""
     r2 = wp.dot(p, p)
     radial = 1.0 + r2 * (c.k[0] + r2 * (c.k[1] + r2 * c.k[4]))
     slope = 2.0 * (c.k[0] + r2 * (2.0 * c.k[1] + r2 * 3.0 * c.k[4]))
@@ -74,39 +79,45 @@ def jacobian_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.mat22:
 
 @wp.func
 def undistort_radial_tangential(c: CameraParams, d: wp.vec2) -> wp.vec3:
-    """Newton's method from the distorted point; invalid where it does not converge inside the one-to-one disc."""
+    """Return the unit bearing of a distorted point, by Newton's method.
+
+    The result is invalid if the method does not converge inside the disc in which the distortion is one-to-one.
+    """
     p = d
     if wp.length(p) > 0.9 * c.limit:
         p = p * (0.9 * c.limit / wp.length(p))
     for _ in range(NEWTON_STEPS):
         p = p - wp.inverse(jacobian_radial_tangential(c, p)) * (distort_radial_tangential(c, p) - d)
     error = wp.length(distort_radial_tangential(c, p) - d)
-    if not (error < RESIDUAL * (1.0 + wp.length(d)) and wp.length(p) <= c.limit):
+    if not (error < LARGEST_RESIDUAL * (1.0 + wp.length(d)) and wp.length(p) <= c.limit):
         return invalid_ray()
     return wp.normalize(wp.vec3(p[0], p[1], 1.0))
 
 
 @wp.func
 def fisheye_radius(c: CameraParams, angle: float) -> float:
+    """Return the distorted radius of an angle [rad] from the optical axis."""
     a2 = angle * angle
     return angle * (1.0 + a2 * (c.k[0] + a2 * (c.k[1] + a2 * (c.k[2] + a2 * c.k[3]))))
 
 
 @wp.func
 def fisheye_slope(c: CameraParams, angle: float) -> float:
+    """Return the derivative of :func:`fisheye_radius`."""
     a2 = angle * angle
     return 1.0 + a2 * (3.0 * c.k[0] + a2 * (5.0 * c.k[1] + a2 * (7.0 * c.k[2] + a2 * 9.0 * c.k[3])))
 
 
 @wp.func
 def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
+    """Return the unit bearing of a distorted point of a fisheye, by Newton's method."""
     radius = wp.length(d)
     if radius < 1.0e-8:
         return wp.normalize(wp.vec3(d[0], d[1], 1.0))
     angle = wp.min(radius, 0.9 * c.limit)
     for _ in range(NEWTON_STEPS):
         angle = wp.clamp(angle - (fisheye_radius(c, angle) - radius) / fisheye_slope(c, angle), 0.0, c.limit)
-    if not (wp.abs(fisheye_radius(c, angle) - radius) < RESIDUAL * (1.0 + radius)):
+    if not (wp.abs(fisheye_radius(c, angle) - radius) < LARGEST_RESIDUAL * (1.0 + radius)):
         return invalid_ray()
     s = wp.sin(angle) / radius
     return wp.vec3(s * d[0], s * d[1], wp.cos(angle))
@@ -114,19 +125,19 @@ def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
 
 @wp.func
 def solve_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
-    """Pixel to unit bearing, computed afresh (no table)."""
+    """Return the unit bearing of a pixel, computed without the table."""
     d = wp.vec2((xy[0] - c.cx) / c.fx, (xy[1] - c.cy) / c.fy)
     if c.kind == RADIAL_TANGENTIAL:
         return undistort_radial_tangential(c, d)
     if c.kind == FISHEYE:
         return undistort_fisheye(c, d)
     ray = wp.vec3(d[0], d[1], 1.0)
-    return ray / wp.length(ray)  # wp.normalize would make a broken pixel's ray zero, not NaN
+    return ray / wp.length(ray)  # wp.normalize would return zero, not NaN, for a NaN pixel
 
 
 @wp.func
 def pixel_to_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
-    """Pixel to unit bearing; whole pixels of a distorted camera come from its table. Invalid: NaN."""
+    """Return the unit bearing of a pixel, NaN if invalid; whole pixels of a distorted camera use its table."""
     if c.kind != PINHOLE:
         col = int(xy[0])
         row = int(xy[1])
@@ -138,7 +149,7 @@ def pixel_to_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
 
 @wp.func
 def distort_fisheye(c: CameraParams, ray: wp.vec3) -> wp.vec2:
-    """OpenCV's fisheye model: bearing to distorted normalised coordinates; invalid past its fold."""
+    """Return distorted normalised coordinates by OpenCV's fisheye model; invalid beyond the fold."""
     r = wp.length(wp.vec2(ray[0], ray[1]))
     angle = wp.atan2(r, ray[2])
     if angle > c.limit:
@@ -150,7 +161,7 @@ def distort_fisheye(c: CameraParams, ray: wp.vec3) -> wp.vec2:
 
 @wp.func
 def ray_to_pixel(c: CameraParams, ray: wp.vec3) -> wp.vec2:
-    """Bearing to pixel. Invalid (NaN): behind the image plane, or past where the distortion folds back."""
+    """Return the pixel of a bearing; NaN behind the image plane or where the distortion folds back."""
     if not (ray[2] > 1.0e-6 and wp.isfinite(ray)):
         return invalid_pixel()
     p = wp.vec2(ray[0] / ray[2], ray[1] / ray[2])
@@ -165,28 +176,31 @@ def ray_to_pixel(c: CameraParams, ray: wp.vec3) -> wp.vec2:
 
 @wp.kernel
 def fill_rays(c: CameraParams, rays: wp.array2d(dtype=wp.vec3)):
+    """Fill the camera's table of bearings."""
     row, col = wp.tid()
     rays[row, col] = solve_ray(c, wp.vec2(float(col), float(row)))
 
 
 @wp.kernel
 def pixels_to_rays(c: CameraParams, xy: wp.array(dtype=wp.vec2), start: int, rays: wp.array(dtype=wp.vec3)):
+    """Compute the unit bearing of one pixel per thread."""
     i = start + wp.tid()
     rays[i] = pixel_to_ray(c, xy[i])
 
 
 @wp.kernel
 def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), start: int, xy: wp.array(dtype=wp.vec2)):
+    """Compute the pixel of one bearing per thread."""
     i = start + wp.tid()
     xy[i] = ray_to_pixel(c, rays[i])
 
 
-# -- the camera's own rotation
+# -- rotation of the camera
 
 
 @wp.struct
 class CameraRotationParams:
-    """Angular velocity at time 0 [rad/s], and its acceleration [rad/s²]."""
+    """Angular velocity at time 0 [rad/s] and angular acceleration [rad/s²]."""
 
     velocity: wp.vec3
     acceleration: wp.vec3
@@ -194,7 +208,7 @@ class CameraRotationParams:
 
 @wp.func
 def turn_back(camera: CameraParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float) -> wp.vec2:
-    """The pixel at time 0 of the scene point that is at ``xy`` at ``time`` [s]."""
+    """Return the pixel that the scene point seen at ``xy`` at ``time`` [s] has at time 0."""
     rotation = camera_rotation.velocity * time + camera_rotation.acceleration * (0.5 * time * time)
     angle = wp.length(rotation)
     if angle < 1.0e-9:

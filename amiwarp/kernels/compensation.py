@@ -1,11 +1,11 @@
-"""Compensation of a recording's columns: angle, displacement and place of every event in one pass."""
+"""Motion compensation of a recording's columns: prism angle, displacement and position of every event in one pass."""
 
 from typing import Any
 
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, PinholeParams
-from amiwarp.kernels.encoder import EncoderParams, angle_at, angle_on, piece_at
+from amiwarp.kernels.encoder import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
 from amiwarp.kernels.native import (
     load_float,
     load_int64,
@@ -15,30 +15,29 @@ from amiwarp.kernels.native import (
     store_uint8,
     store_uint32,
 )
-from amiwarp.kernels.optics import MODEL_STRUCTS, place
+from amiwarp.kernels.optics import MODEL_STRUCTS, displace
 
-# without fused multiply-add, which CPUs and GPUs place differently: both give the same bits
+# Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-BLOCK = wp.constant(64)  # events of one thread on a CPU, placed eight at a time
-FINE = wp.constant(2.0 * 3.141592653589793 / 4294967296.0)  # 2**-32 turn [rad]
+BLOCK = wp.constant(64)  # events per CPU thread, which displaces eight at a time
 
 
 @wp.struct
 class Columns:
-    """A recording's events as they are stored, padded to whole blocks, and where they belong."""
+    """Event columns as stored in a recording, padded to whole blocks, and the compensated positions [px]."""
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
     t: wp.array(dtype=wp.int64)
     out_x: wp.array(dtype=float)
     out_y: wp.array(dtype=float)
-    inside: wp.array(dtype=wp.uint8)  # 1: on a pixel of the image
+    inside: wp.array(dtype=wp.uint8)  # 1 if the event lies on a pixel of the image, else 0
 
 
 @wp.func
-def one_piece(encoder: EncoderParams, t: wp.array(dtype=wp.int64), first: int) -> int:
-    """The piece of a block's events where they share one, as almost all blocks do; -1 where not."""
+def shared_piece(encoder: EncoderParams, t: wp.array(dtype=wp.int64), first: int) -> int:
+    """Return the encoder piece that all events of a block lie on, or -1 if they lie on several."""
     low = t[first]
     high = low
     for k in range(BLOCK):
@@ -50,12 +49,13 @@ def one_piece(encoder: EncoderParams, t: wp.array(dtype=wp.int64), first: int) -
 
 @wp.func
 def azimuth(model: Any, azimuths: wp.array(dtype=float), turn: wp.uint32):
-    """Cosine and sine of an angle [2**-32 turn]: the table's at the coarser angle below it, turned on by the rest.
+    """Return cosine and sine of the tilt azimuth for theta_u32 ``turn``.
 
-    The rest is below 1e-4 rad: what its square leaves out moves an event on an orbit of 100 px by 5e-7 px.
+    The table gives the values at the next coarser angle; a first-order rotation adds the remainder. The remainder is
+    below 1e-4 rad; neglecting its square moves an event on an orbit of 100 px by 5e-7 px.
     """
     coarse = 2 * int(turn >> wp.uint32(16))
-    rest = float(int(turn & wp.uint32(0xFFFF))) * FINE
+    rest = float(int(turn & wp.uint32(0xFFFF))) * THETA_U32_RAD
     c = load_float(azimuths, coarse)
     s = load_float(azimuths, coarse + 1)
     a = c - s * rest
@@ -64,14 +64,16 @@ def azimuth(model: Any, azimuths: wp.array(dtype=float), turn: wp.uint32):
 
 
 @wp.func
-def placed(model: Any, camera: Any, azimuths: wp.array(dtype=float), columns: Columns, turn: wp.uint32, i: int):
+def displace_event(model: Any, camera: Any, azimuths: wp.array(dtype=float), columns: Columns, turn: wp.uint32, i: int):
+    """Return the compensated position [px] of event ``i``."""
     w0, w1 = azimuth(model, azimuths, turn)
-    x, y = place(model, camera, float(load_uint16(columns.x, i)), float(load_uint16(columns.y, i)), w0, w1)
+    x, y = displace(model, camera, float(load_uint16(columns.x, i)), float(load_uint16(columns.y, i)), w0, w1)
     return x, y
 
 
 @wp.func
-def store_place(size: wp.vec2, columns: Columns, i: int, x: float, y: float):
+def store_position(size: wp.vec2, columns: Columns, i: int, x: float, y: float):
+    """Store a compensated position, and whether it lies on a pixel of an image of ``size`` [px]."""
     across = wp.where(x >= -0.5, wp.where(x < size[0] - 0.5, 1, 0), 0)
     store_float(columns.out_x, i, x)
     store_float(columns.out_y, i, y)
@@ -88,25 +90,25 @@ def compensate_blocks(
     columns: Columns,
     start: int,
 ):
-    """For CPUs: a block's angles, then its places by a loop that vectorises."""
+    """Compensate one block of events per thread. For CPUs: a vectorised loop finds the positions."""
     first = (start + wp.tid()) * BLOCK
     turns = wp.zeros(shape=(64,), dtype=wp.uint32)
     xs = wp.zeros(shape=(64,), dtype=float)
     ys = wp.zeros(shape=(64,), dtype=float)
-    piece = one_piece(encoder, columns.t, first)
+    piece = shared_piece(encoder, columns.t, first)
     if piece >= 0:
         for k in range(BLOCK):
             elapsed = load_int64(columns.t, first + k) - encoder.origin
-            store_uint32(turns, k, angle_on(encoder, piece, elapsed))
+            store_uint32(turns, k, theta_u32_on(encoder, piece, elapsed))
     else:
         for k in range(BLOCK):
-            turns[k] = angle_at(encoder, columns.t[first + k])
+            turns[k] = theta_u32_at(encoder, columns.t[first + k])
     for k in range(BLOCK):
-        x, y = placed(model, camera, azimuths, columns, load_uint32(turns, k), first + k)
+        x, y = displace_event(model, camera, azimuths, columns, load_uint32(turns, k), first + k)
         store_float(xs, k, x)
         store_float(ys, k, y)
     for k in range(BLOCK):
-        store_place(size, columns, first + k, load_float(xs, k), load_float(ys, k))
+        store_position(size, columns, first + k, load_float(xs, k), load_float(ys, k))
 
 
 @wp.kernel
@@ -119,10 +121,10 @@ def compensate_events(
     columns: Columns,
     start: int,
 ):
-    """For CUDA: one event."""
+    """Compensate one event per thread. For CUDA."""
     i = start + wp.tid()
-    x, y = placed(model, camera, azimuths, columns, angle_at(encoder, columns.t[i]), i)
-    store_place(size, columns, i, x, y)
+    x, y = displace_event(model, camera, azimuths, columns, theta_u32_at(encoder, columns.t[i]), i)
+    store_position(size, columns, i, x, y)
 
 
 for _model in MODEL_STRUCTS:

@@ -1,8 +1,8 @@
-"""Device side of conjugate gradients over a map's unknowns; sums in fixed point do not depend on the order.
+"""Conjugate gradients over the unknowns of a map; sums in fixed point do not depend on the order of threads.
 
-A thread takes ``width`` unknowns, in order: many on a CPU, one on CUDA, where blocks add up. Dot products are left as
-partial sums, which the next kernel adds up in each of its blocks: nothing is read back, and the bits are the same each
-time.
+A thread processes ``width`` unknowns in order: many on a CPU, one on CUDA, where each block adds up its threads. Dot
+products are stored as partial sums; each block of the next kernel adds them up itself. Nothing is copied to the host,
+and the results are bit-identical on every run.
 """
 
 import warp as wp
@@ -12,17 +12,19 @@ from amiwarp.kernels.prior import Prior, prior_diagonal, prior_product
 wp.set_module_options({"enable_backward": False})
 
 FIXED = wp.constant(wp.float64(4294967296.0))  # 2**32: unit of the sums
-NEVER = wp.constant(wp.float64(1.0e300))  # the last r·z, where there was none: the first direction is z
-CPU_WIDTH = 4096
+NO_PREVIOUS = wp.constant(
+    wp.float64(1.0e300)
+)  # initial value of the previous r·z, so that the first search direction is z
+CPU_WIDTH = 4096  # unknowns per CPU thread
 
 
 @wp.struct
 class Unknowns:
-    """Vectors of conjugate gradients, as long as the image that moves."""
+    """Vectors of the conjugate gradients, each as long as the part of the image that is solved for."""
 
-    diagonal: wp.array(dtype=float)  # of the equations and the prior
+    diagonal: wp.array(dtype=float)  # of the operator, prior included
     residual: wp.array(dtype=float)  # r, of the normal equations
-    direction: wp.array(dtype=float)  # p
+    direction: wp.array(dtype=float)  # p, the search direction
     product: wp.array(dtype=float)  # q: the operator's times p
 
 
@@ -30,18 +32,20 @@ class Unknowns:
 class Dots:
     """Dot products on the device."""
 
-    scalars: wp.array(dtype=wp.float64)  # r·z of the direction as it is, and the one to come
+    scalars: wp.array(dtype=wp.float64)  # r·z of the present search direction, and of the next
     pq: wp.array(dtype=wp.float64)  # partial sums
     rz: wp.array(dtype=wp.float64)
 
 
 @wp.func
 def to_fixed(value: float) -> wp.int64:
+    """Convert to fixed point."""
     return wp.int64(wp.float64(value) * FIXED)
 
 
 @wp.func
 def add_fixed(sums: wp.array(dtype=wp.int64), i: int, value: float):
+    """Add a value in fixed point, atomically."""
     wp.atomic_add(sums, i, to_fixed(value))
 
 
@@ -56,12 +60,12 @@ def add_fixed(sums: wp.array(dtype=wp.int64), i: int, value: float):
 #endif
 """)
 def add_two(sums: wp.array(dtype=wp.int64), i: int, a: wp.int64, b: wp.int64):
-    """Adds to neighbours: atomically on CUDA; on a CPU, where the array is one thread's own, both at once."""
+    """Add to two neighbours: atomically on CUDA; on a CPU both at once, if no other thread writes to the array."""
 
 
 @wp.func
-def gathered(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
-    """Total over the slices, which are cleared for the next pass."""
+def take_total(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
+    """Return the total over the slices, and clear them for the next pass."""
     total = wp.int64(0)
     for k in range(sums.shape[0]):
         total += sums[k, i]
@@ -71,28 +75,30 @@ def gathered(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
 
 @wp.kernel
 def gather(sums: wp.array2d(dtype=wp.int64), start: int, out: wp.array(dtype=float)):
+    """Compute the totals over the slices, and clear the slices."""
     i = start + wp.tid()
     if i < out.shape[0]:
-        out[i] = gathered(sums, i)
+        out[i] = take_total(sums, i)
 
 
 @wp.kernel
 def gather_diagonal(sums: wp.array2d(dtype=wp.int64), prior: Prior, start: int, out: wp.array(dtype=float)):
-    """The equations' diagonal and the prior's."""
+    """Compute the diagonal of the equations and the prior, and clear the slices."""
     i = start + wp.tid()
     if i < out.shape[0]:
-        out[i] = gathered(sums, i) + prior_diagonal(prior, i)
+        out[i] = take_total(sums, i) + prior_diagonal(prior, i)
 
 
 @wp.func
 def block_sum(value: wp.float64) -> wp.float64:
-    """Over the threads of a block, in fixed order; every thread gets it."""
+    """Return the sum over the threads of a block, in fixed order, to every thread."""
     total = wp.tile_sum(wp.tile(value))
     return total[0]
 
 
 @wp.func
 def total_of(partial: wp.array(dtype=wp.float64), thread: int) -> wp.float64:
+    """Return the total of partial sums, to every thread of the block."""
     total = wp.float64(0.0)
     for i in range(thread % wp.block_dim(), partial.shape[0], wp.block_dim()):
         total += partial[i]
@@ -100,8 +106,8 @@ def total_of(partial: wp.array(dtype=wp.float64), thread: int) -> wp.float64:
 
 
 @wp.func
-def leave(partial: wp.array(dtype=wp.float64), thread: int, total: wp.float64):
-    """A block's part of a dot product."""
+def store_partial_sum(partial: wp.array(dtype=wp.float64), thread: int, total: wp.float64):
+    """Store the block's part of a dot product."""
     both = block_sum(total)
     if thread % wp.block_dim() == 0:
         partial[thread / wp.block_dim()] = both
@@ -117,22 +123,25 @@ def start_descent(
     u: Unknowns,
     dots: Dots,
 ):
-    """r = Aᵀ W (b - A x) - prior x; partial sums of r·z, z being r over the diagonal."""
+    """Compute r = Aᵀ W (b - A x) - prior x, and partial sums of r·z, where z = r / diagonal."""
     thread = start + wp.tid()
     total = wp.float64(0.0)
     for i in range(thread * width, wp.min((thread + 1) * width, image.shape[0])):
-        r = gathered(sums, i) - prior_product(prior, image, i)
+        r = take_total(sums, i) - prior_product(prior, image, i)
         u.residual[i] = r
         u.direction[i] = 0.0
         total += wp.float64(r) * wp.float64(r / u.diagonal[i])
-    leave(dots.rz, thread, total)
+    store_partial_sum(dots.rz, thread, total)
     if thread == 0:
-        dots.scalars[0] = NEVER
+        dots.scalars[0] = NO_PREVIOUS
 
 
 @wp.func
 def next_ratio(dots: Dots, thread: int) -> float:
-    """b = new r·z / old r·z; the new one is kept aside, since other blocks may not have read the old one yet."""
+    """Return b = new r·z / old r·z.
+
+    The new value is stored separately, because other blocks may not have read the old value yet.
+    """
     new = total_of(dots.rz, thread)
     if thread == 0:
         dots.scalars[1] = new
@@ -141,7 +150,7 @@ def next_ratio(dots: Dots, thread: int) -> float:
 
 @wp.kernel
 def turn(width: int, start: int, u: Unknowns, dots: Dots):
-    """p = z + b p, z being r over the diagonal."""
+    """Compute the search direction p = z + b p, where z = r / diagonal."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
     for i in range(thread * width, wp.min((thread + 1) * width, u.residual.shape[0])):
@@ -151,7 +160,7 @@ def turn(width: int, start: int, u: Unknowns, dots: Dots):
 
 @wp.kernel
 def turn_to(z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots: Dots):
-    """p = z + b p."""
+    """Compute the search direction p = z + b p for a given z."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
     for i in range(thread * width, wp.min((thread + 1) * width, z.shape[0])):
@@ -160,21 +169,21 @@ def turn_to(z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots:
 
 @wp.kernel
 def finish_product(sums: wp.array2d(dtype=wp.int64), prior: Prior, width: int, start: int, u: Unknowns, dots: Dots):
-    """q = (Aᵀ W A + prior) p from the sums; partial sums of p·q."""
+    """Compute q = (Aᵀ W A + prior) p from the sums, and partial sums of p·q."""
     thread = start + wp.tid()
     total = wp.float64(0.0)
     for i in range(thread * width, wp.min((thread + 1) * width, u.direction.shape[0])):
-        q = gathered(sums, i) + prior_product(prior, u.direction, i)
+        q = take_total(sums, i) + prior_product(prior, u.direction, i)
         u.product[i] = q
         total += wp.float64(u.direction[i]) * wp.float64(q)
-    leave(dots.pq, thread, total)
+    store_partial_sum(dots.pq, thread, total)
     if thread == 0:
         dots.scalars[0] = dots.scalars[1]
 
 
 @wp.kernel
 def descend(width: int, start: int, image: wp.array(dtype=float), u: Unknowns, dots: Dots):
-    """x += a p, r -= a q with a = (r·z)/(p·q); partial sums of the new r·z."""
+    """Compute x += a p and r -= a q with a = (r·z)/(p·q), and partial sums of the new r·z."""
     thread = start + wp.tid()
     step = float(dots.scalars[0] / wp.max(total_of(dots.pq, thread), wp.float64(1.0e-30)))
     total = wp.float64(0.0)
@@ -183,15 +192,16 @@ def descend(width: int, start: int, image: wp.array(dtype=float), u: Unknowns, d
         r = u.residual[i] - step * u.product[i]
         u.residual[i] = r
         total += wp.float64(r) * wp.float64(r / u.diagonal[i])
-    leave(dots.rz, thread, total)
+    store_partial_sum(dots.rz, thread, total)
 
 
 @wp.kernel
 def dot(
     a: wp.array(dtype=float), b: wp.array(dtype=float), width: int, start: int, partial: wp.array(dtype=wp.float64)
 ):
+    """Compute partial sums of a·b."""
     thread = start + wp.tid()
     total = wp.float64(0.0)
     for i in range(thread * width, wp.min((thread + 1) * width, a.shape[0])):
         total += wp.float64(a[i]) * wp.float64(b[i])
-    leave(partial, thread, total)
+    store_partial_sum(partial, thread, total)

@@ -1,29 +1,35 @@
-"""Device side of the encoder: the prism's angle at an event's time, in whole numbers, the same on every device.
+"""Prism angle at an event's time, in integer arithmetic with equal results on every device.
 
-Angles are fractions of a turn that wrap by themselves: 2**64 (inside) or 2**32 (outside) is one turn. Times are whole
-microseconds, so that a slope, too, may wrap: whole turns a microsecond add whole turns.
+Angles are fractions of a turn that wrap on overflow: one turn is 2**64 internally and 2**32 in results. Times are whole
+microseconds, so slopes may wrap too: a whole turn per microsecond adds whole turns.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+THETA_U16_RAD = wp.constant(2.0 * 3.141592653589793 / 65536.0)  # unit of theta_u16, 2**-16 turn [rad]
+THETA_U32_RAD = wp.constant(2.0 * 3.141592653589793 / 4294967296.0)  # unit of theta_u32, 2**-32 turn [rad]
+
 
 @wp.struct
 class EncoderParams:
-    """Linear pieces between samples, the first and last also beyond them; see ``events.device_encoder``."""
+    """Piecewise linear prism angle over time; the first and last pieces extend beyond the samples.
 
-    origin: wp.int64  # event time at which the first bucket starts [us]
+    Built by :mod:`amiwarp.events.device_encoder`.
+    """
+
+    origin: wp.int64  # event time at the start of the first bucket [us]
     shift: int  # a bucket is 2**shift us long
-    first: wp.array(dtype=int)  # per bucket the piece at its start; one entry past the buckets ends the last
-    start: wp.array(dtype=wp.int64)  # per piece its first event time, from the origin [us]
-    angle: wp.array(dtype=wp.uint64)  # there [2**-64 turn]
-    slope: wp.array(dtype=wp.uint64)  # [2**-64 turn per us]
+    first: wp.array(dtype=int)  # index of the piece at the start of each bucket; shape (buckets + 1,)
+    start: wp.array(dtype=wp.int64)  # first event time of each piece, relative to the origin [us]
+    angle: wp.array(dtype=wp.uint64)  # prism angle at the start of each piece [2**-64 turn]
+    slope: wp.array(dtype=wp.uint64)  # speed on each piece [2**-64 turn per us]
 
 
 @wp.func
 def piece_at(encoder: EncoderParams, elapsed: wp.int64) -> int:
-    """The piece of a time from the origin: its bucket's, bisected where several pieces start in one bucket."""
+    """Return the index of the piece at ``elapsed`` [us] from the origin, found by its bucket and bisection."""
     buckets = encoder.first.shape[0] - 1
     bucket = int(wp.clamp(elapsed >> wp.int64(encoder.shift), wp.int64(0), wp.int64(buckets - 1)))
     low = encoder.first[bucket]
@@ -38,14 +44,14 @@ def piece_at(encoder: EncoderParams, elapsed: wp.int64) -> int:
 
 
 @wp.func
-def angle_on(encoder: EncoderParams, piece: int, elapsed: wp.int64) -> wp.uint32:
-    """The angle [2**-32 turn] on a piece, at a time from the origin [us]."""
+def theta_u32_on(encoder: EncoderParams, piece: int, elapsed: wp.int64) -> wp.uint32:
+    """Return theta_u32, the prism angle [2**-32 turn], on a given piece at ``elapsed`` [us] from the origin."""
     since = wp.uint64(elapsed - encoder.start[piece])
     return wp.uint32((encoder.angle[piece] + since * encoder.slope[piece]) >> wp.uint64(32))
 
 
 @wp.func
-def angle_at(encoder: EncoderParams, t: wp.int64) -> wp.uint32:
-    """The prism's angle at an event's time [us], as a fraction of a turn in 1 / 2**32."""
+def theta_u32_at(encoder: EncoderParams, t: wp.int64) -> wp.uint32:
+    """Return theta_u32, the prism angle [2**-32 turn], at event time ``t`` [us]."""
     elapsed = t - encoder.origin
-    return angle_on(encoder, piece_at(encoder, elapsed), elapsed)
+    return theta_u32_on(encoder, piece_at(encoder, elapsed), elapsed)

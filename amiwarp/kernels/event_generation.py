@@ -1,39 +1,50 @@
-"""Device side of the simulator: one thread a pixel walks through the steps of a chunk and writes its events as keys.
+"""Event generation of the simulator: one thread per pixel steps through a chunk and writes the events as keys.
 
-Times are ticks of 1/16 us since the chunk's start, in integers: nothing depends on where a chunk begins. An event is an
-int64 key, ``time | pixel | reversed lag | polarity``, so that sorting the keys makes the stream whatever the order in
-which threads wrote it.
+Times are ticks of 1/16 us since the start of the chunk, in integers, so that results do not depend on where a chunk
+begins. An event is an int64 key, ``time | pixel | reversed lag | polarity``. Sorted keys give the same stream for any
+order of the threads.
 """
 
 import warp as wp
 
 from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.optics import trace
-from amiwarp.kernels.sight import AHEAD, Steps, View, local_ray, locate_ahead, meet_ahead, see, see_ahead
+from amiwarp.kernels.sight import (
+    AHEAD,
+    Steps,
+    View,
+    levels_ahead,
+    locate_texels,
+    ray_in_prism_frame,
+    see_level,
+    texels_ahead,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 TICKS = wp.constant(16)  # per microsecond
 HALF_TICKS = wp.constant(8)
 TICK_BITS = wp.constant(4)
-LOW_BITS = wp.constant(22)  # of a key: lag (19), cause (2), polarity; before them the pixel, in as few bits as it needs
+LOW_BITS = wp.constant(22)  # lowest bits of a key: lag (19), cause (2), polarity (1); pixel and time are above them
 LOW_MASK = wp.constant((1 << 22) - 1)
 SIGNAL = wp.constant(0)  # causes of an event
 SHOT_NOISE = wp.constant(1)
 LEAK = wp.constant(2)
 HOT_PIXEL = wp.constant(3)
-LEAK_SHARE = wp.constant(1.5)  # a rise of less than so many drifts is a leak: at least two thirds of it is drift
+LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the step rises by less than this many drifts
 LARGEST_LAG = wp.constant((1 << 19) - 1)
-LAG_ZERO = wp.constant(16)  # ticks added to the lag: rounding a stamp may make it slightly negative
+LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time stamp may make the lag slightly negative
 NEVER = wp.constant(wp.int64(-(1 << 60)))
 NO_NOISE = wp.constant(wp.int64(1 << 60))
-SMALLEST_THRESHOLD = wp.constant(0.1)  # of the nominal one: mismatch never makes a threshold vanish
-BEYOND = wp.constant(2.0)  # a fraction of a step past its end
+SMALLEST_THRESHOLD = wp.constant(0.1)  # relative to the nominal threshold, so that mismatch cannot remove a threshold
+PAST_STEP = wp.constant(2.0)  # a fraction of the step beyond its end
 
 
 @wp.struct
 class SensorParams:
-    on: float  # nominal thresholds, log intensity
+    """Sensor model."""
+
+    on: float  # nominal ON and OFF thresholds [log intensity]
     off: float
     mismatch: float  # relative standard deviation of both thresholds
     leak: float  # thresholds per step
@@ -47,35 +58,35 @@ class SensorParams:
 
 @wp.struct
 class Pixel:
-    """What one pixel remembers."""
+    """State of one pixel."""
 
-    level: float  # log intensity at the last step
-    reference: float  # log intensity that changes are measured against
-    on: float  # its own thresholds
+    level: float  # level at the last step [log intensity]
+    reference: float  # reference level [log intensity]
+    on: float  # ON and OFF thresholds of this pixel [log intensity]
     off: float
-    noise: float  # its own rate of noise, events per tick
+    noise: float  # noise rate of this pixel [events per tick]
     rng: wp.uint32
-    blind_until: wp.int64  # end of the refractory time; NEVER when over
+    blind_until: wp.int64  # end of the refractory period; NEVER if it has passed
     next_noise: wp.int64
-    last_stamp: wp.int64  # us
+    last_stamp: wp.int64  # [us]
 
 
 @wp.struct
 class Sink:
-    """Where keys go: pixels share segments, each with room and a counter of its own.
+    """Destination of the keys: segments with limited room, each with a counter.
 
-    On a CPU a segment is a run of pixels that belongs to one thread; on CUDA neighbours count apart, for one counter
-    for all, or for a whole warp, would be the bottleneck.
+    On a CPU a segment is a run of pixels of one thread. On CUDA neighbouring pixels use different segments, because one
+    counter for all pixels, or for all of a warp, would be the bottleneck.
     """
 
-    keys: wp.array2d(dtype=wp.int64)  # segment, place
-    count: wp.array2d(dtype=int)  # events of each segment, also those that found no room, in the first column
+    keys: wp.array2d(dtype=wp.int64)  # by segment and position
+    count: wp.array2d(dtype=int)  # first column: events of each segment, including those that did not fit
     run: int  # consecutive pixels in a segment
 
 
 @wp.struct
 class Block:
-    """Events taken out of their keys."""
+    """Events unpacked from their keys."""
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
@@ -83,30 +94,30 @@ class Block:
     p: wp.array(dtype=wp.uint8)
     cause: wp.array(dtype=wp.uint8)
     points: wp.array(dtype=wp.vec2)
-    ticks: wp.array(dtype=int)  # of the crossing, from the first instant of the table
+    ticks: wp.array(dtype=int)  # time of the crossing since the first instant of the table
 
 
 @wp.func
 def crossing(reference: float, on: float, off: float, level: float, slope: float) -> float:
-    """Fraction of the step at which the level next crosses a threshold; past the step if it does not."""
+    """Return the fraction of the step at which the level next crosses a threshold; above 1 if it does not."""
     if slope > 0.0:
         return (reference + on - level) / slope
     if slope < 0.0:
         return (reference - off - level) / slope
-    return BEYOND
+    return PAST_STEP
 
 
 @wp.func
-def waiting(rate: float, uniform: float) -> wp.int64:
-    """Exponential waiting time [ticks] until the next event of a Poisson process."""
+def draw_waiting_time(rate: float, uniform: float) -> wp.int64:
+    """Return an exponential waiting time [ticks] to the next event of a Poisson process."""
     if rate > 0.0:
         return wp.int64(1.0 - wp.log(1.0 - uniform) / rate)
     return NO_NOISE
 
 
 @wp.func
-def write(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64, kind: int):
-    """Append the key of an event at tick ``t``, stamped ``stamp`` [us]; ``kind``: twice its cause, and 1 for ON."""
+def append_key(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64, kind: int):
+    """Append the key of an event at tick ``t`` with time stamp ``stamp`` [us]; ``kind``: 2 cause + polarity."""
     lag = wp.clamp(int(stamp * wp.int64(TICKS) - t) + LAG_ZERO, 0, LARGEST_LAG)
     segment = (index / sink.run) % sink.keys.shape[0]
     place = wp.atomic_add(sink.count, segment, 0, 1)
@@ -117,27 +128,27 @@ def write(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64, kind
 
 @wp.func
 def latency(s: SensorParams, rng: wp.uint32):
-    """Time [ticks] from a change to its stamp, and the generator's next state."""
+    """Return the latency [ticks] from a crossing to its time stamp, and the generator's next state."""
     late = s.latency
-    if s.jitter > 0.0:  # nearly Gaussian, within 3.5 standard deviations: four uniforms
+    if s.jitter > 0.0:  # nearly Gaussian: sum of four uniform numbers, within 3.5 standard deviations
         four = wp.randf(rng) + wp.randf(rng) + wp.randf(rng) + wp.randf(rng)
         late = wp.max(late + s.jitter * 1.7320508 * (four - 2.0), 0.0)
     return late, rng
 
 
 @wp.func
-def cause(p: Pixel, s: SensorParams, slope: float, noise: bool) -> int:
-    """Why a pixel fires while its level, less the leaking reference, rises by ``slope`` in a step."""
+def cause_of(p: Pixel, s: SensorParams, slope: float, noise: bool) -> int:
+    """Return the cause of an event in a step in which the level, minus the leaking reference, rises by ``slope``."""
     if noise:
         return wp.where(p.noise > s.noise, HOT_PIXEL, SHOT_NOISE)
     return wp.where(slope > 0.0 and slope <= LEAK_SHARE * s.leak * p.on, LEAK, SIGNAL)
 
 
 @wp.func
-def fire(
+def fire_event(
     p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, slope: float, f: float, noise: bool
 ) -> Pixel:
-    """The pixel after an event at fraction ``f`` of the step, if that is in the step; the event goes to the sink."""
+    """Return the pixel after an event at fraction ``f`` of the step, and write that event, if f < 1."""
     if f < 1.0:
         rng = p.rng
         on = int(slope > 0.0)
@@ -150,32 +161,33 @@ def fire(
         late, rng = latency(s, rng)
         stamp = (t + wp.int64(late) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
         p.last_stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
-        write(sink, steps.shift, index, t, p.last_stamp, 2 * cause(p, s, slope, noise) + on)
+        append_key(sink, steps.shift, index, t, p.last_stamp, 2 * cause_of(p, s, slope, noise) + on)
         p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
         if noise or p.next_noise < p.blind_until:
-            p.next_noise = wp.max(t, p.blind_until) + waiting(p.noise, wp.randf(rng))
+            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise, wp.randf(rng))
         p.rng = rng
     return p
 
 
 @wp.func
-def react(
+def generate_events(
     p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, slope: float, quiet: bool
 ) -> Pixel:
-    """All events of one step in which the level (less the leaking reference) rises by ``slope``.
+    """Generate all events of a step in which the level, minus the leaking reference, rises by ``slope``.
 
-    The struct changes by field, or without a condition: reassigned under one it would no longer live in registers.
+    The struct is changed field by field or unconditionally: a conditional assignment of the whole struct would move it
+    out of the registers.
     """
-    f = wp.where(quiet, BEYOND, 0.0)
+    f = wp.where(quiet, PAST_STEP, 0.0)
     while f < 1.0:
-        if p.blind_until > NEVER:  # the reference starts afresh where the refractory time ends
+        if p.blind_until > NEVER:  # the reference is reset at the end of the refractory period
             f = wp.max(f, float(p.blind_until - t0) * steps.per_tick)
             if f < 1.0:
                 p.reference = p.level + f * slope
                 p.blind_until = NEVER
         signal = wp.max(crossing(p.reference, p.on, p.off, p.level, slope), f)
         f = wp.min(signal, wp.max(float(p.next_noise - t0) * steps.per_tick, f))
-        p = fire(p, s, sink, index, t0, steps, slope, f, f < signal)
+        p = fire_event(p, s, sink, index, t0, steps, slope, f, f < signal)
     return p
 
 
@@ -185,12 +197,15 @@ __syncwarp();
 #endif
 """)
 def reconverge():
-    """Bring a warp back together: after an event its lanes would else run apart to the end of the chunk."""
+    """Reconverge a warp: after an event its lanes would otherwise diverge until the end of the chunk."""
 
 
 @wp.func
 def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
-    """A pixel with its own thresholds and noise; its reference is the level, less what has leaked by then."""
+    """Draw a pixel's thresholds and noise rate, and set its reference.
+
+    The reference is the level minus a random part of a threshold, which stands for earlier leakage.
+    """
     rng = wp.rand_init(seed, i)
     p = Pixel()
     p.level = level
@@ -205,34 +220,34 @@ def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
         p.reference = p.level - leaked * p.on
     p.blind_until = NEVER
     p.last_stamp = wp.int64(-1)
-    p.next_noise = waiting(p.noise, wp.randf(rng))
+    p.next_noise = draw_waiting_time(p.noise, wp.randf(rng))
     p.rng = rng
     return p
 
 
 @wp.kernel
 def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, start: int, pixels: wp.array(dtype=Pixel)):
-    """Every pixel at the start of the recording."""
+    """Initialise every pixel with the level that it sees at the start."""
     i = start + wp.tid()
-    pixels[i] = new_pixel(sensor, seed, i, see(view, steps.at[steps.margin], local_ray(view, i)))
+    pixels[i] = new_pixel(sensor, seed, i, see_level(view, steps.at[steps.margin], ray_in_prism_frame(view, i)))
 
 
 @wp.func
-def advance(p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float) -> Pixel:
-    """One step, at whose end the pixel sees ``level``."""
+def advance_pixel(p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float) -> Pixel:
+    """Advance a pixel by one step, at the end of which it sees ``level``."""
     drift = s.leak * p.on
     end = level + drift
     within = end < p.reference + p.on and end > p.reference - p.off
     quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(steps.ticks)
-    p = react(p, s, sink, index, t0, steps, end - p.level, quiet)
+    p = generate_events(p, s, sink, index, t0, steps, end - p.level, quiet)
     p.level = level
     p.reference -= drift
     return p
 
 
 @wp.func
-def on_next_clock(p: Pixel, passed: wp.int64) -> Pixel:
-    """The pixel, its times counted from ``passed`` ticks later."""
+def shift_times(p: Pixel, passed: wp.int64) -> Pixel:
+    """Return the pixel with its times counted from ``passed`` ticks later."""
     if p.blind_until > NEVER:
         p.blind_until -= passed
     p.next_noise -= passed
@@ -242,37 +257,41 @@ def on_next_clock(p: Pixel, passed: wp.int64) -> Pixel:
 
 @wp.kernel
 def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink):
+    """Advance one pixel per thread through all steps of a chunk."""
     i = start + wp.tid()
     p = pixels[i]
-    ray = local_ray(view, i)
+    ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for k in range(steps.count):
-        level = see(view, steps.at[steps.margin + k + 1], ray)
-        p = advance(p, sensor, sink, i, t0, steps, level)
+        level = see_level(view, steps.at[steps.margin + k + 1], ray)
+        p = advance_pixel(p, sensor, sink, i, t0, steps, level)
         t0 += wp.int64(steps.ticks)
         reconverge()
-    pixels[i] = on_next_clock(p, t0)
+    pixels[i] = shift_times(p, t0)
 
 
 @wp.kernel
 def run_pixels_ahead(
     view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink
 ):
-    """The same events as :func:`run_pixels`, bit for bit; faster on a CPU, for it looks at several instants at once."""
+    """Generate the same events as :func:`run_pixels`, bit for bit.
+
+    Faster on a CPU, because it computes the log intensities of several instants at once.
+    """
     i = start + wp.tid()
     p = pixels[i]
-    ray = local_ray(view, i)
+    ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
-        at = locate_ahead(view, meet_ahead(view.prism, steps.ahead[block], ray))
-        levels = see_ahead(view, steps, block, n, at)
+        at = locate_texels(view, texels_ahead(view.prism, steps.ahead[block], ray))
+        levels = levels_ahead(view, steps, block, n, at)
         j = int(0)
         while j < n:
-            p = advance(p, sensor, sink, i, t0, steps, levels[j])
+            p = advance_pixel(p, sensor, sink, i, t0, steps, levels[j])
             t0 += wp.int64(steps.ticks)
             j += 1
-    pixels[i] = on_next_clock(p, t0)
+    pixels[i] = shift_times(p, t0)
 
 
 # -- keys to events
@@ -280,7 +299,7 @@ def run_pixels_ahead(
 
 @wp.kernel
 def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.int64, start: int, block: Block):
-    """Event ``i`` of sorted keys, and its point without the prism: compensated at the true angle of its crossing."""
+    """Unpack event ``i`` of the sorted keys, and compensate it with the true prism angle at its crossing."""
     i = start + wp.tid()
     key = keys[i]
     t = key >> wp.int64(steps.shift)
@@ -313,14 +332,14 @@ def pack(sink: Sink, offset: wp.array(dtype=int), out: wp.array(dtype=wp.int64))
 
 @wp.kernel
 def rebase(keys: wp.array(dtype=wp.int64), passed: wp.int64):
-    """Take the time of a chunk that has ended off the keys of events that come after it."""
+    """Subtract the duration of a finished chunk from the keys of later events."""
     i = wp.tid()
     keys[i] -= passed
 
 
 @wp.kernel
 def find(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64, found: wp.array(dtype=int)):
-    """Number of sorted keys below ``limit``: a bisection by one thread."""
+    """Find the number of sorted keys below ``limit``, by bisection in one thread."""
     low = wp.int32(0)
     high = int(n)
     while low < high:

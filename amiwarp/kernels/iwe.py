@@ -1,7 +1,7 @@
-"""The image of warped events (IWE): read from votes, smoothed, and summed.
+"""Image of warped events (IWE): reading it from votes, smoothing it, and summing it.
 
-Kernels come in two widths: a CPU's thread takes 64 pixels of a row in loops that vectorise, a GPU's takes one. Every
-thread writes places of its own, so the bits do not depend on the schedule.
+Kernels come in two widths: a CPU thread processes 64 pixels of a row in vectorised loops, a GPU thread one pixel. No
+two threads write to the same element, so that results do not depend on the schedule.
 """
 
 from functools import cache
@@ -14,35 +14,36 @@ from amiwarp.kernels.votes import Canvas, Cells
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-VARIANCE = wp.constant(0)
+VARIANCE = wp.constant(0)  # sharpness measures
 GRADIENT = wp.constant(1)
 LAPLACIAN = wp.constant(2)
 PAPER_J = wp.constant(3)
 ENTROPY = wp.constant(4)
-STRIP = wp.constant(16)  # rows that one thread sums
-CPU_WIDTH = 64
+STRIP = wp.constant(16)  # rows summed by one thread
+CPU_WIDTH = 64  # pixels per CPU thread
 
 
 @wp.struct
 class Frame:
-    """An image in a flat array, zeros around it: to the right of each row, above, below, and between the layers."""
+    """Image in a flat array with zeros around it: right of each row, above, below, and between layers."""
 
     rows: int
     columns: int
-    stride: int
-    layer: int  # from one layer to the next
-    first: int  # the first pixel
-    blocks: int  # of a row
+    stride: int  # elements from one row to the next
+    layer: int  # elements from one layer to the next
+    first: int  # index of the first pixel
+    blocks: int  # per row
 
 
 @wp.func
 def block_column(frame: Frame, block: int, width: int) -> int:
+    """Return the first column of a block."""
     return (block % frame.blocks) * width
 
 
 @wp.func
 def block_start(frame: Frame, block: int, width: int, step: int) -> int:
-    """Where block ``block`` begins; rows are counted in steps of ``step``."""
+    """Return the index of the first pixel of a block; a block begins every ``step`` rows."""
     lines = (frame.rows + step - 1) / step
     line = block / frame.blocks
     row = (line % lines) * step
@@ -53,25 +54,33 @@ def block_start(frame: Frame, block: int, width: int, step: int) -> int:
 
 
 @wp.func
-def field(word: wp.uint64, first: int, mask: int) -> int:
+def word_field(word: wp.uint64, first: int, mask: int) -> int:
+    """Return the field of a word that begins at bit ``first``."""
     return int((word >> wp.uint64(first)) & wp.uint64(mask))
 
 
 @wp.func
 def votes_of_pixel(words: wp.array(dtype=wp.uint64), cell: int, width: int) -> int:
-    """1/256 votes that the four cells around a pixel hold for it."""
+    """Return the votes [1/256 event] that the four cells around a pixel hold for it."""
     a = load_word(words, cell)
     b = load_word(words, cell - 1)
     c = load_word(words, cell - width)
     d = load_word(words, cell - width - 1)
     mask = 262143
-    total = 256 * field(a, 54, 1023) - field(a, 0, mask) - field(a, 18, mask) + field(a, 36, mask)
-    return total + field(b, 0, mask) - field(b, 36, mask) + field(c, 18, mask) - field(c, 36, mask) + field(d, 36, mask)
+    total = 256 * word_field(a, 54, 1023) - word_field(a, 0, mask) - word_field(a, 18, mask) + word_field(a, 36, mask)
+    return (
+        total
+        + word_field(b, 0, mask)
+        - word_field(b, 36, mask)
+        + word_field(c, 18, mask)
+        - word_field(c, 36, mask)
+        + word_field(d, 36, mask)
+    )
 
 
 @wp.func
 def cell_of(canvas: Canvas, frame: Frame, block: int, width: int) -> int:
-    """Cell of a block's first pixel."""
+    """Return the cell of a block's first pixel."""
     line = block / frame.blocks
     row = (line / frame.rows) * canvas.rows + line % frame.rows + 1
     return row * canvas.columns + block_column(frame, block, width) + 1
@@ -81,9 +90,9 @@ def cell_of(canvas: Canvas, frame: Frame, block: int, width: int) -> int:
 def empty_words(
     canvas: Canvas, cells: Cells, slot: int, counts: wp.array2d(dtype=wp.int64), fullest: wp.array(dtype=int)
 ):
-    """Moves a batch's votes to the totals, and counts its events, those in the trash too; the most in one word.
+    """Add a batch's votes to the totals; count its events, the trash included, and find the fullest word.
 
-    Fewer than were voted, never more, says that words overflowed: the batch is voted again then.
+    If words overflowed, the count is lower than the number of votes, never higher. The batch is then voted again.
     """
     i = wp.tid()
     count = wp.int64(load_word(cells.words, i) >> wp.uint64(54))
@@ -97,7 +106,7 @@ def empty_words(
 
 @wp.kernel
 def add_totals(more: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64), totals: wp.array(dtype=wp.int64)):
-    """Adds, and clears what was added and the batches' counts."""
+    """Add ``more`` to the totals; clear ``more`` and the counts of the batches."""
     i = wp.tid()
     if i < totals.shape[0]:
         totals[i] = totals[i] + more[i]
@@ -108,7 +117,7 @@ def add_totals(more: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64),
 
 @cache
 def read_votes(width: int) -> Any:
-    """Kernel that reads ``width`` pixels [events] of all slices, which are left as they are."""
+    """Return the kernel that reads ``width`` pixels [events] from all slices of votes and keeps the votes."""
 
     @wp.kernel
     def read_votes(
@@ -145,7 +154,7 @@ def read_votes(width: int) -> Any:
 
 @cache
 def smooth(width: int) -> Any:
-    """Kernel that smooths ``width`` pixels with a symmetric kernel (centre first) along the axis of ``step``."""
+    """Return the kernel that smooths ``width`` pixels along the axis of ``step``; its weights begin at the centre."""
 
     @wp.kernel
     def smooth(
@@ -175,7 +184,7 @@ def smooth(width: int) -> Any:
 
 @wp.func
 def gradient2(image: wp.array(dtype=float), i: int, stride: int) -> float:
-    """Squared central-difference gradient."""
+    """Return the squared central-difference gradient."""
     dx = load_float(image, i + 1) - load_float(image, i - 1)
     dy = load_float(image, i + stride) - load_float(image, i - stride)
     return 0.25 * (dx * dx + dy * dy)
@@ -183,7 +192,7 @@ def gradient2(image: wp.array(dtype=float), i: int, stride: int) -> float:
 
 @wp.func
 def laplacian2(image: wp.array(dtype=float), i: int, stride: int) -> float:
-    """Squared five-point Laplacian."""
+    """Return the squared five-point Laplacian."""
     across = load_float(image, i + 1) + load_float(image, i - 1)
     value = across + load_float(image, i + stride) + load_float(image, i - stride) - 4.0 * load_float(image, i)
     return value * value
@@ -191,6 +200,7 @@ def laplacian2(image: wp.array(dtype=float), i: int, stride: int) -> float:
 
 @wp.func
 def other_term(kind: int, h: float, eta: float) -> float:
+    """Return the term of a pixel for the sharpness measures J (the paper's) and entropy."""
     if kind == PAPER_J:
         return wp.where(h > 0.0, 1.0 / (1.0 + wp.exp(wp.min(h / eta, 80.0))), 0.0)
     return wp.where(h > 0.0, h * wp.log(wp.max(h, 1.0e-30)), 0.0)
@@ -198,7 +208,7 @@ def other_term(kind: int, h: float, eta: float) -> float:
 
 @cache
 def sum_terms(width: int, kind: int) -> Any:
-    """Kernel that sums ``width`` columns of a strip of rows: the image, and the sharpness' terms."""
+    """Return the kernel that sums the image and its sharpness terms over ``width`` columns of a strip of rows."""
 
     @wp.func
     def term(image: wp.array(dtype=float), i: int, stride: int, eta: float) -> float:
@@ -234,7 +244,7 @@ def sum_terms(width: int, kind: int) -> Any:
 
 @wp.kernel
 def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array2d(dtype=wp.vec2d)):
-    """Sums of sums, row by row, as many as ``out`` has columns."""
+    """Add up each row of partial sums into as many sums as ``out`` has columns."""
     row, i = wp.tid()
     total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
     for k in range(i, sums.shape[1], out.shape[1]):

@@ -1,4 +1,7 @@
-"""Launching: one launch on CUDA, slices from a thread pool on the CPU (Warp runs one thread a launch there)."""
+"""Kernel launches: a single launch on CUDA, slices on a thread pool on the CPU.
+
+Warp itself runs each CPU launch on one thread.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,28 +13,33 @@ import warp as wp
 
 from amiwarp.kernels.cores import cpu_threads
 
-SMALLEST_SLICE = 1 << 15  # below this many threads a slice costs more to launch than to run
+SMALLEST_SLICE = 1 << 15  # threads; launching a smaller slice takes longer than running it
 
 
 @cache
 def pool() -> ThreadPoolExecutor:
-    """Threads for launches on the CPU, one a core."""
+    """Return the shared thread pool for CPU launches, with one thread per core."""
     return ThreadPoolExecutor(cpu_threads(), thread_name_prefix="amiwarp")
 
 
 @cache
 def beside() -> ThreadPoolExecutor:
-    """One thread, for what may go on beside and must keep its order."""
-    return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-beside")
+    """Return the shared background worker: a pool of one thread, which keeps the order of its jobs."""
+    return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-background")
 
 
 def load(kernel: Any, device: Any) -> None:
-    """Compiles and loads a kernel as it is launched here: once, before threads would each try."""
+    """Compile and load a kernel's module with the block size that launches here use.
+
+    Call it before several threads launch the kernel, or each of them would try to compile it.
+    """
     kernel.module.load(device, block_dim=1 if device.is_cpu else None)
 
 
 def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:
-    """At most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``, none much below ``smallest``."""
+    """Return at most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``, each of about ``smallest`` or
+    more.
+    """
     parts = max(1, min(parts, n // smallest))
     edges = [n * k // parts for k in range(parts + 1)]
     return list(pairwise(edges))
@@ -49,7 +57,7 @@ def launch(
 ) -> None:
     """Run a kernel whose last input is ``start: int`` over ``range(first, first + n)``, on all cores of a CPU.
 
-    Each thread of the kernel must write places of its own: slices run at the same time.
+    Slices run at the same time, so no two threads of the kernel may write to the same element.
     """
     device = wp.get_device(device)
     if n == 0:
@@ -77,9 +85,10 @@ def launch_slices(
     first: int = 0,
     smallest: int = SMALLEST_SLICE,
 ) -> None:
-    """As :func:`launch`, but slice k writes into ``outputs[k]`` alone: for threads that add to shared places.
+    """Run a kernel as :func:`launch` does, but let slice k write into ``outputs[k]`` only.
 
-    Over ``range(first, first + n)``. On CUDA one launch adds into ``outputs[0]`` with atomics.
+    For kernels whose threads add to the same elements. The range is ``range(first, first + n)``. On CUDA there is one
+    launch, which adds into ``outputs[0]`` with atomics.
     """
     device = wp.get_device(device)
     if n == 0:
@@ -97,26 +106,29 @@ def launch_slices(
 
 
 class Recorded:
-    """A launch to be launched again, which takes a tenth of the time; its kernel's last input is ``start: int``."""
+    """Recorded launch that can be repeated, which takes a tenth of the time of a new launch.
+
+    The kernel's last input must be ``start: int``.
+    """
 
     def __init__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
-        """Arrays among the inputs and outputs are used each time. Nothing is launched yet."""
+        """Record the launch without running it. Each repeat uses the same input and output arrays."""
         device = wp.get_device(device)
         load(kernel, device)
         self._start = len(inputs)
         self._command = wp.launch(kernel, 1, [*inputs, 0], list(outputs), device=device, record_cmd=True)
 
     def set(self, index: int, value: Any) -> None:
-        """Another input from now on."""
+        """Replace the input at ``index`` for all later runs."""
         self._command.set_param_at_index(index, value)
 
     def __call__(self, first: int, n: int) -> None:
-        """Over ``range(first, first + n)``, on a CPU by this thread alone."""
+        """Run the kernel over ``range(first, first + n)``; on a CPU in the calling thread only."""
         self._command.set_dim(n)
         self._command.set_param_at_index(self._start, first)
         self._command.launch()
 
 
 def slice_count(device: Any) -> int:
-    """How many outputs :func:`launch_slices` can use on ``device``."""
+    """Return the number of outputs that :func:`launch_slices` can use on ``device``."""
     return cpu_threads() if wp.get_device(device).is_cpu else 1

@@ -1,33 +1,35 @@
-"""Device side of the preconditioner of large maps: corrections on ever coarser grids, added up.
+"""Preconditioner of large maps: the sum of corrections on ever coarser grids.
 
-Bramble, Pasciak and Xu, "Parallel multilevel preconditioners", Math. Comp. 1990. Equations tell of differences between
-near nodes, so brightness travels across the map only slowly where each node is corrected alone.
+Bramble, Pasciak and Xu, "Parallel multilevel preconditioners", Math. Comp. 1990. The equations relate nodes near each
+other, so that brightness would propagate across the map only slowly with single-node corrections.
 """
 
 import warp as wp
 
 from amiwarp.kernels.descent import add_fixed
-from amiwarp.kernels.photometric import Atlas, Geometry, bilinear, fraction, part_of
+from amiwarp.kernels.photometric import Atlas, Geometry, bilinear, fraction, fractions_of
 from amiwarp.kernels.prior import Prior
 
 wp.set_module_options({"enable_backward": False})
 
-HAT = wp.constant(8.0 / 3.0)  # energy of a bilinear hat under links of weight 1, whatever its width
+HAT = wp.constant(8.0 / 3.0)  # energy of a bilinear hat function of any width under links of weight 1
 
 
 @wp.func
-def coarse_place(atlas: Atlas, cell: int, f: wp.vec2, spacing: float) -> wp.vec2:
+def coarse_coordinates(atlas: Atlas, cell: int, f: wp.vec2, spacing: float) -> wp.vec2:
+    """Return node coordinates on the grid of that ``spacing``."""
     return wp.vec2(float(cell % atlas.columns) + f[0], float(cell / atlas.columns) + f[1]) / spacing
 
 
 @wp.func
 def upper_left(at: wp.vec2, columns: int) -> int:
+    """Return the index of the node at the upper left."""
     return int(at[1]) * columns + int(at[0])
 
 
 @wp.func
-def share(a: int, wa: wp.vec4, node: int, columns: int) -> float:
-    """Weight of a node among the four of the cell ``a``."""
+def node_weight(a: int, wa: wp.vec4, node: int, columns: int) -> float:
+    """Return the weight of a node among the four nodes of the cell ``a``; 0 if it is none of them."""
     value = float(0.0)
     for k in range(4):
         if a + (k % 2) + (k / 2) * columns == node:
@@ -46,12 +48,12 @@ def add_coarse_diagonal(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """sums += diag(Pᵀ Aᵀ W A P) of the grid of that ``spacing``, from every ``stride``-th pair."""
+    """Compute sums += diag(Pᵀ Aᵀ W A P) of the grid of that ``spacing``, from every ``stride``-th pair."""
     i = (start + wp.tid()) * stride
     if geometry.cell[i] < 0:
         return
-    a = coarse_place(atlas, geometry.cell[i], part_of(geometry, 0, i), spacing)
-    b = coarse_place(atlas, geometry.cell[geometry.stride + i], part_of(geometry, 1, i), spacing)
+    a = coarse_coordinates(atlas, geometry.cell[i], fractions_of(geometry, 0, i), spacing)
+    b = coarse_coordinates(atlas, geometry.cell[geometry.stride + i], fractions_of(geometry, 1, i), spacing)
     wa = bilinear(fraction(a))
     wb = bilinear(fraction(b))
     na = upper_left(a, columns)
@@ -59,15 +61,15 @@ def add_coarse_diagonal(
     scale = weight[i] * float(stride)
     for k in range(4):
         step = (k % 2) + (k / 2) * columns
-        difference = wb[k] - share(na, wa, nb + step, columns)
+        difference = wb[k] - node_weight(na, wa, nb + step, columns)
         add_fixed(sums, nb + step, scale * difference * difference)
-        if share(nb, wb, na + step, columns) == 0.0:
+        if node_weight(nb, wb, na + step, columns) == 0.0:
             add_fixed(sums, na + step, scale * wa[k] * wa[k])
 
 
 @wp.kernel
 def divide(diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
-    """The finest grid's own correction."""
+    """Compute the correction on the finest grid."""
     i = start + wp.tid()
     if i < out.shape[0]:
         out[i] = residual[i] / diagonal[i]
@@ -86,7 +88,7 @@ def restrict(
     coarse: wp.array(dtype=float),
     correction: wp.array(dtype=float),
 ):
-    """The residual on the next coarser grid, and that grid's correction; ``four``: 4 to the power of its level."""
+    """Compute the residual and the correction on the next coarser grid; ``four`` is 4 to the power of its level."""
     i = start + wp.tid()
     if i >= coarse.shape[0]:
         return
@@ -112,7 +114,7 @@ def prolong(
     start: int,
     fine: wp.array(dtype=float),
 ):
-    """The coarser grid's correction, interpolated, is added to the finer one's."""
+    """Interpolate the coarser grid's correction and add it to the finer grid's."""
     i = start + wp.tid()
     row = i / fine_columns
     column = i % fine_columns

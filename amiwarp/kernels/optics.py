@@ -1,8 +1,8 @@
-"""Device side of the models: observed pixel to the pixel without the prism (compensate), and back (deflect).
+"""Refraction models: observed pixel to the pixel without the prism (compensate), and back (deflect).
 
-Every model struct has the two functions ``compensate(model, camera, xy, w)`` and ``deflect(model, camera, xy, w)``,
-``w`` being the azimuth (cos, sin) of the prism's tilt, and ``azimuth(model, theta)`` that gives it; ``place`` is
-``compensate`` for an event's pixel, in plain floats. ``moved`` compensates a direction.
+Every model struct has ``compensate(model, camera, xy, w)`` and ``deflect(model, camera, xy, w)``, where ``w`` is the
+(cos, sin) of the tilt azimuth that ``azimuth(model, theta)`` returns. ``displace`` is ``compensate`` for an event's
+pixel, with plain floats. ``compensate_direction`` compensates a direction.
 """
 
 from typing import Any
@@ -17,8 +17,9 @@ from amiwarp.kernels.camera import (
     pixel_to_ray,
     ray_to_pixel,
 )
+from amiwarp.kernels.rotations import rotate, rotate_by_deflection, sine_versine
 
-# without fused multiply-add, which CPUs and GPUs place differently: both give the same bits
+# Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 HARMONIC_ANGLES = wp.constant(16)
@@ -27,154 +28,154 @@ INVERSION_STEPS = wp.constant(8)
 
 @wp.struct
 class CircleParams:
-    sine: float  # of the deflection, signed: positive with the flat face to the scene
+    """Circle model: constant deflection."""
+
+    sine: float  # of the deflection; positive if the flat face looks to the scene
     versine: float  # 1 - cosine
-    phase: float
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
 
 
 @wp.struct
 class RadialCircleParams:
-    deflection: float  # on the axis; negative with the flat face to the camera: the sign also says which side
-    phase: float
+    """Radial circle model: the deflection grows with the angle from the axis."""
+
+    deflection: float  # on the axis [rad]; negative if the flat face looks to the camera
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
-    index: float
+    index: float  # refractive index
 
 
 @wp.struct
 class ExactParams:
-    sin_apex: float
+    """Exact model: refraction at both faces."""
+
+    sin_apex: float  # of the apex angle
     cos_apex: float
-    index2: float  # n squared
-    phase: float
+    index2: float  # square of the refractive index
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
-    flat_to_scene: int
-    tilted: int
-    axis: wp.mat33  # columns: the prism's frame in the camera's
+    flat_to_scene: int  # 1 if the flat face looks to the scene, else 0
+    tilted: int  # 1 if the prism's axis differs from the optical axis, else 0
+    axis: wp.mat33  # columns: axes of the prism's frame in the camera's frame
 
 
 @wp.struct
 class EllipseParams:
-    phase: float
+    """Ellipse model: a table of displacements per pixel."""
+
+    phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
     phase_sin: float
-    table: wp.array3d(dtype=float)  # per pixel: offset x, y, then the factors of cos, x, y, then of sin, x, y
+    table: wp.array3d(dtype=float)  # per pixel [px]: offset (x, y), factor of cos (x, y), factor of sin (x, y)
 
 
 @wp.func
 def azimuth(model: Any, theta: float) -> wp.vec2:
+    """Return (cos, sin) of the tilt azimuth at prism angle ``theta`` [rad]."""
     phi = theta + model.phase
     return wp.vec2(wp.cos(phi), wp.sin(phi))
 
 
-# Directions are three floats, not a vec3, wherever CPUs shall run eight events at a time: LLVM does not vectorise calls
-# that return small structs. They may have any length but zero.
+# Directions are three floats, not a vec3, in code that CPUs vectorise over eight events: LLVM does not vectorise calls
+# that return small structs. A direction may have any length except zero.
 
-# -- circle: a rotation of the bearing by a constant angle about z x w
-
-
-@wp.func
-def turned(x: float, y: float, z: float, w0: float, w1: float, sine: float, versine: float):
-    """Rodrigues' rotation of a direction about z x w = (-w1, w0, 0): turns the optical axis towards w."""
-    d = w0 * x + w1 * y
-    g = z * sine - d * versine
-    return x + g * w0, y + g * w1, z - z * versine - d * sine
+# -- circle: rotation of the bearing by a constant angle about z x w
 
 
 @wp.func
-def moved(model: CircleParams, x: float, y: float, z: float, w0: float, w1: float):
-    return turned(x, y, z, w0, w1, model.sine, model.versine)
+def compensate_direction(model: CircleParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Compensate a direction by the circle model."""
+    return rotate_by_deflection(x, y, z, w0, w1, model.sine, model.versine)
 
 
 @wp.func
 def deflect(model: CircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the observed pixel by the circle model."""
     ray = pixel_to_ray(camera, xy)
-    x, y, z = turned(ray[0], ray[1], ray[2], w[0], w[1], -model.sine, model.versine)
+    x, y, z = rotate_by_deflection(ray[0], ray[1], ray[2], w[0], w[1], -model.sine, model.versine)
     return ray_to_pixel(camera, wp.vec3(x, y, z))
 
 
-# -- radial circle: the same, the angle growing off the axis
-
-
-@wp.func
-def sine_versine(a: float):
-    """Sine and 1 - cosine of an angle up to pi/2, by their series: the same bits on every device."""
-    b = a * a
-    s = 1.0 / 120.0 + b * (-1.0 / 5040.0 + b * (1.0 / 362880.0 - b / 39916800.0))
-    v = 1.0 / 720.0 + b * (-1.0 / 40320.0 + b * (1.0 / 3628800.0 - b / 479001600.0))
-    return a * (1.0 + b * (-1.0 / 6.0 + b * s)), b * (0.5 + b * (-1.0 / 24.0 + b * v))
+# -- radial circle: rotation by an angle that grows with the distance from the axis
 
 
 @wp.func
 def radial_deflection(model: RadialCircleParams, z: float) -> float:
-    """delta(phi) = delta_0 (sqrt(n^2 - sin^2 phi) / cos phi - 1) / (n - 1), for a thin prism; z is cos phi."""
+    """Return the deflection [rad] of a thin prism for a bearing with cosine ``z``.
+
+    delta(phi) = delta_0 (sqrt(n^2 - sin^2 phi) / cos phi - 1) / (n - 1), where z = cos phi.
+    """
     cos2 = z * z
     growth = wp.sqrt((model.index * model.index - 1.0 + cos2) / wp.max(cos2, 1.0e-4)) - 1.0
     return wp.abs(model.deflection * growth / (model.index - 1.0))
 
 
 @wp.func
-def turn_from_tilted_side(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
-    """From the bearing on the tilted face's side, to which the angle belongs, to the one on the flat face's side."""
+def rotate_from_tilted_side(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Rotate a bearing on the side of the tilted face to the bearing on the side of the flat face.
+
+    The deflection is a function of the given bearing.
+    """
     sine, versine = sine_versine(radial_deflection(model, z))
-    return turned(x, y, z, w0, w1, sine, versine)
+    return rotate_by_deflection(x, y, z, w0, w1, sine, versine)
 
 
 @wp.func
-def turn_from_flat_side(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
-    """The reverse: the angle belongs to the bearing that is sought; a contraction, solved by iteration."""
+def rotate_from_flat_side(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Rotate a bearing on the side of the flat face to the bearing on the side of the tilted face.
+
+    The deflection is a function of the result, so that a fixed-point iteration solves for it.
+    """
     a, b, c = x, y, z
     step = float(1.0)
     for _ in range(INVERSION_STEPS):
         sine, versine = sine_versine(-radial_deflection(model, c))
         before = c
-        a, b, c = turned(x, y, z, w0, w1, sine, versine)
+        a, b, c = rotate_by_deflection(x, y, z, w0, w1, sine, versine)
         step = wp.abs(c - before)
     scale = wp.where(step < 1.0e-4, 1.0, NAN)
     return a * scale, b * scale, c * scale
 
 
 @wp.func
-def moved(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
+def compensate_direction(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Compensate a direction by the radial circle model."""
     length = wp.sqrt(x * x + y * y + z * z)
     a, b, c = x / length, y / length, z / length
     if model.deflection < 0.0:
-        a, b, c = turn_from_flat_side(model, a, b, c, w0, w1)
+        a, b, c = rotate_from_flat_side(model, a, b, c, w0, w1)
     else:
-        a, b, c = turn_from_tilted_side(model, a, b, c, w0, w1)
+        a, b, c = rotate_from_tilted_side(model, a, b, c, w0, w1)
     return a, b, c
 
 
 @wp.func
 def deflect(model: RadialCircleParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the observed pixel by the radial circle model."""
     ray = pixel_to_ray(camera, xy)
     a, b, c = ray[0], ray[1], ray[2]
     if model.deflection < 0.0:
-        a, b, c = turn_from_tilted_side(model, a, b, c, w[0], w[1])
+        a, b, c = rotate_from_tilted_side(model, a, b, c, w[0], w[1])
     else:
-        a, b, c = turn_from_flat_side(model, a, b, c, w[0], w[1])
+        a, b, c = rotate_from_flat_side(model, a, b, c, w[0], w[1])
     return ray_to_pixel(camera, wp.vec3(a, b, c))
 
 
-# -- exact: both faces in closed form
+# -- exact: refraction at both faces in closed form
 
 
 @wp.func
-def rotated(r: wp.mat33, x: float, y: float, z: float):
-    a = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
-    b = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
-    return a, b, r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+def refract_in_prism_frame(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float, entering: int):
+    """Refract a direction at both faces, in the prism's frame; NaN if no light passes.
 
-
-@wp.func
-def refracted(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float, entering: int):
-    """A direction through both faces in the prism's frame: Gamma sin(alpha) along w; NaN where no light passes.
-
-    In at the tilted face (``entering`` 1): q is its cosine there. Out at it (0): the same behind the flat face, and the
-    other sign of n^2 - 1. z^2 by its change, not from x^2 + y^2: far off the axis that would cancel in float32.
+    The faces shift it by Gamma sin(alpha) along w. ``entering`` is 1 if the light enters at the tilted face, where q is
+    its cosine. It is 0 if the light leaves there: q is then the cosine behind the flat face, and n^2 - 1 changes its
+    sign. z^2 is computed from its change, because computing it from x^2 + y^2 would cancel in float32 far from the
+    axis.
     """
     inside = float(entering)
     length2 = x * x + y * y + z * z
@@ -183,50 +184,56 @@ def refracted(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float
     q = m.sin_apex * d + m.cos_apex * wp.sqrt(z * z + (1.0 - inside) * bent)
     shift = (wp.sqrt(q * q + (2.0 * inside - 1.0) * bent) - q) * m.sin_apex
     z2 = z * z - shift * (2.0 * d + shift)
-    passes = wp.min(wp.min(z, q), z2) > 0.0  # z2, which may be NaN, last: min(a, NaN) is NaN here
+    passes = wp.min(wp.min(z, q), z2) > 0.0  # z2 may be NaN and comes last: min(a, NaN) is NaN here
     return x + shift * w0, y + shift * w1, wp.where(passes, wp.sqrt(z2), NAN)
 
 
 @wp.func
-def through(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float, entering: int):
-    """Through the prism, entering at the tilted (1) or the flat (0) face; directions in the camera's frame."""
+def refract_through_prism(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float, entering: int):
+    """Refract a direction, given in the camera's frame, through the prism.
+
+    The light enters at the tilted (``entering`` 1) or the flat face (0).
+    """
     if m.tilted == 0:
-        d, e, f = refracted(m, x, y, z, w0, w1, entering)
+        d, e, f = refract_in_prism_frame(m, x, y, z, w0, w1, entering)
         return d, e, f
-    d, e, f = rotated(wp.transpose(m.axis), x, y, z)
-    d, e, f = refracted(m, d, e, f, w0, w1, entering)
-    return rotated(m.axis, d, e, f)
+    d, e, f = rotate(wp.transpose(m.axis), x, y, z)
+    d, e, f = refract_in_prism_frame(m, d, e, f, w0, w1, entering)
+    return rotate(m.axis, d, e, f)
 
 
 @wp.func
 def trace(m: ExactParams, ray: wp.vec3, w: wp.vec2, entering: int) -> wp.vec3:
-    x, y, z = through(m, ray[0], ray[1], ray[2], w[0], w[1], entering)
+    """Refract a bearing through the prism; :func:`refract_through_prism` with vectors."""
+    x, y, z = refract_through_prism(m, ray[0], ray[1], ray[2], w[0], w[1], entering)
     return wp.vec3(x, y, z)
 
 
 @wp.func
-def moved(model: ExactParams, x: float, y: float, z: float, w0: float, w1: float):
-    return through(model, x, y, z, w0, w1, model.flat_to_scene)
+def compensate_direction(model: ExactParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Compensate a direction by the exact model."""
+    return refract_through_prism(model, x, y, z, w0, w1, model.flat_to_scene)
 
 
 @wp.func
 def deflect(model: ExactParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the observed pixel by the exact model."""
     return ray_to_pixel(camera, trace(model, pixel_to_ray(camera, xy), w, 1 - model.flat_to_scene))
 
 
-# -- ellipse: offset and first harmonic of the displacement, per observed pixel
+# -- ellipse: offset and first harmonic of the displacement of each observed pixel
 
 
 @wp.func
-def on_ellipse(m: EllipseParams, row: int, col: int, w0: float, w1: float):
-    """Displacement of one pixel."""
+def ellipse_displacement(m: EllipseParams, row: int, col: int, w0: float, w1: float):
+    """Return the displacement [px] of a whole pixel."""
     x = m.table[row, col, 0] + m.table[row, col, 2] * w0 + m.table[row, col, 4] * w1
     return x, m.table[row, col, 1] + m.table[row, col, 3] * w0 + m.table[row, col, 5] * w1
 
 
 @wp.func
-def between_ellipses(m: EllipseParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    """Displacement bilinear between pixels, held constant past the border."""
+def interpolate_ellipses(m: EllipseParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the displacement [px] between pixels: bilinear, constant beyond the border."""
     x = wp.clamp(xy[0], 0.0, float(m.table.shape[1] - 1))
     y = wp.clamp(xy[1], 0.0, float(m.table.shape[0] - 1))
     col = wp.min(int(x), wp.max(m.table.shape[1] - 2, 0))
@@ -235,7 +242,7 @@ def between_ellipses(m: EllipseParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
     for k in range(4):
         across = wp.min(col + k % 2, m.table.shape[1] - 1)
         down = wp.min(row + k / 2, m.table.shape[0] - 1)
-        dx, dy = on_ellipse(m, down, across, w[0], w[1])
+        dx, dy = ellipse_displacement(m, down, across, w[0], w[1])
         weight = (1.0 - wp.abs(x - float(col + k % 2))) * (1.0 - wp.abs(y - float(row + k / 2)))
         total += wp.vec2(dx, dy) * weight
     return total
@@ -243,20 +250,24 @@ def between_ellipses(m: EllipseParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
 
 @wp.func
 def compensate(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    if not (wp.length(xy) < 1.0e9):  # an invalid pixel must not become an index
+    """Return the compensated pixel by the ellipse model."""
+    if not (wp.length(xy) < 1.0e9):  # a NaN pixel must not become an index
         return invalid_pixel()
     col = int(xy[0])
     row = int(xy[1])
     inside = col >= 0 and row >= 0 and col < model.table.shape[1] and row < model.table.shape[0]
     if inside and float(col) == xy[0] and float(row) == xy[1]:
-        dx, dy = on_ellipse(model, row, col, w[0], w[1])
+        dx, dy = ellipse_displacement(model, row, col, w[0], w[1])
         return xy + wp.vec2(dx, dy)
-    return xy + between_ellipses(model, xy, w)
+    return xy + interpolate_ellipses(model, xy, w)
 
 
 @wp.func
 def deflect(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    """The tables belong to the observed pixel, which is sought: a contraction, solved by iteration."""
+    """Return the observed pixel by the ellipse model.
+
+    The table belongs to the observed pixel, so that a fixed-point iteration solves for it.
+    """
     observed = xy
     error = wp.vec2(0.0, 0.0)
     for _ in range(INVERSION_STEPS):
@@ -267,33 +278,37 @@ def deflect(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2)
     return observed
 
 
-# -- every model: pixels to pixels
+# -- all models: pixels to pixels
 
 
 @wp.func
 def compensate(model: Any, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the compensated pixel of any model that compensates directions."""
     ray = pixel_to_ray(camera, xy)
-    x, y, z = moved(model, ray[0], ray[1], ray[2], w[0], w[1])
+    x, y, z = compensate_direction(model, ray[0], ray[1], ray[2], w[0], w[1])
     return ray_to_pixel(camera, wp.vec3(x, y, z))
 
 
 @wp.func
-def place(model: Any, camera: CameraParams, x: float, y: float, w0: float, w1: float):
-    """Where an event of a pixel belongs; NaN: nowhere."""
+def displace(model: Any, camera: CameraParams, x: float, y: float, w0: float, w1: float):
+    """Return the compensated position of an event at pixel (x, y); NaN if it has none."""
     xy = compensate(model, camera, wp.vec2(x, y), wp.vec2(w0, w1))
     return xy[0], xy[1]
 
 
 @wp.func
-def place(model: EllipseParams, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
-    dx, dy = on_ellipse(model, int(y), int(x), w0, w1)
+def displace(model: EllipseParams, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
+    """Return the compensated position by the ellipse model, for a camera without distortion."""
+    dx, dy = ellipse_displacement(model, int(y), int(x), w0, w1)
     return x + dx, y + dy
 
 
 @wp.func
-def place(model: Any, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
-    """The same without a branch, for cameras without distortion."""
-    a, b, c = moved(model, (x - camera.cx) * camera.inverse_fx, (y - camera.cy) * camera.inverse_fy, 1.0, w0, w1)
+def displace(model: Any, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
+    """Return the compensated position without branches, for a camera without distortion."""
+    a, b, c = compensate_direction(
+        model, (x - camera.cx) * camera.inverse_fx, (y - camera.cy) * camera.inverse_fy, 1.0, w0, w1
+    )
     scale = wp.where(c > 1.0e-6, 1.0 / c, NAN)
     return camera.fx * (a * scale) + camera.cx, camera.fy * (b * scale) + camera.cy
 
@@ -307,6 +322,7 @@ def compensate_points(
     start: int,
     out: wp.array(dtype=wp.vec2),
 ):
+    """Compensate one pixel per thread."""
     i = start + wp.tid()
     out[i] = compensate(model, camera, xy[i], azimuth(model, theta[i]))
 
@@ -320,6 +336,7 @@ def deflect_points(
     start: int,
     out: wp.array(dtype=wp.vec2),
 ):
+    """Deflect one pixel per thread."""
     i = start + wp.tid()
     out[i] = deflect(model, camera, xy[i], azimuth(model, theta[i]))
 
@@ -331,7 +348,7 @@ def fit_harmonics(
     start: int,
     table: wp.array3d(dtype=float),
 ):
-    """Least squares of offset and first harmonic over evenly spaced angles (their Fourier sums)."""
+    """Fit offset and first harmonic of the displacement of one pixel per thread, by Fourier sums over angles."""
     pixel = start + wp.tid()
     row, col = pixel // table.shape[1], pixel % table.shape[1]
     xy = wp.vec2(float(col), float(row))

@@ -1,15 +1,18 @@
-"""Packets' columns put one after the other on a CPU, and looked at in passing: many packets by one launch, so that
-threads do not wait for Python's lock at each of them."""
+"""Copy of the columns of many packets into contiguous arrays on a CPU, with a check of order and range.
+
+One launch copies many packets, so that threads do not wait for Python's lock at each packet.
+"""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 ROW = 10
-"""Numbers of a part: where the addresses of its x, y, t, p stand, addresses where they go (p: 0 for nowhere), how many
-events, and 1 where the event before them in memory is the one before them in time."""
+"""Entries per table row: addresses of the pointers to x, y, t and p; destination addresses (p: 0 to skip it); number of
+events; and 1 if the event before the first one in memory also precedes it in time.
+"""
 FOUND = 3
-"""What is found of a part: whether it is unsorted, and the largest x and y [px]."""
+"""Results per table row: 1 if the times are out of order, else 0; largest x [px]; largest y [px]."""
 
 
 @wp.func_native("""
@@ -33,9 +36,11 @@ FOUND = 3
     int32_t* out = (int32_t*)found.data + 3 * i;
     out[0] = back != 0; out[1] = most_x; out[2] = most_y;
 """)
-def gather_part(table: wp.array(dtype=wp.uint64), i: int, found: wp.array(dtype=int)): ...
+def gather_part(table: wp.array(dtype=wp.uint64), i: int, found: wp.array(dtype=int)):
+    """Copy the packet of table row ``i`` and store its results in ``found``."""
 
 
 @wp.kernel
 def gather_parts(table: wp.array(dtype=wp.uint64), found: wp.array(dtype=int), start: int):
+    """Copy the packet of one table row per thread."""
     gather_part(table, start + wp.tid(), found)

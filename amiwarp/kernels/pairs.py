@@ -1,22 +1,23 @@
-"""Device side of :mod:`amiwarp.brightness.solver.event_pairs`: from events to the pairs that the equations are made of.
+"""Event pairs: from events to the pairs that form the equations of :mod:`amiwarp.brightness.solver`.
 
-Events are sorted by pixel, and stay in time's order within one. Every event is then a candidate for up to three pairs,
-and every pixel for one in each span of time in which it kept quiet: candidates are marked, counted and written.
+Events are sorted by pixel, and by time within a pixel. Every event is then a candidate for up to three pairs; every
+pixel is a candidate for one pair in each time span without events. Candidates are marked, counted and written.
 """
 
 import warp as wp
 
-from amiwarp.kernels.encoder import EncoderParams, piece_at
+from amiwarp.kernels.encoder import THETA_U32_RAD, EncoderParams, piece_at
 from amiwarp.kernels.photometric import HELD, QUIET, Pairs
 
 wp.set_module_options({"enable_backward": False})
 
-TURN = wp.constant(2.0 * 3.141592653589793 / 4294967296.0)  # rad in an angle's unit, 2**-32 turn
-
 
 @wp.struct
 class Sorted:
-    """Events, and their order by span and pixel: ``key`` = span · pixels + pixel; ``order``: index of the event."""
+    """Events and their order by span and pixel.
+
+    ``key`` is span · pixels + pixel; ``order`` is the index of the event.
+    """
 
     count: int
     pixels: int
@@ -31,15 +32,15 @@ class Sorted:
 
 @wp.struct
 class Window:
-    """Times [us]: of the window, and of what the sensor does."""
+    """Times of the window and of the sensor."""
 
-    start: wp.int64
+    start: wp.int64  # of the window [us]
     stop: wp.int64
     middle: wp.int64
-    late_first: wp.float64  # added to the time of the event that sets the reference
-    late_second: wp.float64
-    longest: wp.int64  # gap between the two events of a pair
-    shortest: wp.float64
+    late_first: wp.float64  # added to the time of the first event [us]
+    late_second: wp.float64  # added to the time of the second event [us]
+    longest: wp.int64  # longest gap between the two events of a pair [us]
+    shortest: wp.float64  # the gap must be longer than this [us]
 
 
 @wp.kernel
@@ -50,7 +51,7 @@ def mark_inside(
     start: int,
     flag: wp.array(dtype=int),
 ):
-    """Events of pixels that belong to a tile."""
+    """Mark the events of pixels that belong to a tile."""
     i = start + wp.tid()
     flag[i] = wp.where(tile_of[int(y[i]), int(x[i])] >= 0, 1, 0)
 
@@ -66,7 +67,10 @@ def fill_keys(
     key: wp.array(dtype=int),
     order: wp.array(dtype=int),
 ):
-    """Keys of the events that are marked, one behind the other; ``first``: index of each span's first event."""
+    """Write the keys of the marked events contiguously.
+
+    ``first`` is the index of the first event of each span.
+    """
     i = start + wp.tid()
     row = int(y[i])
     column = int(x[i])
@@ -82,7 +86,7 @@ def fill_keys(
 
 @wp.kernel
 def mark_pairs(s: Sorted, window: Window, start: int, flag: wp.array(dtype=int)):
-    """Neighbours in time of one pixel."""
+    """Mark pairs of consecutive events of one pixel."""
     i = start + wp.tid()
     flag[i] = 0
     if i + 1 < s.count and s.key[i + 1] == s.key[i]:
@@ -93,7 +97,10 @@ def mark_pairs(s: Sorted, window: Window, start: int, flag: wp.array(dtype=int))
 
 @wp.kernel
 def mark_ends(s: Sorted, start: int, flag: wp.array(dtype=int)):
-    """Each pixel's first event, behind the candidates of :func:`mark_pairs`, and its last, behind those."""
+    """Mark the first event of each pixel, and the last.
+
+    The flags follow those of :func:`mark_pairs`: ``count`` flags for first events, then ``count`` for last events.
+    """
     i = start + wp.tid()
     flag[s.count + i] = wp.where(i == 0 or s.key[wp.max(i - 1, 0)] != s.key[i], 1, 0)
     flag[2 * s.count + i] = wp.where(i == s.count - 1 or s.key[wp.min(i + 1, s.count - 1)] != s.key[i], 1, 0)
@@ -101,7 +108,7 @@ def mark_ends(s: Sorted, start: int, flag: wp.array(dtype=int)):
 
 @wp.kernel
 def mark_spans(s: Sorted, edges: wp.array(dtype=wp.int64), start: int, fired: wp.array(dtype=wp.uint8)):
-    """Which pixels fire between which two edges."""
+    """Mark the pixels that fire in each span between two edges."""
     i = start + wp.tid()
     t = s.t[i]
     spans = edges.shape[0] - 1
@@ -123,7 +130,7 @@ def mark_quiet(
     fired: wp.array(dtype=wp.uint8), tile_of: wp.array(dtype=int), at_least: int, base: int, start: int,
     flag: wp.array(dtype=int),
 ):  # fmt: skip
-    """Spans of a pixel that belong to ``at_least`` spans in a row without an event."""
+    """Mark the spans of each pixel that belong to at least ``at_least`` consecutive spans without an event."""
     pixel = start + wp.tid()
     pixels = tile_of.shape[0]
     spans = fired.shape[0] / pixels
@@ -145,23 +152,27 @@ def mark_quiet(
 
 
 @wp.func
-def keep_time(encoder: EncoderParams, window: Window, pairs: Pairs, k: int, i: int, t: wp.int64, late: wp.float64):
-    """Time and azimuth of an event, ``late`` [us] after its stamp, on the piece of the encoder that its stamp is on."""
+def store_time(encoder: EncoderParams, window: Window, pairs: Pairs, k: int, i: int, t: wp.int64, late: wp.float64):
+    """Store time and azimuth of an event, ``late`` [us] after its time stamp.
+
+    The angle is extrapolated on the encoder's piece at the time stamp.
+    """
     elapsed = t - encoder.origin
     piece = piece_at(encoder, elapsed)
     slope = encoder.slope[piece]
     angle = encoder.angle[piece] + wp.uint64(elapsed - encoder.start[piece]) * slope
     angle += wp.uint64(wp.int64(wp.float64(wp.int64(slope)) * late))
-    theta = float(wp.float64(wp.int32(wp.uint32(angle >> wp.uint64(32)))) * wp.float64(TURN))
+    theta = float(wp.float64(wp.int32(wp.uint32(angle >> wp.uint64(32)))) * wp.float64(THETA_U32_RAD))
     pairs.azimuth[2 * k * pairs.stride + i] = wp.cos(theta)
     pairs.azimuth[(2 * k + 1) * pairs.stride + i] = wp.sin(theta)
     pairs.time[k * pairs.stride + i] = float(wp.float64(t - window.middle) * wp.float64(1.0e-6))
 
 
 @wp.func
-def keep_pair(encoder: EncoderParams, window: Window, pairs: Pairs, i: int, first: wp.int64, second: wp.int64):
-    keep_time(encoder, window, pairs, 0, i, first, window.late_first)
-    keep_time(encoder, window, pairs, 1, i, second, window.late_second)
+def store_pair(encoder: EncoderParams, window: Window, pairs: Pairs, i: int, first: wp.int64, second: wp.int64):
+    """Store the times and azimuths of both events of a pair."""
+    store_time(encoder, window, pairs, 0, i, first, window.late_first)
+    store_time(encoder, window, pairs, 1, i, second, window.late_second)
 
 
 @wp.kernel
@@ -169,7 +180,7 @@ def write_pairs(
     s: Sorted, window: Window, encoder: EncoderParams, tile_of: wp.array2d(dtype=int), flag: wp.array(dtype=int),
     place: wp.array(dtype=int), start: int, pairs: Pairs,
 ):  # fmt: skip
-    """The candidates that are marked, of events."""
+    """Write the marked pairs that include an event."""
     candidate = start + wp.tid()
     if flag[candidate] == 0:
         return
@@ -182,13 +193,13 @@ def write_pairs(
     pairs.tile[i] = tile_of[int(s.y[event]), int(s.x[event])]
     if kind == 0:
         pairs.on[i] = s.p[s.order[at + 1]]
-        keep_pair(encoder, window, pairs, i, s.t[event], s.t[s.order[at + 1]])
+        store_pair(encoder, window, pairs, i, s.t[event], s.t[s.order[at + 1]])
     elif kind == 1:
         pairs.on[i] = s.p[event] | wp.uint8(4)
-        keep_pair(encoder, window, pairs, i, window.start, s.t[event])
+        store_pair(encoder, window, pairs, i, window.start, s.t[event])
     else:
         pairs.on[i] = wp.uint8(2)
-        keep_pair(encoder, window, pairs, i, s.t[event], window.stop)
+        store_pair(encoder, window, pairs, i, s.t[event], window.stop)
 
 
 @wp.kernel
@@ -196,7 +207,7 @@ def write_quiet(
     edges: wp.array(dtype=wp.int64), window: Window, encoder: EncoderParams, tile_of: wp.array2d(dtype=int), base: int,
     flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, pairs: Pairs,
 ):  # fmt: skip
-    """The candidates that are marked, of silence."""
+    """Write the marked pairs of spans without an event."""
     candidate = start + wp.tid()
     if flag[base + candidate] == 0:
         return
@@ -209,15 +220,15 @@ def write_quiet(
     pairs.y[i] = wp.uint16(row)
     pairs.tile[i] = tile_of[row, column]
     pairs.on[i] = wp.uint8(2)
-    keep_pair(encoder, window, pairs, i, edges[span], edges[span + 1])
+    store_pair(encoder, window, pairs, i, edges[span], edges[span + 1])
 
 
-# -- choosing
+# -- selecting
 
 
 @wp.func
 def tile_at(tile_of: wp.array2d(dtype=int), x: float, y: float) -> int:
-    """The tile of the pixel about a place; -1 outside, and where the place is NaN."""
+    """Return the tile of the pixel nearest to a position; -1 outside, and for NaN."""
     inside = x >= -0.5 and y >= -0.5 and x < float(tile_of.shape[1]) - 0.5 and y < float(tile_of.shape[0]) - 0.5
     if not inside:
         return -1
@@ -229,7 +240,10 @@ def mark_same_tile(
     places: wp.array(dtype=wp.vec4), tile_of: wp.array2d(dtype=int), listed: wp.array(dtype=int), start: int,
     tile: wp.array(dtype=int), flag: wp.array(dtype=int),
 ):  # fmt: skip
-    """Pairs whose events both fall on one tile of those ``listed`` (1, else 0), which becomes theirs."""
+    """Mark pairs whose events both fall on one tile that is ``listed`` (1, else 0).
+
+    That tile becomes the tile of the pair.
+    """
     i = start + wp.tid()
     a = tile_at(tile_of, places[i][0], places[i][1])
     b = tile_at(tile_of, places[i][2], places[i][3])
@@ -241,12 +255,14 @@ def mark_same_tile(
 
 @wp.kernel
 def mark_listed(tile: wp.array(dtype=int), listed: wp.array(dtype=int), start: int, flag: wp.array(dtype=int)):
+    """Mark pairs whose tile is listed."""
     i = start + wp.tid()
     flag[i] = listed[tile[i]]
 
 
 @wp.kernel
 def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: wp.array(dtype=int)):
+    """Mark pairs in a square of the sensor [px]."""
     i = start + wp.tid()
     x = int(pairs.x[i]) - left
     y = int(pairs.y[i]) - top
@@ -255,7 +271,7 @@ def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: 
 
 @wp.kernel
 def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs):
-    """The pairs that are marked, one behind the other."""
+    """Copy the marked pairs contiguously."""
     i = start + wp.tid()
     if flag[i] == 0:
         return
@@ -274,7 +290,7 @@ def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), 
 
 @wp.kernel
 def hold_out(every: int, start: int, on: wp.array(dtype=wp.uint8)):
-    """Marks every so many-th pair of two events, which come first."""
+    """Hold out every ``every``-th pair of two events; these pairs come first."""
     i = start + wp.tid()
     if i % every == 0 and on[i] < QUIET:
         on[i] = on[i] | HELD
@@ -283,7 +299,7 @@ def hold_out(every: int, start: int, on: wp.array(dtype=wp.uint8)):
 @wp.kernel
 def keep_nodes(nodes: wp.array(dtype=wp.uint8), on: wp.array(dtype=wp.uint8), stride: int, start: int,
                cell: wp.array(dtype=int)):  # fmt: skip
-    """Leaves out pairs of two events one of which lies off ``nodes``."""
+    """Leave out pairs of two events if either event lies off ``nodes``."""
     i = start + wp.tid()
     if cell[i] < 0 or on[i] > wp.uint8(1):
         return
@@ -294,22 +310,23 @@ def keep_nodes(nodes: wp.array(dtype=wp.uint8), on: wp.array(dtype=wp.uint8), st
 
 @wp.kernel
 def count_pixels(s: Sorted, start: int, count: wp.array(dtype=int)):
+    """Count the events of each pixel."""
     i = start + wp.tid()
     wp.atomic_add(count, int(s.y[i]) * s.columns + int(s.x[i]), 1)
 
 
 @wp.func
 def mirrored(i: int, n: int) -> int:
-    """Reflected about the centres of the outermost pixels."""
+    """Return the index reflected about the centres of the outermost pixels."""
     j = wp.abs(i)
     return wp.where(j < n, j, 2 * n - 2 - j)
 
 
 @wp.kernel
 def mark_hot(count: wp.array2d(dtype=int), tile: int, start: int, tile_of: wp.array(dtype=int)):
-    """-1 for pixels that fire far more than the third quartile of the 5 x 5 around them, else ``tile``.
+    """Set the tile to -1 for hot pixels, and to ``tile`` for the others.
 
-    That is so where 19 of the 25 are so low that even they would make this one hot.
+    A pixel is hot if it fires far more than at least 19 of the 25 pixels of the 5 x 5 around it.
     """
     i = start + wp.tid()
     rows = count.shape[0]

@@ -1,9 +1,9 @@
-"""Device side of the photometric stage: pairs of events as equations in a log-brightness map, and their operator.
+"""Event pairs as equations in a log-brightness map, and the operator of these equations.
 
-The map is a set of rectangular tiles of equal shape, one behind the other, followed by two more unknowns: the leak, and
-by how much the OFF threshold exceeds the ON threshold. Sums are kept in fixed point, as votes are: they do not depend
-on the order of threads. Of what is done often there are two kernels: on CUDA a thread takes one pair, on a CPU a block
-of :data:`BLOCK`, in loops that vectorise.
+The map is a set of rectangular tiles of equal shape, stored one after the other, followed by two more unknowns: the
+leak, and the excess of the OFF threshold over the ON threshold. Sums are in fixed point, as votes are, so that they do
+not depend on the order of threads. Frequent operations have two kernels: on CUDA a thread processes one pair, on a CPU
+a block of :data:`BLOCK` pairs in vectorised loops.
 """
 
 import warp as wp
@@ -15,9 +15,9 @@ from amiwarp.kernels.prior import EXTRA
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = wp.constant(64)  # pairs that a CPU takes at a time; their arrays are padded to whole blocks
-# What a pair's ``on`` may hold: bit 0, the polarity; bit 1, no event at the second time; bit 2, none at the first;
-# bit 3, held out: it does not weigh.
+BLOCK = wp.constant(64)  # pairs per CPU thread; arrays are padded to whole blocks
+# Bits of a pair's ``on``: bit 0 is the polarity; bit 1, no event at the second time; bit 2, no event at the first time;
+# bit 3, held out, with weight 0.
 ON = wp.constant(wp.uint8(1))
 QUIET = wp.constant(wp.uint8(2))
 HELD = wp.constant(wp.uint8(8))
@@ -25,20 +25,20 @@ HELD = wp.constant(wp.uint8(8))
 
 @wp.struct
 class Pairs:
-    """Two consecutive events of a pixel each: the first sets the reference, the second is fired.
+    """Pairs of consecutive events of a pixel: the first sets the reference level, the second is triggered by it.
 
-    Flat arrays: ``azimuth`` holds all cosines of the encoder's angle at the first, the sines, and both at the second;
-    ``time`` [s] from the window's middle, and ``slope`` of the angle per unit of the drifting parameter (or empty),
-    all first, then all second ones.
+    All arrays are flat. ``azimuth`` holds four parts: the cosines of the encoder's angle at the first events, the
+    sines, and both at the second events. ``time`` [s] counts from the middle of the window; ``slope`` is the derivative
+    of the angle by the drifting parameter, or empty. Both hold the first events, then the second events.
     """
 
     count: int
-    stride: int  # length of each of these parts
-    weak: float  # weight of pairs that are not of two events
+    stride: int  # length of each part of ``azimuth``, ``time`` and ``slope``
+    weak: float  # weight of pairs without two events
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
     tile: wp.array(dtype=wp.int32)
-    on: wp.array(dtype=wp.uint8)  # polarity of the second, and which of the two is no event
+    on: wp.array(dtype=wp.uint8)  # polarity of the second event, and flags; see ON, QUIET and HELD
     azimuth: wp.array(dtype=float)
     slope: wp.array(dtype=float)
     time: wp.array(dtype=float)
@@ -46,48 +46,52 @@ class Pairs:
 
 @wp.struct
 class Atlas:
-    """Tiles of the map: ``origin`` (x, y, x, …) is the pixel of a tile's first node, nodes are ``1 / density`` px
-    apart."""
+    """Tiles of the map.
+
+    ``origin`` (x, y, x, …) is the pixel of each tile's first node. Nodes are ``1 / density`` px apart.
+    """
 
     origin: wp.array(dtype=float)
     rows: int
     columns: int
     density: float
-    with_leak: float
-    with_off: int  # whether the OFF threshold is solved for
+    with_leak: float  # 1 if the leak is solved for, else 0
+    with_off: int  # 1 if the OFF threshold is solved for, else 0
 
 
 @wp.struct
 class Geometry:
-    """Where either event of a pair falls on the map: index of the upper left node, and the way to the next."""
+    """Position of both events of a pair on the map: index of the upper left node, and the fraction to the next node."""
 
     stride: int
-    cell: wp.array(dtype=int)  # of all first, then all second events; -1: one of the two is not on its tile
-    part: wp.array(dtype=float)  # all x of the first, y, x of the second, y
+    cell: wp.array(dtype=int)  # nodes of all first, then of all second events; -1 if either event is off its tile
+    part: wp.array(dtype=float)  # fractions: x of all first events, y of them, x of all second events, y of them
 
 
 # -- one equation
 
 
 @wp.func
-def part_of(g: Geometry, k: int, i: int) -> wp.vec2:
+def fractions_of(g: Geometry, k: int, i: int) -> wp.vec2:
+    """Return the fractions (x, y) of the first (k = 0) or second event."""
     return wp.vec2(load_float(g.part, 2 * k * g.stride + i), load_float(g.part, (2 * k + 1) * g.stride + i))
 
 
 @wp.func
 def fraction(node: wp.vec2) -> wp.vec2:
+    """Return the fractional part of node coordinates."""
     return wp.vec2(node[0] - wp.floor(node[0]), node[1] - wp.floor(node[1]))
 
 
 @wp.func
 def bilinear(f: wp.vec2) -> wp.vec4:
-    """Weights of the nodes: upper left, upper right, lower left, lower right."""
+    """Return the weights of the nodes: upper left, upper right, lower left, lower right."""
     return wp.vec4((1.0 - f[0]) * (1.0 - f[1]), f[0] * (1.0 - f[1]), (1.0 - f[0]) * f[1], f[0] * f[1])
 
 
 @wp.func
-def look_up(image: wp.array(dtype=float), g: Geometry, columns: int, k: int, i: int) -> float:
-    """Brightness at the first (k = 0) or second event; that of node 0 for a pair off the map."""
+def brightness_at(image: wp.array(dtype=float), g: Geometry, columns: int, k: int, i: int) -> float:
+    """Return the brightness at the first (k = 0) or second event; for a pair off the map that of node 0."""
     cell = wp.max(load_int(g.cell, k * g.stride + i), 0)
     fx = load_float(g.part, 2 * k * g.stride + i)
     fy = load_float(g.part, (2 * k + 1) * g.stride + i)
@@ -98,14 +102,15 @@ def look_up(image: wp.array(dtype=float), g: Geometry, columns: int, k: int, i: 
 
 @wp.func
 def is_off(pairs: Pairs, i: int) -> float:
+    """Return 1 if the second event of the pair is an OFF event, else 0."""
     return wp.where((int(load_uint8(pairs.on, i)) & 3) == 0, 1.0, 0.0)
 
 
 @wp.func
 def difference(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, g: Geometry, i: int) -> float:
-    """Left side of a pair's equation: L(second) - L(first) + [OFF] s + leak (t2 - t1)."""
+    """Return the left side of a pair's equation: L(second) - L(first) + [OFF] s + leak (t2 - t1)."""
     extra = image.shape[0] - EXTRA
-    value = look_up(image, g, atlas.columns, 1, i) - look_up(image, g, atlas.columns, 0, i)
+    value = brightness_at(image, g, atlas.columns, 1, i) - brightness_at(image, g, atlas.columns, 0, i)
     elapsed = load_float(pairs.time, pairs.stride + i) - load_float(pairs.time, i)
     value += atlas.with_leak * load_float(image, extra) * elapsed
     return value + is_off(pairs, i) * load_float(image, extra + 1)
@@ -113,14 +118,14 @@ def difference(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, g: Geom
 
 @wp.func
 def right_side(pairs: Pairs, i: int) -> float:
-    """In units of the ON threshold: +1 for ON, -1 for OFF, 0 where the pixel kept quiet."""
+    """Return the right side in units of the ON threshold: +1 for ON, -1 for OFF, 0 for a quiet pixel."""
     on = int(load_uint8(pairs.on, i))
     return wp.where((on & 2) != 0, 0.0, wp.where((on & 1) != 0, 1.0, -1.0))
 
 
 @wp.func
-def spread(sums: wp.array(dtype=wp.int64), cell: int, columns: int, f: wp.vec2, value: float):
-    """The reverse of :func:`look_up`."""
+def add_to_nodes(sums: wp.array(dtype=wp.int64), cell: int, columns: int, f: wp.vec2, value: float):
+    """Add a value to the sums of four nodes; the transpose of :func:`brightness_at`."""
     upper = value * (1.0 - f[1])
     lower = value * f[1]
     add_two(sums, cell, to_fixed(upper * (1.0 - f[0])), to_fixed(upper * f[0]))
@@ -129,17 +134,17 @@ def spread(sums: wp.array(dtype=wp.int64), cell: int, columns: int, f: wp.vec2, 
 
 @wp.func
 def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g: Geometry, i: int, value: float):
-    """The transpose of :func:`difference`; nothing for a pair off the map."""
+    """Add the transpose of :func:`difference` times a value to the sums; nothing for a pair off the map."""
     if g.cell[i] < 0:
         return
-    spread(sums, g.cell[g.stride + i], atlas.columns, part_of(g, 1, i), value)
-    spread(sums, g.cell[i], atlas.columns, part_of(g, 0, i), -value)
+    add_to_nodes(sums, g.cell[g.stride + i], atlas.columns, fractions_of(g, 1, i), value)
+    add_to_nodes(sums, g.cell[i], atlas.columns, fractions_of(g, 0, i), -value)
     add_extra(sums, atlas, pairs, i, value)
 
 
 @wp.func
 def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int, value: float):
-    """To the unknowns behind the map."""
+    """Add to the sums of the leak and the OFF threshold."""
     extra = sums.shape[0] - EXTRA
     if atlas.with_leak > 0.0:
         add_fixed(sums, extra, value * (pairs.time[pairs.stride + i] - pairs.time[i]))
@@ -148,8 +153,11 @@ def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int
 
 
 @wp.func
-def continues(g: Geometry, i: int) -> bool:
-    """Whether pair i - 1, i > 0, ends where pair i begins: one addition then does for both."""
+def continues_previous(g: Geometry, i: int) -> bool:
+    """Return whether pair i begins at the position at which pair i - 1 ends, for i > 0.
+
+    A single addition then serves both pairs.
+    """
     before = g.stride + i - 1
     if g.cell[i] < 0 or g.cell[i] != g.cell[before]:
         return False
@@ -169,17 +177,17 @@ def apply_normal(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """sums += Aᵀ W A vector."""
+    """Compute sums += Aᵀ W A vector, one pair per thread."""
     i = start + wp.tid()
     if geometry.cell[i] < 0:
         return
     value = weight[i] * difference(vector, atlas, pairs, geometry, i)
     add_extra(sums, atlas, pairs, i, value)
-    if i == 0 or not continues(geometry, i):
-        spread(sums, geometry.cell[i], atlas.columns, part_of(geometry, 0, i), -value)
-    if i + 1 < pairs.count and continues(geometry, i + 1):
+    if i == 0 or not continues_previous(geometry, i):
+        add_to_nodes(sums, geometry.cell[i], atlas.columns, fractions_of(geometry, 0, i), -value)
+    if i + 1 < pairs.count and continues_previous(geometry, i + 1):
         value -= weight[i + 1] * difference(vector, atlas, pairs, geometry, i + 1)
-    spread(sums, geometry.cell[geometry.stride + i], atlas.columns, part_of(geometry, 1, i), value)
+    add_to_nodes(sums, geometry.cell[geometry.stride + i], atlas.columns, fractions_of(geometry, 1, i), value)
 
 
 @wp.kernel
@@ -192,7 +200,7 @@ def apply_normal_blocks(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """The same, a block a thread."""
+    """Compute sums += Aᵀ W A vector, one block of pairs per thread. For CPUs."""
     first = (start + wp.tid()) * BLOCK
     values = wp.zeros(shape=(64,), dtype=float)
     for k in range(BLOCK):
@@ -211,7 +219,7 @@ def apply_transpose(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """sums += Aᵀ W residual."""
+    """Compute sums += Aᵀ W residual."""
     i = start + wp.tid()
     transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
 
@@ -225,7 +233,7 @@ def subtract(
     start: int,
     residual: wp.array(dtype=float),
 ):
-    """residual -= A vector; 0 for a pair that is not on the map."""
+    """Compute residual -= A vector; 0 for a pair off the map."""
     i = start + wp.tid()
     if i < pairs.count:
         rest = residual[i] - difference(vector, atlas, pairs, geometry, i)
@@ -241,13 +249,13 @@ def add_diagonal(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """sums += diag(Aᵀ W A), as if the two places of a pair shared no node: the preconditioner."""
+    """Compute sums += diag(Aᵀ W A), the preconditioner, as if the two positions of a pair shared no node."""
     i = start + wp.tid()
     if geometry.cell[i] < 0:
         return
     extra = sums.shape[0] - EXTRA
     for k in range(2):
-        w = bilinear(part_of(geometry, k, i))
+        w = bilinear(fractions_of(geometry, k, i))
         w = wp.cw_mul(w, w) * weight[i]
         cell = geometry.cell[k * geometry.stride + i]
         add_two(sums, cell, to_fixed(w[0]), to_fixed(w[1]))
@@ -270,7 +278,7 @@ def weigh(
     weight: wp.array(dtype=float),
     residual: wp.array(dtype=float),
 ):
-    """Residual of each equation, and Cauchy's weight for it; NaN and 0 for a pair that is not on the map."""
+    """Compute the residual of each equation and its Cauchy weight; NaN and 0 for a pair off the map."""
     i = start + wp.tid()
     if i >= pairs.count:
         return
@@ -279,7 +287,7 @@ def weigh(
     residual[i] = wp.where(on_map, r, NAN)
     cauchy = 1.0 / (1.0 + (r / scale[0]) * (r / scale[0]))
     if pairs.on[i] > ON:
-        cauchy = pairs.weak / (1.0 + r * r)  # right to within a threshold
+        cauchy = pairs.weak / (1.0 + r * r)  # accurate to within one threshold
     if (pairs.on[i] & HELD) != wp.uint8(0):
         cauchy = 0.0
     weight[i] = wp.where(on_map, cauchy, 0.0)

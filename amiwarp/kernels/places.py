@@ -1,4 +1,4 @@
-"""Device side of :mod:`amiwarp.brightness.solver`: where the events of a pair fall on the map."""
+"""Positions of event pairs on the map, for :mod:`amiwarp.brightness.solver`."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
 from amiwarp.kernels.native import load_float, load_int, load_uint16, store_float, store_int
-from amiwarp.kernels.optics import MODEL_STRUCTS, compensate, place
+from amiwarp.kernels.optics import MODEL_STRUCTS, compensate, displace
 from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs
 
 wp.set_module_options({"enable_backward": False})
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def node_at(atlas: Atlas, tile: int, x: float, y: float):
-    """Index of the node to the upper left, -1 off the tile or where the place is NaN; and the way to the next."""
+    """Return the index of the node to the upper left and the fractions to the next; -1 off the tile, and for NaN."""
     u = (x - load_float(atlas.origin, 2 * tile)) * atlas.density
     v = (y - load_float(atlas.origin, 2 * tile + 1)) * atlas.density
     inside = wp.where(u >= 0.0, wp.where(u < float(atlas.columns - 1), 1, 0), 0)
@@ -26,19 +26,19 @@ def node_at(atlas: Atlas, tile: int, x: float, y: float):
 
 
 @wp.func
-def azimuth_of(model: Any, pairs: Pairs, k: int, i: int):
-    """Cosine and sine of the prism's azimuth at the first (k = 0) or second event."""
+def event_azimuth(model: Any, pairs: Pairs, k: int, i: int):
+    """Return (cos, sin) of the tilt azimuth at the first (k = 0) or second event."""
     c = load_float(pairs.azimuth, 2 * k * pairs.stride + i)
     s = load_float(pairs.azimuth, (2 * k + 1) * pairs.stride + i)
     return c * model.phase_cos - s * model.phase_sin, s * model.phase_cos + c * model.phase_sin
 
 
 @wp.func
-def place_of(
+def compensated_position(
     model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
-    """Compensated place of the first (k = 0) or second event of a pair [px], whatever moves."""
-    w0, w1 = azimuth_of(model, pairs, k, i)
+    """Return the compensated position [px] of the first (k = 0) or second event, drift and camera rotation included."""
+    w0, w1 = event_azimuth(model, pairs, k, i)
     if pairs.slope.shape[0] > 0:
         angle = pairs.slope[k * pairs.stride + i] * drift
         c = wp.cos(angle)
@@ -60,15 +60,16 @@ def find_places(
     start: int,
     places: wp.array(dtype=wp.vec4),
 ):
-    """Compensated places of both events of a pair [px]."""
+    """Compute the compensated positions [px] of both events of a pair."""
     i = start + wp.tid()
-    a = place_of(model, camera, camera_rotation, pairs, drift, i, 0)
-    b = place_of(model, camera, camera_rotation, pairs, drift, i, 1)
+    a = compensated_position(model, camera, camera_rotation, pairs, drift, i, 0)
+    b = compensated_position(model, camera, camera_rotation, pairs, drift, i, 1)
     places[i] = wp.vec4(a[0], a[1], b[0], b[1])
 
 
 @wp.func
-def keep_place(g: Geometry, i: int, a: int, ax: float, ay: float, b: int, bx: float, by: float):
+def store_geometry(g: Geometry, i: int, a: int, ax: float, ay: float, b: int, bx: float, by: float):
+    """Store the nodes and fractions of both events; both nodes are -1 if either is."""
     store_int(g.cell, i, wp.where(b < 0, -1, a))
     store_int(g.cell, g.stride + i, wp.where(a < 0, -1, b))
     store_float(g.part, i, ax)
@@ -88,52 +89,55 @@ def place_pairs(
     start: int,
     geometry: Geometry,
 ):
-    """Compensated places of both events of a pair, on the map."""
+    """Compute the positions of both events of a pair on the map."""
     i = start + wp.tid()
-    a = place_of(model, camera, camera_rotation, pairs, drift, i, 0)
-    b = place_of(model, camera, camera_rotation, pairs, drift, i, 1)
+    a = compensated_position(model, camera, camera_rotation, pairs, drift, i, 0)
+    b = compensated_position(model, camera, camera_rotation, pairs, drift, i, 1)
     tile = pairs.tile[i]
     cell_a, ax, ay = node_at(atlas, tile, a[0], a[1])
     cell_b, bx, by = node_at(atlas, tile, b[0], b[1])
-    keep_place(geometry, i, cell_a, ax, ay, cell_b, bx, by)
+    store_geometry(geometry, i, cell_a, ax, ay, cell_b, bx, by)
 
 
 @wp.func
-def node_of(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, k: int, i: int):
-    """Where the first (k = 0) or second event falls, for a camera without distortion that stands still, no drift."""
-    w0, w1 = azimuth_of(model, pairs, k, i)
-    u, v = place(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
+def event_node(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, k: int, i: int):
+    """Return node and fractions of the first (k = 0) or second event.
+
+    For a camera without distortion and rotation, and without drift.
+    """
+    w0, w1 = event_azimuth(model, pairs, k, i)
+    u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
     cell, x, y = node_at(atlas, load_int(pairs.tile, i), u, v)
     return cell, x, y
 
 
 @wp.kernel
 def place_still(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry):
-    """The same without branches."""
+    """Compute the positions as :func:`place_pairs` does, without branches; see :func:`event_node`."""
     i = start + wp.tid()
-    a, ax, ay = node_of(model, camera, pairs, atlas, 0, i)
-    b, bx, by = node_of(model, camera, pairs, atlas, 1, i)
-    keep_place(geometry, i, a, ax, ay, b, bx, by)
+    a, ax, ay = event_node(model, camera, pairs, atlas, 0, i)
+    b, bx, by = event_node(model, camera, pairs, atlas, 1, i)
+    store_geometry(geometry, i, a, ax, ay, b, bx, by)
 
 
 @wp.kernel
 def place_blocks(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry):
-    """The same, a block a thread."""
+    """Compute the positions as :func:`place_still` does, one block of pairs per thread. For CPUs."""
     first = (start + wp.tid()) * BLOCK
     cells = wp.zeros(shape=(128,), dtype=int)
     parts = wp.zeros(shape=(256,), dtype=float)
     for k in range(BLOCK):
-        cell, x, y = node_of(model, camera, pairs, atlas, 0, first + k)
+        cell, x, y = event_node(model, camera, pairs, atlas, 0, first + k)
         store_int(cells, k, cell)
         store_float(parts, k, x)
         store_float(parts, 64 + k, y)
     for k in range(BLOCK):
-        cell, x, y = node_of(model, camera, pairs, atlas, 1, first + k)
+        cell, x, y = event_node(model, camera, pairs, atlas, 1, first + k)
         store_int(cells, 64 + k, cell)
         store_float(parts, 128 + k, x)
         store_float(parts, 192 + k, y)
     for k in range(BLOCK):
-        keep_place(
+        store_geometry(
             geometry, first + k, cells[k], parts[k], parts[64 + k], cells[64 + k], parts[128 + k], parts[192 + k]
         )
 

@@ -1,29 +1,29 @@
-"""Device side of what holds the unknowns that no equation determines: damping, and links between neighbouring nodes."""
+"""Prior for unknowns that no equation determines: damping, and links between neighbouring nodes."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 
-EXTRA = wp.constant(2)  # unknowns behind the map: leak, OFF threshold
+EXTRA = wp.constant(2)  # unknowns after the map: leak, OFF threshold
 
 
 @wp.struct
 class Prior:
-    """Cost damping x² + sum over links of weight (xᵢ - xⱼ)²; no link leaves a tile."""
+    """Prior cost: damping x² plus the sum of weight (xᵢ - xⱼ)² over all links. No link leaves a tile."""
 
     damping: float
-    linked: int
+    linked: int  # 1 if there are links, else 0
     columns: int
-    held: int  # unknowns from here on keep their values
-    smooth: wp.array(dtype=float)  # one number: weight of a link between equal neighbours
+    held: int  # unknowns from this index on are fixed
+    smooth: wp.array(dtype=float)  # one element: weight of a link between equal neighbours
     right: wp.array(dtype=float)  # weight of the link to the next node; 0 in a tile's last column
-    down: wp.array(dtype=float)  # to the node below; 0 in a tile's last row
+    down: wp.array(dtype=float)  # weight of the link to the node below; 0 in a tile's last row
 
 
 @wp.func
 def prior_product(prior: Prior, vector: wp.array(dtype=float), i: int) -> float:
-    """Row i of the prior's operator times a vector."""
+    """Return row i of the prior's operator times a vector."""
     total = prior.damping * vector[i]
     if prior.linked == 0:
         return total
@@ -40,7 +40,10 @@ def prior_product(prior: Prior, vector: wp.array(dtype=float), i: int) -> float:
 
 @wp.func
 def prior_diagonal(prior: Prior, i: int) -> float:
-    """The operator's diagonal; for an unknown that is held so large that the preconditioner stops all steps to it."""
+    """Return the diagonal of the prior's operator.
+
+    For a fixed unknown it is so large that the preconditioner suppresses every step.
+    """
     if i >= prior.held:
         return 1.0e30
     total = prior.damping
@@ -56,7 +59,10 @@ def prior_diagonal(prior: Prior, i: int) -> float:
 
 @wp.func
 def link_weight(difference: float, smooth: float, edge: float) -> float:
-    """Charbonnier's weight: links let go where neighbours differ by more than ``edge``; 0 for equal weights."""
+    """Return Charbonnier's weight of a link, which falls if neighbours differ by more than ``edge``.
+
+    An ``edge`` of 0 gives all links equal weight.
+    """
     if edge <= 0.0:
         return smooth
     return smooth / wp.sqrt(1.0 + (difference / edge) * (difference / edge))
@@ -72,7 +78,7 @@ def link(
     right: wp.array(dtype=float),
     down: wp.array(dtype=float),
 ):
-    """Weights of the links from each node of the map, into the prior's arrays."""
+    """Compute the weights of the links from each node of the map."""
     i = start + wp.tid()
     if i >= right.shape[0]:
         return

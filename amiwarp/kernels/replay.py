@@ -1,4 +1,4 @@
-"""Launches that run again and again over the same arrays: a captured graph on CUDA, recorded slices on a CPU."""
+"""Programs of launches that run repeatedly on the same arrays: a CUDA graph, or recorded CPU slices."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,11 +8,14 @@ import warp as wp
 from amiwarp.kernels.cores import cpu_threads
 from amiwarp.kernels.launch import SMALLEST_SLICE, pool, slices
 
-BLOCK_DIM = 256  # threads of a block on CUDA; sums over blocks count on whole ones
+BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 
 
 class Program:
-    """Arrays and numbers are those given to :meth:`add`; what changes from run to run must lie in an array."""
+    """Sequence of launches that can be run many times.
+
+    Arrays and numbers are those passed to :meth:`add`. A value that changes between runs must be stored in an array.
+    """
 
     def __init__(self, device: Any) -> None:
         self.device = wp.get_device(device)
@@ -28,7 +31,10 @@ class Program:
         *,
         smallest: int = SMALLEST_SLICE,
     ) -> None:
-        """A kernel over ``range(n)`` whose last input is ``start: int``; see :func:`amiwarp.kernels.launch.launch`."""
+        """Append a kernel over ``range(n)`` whose last input is ``start: int``.
+
+        See :func:`amiwarp.kernels.launch.launch`. On CUDA the range is rounded up to whole blocks.
+        """
         if n == 0:
             return
         if not self.device.is_cpu:
@@ -40,7 +46,10 @@ class Program:
     def add_slices(
         self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any], *, smallest: int = SMALLEST_SLICE
     ) -> None:
-        """As :meth:`add`, slice k into ``outputs[k]`` alone; on CUDA all into the first, over ``range(n)`` alone."""
+        """Append a kernel as :meth:`add` does, but let slice k write into ``outputs[k]`` only.
+
+        On CUDA everything goes to ``outputs[0]``, and the range is exactly ``range(n)``.
+        """
         if n == 0:
             return
         ranges = slices(n, len(outputs), smallest) if self.device.is_cpu else [(0, n)]
@@ -48,6 +57,7 @@ class Program:
         self._stages.append([self._record(kernel, b - a, [*inputs, a], [out]) for (a, b), out in jobs])
 
     def _record(self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> Any:
+        """Load the kernel and return its recorded launch."""
         kernel.module.load(self.device, block_dim=1 if self.device.is_cpu else BLOCK_DIM)
         return wp.launch(
             kernel, dim=n, inputs=list(inputs), outputs=list(outputs), device=self.device, block_dim=BLOCK_DIM,
@@ -55,12 +65,12 @@ class Program:
         )  # fmt: skip
 
     def launch(self) -> None:
-        """All that was added, in order, once and for all."""
+        """Run all stages once, in the order in which they were added."""
         for stage in self._stages:
             _run_stage(stage)
 
     def run(self, times: int = 1) -> None:
-        """The same again and again."""
+        """Run all stages ``times`` times; on CUDA as a graph, which the first call captures."""
         if self.device.is_cpu:
             for _ in range(times):
                 self.launch()
@@ -74,7 +84,7 @@ class Program:
 
 
 def _run_stage(stage: list[Any]) -> None:
-    """The first slice here, the others on the pool's threads."""
+    """Run the first slice in this thread and the others on the pool."""
     others = [pool().submit(command.launch) for command in stage[1:]]
     stage[0].launch()
     for other in others:

@@ -1,61 +1,60 @@
-"""Device side of the simulator: what a pixel sees through the prism at an instant, or at several at once."""
+"""Log intensity that a pixel of the simulator sees through the prism, at one instant or at several."""
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, pixel_to_ray
+from amiwarp.kernels.camera import NAN, CameraParams, pixel_to_ray
 from amiwarp.kernels.optics import ExactParams, trace
 
 wp.set_module_options({"enable_backward": False})
 
-AHEAD = wp.constant(16)  # instants that a CPU looks at together: the columns of the next four types
+AHEAD = wp.constant(16)  # instants that a CPU computes together: number of columns of the next four types
 Instants = wp.types.matrix(shape=(11, 16), dtype=float)  # rows: cos and sin of the azimuth, then to_texel
-Met = wp.types.matrix(shape=(2, 16), dtype=float)  # rows: x and y, texel coordinates
-Located = wp.types.matrix(shape=(3, 16), dtype=float)  # rows: a texel's number (an int's bits), x and y from its centre
+TexelCoordinates = wp.types.matrix(shape=(2, 16), dtype=float)  # rows: x and y, texel coordinates
+TexelPieces = wp.types.matrix(shape=(3, 16), dtype=float)  # rows: texel index (bits of an int), x and y in it
 Levels = wp.types.vector(length=16, dtype=float)  # log intensities
-SMALLEST_DEPTH = wp.constant(1.0e-3)  # of what a bearing meets, before the camera
-NAN = wp.constant(float("nan"))
+SMALLEST_DEPTH = wp.constant(1.0e-3)  # of a scene point in front of the camera
 
 
 @wp.struct
 class View:
-    """What the pixels look at: camera, prism, picture maps."""
+    """Camera, prism and picture maps."""
 
     camera: CameraParams
     prism: ExactParams
-    maps: wp.array(dtype=wp.vec4)  # log intensity, as the four numbers of each texel's bilinear piece; slot by slot
-    width: int  # of a map
+    maps: wp.array(dtype=wp.vec4)  # coefficients of log intensity in each texel's bilinear piece; slot by slot
+    width: int  # of a map [texels]
     height: int
 
 
 @wp.struct
 class Step:
-    """An instant: the end of one step and the start of the next."""
+    """Instant: the end of one step and the start of the next."""
 
     azimuth: wp.vec2  # cos, sin of the true tilt azimuth
     to_texel: wp.mat33  # prism's frame to homogeneous texel coordinates
     before: int  # slots of the maps before and after this time
     after: int
-    weight: float  # of the one after
+    weight: float  # weight of the map after this time
 
 
 @wp.struct
 class Steps:
-    """A chunk's table of instants, equally spaced; entry ``margin`` is the chunk's start."""
+    """Table of the equally spaced instants of a chunk; entry ``margin`` is the start of the chunk."""
 
     at: wp.array(dtype=Step)
-    ahead: wp.array(dtype=Instants)  # the ends of the chunk's steps again, the last ones repeated; on a CPU only
+    ahead: wp.array(dtype=Instants)  # CPU only: the ends of the chunk's steps, the last one repeated
     angle: wp.array(dtype=float)  # true tilt azimuth [rad]
-    turn: wp.array(dtype=float)  # its change until the next instant
+    turn: wp.array(dtype=float)  # change of the azimuth until the next instant [rad]
     margin: int
     count: int
-    ticks: int  # per step
-    per_tick: float  # steps
-    shift: int  # of the time in a key: above the bits of the pixel
+    ticks: int  # ticks per step
+    per_tick: float  # steps per tick
+    shift: int  # bit position of the time in a key, above the bits of the pixel
 
 
 @wp.func
 def mirror(x: float, size: int) -> float:
-    """Texel coordinate reflected at the map's edges; to the bit the same where it is on the map."""
+    """Return a texel coordinate reflected at the map's edges; on the map it keeps its bits."""
     last = float(size - 1)
     r = wp.abs(x)
     r = r - 2.0 * last * wp.floor(r / (2.0 * last))
@@ -63,46 +62,47 @@ def mirror(x: float, size: int) -> float:
 
 
 @wp.func
-def corner(x: float, size: int) -> int:
-    """Texel whose bilinear piece holds a mirrored coordinate, which may be NaN."""
+def texel_of(x: float, size: int) -> int:
+    """Return the texel whose bilinear piece holds a mirrored coordinate, which may be NaN."""
     return wp.min(int(wp.where(x >= 0.0, x, 0.0)), size - 2)
 
 
 @wp.func
-def piece(view: View, slot: int, texel: int, fx: float, fy: float) -> float:
-    """Bilinear look-up: one load."""
+def bilinear_level(view: View, slot: int, texel: int, fx: float, fy: float) -> float:
+    """Return the log intensity in a bilinear piece, with a single load."""
     c = view.maps[slot * (view.height * view.width) + texel]
     return c[0] + fx * c[1] + fy * (c[2] + fx * c[3])
 
 
 @wp.func
-def blend(view: View, step: Step, texel: int, fx: float, fy: float) -> float:
-    """Log intensity at a place in a bilinear piece, between the maps before and after an instant."""
-    level = piece(view, step.before, texel, fx, fy)
+def blend_maps(view: View, step: Step, texel: int, fx: float, fy: float) -> float:
+    """Return the log intensity in a bilinear piece, interpolated between the maps before and after an instant."""
+    level = bilinear_level(view, step.before, texel, fx, fy)
     if step.weight > 0.0:
-        level += step.weight * (piece(view, step.after, texel, fx, fy) - level)
+        level += step.weight * (bilinear_level(view, step.after, texel, fx, fy) - level)
     return level
 
 
 @wp.func
-def look(view: View, step: Step, u: float, v: float) -> float:
-    """Log intensity at texel coordinates at an instant; NaN stays NaN."""
+def level_at(view: View, step: Step, u: float, v: float) -> float:
+    """Return the log intensity at texel coordinates at an instant; NaN for NaN."""
     x = u
     y = v
     if not (x >= 0.0 and y >= 0.0 and x <= float(view.width - 1) and y <= float(view.height - 1)):
         x = mirror(u, view.width)
         y = mirror(v, view.height)
-    col = corner(x, view.width)
-    row = corner(y, view.height)
-    return blend(view, step, row * view.width + col, x - float(col), y - float(row))
+    col = texel_of(x, view.width)
+    row = texel_of(y, view.height)
+    return blend_maps(view, step, row * view.width + col, x - float(col), y - float(row))
 
 
 @wp.func
-def bend(m: ExactParams, along: float, z: float) -> float:
-    """How far the prism shifts a bearing along the azimuth, as in kernels/optics.py; NaN where it lets no light pass.
+def prism_shift(m: ExactParams, along: float, z: float) -> float:
+    """Return the distance by which the prism shifts a bearing along the azimuth; NaN if no light passes.
 
-    ``along``, ``z``: the bearing's components along the azimuth and the axis. Without branches, see :func:`meet_ahead`:
-    the square root of a negative number is NaN, which stays NaN to the end.
+    The formula is that of kernels/optics.py. ``along`` and ``z`` are the components of the bearing along the azimuth
+    and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number gives
+    NaN, which propagates to the result.
     """
     inside = m.index2 - 1.0
     if m.flat_to_scene == 1:
@@ -113,39 +113,39 @@ def bend(m: ExactParams, along: float, z: float) -> float:
 
 
 @wp.func
-def in_front(depth: float) -> float:
-    """A depth; NaN where it is not before the camera."""
+def depth_or_nan(depth: float) -> float:
+    """Return a depth, or NaN if it is not in front of the camera."""
     return wp.where(depth > SMALLEST_DEPTH, depth, NAN)
 
 
 @wp.func
-def see(view: View, step: Step, ray: wp.vec3) -> float:
-    """Log intensity that a bearing (in the prism's frame) meets at an instant; NaN where it has no ray."""
+def see_level(view: View, step: Step, ray: wp.vec3) -> float:
+    """Return the log intensity that a bearing, in the prism's frame, sees at an instant; NaN if no light passes."""
     w = step.azimuth
     along = w[0] * ray[0] + w[1] * ray[1]
-    shift = bend(view.prism, along, ray[2])
+    shift = prism_shift(view.prism, along, ray[2])
     z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
     h = step.to_texel * wp.vec3(ray[0] + shift * w[0], ray[1] + shift * w[1], z)
-    depth = in_front(h[2])
-    return look(view, step, h[0] / depth, h[1] / depth)
+    depth = depth_or_nan(h[2])
+    return level_at(view, step, h[0] / depth, h[1] / depth)
 
 
 @wp.func
-def meet_ahead(prism: ExactParams, m: Instants, ray: wp.vec3) -> Met:
-    """Texel coordinates, as :func:`see` has them, that a bearing meets at several instants: rows of x and y.
+def texels_ahead(prism: ExactParams, m: Instants, ray: wp.vec3) -> TexelCoordinates:
+    """Return the texel coordinates, rows x and y, that a bearing sees at several instants; see :func:`see_level`.
 
-    LLVM turns such a loop to vector instructions: it has no branches, no vectors, no loads but contiguous ones, and is
-    no ``for``, which would be unrolled.
+    LLVM vectorises this loop because it has no branches, no vector types and only contiguous loads. It is a ``while``
+    loop, because Warp would unroll a ``for`` loop.
     """
-    met = Met()
+    met = TexelCoordinates()
     j = int(0)
     while j < AHEAD:
         along = m[0, j] * ray[0] + m[1, j] * ray[1]
-        shift = bend(prism, along, ray[2])
+        shift = prism_shift(prism, along, ray[2])
         x = ray[0] + shift * m[0, j]
         y = ray[1] + shift * m[1, j]
         z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
-        depth = in_front(m[8, j] * x + m[9, j] * y + m[10, j] * z)
+        depth = depth_or_nan(m[8, j] * x + m[9, j] * y + m[10, j] * z)
         met[0, j] = (m[2, j] * x + m[3, j] * y + m[4, j] * z) / depth
         met[1, j] = (m[5, j] * x + m[6, j] * y + m[7, j] * z) / depth
         j += 1
@@ -153,15 +153,15 @@ def meet_ahead(prism: ExactParams, m: Instants, ray: wp.vec3) -> Met:
 
 
 @wp.func
-def locate_ahead(view: View, met: Met) -> Located:
-    """Bilinear pieces that hold texel coordinates, and the places in them, as :func:`look` has them."""
-    at = Located()
+def locate_texels(view: View, met: TexelCoordinates) -> TexelPieces:
+    """Return the bilinear pieces of texel coordinates and the positions in them; see :func:`level_at`."""
+    at = TexelPieces()
     j = int(0)
     while j < AHEAD:
         x = mirror(met[0, j], view.width)
         y = mirror(met[1, j], view.height)
-        col = corner(x, view.width)
-        row = corner(y, view.height)
+        col = texel_of(x, view.width)
+        row = texel_of(y, view.height)
         at[0, j] = wp.cast(row * view.width + col, float)
         at[1, j] = x - float(col)
         at[2, j] = y - float(row)
@@ -170,20 +170,20 @@ def locate_ahead(view: View, met: Met) -> Located:
 
 
 @wp.func
-def see_ahead(view: View, steps: Steps, block: int, n: int, at: Located) -> Levels:
-    """Log intensities at the first ``n`` instants of a block."""
+def levels_ahead(view: View, steps: Steps, block: int, n: int, at: TexelPieces) -> Levels:
+    """Return the log intensities at the first ``n`` instants of a block."""
     levels = Levels()
     first = steps.margin + block * AHEAD + 1
     j = int(0)
     while j < n:
-        levels[j] = blend(view, steps.at[first + j], wp.cast(at[0, j], int), at[1, j], at[2, j])
+        levels[j] = blend_maps(view, steps.at[first + j], wp.cast(at[0, j], int), at[1, j], at[2, j])
         j += 1
     return levels
 
 
 @wp.func
-def local_ray(view: View, index: int) -> wp.vec3:
-    """Bearing of a pixel in the prism's frame; NaN where it points away from the prism."""
+def ray_in_prism_frame(view: View, index: int) -> wp.vec3:
+    """Return the bearing of a pixel in the prism's frame; NaN if it points away from the prism."""
     row = index / view.camera.width
     col = index - row * view.camera.width
     ray = wp.transpose(view.prism.axis) * pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
@@ -199,7 +199,7 @@ def scene_bearings(
     start: int,
     out: wp.array(dtype=wp.vec3),
 ):
-    """Bearing in the camera's frame of what a pixel sees at tilt azimuth ``theta``."""
+    """Compute the bearing, in the camera's frame, of the scene point that a pixel sees at tilt azimuth ``theta``."""
     i = start + wp.tid()
     w = wp.vec2(wp.cos(theta[i]), wp.sin(theta[i]))
     out[i] = trace(prism, pixel_to_ray(camera, xy[i]), w, prism.flat_to_scene)
@@ -207,10 +207,10 @@ def scene_bearings(
 
 @wp.kernel
 def see_without_prism(view: View, to_texel: wp.mat33, start: int, out: wp.array(dtype=float)):
-    """Log intensity at each pixel with no prism, in the first map; NaN where it has no ray."""
+    """Compute the log intensity of each pixel without a prism, in the first map; NaN if it has no ray."""
     i = start + wp.tid()
     row = i / view.camera.width
     col = i - row * view.camera.width
     h = to_texel * pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
-    depth = in_front(h[2])
-    out[i] = look(view, Step(), h[0] / depth, h[1] / depth)
+    depth = depth_or_nan(h[2])
+    out[i] = level_at(view, Step(), h[0] / depth, h[1] / depth)

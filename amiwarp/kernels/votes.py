@@ -1,11 +1,13 @@
-"""Voting events into the image of warped events (IWE): one 64-bit addition an event, nearest or bilinear.
+"""Votes into the image of warped events (IWE): one 64-bit addition per event, nearest or bilinear.
 
-A cell is the square between four pixel centres. Its word holds four sums over the events in it: their number n, and
-fx, fy and b = fx fy of their places in it, in 1/256. They are the bilinear weights' sums: n - fx - fy + b for the
-cell's first pixel, fx - b for the next column, fy - b for the next row, b for both. Integers: the image does not depend
-on order and is the same bit for bit. A word is full with 1,023 events. What is carried out of a field is taken down at
-once, exactly, in 64-bit totals; or, faster on CUDA, words are emptied before, and checked:
-see :mod:`amiwarp.imaging.warped_image`.
+A cell is the square between four pixel centres. Its word holds four sums over the events in it: their number n, and the
+sums fx, fy and b of x, y and x y, where x and y are the positions in the cell. The sums fx, fy and b are in units of
+1/256. They give the sums of the bilinear weights: n - fx - fy + b for the cell's first pixel, fx - b for the next
+column, fy - b for the next row, and b for the pixel diagonally opposite. Because the sums are integers, the image does
+not depend on the order of events and is bit-identical on every run.
+
+A word overflows after 1,023 events. Either each carry out of a field is added exactly to 64-bit totals at once; or,
+faster on CUDA, words are emptied in time and checked afterwards: see :mod:`amiwarp.imaging.warped_image`.
 """
 
 from typing import Any
@@ -13,27 +15,30 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
-from amiwarp.kernels.encoder import EncoderParams, angle_at
+from amiwarp.kernels.encoder import EncoderParams, theta_u32_at
 from amiwarp.kernels.native import add_word, load_float, load_uint8, load_uint16, store_int, store_word
-from amiwarp.kernels.optics import MODEL_STRUCTS, place
+from amiwarp.kernels.optics import MODEL_STRUCTS, displace
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-BLOCK = wp.constant(64)  # events that a CPU places eight at a time before it votes them
-TRASH = wp.constant(4096)  # words past the cells: votes outside the image, spread so that none fills up
-CAPACITY = wp.constant(1024)  # events that overflow a word
-FIELD = wp.constant(wp.int64(1 << 18))  # what a carry out of the fields fx, fy, b is worth
-MIX_1 = wp.constant(wp.uint32(0x85EBCA6B))
+BLOCK = wp.constant(64)  # events per CPU thread, which displaces eight at a time and then votes
+TRASH = wp.constant(4096)  # words after the cells for votes outside the image; many, so that none overflows
+CAPACITY = wp.constant(1024)  # number of events that overflows a word
+FIELD_CARRY = wp.constant(wp.int64(1 << 18))  # value of a carry out of the fields fx, fy, b
+MIX_1 = wp.constant(wp.uint32(0x85EBCA6B))  # multipliers of MurmurHash3's finaliser
 MIX_2 = wp.constant(wp.uint32(0xC2B2AE35))
-ONE = wp.constant(wp.uint64(1 << 54))
-CARRIES = wp.constant(wp.uint64((1 << 63) | (1 << 53) | (1 << 35) | (1 << 17)))
+ONE_EVENT = wp.constant(wp.uint64(1 << 54))  # one event in the field n
+CARRIES = wp.constant(wp.uint64((1 << 63) | (1 << 53) | (1 << 35) | (1 << 17)))  # highest bit of each field
 
 
 @wp.struct
 class EventArrays:
-    """Events on a device, padded to whole blocks. ``layer``: the image that an event goes to, by its polarity;
-    ``turn``: the encoder's angle in 1/65536 turn; ``azimuths``: cosine and sine of each such angle; ``time``: from the
-    window's middle [s], or empty where the camera does not turn."""
+    """Events on a device, padded to whole blocks.
+
+    ``layer`` is the image that an event goes to, by its polarity. ``turn`` is theta_u16, the encoder's angle [1/65536
+    turn], and ``azimuths`` holds cosine and sine of each such angle. ``time`` [s] counts from the middle of the window;
+    it is empty if the camera does not rotate. ``weight`` is the number of events that an entry stands for, or empty.
+    """
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
@@ -46,28 +51,29 @@ class EventArrays:
 
 @wp.struct
 class Canvas:
-    """Where votes go: the image grown by ``pad`` pixels on each side, then scaled, within a ring of one pixel."""
+    """Geometry of the votes: the image grown by ``pad`` pixels on each side, scaled, with a border of one pixel."""
 
-    pad: float
-    scale: float
-    nearest: int
-    dither: float  # 1: an event lies somewhere in its pixel, 0: at its centre
-    rows: int
+    pad: float  # [px]
+    scale: float  # canvas pixels per sensor pixel
+    nearest: int  # 1: nearest votes, 0: bilinear votes
+    dither: float  # 1: events get a random offset in their pixels; 0: they lie at the centres
+    rows: int  # of cells, the border included
     columns: int
-    layer: int  # cells from one image to the next; 0: together
+    layer: int  # cells from one image to the next; 0: one image for all events
 
 
 @wp.struct
 class Cells:
-    """The words of one image, trash after the cells, and the totals of what no longer fitted into them."""
+    """Words of one image, followed by the trash words, and the totals of what overflowed the words."""
 
     words: wp.array(dtype=wp.uint64)
     totals: wp.array(dtype=wp.int64)
-    spilled: wp.array(dtype=wp.int32)  # 1 once there is anything in the totals
+    spilled: wp.array(dtype=wp.int32)  # 1 if the totals are not all zero
 
 
 @wp.func
-def add_moments(cells: Cells, cell: int, width: int, n: wp.int64, fx: wp.int64, fy: wp.int64, b: wp.int64):
+def add_to_totals(cells: Cells, cell: int, width: int, n: wp.int64, fx: wp.int64, fy: wp.int64, b: wp.int64):
+    """Add moments of a cell, given in the units of its word, to the totals of its four pixels."""
     wp.atomic_add(cells.totals, cell, wp.int64(256) * n - fx - fy + b)
     wp.atomic_add(cells.totals, cell + 1, fx - b)
     wp.atomic_add(cells.totals, cell + width, fy - b)
@@ -76,40 +82,47 @@ def add_moments(cells: Cells, cell: int, width: int, n: wp.int64, fx: wp.int64, 
 
 
 @wp.func
-def carried(carry: wp.uint64, bit: int) -> wp.int64:
+def carry_bit(carry: wp.uint64, bit: int) -> wp.int64:
+    """Return bit ``bit`` of the carries."""
     return wp.int64((carry >> wp.uint64(bit)) & wp.uint64(1))
 
 
 @wp.func
-def take_down(cells: Cells, cell: int, width: int, carry: wp.uint64):
-    """Moves carries to the totals: what a field lost, less the one that the next field wrongly got."""
-    fx = carried(carry, 17)
-    fy = carried(carry, 35)
-    b = carried(carry, 53)
-    n = wp.int64(CAPACITY) * carried(carry, 63) - b
-    add_moments(cells, cell, width, n, FIELD * fx, FIELD * fy - fx, FIELD * b - fy)
+def add_carries_to_totals(cells: Cells, cell: int, width: int, carry: wp.uint64):
+    """Add the carries of a word to the totals.
+
+    Each field lost its overflow; the field above it received a 1 that does not belong to it.
+    """
+    fx = carry_bit(carry, 17)
+    fy = carry_bit(carry, 35)
+    b = carry_bit(carry, 53)
+    n = wp.int64(CAPACITY) * carry_bit(carry, 63) - b
+    add_to_totals(cells, cell, width, n, FIELD_CARRY * fx, FIELD_CARRY * fy - fx, FIELD_CARRY * b - fy)
 
 
 @wp.func
-def cast_vote(cells: Cells, cell: int, width: int, word: wp.uint64):
-    """Adds a word exactly, whatever came before it."""
+def add_vote_atomically(cells: Cells, cell: int, width: int, word: wp.uint64):
+    """Add a vote to a word with an atomic addition, and move its carries to the totals."""
     old = wp.atomic_add(cells.words, cell, word)
     carry = ((old & word) | ((old | word) & (~(old + word)))) & CARRIES
     if carry != wp.uint64(0):
-        take_down(cells, cell, width, carry)
+        add_carries_to_totals(cells, cell, width, carry)
 
 
 @wp.func
-def add_vote(cells: Cells, cell: int, width: int, word: wp.uint64):
-    """The same where no other thread adds to these words."""
+def add_vote_unshared(cells: Cells, cell: int, width: int, word: wp.uint64):
+    """Add a vote as :func:`add_vote_atomically` does, if no other thread adds to these words."""
     carry = add_word(cells.words, cell, word) & CARRIES
     if carry != wp.uint64(0):
-        take_down(cells, cell, width, carry)
+        add_carries_to_totals(cells, cell, width, carry)
 
 
 @wp.func
-def somewhere(i: int):
-    """A place in the pixel, even over it, the same for event ``i`` at every call (MurmurHash3's finaliser)."""
+def dither_offset(i: int):
+    """Return a random offset in the pixel, uniform over it, for event ``i``.
+
+    It is the same at every call. The hash is MurmurHash3's finaliser.
+    """
     h = wp.uint32(i + 1)
     h = (h ^ (h >> wp.uint32(16))) * MIX_1
     h = (h ^ (h >> wp.uint32(13))) * MIX_2
@@ -120,7 +133,10 @@ def somewhere(i: int):
 
 @wp.func
 def vote_at(canvas: Canvas, x: float, y: float, layer: int):
-    """Whether a place lies on the canvas, its cell and its word; NaN lies nowhere, and votes nothing in cell 0."""
+    """Return whether a position lies on the canvas, its cell and its word.
+
+    A position off the canvas, or NaN, gets cell 0 and an empty word.
+    """
     u = (x + canvas.pad + 0.5) * canvas.scale + 0.5
     v = (y + canvas.pad + 0.5) * canvas.scale + 0.5
     inside = wp.where(u > 0.0, wp.where(u < float(canvas.columns - 1), 1, 0), 0)
@@ -132,13 +148,14 @@ def vote_at(canvas: Canvas, x: float, y: float, layer: int):
     fx = int((u - float(col)) * 256.0 + 0.5)
     fy = int((v - float(row)) * 256.0 + 0.5)
     b = (fx * fy + 128) >> 8
-    word = (wp.uint64(b) << wp.uint64(36)) | (wp.uint64(fy) << wp.uint64(18)) | wp.uint64(fx) | ONE
+    word = (wp.uint64(b) << wp.uint64(36)) | (wp.uint64(fy) << wp.uint64(18)) | wp.uint64(fx) | ONE_EVENT
     cell = row * canvas.columns + col + layer
     return inside, wp.where(inside == 1, cell, 0), wp.where(inside == 1, word, wp.uint64(0))
 
 
 @wp.func
 def azimuth_at(model: Any, events: EventArrays, i: int):
+    """Return (cos, sin) of the tilt azimuth of event ``i``."""
     turn = 2 * int(load_uint16(events.turn, i))
     c = load_float(events.azimuths, turn)
     s = load_float(events.azimuths, turn + 1)
@@ -146,8 +163,8 @@ def azimuth_at(model: Any, events: EventArrays, i: int):
 
 
 @wp.func
-def weighted(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
-    """The word of as many events in one place: up to 255, so that no field overflows."""
+def repeat_vote(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
+    """Return the word of ``weight`` events at one position: at most 255, so that no field overflows."""
     if events.weight.shape[0] == 0:
         return word
     return word * wp.uint64(events.weight[i])
@@ -155,10 +172,10 @@ def weighted(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
 
 @wp.func
 def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: int):
-    """Angle, displacement and vote of one event."""
+    """Compute prism angle, displacement and vote of one event."""
     w0, w1 = azimuth_at(model, events, i)
-    x, y = place(model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1)
-    dx, dy = somewhere(i)
+    x, y = displace(model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1)
+    dx, dy = dither_offset(i)
     layer = int(load_uint8(events.layer, i)) * canvas.layer
     inside, cell, word = vote_at(canvas, x + canvas.dither * dx, y + canvas.dither * dy, layer)
     return inside, cell, word
@@ -168,7 +185,7 @@ def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: 
 def vote_blocks(
     model: Any, camera: PinholeParams, events: EventArrays, canvas: Canvas, count: int, start: int, cells: Cells
 ):
-    """For CPUs: a block's votes, found by a loop that vectorises, then cast."""
+    """Vote one block of events per thread. For CPUs: a vectorised loop finds the votes."""
     first = (start + wp.tid()) * BLOCK
     places = wp.zeros(shape=(64,), dtype=int)
     words = wp.zeros(shape=(64,), dtype=wp.uint64)
@@ -177,15 +194,15 @@ def vote_blocks(
         store_int(places, k, cell)
         store_word(words, k, wp.where(first + k < count, word, wp.uint64(0)))
     for k in range(BLOCK):
-        add_vote(cells, places[k], canvas.columns, weighted(events, first + k, words[k]))
+        add_vote_unshared(cells, places[k], canvas.columns, repeat_vote(events, first + k, words[k]))
 
 
 @wp.kernel
 def vote_events(model: Any, camera: Any, events: EventArrays, canvas: Canvas, start: int, cells: Cells):
-    """One event, exactly."""
+    """Vote one event per thread, exactly."""
     i = start + wp.tid()
     _inside, cell, word = event_vote(model, camera, events, canvas, i)
-    cast_vote(cells, cell, canvas.columns, weighted(events, i, word))
+    add_vote_atomically(cells, cell, canvas.columns, repeat_vote(events, i, word))
 
 
 @wp.kernel
@@ -198,37 +215,41 @@ def vote_turning(
     start: int,
     cells: Cells,
 ):
-    """The same, the camera's own turning taken back."""
+    """Vote one event per thread, exactly, with the camera's rotation removed."""
     i = start + wp.tid()
     w0, w1 = azimuth_at(model, events, i)
-    x, y = place(model, camera, float(events.x[i]), float(events.y[i]), w0, w1)
+    x, y = displace(model, camera, float(events.x[i]), float(events.y[i]), w0, w1)
     xy = turn_back(camera, wp.vec2(x, y), camera_rotation, events.time[i])
-    dx, dy = somewhere(i)
+    dx, dy = dither_offset(i)
     layer = int(events.layer[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, xy[0] + canvas.dither * dx, xy[1] + canvas.dither * dy, layer)
-    cast_vote(cells, cell, canvas.columns, word)
+    add_vote_atomically(cells, cell, canvas.columns, word)
 
 
 @wp.kernel
 def vote_quickly(model: Any, camera: Any, events: EventArrays, canvas: Canvas, trash: int, start: int, cells: Cells):
-    """For CUDA: one event, without a look at what its word held; votes outside are counted in the trash."""
+    """Vote one event per thread without checking for carries. For CUDA.
+
+    Votes outside the canvas are counted in the trash words.
+    """
     i = start + wp.tid()
     inside, cell, word = event_vote(model, camera, events, canvas, i)
     if inside == 1:
         wp.atomic_add(cells.words, cell, word)
     else:
-        wp.atomic_add(cells.words, trash + (i & (TRASH - 1)), ONE)
+        wp.atomic_add(cells.words, trash + (i & (TRASH - 1)), ONE_EVENT)
 
 
 @wp.kernel
 def turn_events(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
-    """The encoder's angle at each event's time, to the nearest 1/65536 turn."""
+    """Compute theta_u16 of each event: the prism angle at its time, rounded to 1/65536 turn."""
     i = start + wp.tid()
-    turn[i] = wp.uint16((angle_at(encoder, t[i]) + wp.uint32(32768)) >> wp.uint32(16))
+    turn[i] = wp.uint16((theta_u32_at(encoder, t[i]) + wp.uint32(32768)) >> wp.uint32(16))
 
 
 @wp.kernel
 def time_events(t: wp.array(dtype=wp.int64), middle: wp.int64, start: int, time: wp.array(dtype=float)):
+    """Compute the time of each event from the middle of the window [s]."""
     i = start + wp.tid()
     time[i] = float(int(t[i] - middle)) * 1.0e-6
 
@@ -237,7 +258,7 @@ def time_events(t: wp.array(dtype=wp.int64), middle: wp.int64, start: int, time:
 def layer_events(
     p: wp.array(dtype=wp.uint8), parts: int, per_polarity: int, start: int, layer: wp.array(dtype=wp.uint8)
 ):
-    """Which image an event goes to: that of its part, every so manieth, and there OFF or ON."""
+    """Assign an image to each event: by its part (event i belongs to part i modulo ``parts``), then by its polarity."""
     i = start + wp.tid()
     layer[i] = wp.uint8((i % parts) * (1 + per_polarity) + per_polarity * wp.where(p[i] != wp.uint8(0), 1, 0))
 
@@ -252,7 +273,7 @@ def fold_keys(
     start: int,
     keys: wp.array(dtype=wp.int64),
 ):
-    """One number for the angle's bin, the pixel and the polarity, in that order."""
+    """Compute a sort key of each event: bin of the prism angle, pixel and polarity, in that order."""
     i = start + wp.tid()
     bin_of = wp.int64((wp.uint32(turn[i]) * wp.uint32(bins)) >> wp.uint32(16))
     pixel = (wp.int64(y[i]) << wp.int64(16)) | wp.int64(x[i])
@@ -261,6 +282,7 @@ def fold_keys(
 
 @wp.kernel
 def unfold_keys(keys: wp.array(dtype=wp.int64), bins: int, start: int, events: EventArrays):
+    """Recover the events from their sort keys; the prism angle becomes the middle of its bin."""
     i = start + wp.tid()
     key = keys[i]
     events.layer[i] = wp.uint8(key & wp.int64(1))
@@ -279,10 +301,11 @@ def vote_points(
     start: int,
     cells: Cells,
 ):
+    """Vote one point per thread, exactly."""
     i = start + wp.tid()
     layer = int(layers[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, x[i], y[i], layer)
-    cast_vote(cells, cell, canvas.columns, word)
+    add_vote_atomically(cells, cell, canvas.columns, word)
 
 
 @wp.kernel
@@ -294,7 +317,7 @@ def vote_point_blocks(
     start: int,
     cells: Cells,
 ):
-    """For CPUs: a whole block of them."""
+    """Vote one block of points per thread. For CPUs."""
     first = (start + wp.tid()) * BLOCK
     places = wp.zeros(shape=(64,), dtype=int)
     words = wp.zeros(shape=(64,), dtype=wp.uint64)
@@ -304,7 +327,7 @@ def vote_point_blocks(
         store_int(places, k, cell)
         store_word(words, k, word)
     for k in range(BLOCK):
-        add_vote(cells, places[k], canvas.columns, words[k])
+        add_vote_unshared(cells, places[k], canvas.columns, words[k])
 
 
 @wp.kernel
@@ -315,7 +338,10 @@ def drift_turns(
     start: int,
     turn: wp.array(dtype=wp.uint16),
 ):
-    """Angles [1/65536 turn] after a parameter changed by ``drift``; ``slope``: their change per unit of it."""
+    """Compute theta_u16 after a parameter has changed by ``drift``.
+
+    ``slope`` is the derivative of the angle by the parameter [1/65536 turn per unit].
+    """
     i = start + wp.tid()
     turn[i] = wp.uint16((int(base[i]) + int(wp.floor(drift * slope[i] + 0.5))) & 65535)
 

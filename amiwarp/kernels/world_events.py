@@ -3,7 +3,15 @@
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray
-from amiwarp.kernels.event_generation import Pixel, SensorParams, Sink, advance, new_pixel, on_next_clock, reconverge
+from amiwarp.kernels.event_generation import (
+    Pixel,
+    SensorParams,
+    Sink,
+    advance_pixel,
+    new_pixel,
+    reconverge,
+    shift_times,
+)
 from amiwarp.kernels.optics import ExactParams, trace
 from amiwarp.kernels.sight import Steps
 from amiwarp.kernels.world import Pose, World, radiance
@@ -64,10 +72,10 @@ def run_world_pixels(
     p = pixels[i]
     t0 = wp.int64(0)
     for k in range(steps.count):
-        p = advance(p, sensor, sink, i, t0, steps, see_world(world, view, steps, steps.margin + k + 1, i))
+        p = advance_pixel(p, sensor, sink, i, t0, steps, see_world(world, view, steps, steps.margin + k + 1, i))
         t0 += wp.int64(steps.ticks)
         reconverge()
-    pixels[i] = on_next_clock(p, t0)
+    pixels[i] = shift_times(p, t0)
 
 
 @wp.kernel

@@ -1,1 +1,1 @@
-"""Live work: the link to the prism's controller, and streams of events."""
+"""Live operation: the serial link to the prism's controller, and streams of events."""

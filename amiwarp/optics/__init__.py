@@ -1,1 +1,1 @@
-"""The camera, the prism, and the models of its refraction."""
+"""The camera, the wedge prism, and the models of its refraction."""

@@ -1,4 +1,4 @@
-"""The pinhole camera: size, intrinsics and lens distortion."""
+"""Camera model: image size, pinhole intrinsics and lens distortion."""
 
 from __future__ import annotations
 
@@ -13,25 +13,37 @@ from amiwarp.optics.lens import Distortion
 from amiwarp.validation import array, real, shown, whole
 
 LARGEST_SIZE = 65536
-"""Largest width and height of a sensor [px]: columns and rows of events are uint16."""
+"""Largest width and height of a sensor [px]. Columns and rows of events are uint16."""
 LEAST_FOCAL = 1e-3
-"""Least focal length, in widths (fx) or heights (fy) of the image: a field of view of 179.8 deg."""
+"""Least focal length as a multiple of the image's width (fx) or height (fy): a field of view of 179.8 deg."""
 LARGEST_FOCAL = 1e6
-"""Largest focal length [px]: a microradian per pixel. Beyond it float32 no longer holds the prism's displacement."""
+"""Largest focal length [px]: one microradian per pixel. Beyond it float32 cannot represent the displacement."""
 LEAST_FOV = 1e-9
-"""Least field of view [rad]; the focal length then decides."""
+"""Least field of view [rad]. :data:`LARGEST_FOCAL` sets the limit in practice."""
 
+CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
+"""Names of a camera's fields without the distortion, as files and streams use them."""
 
 Rows = TypeVar("Rows")
-"""A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3, shape (n,): the same kind comes out."""
+"""A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3. Results are of the same kind."""
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera: pixel ``(0, 0)`` has its centre at image coordinate ``(0.0, 0.0)``.
+    """A camera: image size, intrinsics and lens distortion.
 
-    Limits: 1 to 65536 px each way; a focal length from 0.001 of the image's width or height (179.8 deg) to 1e6 px; a
-    principal point within 65536 px of the first pixel. Raises :class:`AmiwarpError` for anything else.
+    The centre of pixel ``(0, 0)`` has the image coordinates ``(0.0, 0.0)``.
+
+    Raises
+    ------
+    AmiwarpError
+        If the width or height is not in 1 .. 65536 px, a focal length is not between 0.001 times the image's width or
+        height (179.8 deg) and 1e6 px, or the principal point is more than 65536 px from the first pixel.
+
+    Examples
+    --------
+    >>> amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=319.5, cy=239.5).fov
+    1.13...
     """
 
     width: int
@@ -47,7 +59,7 @@ class Camera:
     cy: float
     """Principal point, y [px]."""
     distortion: Distortion | None = None
-    """Lens distortion, or None for a pure pinhole."""
+    """Lens distortion, or None for a pinhole camera."""
 
     def __post_init__(self) -> None:
         for name, focal in (("width", "fx"), ("height", "fy")):
@@ -65,7 +77,32 @@ class Camera:
 
     @classmethod
     def from_fov(cls, width: int, height: int, fov: float, distortion: Distortion | None = None) -> Camera:
-        """A centred camera with square pixels and horizontal field of view ``fov`` [rad] (before distortion)."""
+        """Create a camera with square pixels and a centred principal point from its field of view.
+
+        Parameters
+        ----------
+        width, height : int
+            Image size [px].
+        fov : float
+            Horizontal field of view [rad], before distortion.
+        distortion : Distortion, optional
+            Lens distortion.
+
+        Returns
+        -------
+        Camera
+            The camera.
+
+        Raises
+        ------
+        AmiwarpError
+            If the field of view is not between 0 and pi, or the size is not in 1 .. 65536 px.
+
+        Examples
+        --------
+        >>> amiwarp.Camera.from_fov(640, 480, fov=1.0).fx
+        585.75...
+        """
         width = whole(width, "camera width", 1, LARGEST_SIZE, " pixels")
         height = whole(height, "camera height", 1, LARGEST_SIZE, " pixels")
         hint = " rad, 0 .. 180 deg; is it given in degrees?"
@@ -75,26 +112,65 @@ class Camera:
 
     @property
     def fov(self) -> float:
-        """Horizontal field of view of the undistorted pinhole [rad]."""
+        """Horizontal field of view without distortion [rad]."""
         return 2.0 * math.atan(self.width / (2.0 * self.fx))
 
     def pixels_to_rays(self, xy: Rows) -> Rows:
-        """Unit bearings (n, 3) of pixels (n, 2) [px]; NaN rows where the lens sends no ray.
+        """Return the unit bearing vector of each pixel.
 
-        Raises :class:`AmiwarpError` for other shapes, and for what are no numbers.
+        Parameters
+        ----------
+        xy : numpy.ndarray or warp.array
+            Pixels [px], shape (n, 2), or vec2 of shape (n,).
+
+        Returns
+        -------
+        numpy.ndarray or warp.array
+            Unit vectors, shape (n, 3), or vec3 of shape (n,). A row is NaN if no ray reaches that pixel.
+
+        Raises
+        ------
+        AmiwarpError
+            If the array has another shape or does not hold numbers.
+
+        Examples
+        --------
+        >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+        >>> camera.pixels_to_rays([[320.0, 240.0]])
+        array([[0., 0., 1.]])
         """
         return _run("pixels_to_rays", self, xy, (2, 3))
 
     def rays_to_pixels(self, rays: Rows) -> Rows:
-        """Pixels (n, 2) [px] of bearings (n, 3), of any length.
+        """Return the pixel of each bearing vector.
 
-        NaN rows behind the image plane and where the distortion folds back. Raises :class:`AmiwarpError` for other
-        shapes.
+        Parameters
+        ----------
+        rays : numpy.ndarray or warp.array
+            Bearing vectors of any length, shape (n, 3), or vec3 of shape (n,).
+
+        Returns
+        -------
+        numpy.ndarray or warp.array
+            Pixels [px], shape (n, 2), or vec2 of shape (n,). A row is NaN if the ray lies behind the image plane, or
+            beyond the radius at which the distortion stops increasing.
+
+        Raises
+        ------
+        AmiwarpError
+            If the array has another shape or does not hold numbers.
         """
         return _run("rays_to_pixels", self, rays, (3, 2))
 
 
+def check_size(width: float, height: float, where: object) -> None:
+    """Raise :class:`AmiwarpError` for a sensor size out of 1 .. :data:`LARGEST_SIZE` px; ``where`` names the source."""
+    if not (1 <= width <= LARGEST_SIZE and 1 <= height <= LARGEST_SIZE):
+        raise AmiwarpError(f"{where}: size {width}x{height}; expected 1 .. {LARGEST_SIZE} pixels each way")
+
+
 def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) -> Any:
+    """Run a kernel over ``rows``; ``sizes`` are the vector lengths of its input and of its output."""
     import warp as wp
 
     from amiwarp.kernels import camera as kernels

@@ -1,4 +1,4 @@
-"""How the camera itself turns during a window: its angular velocity, constant or linear in time."""
+"""The camera's own rotation during a window: its angular velocity, constant or linear in time."""
 
 from __future__ import annotations
 
@@ -17,21 +17,42 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CameraRotation:
-    """Angular velocity in the camera's frame, constant or linear in time.
+    """Angular velocity of the camera in its own frame, constant or linear in time.
 
-    At time t it is ``angular_velocity + angular_acceleration * (t - middle_us)``. Places are turned back to the middle.
+    The angular velocity at time t is ``angular_velocity + angular_acceleration * (t - middle_us)``. Compensation
+    rotates every pixel back to the time ``middle_us``.
 
-    Over a window the rotation vector is ωτ + ατ²/2, τ from the middle: exact while the axis stays.
+    Notes
+    -----
+    The rotation vector is ωτ + ατ²/2, with τ the time since ``middle_us``. This is exact if the axis is constant.
+
+    Examples
+    --------
+    >>> pan = amiwarp.CameraRotation(angular_velocity=(0.0, 0.5, 0.0), middle_us=10_000)
+    >>> pan.moves
+    True
     """
 
     angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """At the middle [rad/s]."""
+    """Angular velocity at ``middle_us`` [rad/s], about x, y and z."""
     angular_acceleration: Vector = (0.0, 0.0, 0.0)
-    """[rad/s²]."""
+    """Angular acceleration [rad/s²], about x, y and z."""
     middle_us: int = 0
+    """Reference time [us], usually the middle of the window."""
 
     def about(self, middle_us: int) -> CameraRotation:
-        """The same motion seen from another middle."""
+        """Return the same motion with another reference time.
+
+        Parameters
+        ----------
+        middle_us : int
+            New reference time [us].
+
+        Returns
+        -------
+        CameraRotation
+            The rotation with the angular velocity at the new reference time.
+        """
         later = (middle_us - self.middle_us) * 1e-6
         x, y, z = (r + c * later for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True))
         return replace(self, angular_velocity=(x, y, z), middle_us=middle_us)
@@ -42,11 +63,28 @@ class CameraRotation:
         return any(self.angular_velocity) or any(self.angular_acceleration)
 
     def rotation(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rotation vectors [rad] since the middle at ``tau`` [s] from it, shape (n, 3)."""
+        """Return rotation vectors since the reference time.
+
+        Parameters
+        ----------
+        tau : numpy.ndarray
+            Time since the reference time [s], shape (n,).
+
+        Returns
+        -------
+        numpy.ndarray
+            Rotation vectors [rad], shape (n, 3).
+        """
         return np.outer(tau, self.angular_velocity) + np.outer(0.5 * tau**2, self.angular_acceleration)
 
     def params(self) -> Any:
-        """For kernels."""
+        """Return the parameters for kernels.
+
+        Returns
+        -------
+        amiwarp.kernels.camera.CameraRotationParams
+            Angular velocity and acceleration as a Warp struct.
+        """
         import warp as wp
 
         from amiwarp.kernels.camera import CameraRotationParams
@@ -56,7 +94,21 @@ class CameraRotation:
         return p
 
     def reach(self, camera: Camera, half_s: float) -> NDArray[np.float64]:
-        """How far pixels of the image's border move within ``half_s`` of the middle, at most, along x and y [px]."""
+        """Return the largest displacement of border pixels within ``half_s`` of the reference time.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+        half_s : float
+            Half the length of the window [s].
+
+        Returns
+        -------
+        numpy.ndarray
+            Largest displacement along x and y [px], shape (2,). It is the image size if every border pixel leaves the
+            view.
+        """
         from scipy.spatial.transform import Rotation
 
         rotations = self.rotation(np.array([-half_s, half_s]))
@@ -65,14 +117,13 @@ class CameraRotation:
         xy = border(camera)
         rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
         moved = [camera.rays_to_pixels(Rotation.from_rotvec(r).apply(rays).astype(np.float32)) for r in rotations]
-        far = np.abs(np.concatenate([np.asarray(m) - xy for m in moved]))
-        seen = far[np.isfinite(far).all(axis=1)]
-        # turned out of view altogether: by more than the image
-        return seen.max(axis=0) if len(seen) else np.array([camera.width, camera.height], np.float64)
+        displacement = np.abs(np.concatenate([np.asarray(m) - xy for m in moved]))
+        visible = displacement[np.isfinite(displacement).all(axis=1)]
+        return visible.max(axis=0) if len(visible) else np.array([camera.width, camera.height], np.float64)
 
 
 def border(camera: Camera) -> NDArray[np.float64]:
-    """Pixels along the image's border, shape (n, 2)."""
+    """Return pixels along the image's border [px], shape (n, 2)."""
     x, y = np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9)
     grid = np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
     edge = np.isin(grid[:, 0], x[[0, -1]]) | np.isin(grid[:, 1], y[[0, -1]])

@@ -1,4 +1,4 @@
-"""Parameters of a camera on a device, for the kernels."""
+"""Camera parameters on a device, for kernels."""
 
 import math
 from functools import lru_cache
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @lru_cache(maxsize=16)
 def camera_params(camera: "Camera", device: str) -> kernels.CameraParams:
-    """The camera on ``device``, with its table of bearings where the lens distorts."""
+    """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
     c = kernels.CameraParams()
     c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
     c.width, c.height = camera.width, camera.height
@@ -27,10 +27,10 @@ def camera_params(camera: "Camera", device: str) -> kernels.CameraParams:
         return c
     if isinstance(d, RadialTangential):
         coefficients = (d.k1, d.k2, d.p1, d.p2, d.k3)
-        c.kind, c.limit = int(kernels.RADIAL_TANGENTIAL), fold(d.k1, d.k2, d.k3, largest=100.0)
+        c.kind, c.limit = int(kernels.RADIAL_TANGENTIAL), fold_radius(d.k1, d.k2, d.k3, largest=100.0)
     elif isinstance(d, Fisheye):
         coefficients = (d.k1, d.k2, d.k3, d.k4, 0.0)
-        c.kind, c.limit = int(kernels.FISHEYE), fold(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
+        c.kind, c.limit = int(kernels.FISHEYE), fold_radius(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
     c.k = type(c.k)(*coefficients)
     rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
     wp.launch(kernels.fill_rays, dim=rays.shape, inputs=[c], outputs=[rays], device=device)
@@ -40,7 +40,7 @@ def camera_params(camera: "Camera", device: str) -> kernels.CameraParams:
 
 @lru_cache(maxsize=16)
 def pinhole_params(camera: "Camera") -> "kernels.PinholeParams | None":
-    """The camera for kernels without branches; None where its lens distorts."""
+    """Return the parameters for kernels without branches, or None if the lens distorts."""
     if camera.distortion is not None:
         return None
     c = kernels.PinholeParams()
@@ -49,10 +49,10 @@ def pinhole_params(camera: "Camera") -> "kernels.PinholeParams | None":
     return c
 
 
-def fold(*k: float, largest: float) -> float:
-    """Radius up to which r(1 + k1 r² + k2 r⁴ + …) grows: the first root of its slope, at most ``largest``.
+def fold_radius(*k: float, largest: float) -> float:
+    """Return the radius up to which r(1 + k1 r² + k2 r⁴ + …) increases: the first root of its slope, or ``largest``.
 
-    Solved for 1/r², where the polynomial is monic: a vanishing last coefficient then does no harm.
+    The polynomial in 1/r² is monic, so a last coefficient of zero causes no division by zero.
     """
     roots = np.roots([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]

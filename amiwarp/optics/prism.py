@@ -1,4 +1,4 @@
-"""The wedge prism itself: apex, glass, the side of its flat face, and what it deflects."""
+"""The wedge prism: apex angle, refractive index, the side of its flat face, and its deflection."""
 
 from __future__ import annotations
 
@@ -11,33 +11,46 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.validation import choice, real, vector
 
 LARGEST_APEX = math.radians(30.0)
-"""Apex angle from which on a value must be a mistake [rad]."""
+"""Upper limit of the apex angle [rad]. Larger values are mistakes, such as degrees."""
 LARGEST_INDEX = 4.0
-"""Refractive index up to which prisms are made: germanium."""
+"""Upper limit of the refractive index: that of germanium."""
 LARGEST_PHASE = 1e6
-"""Largest magnitude of a phase [rad]: float64 then still resolves 1e-10 rad of it."""
+"""Largest magnitude of a phase [rad]. Up to it float64 resolves 1e-10 rad."""
 
 
 class FlatSide(enum.StrEnum):
-    """Which way the flat face of the prism looks."""
+    """The side that the flat face of the prism points to."""
 
     SCENE = "scene"
+    """The flat face points to the scene."""
     CAMERA = "camera"
+    """The flat face points to the camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prism:
-    """A wedge prism in air: apex in 0 .. 30 deg, index in 1 .. 4, the upper limits not included.
+    """A wedge prism in air.
 
-    ``flat_side`` may be given as its name. Raises :class:`AmiwarpError` for anything else.
+    Raises
+    ------
+    AmiwarpError
+        If the apex angle is not at least 0 and below 30 deg, the index is not between 1 and 4 (both excluded), or
+        ``flat_side`` is neither a :class:`FlatSide` nor its name.
+
+    Examples
+    --------
+    >>> import math
+    >>> prism = amiwarp.Prism(apex=math.radians(2.0), index=1.5)
+    >>> round(math.degrees(prism.deflection), 3)
+    1.0
     """
 
     apex: float
-    """Angle between its two faces [rad]; not the deflection (see :func:`deflection_from_apex`)."""
+    """Angle between the two faces [rad]. It differs from the deflection (see :attr:`deflection`)."""
     index: float = 1.5168
-    """Refractive index; the default is N-BK7 at the d line, 587.6 nm."""
+    """Refractive index. The default is that of N-BK7 at the d line, 587.6 nm."""
     flat_side: FlatSide = FlatSide.SCENE
-    """Where the flat face looks."""
+    """Side that the flat face points to."""
 
     def __post_init__(self) -> None:
         below = math.nextafter(LARGEST_APEX, 0.0)
@@ -48,52 +61,70 @@ class Prism:
 
     @property
     def deflection(self) -> float:
-        """Deflection of the ray that the camera sees on its axis [rad]."""
+        """Deflection of the ray on the camera's optical axis [rad]."""
         return deflection_from_apex(self.apex, self.index, self.flat_side)
 
 
 @dataclass(frozen=True, slots=True)
 class UnsizedPrism:
-    """What is known of a prism whose apex is not: its glass and the side of its flat face."""
+    """A prism of unknown apex angle: its refractive index and the side of its flat face.
+
+    Examples
+    --------
+    >>> amiwarp.UnsizedPrism(index=1.5).with_apex(0.03)
+    Prism(apex=0.03, index=1.5, flat_side=<FlatSide.SCENE: 'scene'>)
+    """
 
     index: float = 1.5168
-    """Refractive index; the default is N-BK7 at the d line, 587.6 nm."""
+    """Refractive index. The default is that of N-BK7 at the d line, 587.6 nm."""
     flat_side: FlatSide = FlatSide.SCENE
-    """Where the flat face looks."""
+    """Side that the flat face points to."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "index", check_index(self.index, "prism index"))
         object.__setattr__(self, "flat_side", choice(FlatSide, self.flat_side, "prism flat_side"))
 
     def with_apex(self, apex: float) -> Prism:
-        """Return the prism of this glass with an ``apex`` [rad]."""
+        """Return a prism with this index and flat side, and a given apex angle.
+
+        Parameters
+        ----------
+        apex : float
+            Apex angle [rad].
+
+        Returns
+        -------
+        Prism
+            The prism.
+        """
         return Prism(apex, self.index, self.flat_side)
 
 
 NominalPrism: TypeAlias = Prism | UnsizedPrism
-"""What is known of a prism before a calibration: all of it, or all but its apex."""
+"""Nominal prism before calibration, with or without a known apex angle."""
 
 
 def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
-    """Deflection [rad] of the camera's axial ray by a wedge of ``apex`` [rad]; about ``(index - 1) * apex``.
+    """Return the deflection [rad] of the camera's axial ray by a wedge of ``apex`` [rad], about ``(index - 1) * apex``.
 
-    Snell's law at both faces in the plane of the wedge. Raises :class:`AmiwarpError` for total reflection.
+    Applies Snell's law at both faces in the plane of the wedge. Raises :class:`AmiwarpError` for total internal
+    reflection.
     """
     scene = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE
-    # flat face to the scene: in through the tilted face, out through the flat one
+    # Traced from the camera. With the flat face to the scene the ray enters the tilted face and leaves the flat one.
     sine = index * math.sin(apex - math.asin(math.sin(apex) / index) if scene else apex)
     if not abs(sine) <= 1.0:
         raise AmiwarpError(
-            f"an apex of {math.degrees(apex):.4g} deg with index {index:.4g} reflects the camera's axial ray; "
+            f"an apex of {math.degrees(apex):.4g} deg with index {index:.4g} totally reflects the camera's axial ray; "
             "give a smaller apex or index"
         )
     return math.asin(sine) - (0.0 if scene else apex)
 
 
 def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
-    """Apex [rad] that deflects the camera's axial ray by ``deflection`` [rad].
+    """Return the apex angle [rad] for a ``deflection`` [rad] of the camera's axial ray.
 
-    The inverse of :func:`deflection_from_apex`.
+    Inverse of :func:`deflection_from_apex`.
     """
     if choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE:
         return math.atan2(math.sin(deflection), math.sqrt(index**2 - math.sin(deflection) ** 2) - 1.0)
@@ -101,7 +132,7 @@ def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = 
 
 
 def check_index(value: object, what: str) -> float:
-    """A refractive index between 1 and :data:`LARGEST_INDEX`, neither included."""
+    """Return a refractive index between 1 and :data:`LARGEST_INDEX`, both excluded. Raises :class:`AmiwarpError`."""
     return real(value, what, math.nextafter(1.0, 2.0), math.nextafter(LARGEST_INDEX, 0.0), "; N-BK7 has 1.5168")
 
 
@@ -111,7 +142,7 @@ def check_phase(value: object, what: str = "phase") -> float:
 
 
 def check_tilt(value: object) -> tuple[float, float]:
-    """Return the two tilts of an axis of rotation [rad], each under a right angle. Raises :class:`AmiwarpError`."""
+    """Return the two tilts of a rotation axis [rad], each below a right angle. Raises :class:`AmiwarpError`."""
     below = math.nextafter(math.pi / 2.0, 0.0)
     x, y = vector(value, 2, "tilt", lambda entry, what: real(entry, what, -below, below, " rad"))
     return x, y

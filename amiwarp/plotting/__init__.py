@@ -1,1 +1,1 @@
-"""Figures and point clouds."""
+"""Figures, point clouds, and the palette that they share."""

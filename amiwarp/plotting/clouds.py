@@ -1,7 +1,7 @@
-"""Events as clouds of points in x, y and prism angle, drawn off screen.
+"""Events as point clouds in x, y and prism angle, drawn off screen.
 
-VTK ends the whole process where it finds no OpenGL to draw with, so it runs in a process of its own; where that fails
-Matplotlib draws the same points.
+VTK ends its whole process if it finds no OpenGL, so it runs in a separate process. If that fails, Matplotlib draws the
+same points.
 """
 
 from __future__ import annotations
@@ -17,18 +17,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-OFF_COLOUR, ON_COLOUR = "#0072b2", "#d55e00"
-"""Okabe and Ito's blue and vermilion, told apart by all common kinds of colour vision."""
-MISSING = "VTK found no OpenGL to draw with, Matplotlib drew the clouds; on Debian install libegl1 and libgl1-mesa-dri"
+MISSING = "VTK found no OpenGL, so Matplotlib drew the point clouds; on Debian install libegl1 and libgl1-mesa-dri"
+"""Note for a figure whose clouds were drawn by Matplotlib."""
 SECONDS = 60.0
+"""Time limit of the process that draws with VTK [s]."""
 HALF = (0.4, 0.5, 0.5)
-"""Half width of the box about the origin in which the points lie."""
+"""Half width of the box about the origin in which the points lie: x, y, angle."""
 _SIZE = (1100, 1000)
+"""Width and height of a picture [px]."""
 _CAMERA = ((2.75, -2.75, 1.55), (0.0, 0.0, -0.03), (0.0, 0.0, 1.0))
-"""Position, focal point and up."""
+"""Position, focal point and upward direction of the camera."""
+
+
+__all__ = ["HALF", "MISSING", "Cloud", "draw_plain", "render"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,19 +42,19 @@ class Cloud:
     """Points of one cloud."""
 
     xyz: NDArray[np.float32]
-    """x, y (up) and angle within :data:`HALF` of the origin, where they are not outside the region; shape (n, 3)."""
+    """x, y (up) and prism angle, within :data:`HALF` of the origin for points in the region, shape ``(n, 3)``."""
     on: NDArray[np.bool_]
-    """Which are ON events, shape (n,)."""
+    """Whether each point is an ON event, shape ``(n,)``."""
 
 
 def render(clouds: Sequence[Cloud]) -> list[NDArray[np.uint8]] | None:
-    """A picture of each cloud by VTK, shape (height, width, 3); None where VTK cannot draw here."""
+    """Return a picture of each cloud, drawn by VTK, shape ``(height, width, 3)``; None if VTK cannot draw here."""
     with tempfile.TemporaryDirectory() as folder:
         for k, cloud in enumerate(clouds):
             np.savez(Path(folder) / f"{k}.npz", xyz=cloud.xyz, on=cloud.on)
         environment = dict(os.environ)
         if sys.platform.startswith("linux"):
-            # By default VTK tries X first, and crashes where libX11 is missing; EGL needs no display.
+            # By default VTK tries X first, and crashes if libX11 is missing; EGL needs no display.
             environment["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
         command = [sys.executable, "-m", "amiwarp.plotting.clouds", folder]
         try:
@@ -62,7 +68,7 @@ def render(clouds: Sequence[Cloud]) -> list[NDArray[np.uint8]] | None:
 
 
 def draw_plain(axes: Any, cloud: Cloud) -> None:
-    """The same cloud on Matplotlib's three-dimensional ``axes``."""
+    """Draw a cloud on three-dimensional Matplotlib axes."""
     colours = np.where(cloud.on, ON_COLOUR, OFF_COLOUR)
     axes.scatter(*cloud.xyz.T, s=1.6, c=colours, linewidths=0, alpha=0.7, depthshade=False)
     axes.set_box_aspect(HALF, zoom=1.1)
@@ -73,6 +79,7 @@ def draw_plain(axes: Any, cloud: Cloud) -> None:
 
 
 def _render_here(points: Path, picture: Path) -> None:
+    """Draw one stored cloud with VTK in this process, and store the picture."""
     import pyvista
 
     data = np.load(points)
@@ -93,7 +100,7 @@ def _render_here(points: Path, picture: Path) -> None:
 
 
 def _cropped(picture: NDArray[np.uint8], border: int = 8) -> NDArray[np.uint8]:
-    """Without the empty margins."""
+    """Return the picture without its empty margins."""
     rows, columns = (np.flatnonzero((picture < 255).any(axis=(2, axis))) for axis in (1, 0))
     top, left = max(0, rows[0] - border), max(0, columns[0] - border)
     return picture[top : rows[-1] + border, left : columns[-1] + border]

@@ -15,6 +15,7 @@ from amiwarp.calib.result import cost_surface
 from amiwarp.calib.thinning import thin
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.imaging.export import PERCENTILE, save_png
+from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io.output import write_text
 from amiwarp.plotting import clouds
@@ -31,33 +32,36 @@ if TYPE_CHECKING:
     from amiwarp.reconstruction.picture import Picture
 
 EVENTS = 2_000_000
-"""At most so many events, thinned evenly, make an image of a figure."""
+"""Largest number of events in an image of a figure; more are thinned evenly."""
 POINTS = 60_000
-"""At most so many points make a cloud."""
+"""Largest number of points in a cloud."""
 REGION = (64, 80)
-"""Part of the image that is shown enlarged and as clouds [px]."""
+"""Width and height of the part of the image that is enlarged and drawn as clouds [px]."""
 WIDTH, TITLE = 15.0, 14.0
-"""Of the demo's figure [inch], and of its titles' letters [point]."""
+"""Width of the demo's figure [inch], and size of its titles [point]."""
 GREYS, FAINT = 128, 8
-"""Of a figure's 256 colours so many are grey; a colour whose channels differ by no more counts as grey."""
-FOUND, TRUTH, LOCAL = "#d55e00", "#000000", "#e69f00"
+"""Number of grey entries in a figure's palette of 256; largest channel difference [levels] of a grey."""
+FOUND, TRUTH, LOCAL = VERMILION, BLACK, ORANGE
+"""Colours of the calibrated parameters, of the true parameters, and of the local search."""
 
 
 @dataclass(frozen=True)
 class Images:
-    """The image of the events before and after compensation, [events per pixel], shape (height, width) each."""
+    """Images of the events before and after compensation [events per pixel], shape ``(height, width)`` each."""
 
     before: NDArray[np.float32]
+    """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
     after: NDArray[np.float32]
+    """Image of the compensated events [events per pixel], shape ``(height, width)``."""
 
     @property
     def top(self) -> float:
-        """What both show as white."""
+        """Count that both images show as white [events per pixel]."""
         return float(np.percentile(self.after[self.after > 0], PERCENTILE)) if (self.after > 0).any() else 1.0
 
 
 def draw_calibration(path: Path, recording: Recording, calibration: Calibration, *, device: Any) -> None:
-    """Cost surface with the samples of all stages, and the image of the events before and after."""
+    """Draw the images before and after compensation, and the cost surface with the samples of all stages."""
     figure, axes = _figure((14.0, 4.2), 1, 3, (1.0, 1.0, 0.8))
     draw_images(axes[:2], images(thin(recording, EVENTS), recording, calibration, device=device))
     draw_cost(figure, axes[2], calibration)
@@ -65,7 +69,7 @@ def draw_calibration(path: Path, recording: Recording, calibration: Calibration,
 
 
 def images(events: Events, recording: Recording, calibration: Calibration, *, device: Any) -> Images:
-    """The two images of ``events``."""
+    """Return the images of ``events`` before and after compensation."""
     size = recording.events.size
     encoder = calibration.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
     after = iwe(events, *size, model=calibration.model, encoder=encoder, device=device)
@@ -73,13 +77,13 @@ def images(events: Events, recording: Recording, calibration: Calibration, *, de
 
 
 def draw_images(axes: Any, pair: Images) -> None:
-    """Both images on the same scale."""
+    """Draw both images on the same scale."""
     for ax, image, title in zip(axes, (pair.before, pair.after), ("before", "after"), strict=True):
         show(ax, image, pair.top, f"events {title} compensation")
 
 
 def show(ax: Any, image: NDArray[np.float32], top: float, title: str) -> None:
-    """An image of events, its counts under a square root."""
+    """Draw an image of events; brightness is the square root of the count."""
     from matplotlib.colors import PowerNorm
 
     ax.imshow(image, cmap="gray", norm=PowerNorm(0.5, 0.0, top, clip=True), interpolation="nearest")
@@ -88,9 +92,9 @@ def show(ax: Any, image: NDArray[np.float32], top: float, title: str) -> None:
 
 
 def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float, float] | None = None) -> None:
-    """The global search's cost over (size cos phase, size sin phase), all samples, what was found, and the ``truth``.
+    """Draw the global search's cost over (size cos phase, size sin phase), all samples, and the result.
 
-    ``truth``: size and phase [rad]. Where there was no global search the samples stand alone.
+    ``truth`` is the true size and phase [rad]. Without a global search only the samples are drawn.
     """
     calibration = calibration.exact
     size = size_name(calibration.model_name)
@@ -115,20 +119,26 @@ def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float
 
 
 def _polar(size: float, phase: float) -> tuple[float, float]:
+    """Return size cos phase and size sin phase [deg]."""
     return math.degrees(size) * math.cos(phase), math.degrees(size) * math.sin(phase)
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstructed:
-    """A reconstructed picture beside the truth."""
+    """Reconstructed picture with its ground truth."""
 
     picture: Picture
+    """Reconstructed picture."""
     original: NDArray[np.float32]
-    """What the camera would see without the prism: log intensity, shape (height, width)."""
+    """Log intensity that the camera would see without the prism, shape ``(height, width)``."""
     quality: PictureQuality
+    """Quality of the picture against the original."""
 
     def tones(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Both for the eye, 0 .. 1, with the original's black and white: gain and offset are those of the fit."""
+        """Return picture and original as displayed, 0 .. 1, with the same black and white.
+
+        Black and white are those of the original. Gain and offset of the picture are those of the quality fit.
+        """
         log = np.float32(self.quality.gain) * self.picture.log + np.float32(self.quality.offset)
         original = replace(self.picture, log=self.original, known=np.ones(self.original.shape, np.bool_))
         between = limits(original, 1.0)
@@ -146,9 +156,9 @@ def draw_demo(
     truth: tuple[float, float],
     device: Any,
 ) -> tuple[str, ...]:
-    """What came in and what came of it, the marked region enlarged, clouds and cost surface in one figure.
+    """Draw images, the enlarged region, point clouds and cost surface of the demo in one figure.
 
-    Returns notes on what could not be drawn as it should.
+    Return notes on parts that were drawn by a fallback.
     """
     pair = images(thin(recording, EVENTS), recording, calibration, device=device)
     corner = busiest(pair.after)
@@ -156,15 +166,15 @@ def draw_demo(
     grid = Grid.make(*recording.events.size)
     figure, ax = grid.figure, grid.axes
     figure.text(0.5, 1.0 - 0.34 / grid.height, headline, ha="center", va="center", fontsize=18)
-    show(ax["raw"], pair.before, pair.top, "events as they come")
+    show(ax["raw"], pair.before, pair.top, "events before compensation")
     show_grey(ax["picture"], found, f"reconstructed from one turn, correlation {reconstructed.quality.correlation:.3f}")
-    show_grey(ax["original"], original, "the original, as seen without the prism")
-    show(ax["compensated"], pair.after, pair.top, "events, compensated")
+    show_grey(ax["original"], original, "ground truth: the view without the prism")
+    show(ax["compensated"], pair.after, pair.top, "events after compensation")
     for name in ("raw", "picture", "original", "compensated"):
         mark(ax[name], corner)
     part = (slice(corner[1], corner[1] + REGION[1]), slice(corner[0], corner[0] + REGION[0]))
-    show(ax["part raw"], pair.before[part], pair.top, "marked region: as it comes")
-    show(ax["part compensated"], pair.after[part], pair.top, "compensated")
+    show(ax["part raw"], pair.before[part], pair.top, "marked region: before")
+    show(ax["part compensated"], pair.after[part], pair.top, "after compensation")
     show_grey(ax["part picture"], found[part], "reconstructed")
     notes = _draw_clouds(figure, (ax["cloud before"], ax["cloud after"]), recording, calibration, corner, device)
     draw_cost(figure, ax["cost"], calibration, truth)
@@ -175,16 +185,18 @@ def draw_demo(
 
 @dataclass(frozen=True)
 class Grid:
-    """The demo's figure: axes by name at places that follow from the image's proportions, so that nothing overlaps."""
+    """Axes of the demo's figure by name, laid out by the image's aspect ratio so that nothing overlaps."""
 
     figure: Any
+    """Matplotlib's figure."""
     axes: dict[str, Any]
+    """Axes by name."""
     height: float
-    """Of the figure [inch]."""
+    """Height of the figure [inch]."""
 
     @classmethod
     def make(cls, columns: int, rows: int) -> Grid:
-        """For images of ``columns`` x ``rows`` pixels: three in the first row, one and its region in the second."""
+        """Lay out the axes for images of ``columns`` x ``rows`` pixels."""
         gap, title = 0.12, 0.42
         width = (WIDTH - 4 * gap) / 3.0
         tall = width * rows / columns
@@ -213,7 +225,7 @@ class Grid:
 
 
 def enlarge(figure: Any, cost: Any) -> None:
-    """Letters that can still be read where the figure is shown at half its size."""
+    """Enlarge the text so that it stays legible when the figure is shown at half its size."""
     for each in figure.axes:
         each.title.set_fontsize(TITLE)
         each.tick_params(labelsize=TITLE - 2.0)
@@ -224,7 +236,7 @@ def enlarge(figure: Any, cost: Any) -> None:
 
 
 def mark(ax: Any, corner: tuple[int, int]) -> None:
-    """Marks the region whose left top pixel is ``corner``."""
+    """Mark the region whose top left pixel is ``corner``."""
     from matplotlib.patches import Rectangle
 
     ax.add_patch(Rectangle(corner, *REGION, fill=False, edgecolor=LOCAL, linewidth=2.0))
@@ -238,9 +250,9 @@ def show_grey(ax: Any, image: NDArray[np.float32], title: str) -> None:
 
 
 def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
-    """Left top pixel of the region in which the image has most contrast, away from its border.
+    """Return the top left pixel of the region with the highest contrast, away from the image's border.
 
-    Single bright spots count no more than a strong edge.
+    Pixels brighter than the display's white are clipped, so that single hot pixels do not decide.
     """
     from scipy.ndimage import uniform_filter
 
@@ -257,6 +269,7 @@ def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
 def _draw_clouds(
     figure: Any, axes: Any, recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
 ) -> tuple[str, ...]:
+    """Draw the clouds before and after compensation; return notes if VTK could not draw them."""
     pair = region_clouds(recording, calibration, corner, device)
     pictures = clouds.render(pair)
     for k, (ax, title) in enumerate(zip(axes, ("before", "after"), strict=True)):
@@ -275,7 +288,7 @@ def _draw_clouds(
 def region_clouds(
     recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
 ) -> tuple[clouds.Cloud, clouds.Cloud]:
-    """The same events of one turn before and after: those that end up in the region."""
+    """Return the events of one turn that compensation moves into the region, before and after compensation."""
     source = recording.events
     encoder = calibration.encoder_for(recording.encoder, source.t_first, source.t_last)
     turn_us = round(60e6 / max(abs(encoder.rpm), 1e-3))
@@ -294,17 +307,20 @@ def region_clouds(
 
 
 def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int, int]) -> NDArray[np.float32]:
+    """Return coordinates relative to the centre of the region, in units of its longer side."""
     centred = (xy - np.array(corner) - np.array(REGION) / 2.0) / max(REGION)
     return np.column_stack([centred[:, 0], -centred[:, 1], height]).astype(np.float32)
 
 
 def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[float, ...]) -> tuple[Any, Any]:
+    """Return a figure and its grid of axes."""
     figure = _blank(size, layout="compressed")
     return figure, figure.subplots(rows, columns, width_ratios=widths)
 
 
 def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
-    # Not through pyplot: nothing global is touched, and no display is looked for.
+    """Return an empty figure."""
+    # Without pyplot, which would change global state and look for a display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -314,7 +330,7 @@ def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = Non
 
 
 def save(figure: Any, path: Path, *, overwrite: bool = False) -> None:
-    """Writes a figure as a PNG of 256 colours, which is a third of the size and looks the same; whole or not at all."""
+    """Write a figure as a PNG of 256 colours, a third of the full size; the write is atomic."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -323,16 +339,16 @@ def save(figure: Any, path: Path, *, overwrite: bool = False) -> None:
 
 
 def save_svg(figure: Any, path: Path) -> None:
-    """Writes a figure as an SVG without its date; whole or not at all."""
+    """Write a figure as an SVG without a date; the write is atomic."""
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None})
     write_text(path, text.getvalue())
 
 
 def indexed(rgb: NDArray[np.uint8]) -> Any:
-    """The picture (height, width, 3) with a palette of :data:`GREYS` even greys, and the rest for what has colour.
+    """Return the picture ``(height, width, 3)`` with a palette of :data:`GREYS` even greys and other colours.
 
-    A palette chosen for all at once has too few greys, and smooth areas show steps, or too few colours.
+    A palette optimised for all pixels at once has too few greys, which shows steps in smooth areas, or too few colours.
     """
     from PIL import Image
 

@@ -1,1 +1,1 @@
-"""Image reconstruction from events."""
+"""Reconstruction of log-intensity pictures from events."""

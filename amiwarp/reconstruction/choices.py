@@ -1,26 +1,32 @@
-"""The closed sets of choices for reconstructed pictures."""
+"""Choices for reconstructed pictures: how to fill unknown parts, and how to display intensity."""
 
 import enum
 
 CONTRAST = 0.25
-"""ON threshold where none is given [log intensity]."""
+"""Default ON threshold [log intensity]."""
 
 
 class Fill(enum.StrEnum):
-    """What stands where the events say nothing."""
+    """How to fill the parts of a picture that the events do not determine.
+
+    Examples
+    --------
+    >>> [fill.value for fill in amiwarp.Fill]
+    ['none', 'smooth', 'edge']
+    """
 
     NONE = "none"
-    """Nothing: NaN."""
+    """Leave them NaN."""
     SMOOTH = "smooth"
-    """The membrane through what is known around it."""
+    """Interpolate smoothly from the known parts around (a membrane)."""
     EDGE = "edge"
-    """The same, but that it breaks rather than bends: flat parts with edges between them."""
+    """The same with an edge-preserving prior: flat regions with sharp edges between them."""
 
 
 class Tone(enum.StrEnum):
-    """How intensity becomes a pixel's value."""
+    """How intensity becomes a pixel value."""
 
     MAPPED = "mapped"
-    """For the eye: the 0.5th percentile of intensity is black, the 99.5th white, with gamma 2.2."""
+    """For display: the 0.5th percentile of intensity is black, the 99.5th is white, with gamma 2.2."""
     LINEAR = "linear"
-    """Proportional to intensity: 0 is dark, the 99.5th percentile the largest value."""
+    """Proportional to intensity: 0 is dark, the 99.5th percentile is the largest value."""

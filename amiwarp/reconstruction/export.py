@@ -1,4 +1,4 @@
-"""Reconstructed pictures into files: tones for the eye, 8 and 16 bit, arrays, video; each whole or not at all."""
+"""Write reconstructed pictures to files: 8 and 16 bit pictures, arrays and video. Each file is complete or absent."""
 
 from __future__ import annotations
 
@@ -21,16 +21,19 @@ if TYPE_CHECKING:
     from amiwarp.reconstruction.picture import Picture
 
 DARK, BRIGHT = 0.5, 99.5
-"""Percentiles of the known pixels that become black and white."""
+"""Percentiles of the known pixels that are shown black and white."""
 GAMMA = 2.2
-STEADY = 0.1
-"""Share of a new picture in a video's black and white points: they do not flicker."""
-STILLS = (".png", ".tif", ".tiff", ".npy")
+"""Display gamma."""
+LIMITS_UPDATE = 0.1
+"""Weight of a new frame in a video's black and white levels, which prevents flicker."""
+STILL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
+"""File suffixes of single pictures."""
 VIDEO = ".mp4"
+"""File suffix of videos."""
 
 
 def limits(picture: Picture, contrast: float = CONTRAST) -> tuple[float, float]:
-    """Intensities that become black and white."""
+    """Return the intensities that are shown black and white."""
     shown = picture.known if picture.known.any() else np.isfinite(picture.log)
     dark, bright = np.exp(contrast * np.percentile(picture.log[shown], [DARK, BRIGHT]))
     return float(dark), float(max(bright, dark * (1.0 + 1e-6)))
@@ -39,9 +42,10 @@ def limits(picture: Picture, contrast: float = CONTRAST) -> tuple[float, float]:
 def tones(
     picture: Picture, tone: Tone, *, contrast: float = CONTRAST, between: tuple[float, float] | None = None
 ) -> NDArray[np.float32]:
-    """The picture as values 0 .. 1, shape (height, width); 0 where it is not filled.
+    """Return the picture as values 0 .. 1, shape (height, width); 0 where it is not filled.
 
-    ``contrast``: the ON threshold [log intensity]; ``between``: see :func:`limits`.
+    ``contrast``: the ON threshold [log intensity]. ``between``: intensities of black and white, by default
+    :func:`limits`.
     """
     tone = choice(Tone, tone, "tone")
     dark, bright = between or limits(picture, contrast)
@@ -53,18 +57,21 @@ def tones(
     return np.nan_to_num(value).astype(np.float32)
 
 
-def check_path(path: Path, endings: tuple[str, ...] = (*STILLS, VIDEO)) -> None:
-    """Raises :class:`AmiwarpError` for another ending, or where there is no folder."""
+def check_path(path: Path, endings: tuple[str, ...] = (*STILL_SUFFIXES, VIDEO)) -> None:
+    """Raise :class:`AmiwarpError` for an unknown suffix or a folder that does not exist."""
     if path.suffix.lower() not in endings:
-        raise AmiwarpError(f"{path}: ends in {path.suffix or 'nothing'}; expected one of {', '.join(endings)}")
+        raise AmiwarpError(f"{path}: ends in {path.suffix or 'no suffix'}; expected one of {', '.join(endings)}")
     check_output(path)
 
 
 def save_picture(
     picture: Picture, path: Path, *, tone: Tone = Tone.MAPPED, bits: int = 8, contrast: float = CONTRAST
 ) -> None:
-    """Writes .png (8 bit, or 16), .tif (16 bit), or .npy: natural log intensity, float32, NaN where not filled."""
-    check_path(path, STILLS)
+    """Write a picture as .png (8 or 16 bit), .tif (16 bit) or .npy.
+
+    A .npy file holds the natural log intensity, float32, NaN where it is not filled.
+    """
+    check_path(path, STILL_SUFFIXES)
     tone = choice(Tone, tone, "tone")
     if bits not in (8, 16):
         raise AmiwarpError(f"{path}: {bits} bits; expected 8 or 16")
@@ -77,12 +84,13 @@ def save_picture(
 
 
 def save_mask(picture: Picture, path: Path) -> None:
-    """Writes where the events determine the picture: white where they do, .png or .tif."""
-    check_path(path, STILLS[:3])
+    """Write the mask of known pixels as .png or .tif: white where events determine the picture."""
+    check_path(path, STILL_SUFFIXES[:3])
     save_grey(picture.known.astype(np.float32), path, bits=8)
 
 
 def save_grey(value: NDArray[np.float32], path: Path, *, bits: int) -> None:
+    """Write values 0 .. 1, shape (height, width), as a grey picture of 8 or 16 bits."""
     from PIL import Image
 
     kind = np.uint8 if bits == 8 else np.uint16
@@ -94,15 +102,15 @@ def save_grey(value: NDArray[np.float32], path: Path, *, bits: int) -> None:
 def save_video(
     pictures: Iterable[Picture], path: Path, *, fps: float, tone: Tone = Tone.MAPPED, contrast: float = CONTRAST
 ) -> int:
-    """Writes an MP4 (H.264) and returns how many frames it has. Black and white follow the scene slowly."""
+    """Write an MP4 (H.264) and return its number of frames. Black and white levels follow the scene slowly."""
 
     def frames() -> Iterator[NDArray[np.uint8]]:
         between: tuple[float, float] | None = None
         for picture in pictures:
             dark, bright = limits(picture, contrast)
             if between is not None:
-                dark = between[0] + STEADY * (dark - between[0])
-                bright = between[1] + STEADY * (bright - between[1])
+                dark = between[0] + LIMITS_UPDATE * (dark - between[0])
+                bright = between[1] + LIMITS_UPDATE * (bright - between[1])
             between = (dark, bright)
             yield np.rint(255.0 * tones(picture, tone, contrast=contrast, between=between)).astype(np.uint8)
 
@@ -110,9 +118,10 @@ def save_video(
 
 
 def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) -> int:
-    """Writes frames, shape (height, width) or (height, width, 3) each, as MP4 (H.264) or, if ``path`` ends so, GIF.
+    """Write frames as MP4 (H.264), or as GIF if ``path`` ends in .gif; return their number.
 
-    Returns how many there were. Raises :class:`AmiwarpError` for none, another ending, or where there is no folder.
+    Each frame has shape (height, width) or (height, width, 3). Raises :class:`AmiwarpError` for no frames, an unknown
+    suffix, or a folder that does not exist.
     """
     import av
 
@@ -120,19 +129,20 @@ def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) ->
     count, kind = 0, path.suffix.lower().removeprefix(".")
     with NewFile(path) as new, av.open(str(new.part), "w", format=kind) as container:
         stream: Any = None
-        for value in map(even, frames):
+        for value in map(padded_to_even, frames):
             if stream is None:
-                stream = add_stream(container, fps, value.shape[:2], kind)
+                stream = _add_stream(container, fps, value.shape[:2], kind)
             frame = av.VideoFrame.from_ndarray(value, format="gray" if value.ndim == 2 else "rgb24")
             container.mux(stream.encode(frame))
             count += 1
         if stream is None:
-            raise AmiwarpError(f"{path}: no picture to write")
+            raise AmiwarpError(f"{path}: no picture to write; give at least one frame")
         container.mux(stream.encode())
     return count
 
 
-def add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -> Any:
+def _add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -> Any:
+    """Return a new video stream of a PyAV container."""
     rate = Fraction(fps).limit_denominator(1000)
     stream = container.add_stream("gif" if kind == "gif" else "libx264", rate=rate)
     stream.height, stream.width = shape
@@ -142,8 +152,8 @@ def add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) ->
     return stream
 
 
-def even(value: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grown by a repeated row and column to even sizes, which the codec needs."""
+def padded_to_even(value: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Repeat the last row and column where needed for an even size, which the codec requires."""
     rows, columns = value.shape[:2]
     return np.pad(value, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (value.ndim - 2)), mode="edge")
 

@@ -1,8 +1,8 @@
-"""A picture of the scene from the events of a window: log intensity, solved for, with no network and no training.
+"""A picture of the scene from the events of a time window: log intensity by least squares, without training.
 
-The pairs of consecutive events of each pixel are linear equations in the log-intensity map (see
-:mod:`amiwarp.brightness.solver`). One tile, the image grown by the prism's orbit, is solved for; the picture is cut
-out of it.
+The pairs of consecutive events of each pixel are linear equations in the log-intensity map, see
+:mod:`amiwarp.brightness.solver`. The map is one tile: the image, extended by the prism's orbit. The picture is cut out
+of it. ``docs/explanation/reconstruction.md`` gives the method and its limits.
 """
 
 from __future__ import annotations
@@ -10,98 +10,88 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet
 from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
-from amiwarp.optics.camera_rotation import CameraRotation, border
+from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
+from amiwarp.reconstruction.known import dilated, known_nodes
+from amiwarp.reconstruction.result import Picture
+from amiwarp.reconstruction.window import busiest_square, map_tile, off_excess_by_counts
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.result import Calibration
+    from amiwarp.events.encoder import Encoder
     from amiwarp.events.recording import Recording
     from amiwarp.optics.models import Model
 
 SCALES = (1.0, 0.5, 0.5)
-"""Of Cauchy's weights, round by round [thresholds]: an equation that is off by as much counts half."""
+"""Scale of the Cauchy weights in each round [thresholds]: residual at which an equation gets half weight."""
 STEPS = 30
-"""Of conjugate gradients in each round."""
+"""Number of conjugate-gradient steps per round."""
 SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
-"""Weights of the prior among which held-out equations choose."""
-WEAK = 0.03
-"""Weight of silence and open ends: the one that held-out equations like best, or near it (see the docs)."""
-HELD_OUT = 8
-"""Every so many-th pair is held out."""
-PROBE = 96
-"""The choice is made on a square of so many pixels with the most events."""
-EDGE = 0.5
-"""Neighbours that differ by more [thresholds] are an edge to ``Fill.EDGE``."""
-MEAN_HOLD = 1e-6
-"""Of the map's square: holds its mean, of which no equation tells."""
-SPANS = 8
-"""A turn in so many parts: a pixel silent throughout says in each that nothing changed."""
-COVERED = 0.5
-"""Of a node that the picture claims to know: the sum of its equations' weights."""
-HOLDS, AGREED = 0.25, 0.4
-"""An equation that is off by the one [thresholds] holds by half; so much of those about a node must hold."""
-SPECK = 12
-"""Known regions of fewer pixels are noise."""
-PINHOLE = 4
-"""Unknown places of up to so many pixels within a known region are known: equations on all sides of them are."""
-NEAR = 2
-"""Pairs of events that are further from what is known are noise, and left out [px]."""
-STILL_US = 100_000
-"""Default window where no prism turns [us]."""
-LARGEST_MARGIN = 0.5
-"""Of the image's width: by no more is the map grown."""
-
-"""Called with what is being done and the share of it that is."""
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """The scene over a window, without the prism."""
-
-    log: NDArray[np.float32]
-    """Log intensity in units of the ON threshold, median 0, shape (height, width); NaN where it is not filled.
-
-    It is determined up to one constant for each connected region of :attr:`known`; the fill joins them.
-    """
-    known: NDArray[np.bool_]
-    """Where events determine it."""
-    start_us: int
-    length_us: int
-    pairs: int
-    """Equations of two events each."""
-    off_excess: float
-    """The OFF threshold over the ON threshold, less 1, as it was taken to be."""
-    smoothness: float
-    """Weight of the prior that held-out equations chose."""
-    residual: float
-    """Median of the equations' absolute residuals [ON thresholds]; near 1 where the optics or the motion is wrong."""
-    hot: int
-    """Pixels left out because they fire too much."""
-    seconds: float
-    unknowns: NDArray[np.float32] = field(repr=False)
-    """The whole map, to start the next window from."""
-
-    def intensity(self, contrast: float = 0.25) -> NDArray[np.float32]:
-        """Relative linear intensity for an ON threshold of ``contrast`` (log intensity), 1 at the median."""
-        return np.exp(np.float32(contrast) * self.log)
+"""Candidate weights of the smoothness prior; held-out equations choose among them."""
+WEAK_WEIGHT = 0.03
+"""Weight of equations from silence and open ends: near the best for held-out equations."""
+HOLD_OUT_EVERY = 8
+"""One pair in this many is held out."""
+CHOICE_SQUARE = 96
+"""Side of the square in which the smoothness is chosen, the one with the most events [px]."""
+EDGE_STEP = 0.5
+"""Difference of neighbours above which ``Fill.EDGE`` regards them as separated by an edge [thresholds]."""
+MEAN_DAMPING = 1e-6
+"""Weight of the map's square. It fixes the mean of the map, which no equation determines."""
+SPANS_PER_TURN = 8
+"""Number of spans per turn. A pixel that is silent in all of them adds one no-change equation per span."""
+NOISE_DISTANCE = 2
+"""Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
+STILL_WINDOW_US = 100_000
+"""Default length of a window if the prism does not turn [us]."""
 
 
 class Reconstruction:
-    """Pictures of windows of one recording, with all that they share."""
+    """Reconstruction of pictures from time windows of one recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording with events.
+    calibration : Calibration, optional
+        Calibration of the same sensor size. It provides model, encoder and camera rotation.
+    model : Model, optional
+        Optical model of the prism, if there is no calibration.
+    encoder : Encoder, optional
+        Encoder, if neither calibration nor recording provides one.
+    camera_rotation : CameraRotation, optional
+        The camera's own rotation; by default that of the calibration.
+    fill : Fill, optional
+        How to fill unknown parts.
+    device : str or warp.Device, optional
+        Device to compute on.
+
+    Raises
+    ------
+    AmiwarpError
+        If the recording has no events, the sensor sizes differ, or there is no model or no encoder.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> picture = np.random.default_rng(0).random((64, 64)).astype(np.float32)
+    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.03)
+    >>> recording = amiwarp.simulate(picture, camera, prism, duration_s=0.1)
+    >>> work = amiwarp.Reconstruction(recording, model=amiwarp.ExactModel.from_prism(camera, prism, 0.0))
+    >>> work.window(*work.span(turns=1.0)).log.shape
+    (24, 32)
+    """
 
     def __init__(
         self,
@@ -114,15 +104,8 @@ class Reconstruction:
         fill: Fill = Fill.SMOOTH,
         device: Any = "cpu",
     ) -> None:
-        """Give a ``calibration``, or a ``model`` and, unless the recording has one, an ``encoder``.
-
-        ``turning``: how the camera turns, unless the calibration found it.
-
-        Raises :class:`AmiwarpError` for a camera of another size, no
-        events, or no encoder.
-        """
         if not len(recording.events):
-            raise AmiwarpError(f"{recording.name}: has no events to make a picture of")
+            raise AmiwarpError(f"{recording.name}: has no events; give a recording with events")
         first, last = recording.events.t_first, recording.events.t_last
         if calibration is not None:
             check_size(calibration, recording.events.size, recording.name)
@@ -130,12 +113,7 @@ class Reconstruction:
         encoder = encoder or recording.encoder
         if model is None or encoder is None:
             raise AmiwarpError(f"{recording.name}: give a calibration, or a model and an encoder")
-        if (model.camera.width, model.camera.height) != recording.events.size:
-            width, height = recording.events.size
-            given = f"{model.camera.width}x{model.camera.height}"
-            raise AmiwarpError(
-                f"{recording.name}: is {width}x{height}, the model is for {given}; calibrate this camera"
-            )
+        check_size(model, recording.events.size, recording.name, what="model")
         self.recording, self.model, self.encoder = recording, model, encoder
         if camera_rotation is None and calibration is not None:
             camera_rotation = calibration.camera_rotation
@@ -147,49 +125,80 @@ class Reconstruction:
     def span(
         self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
     ) -> tuple[int, int]:
-        """Start and length of a window [us]: from the first event where not given, one turn or 0.1 s long."""
+        """Return start and length of a time window.
+
+        Parameters
+        ----------
+        start_us : int, optional
+            Start [us]; by default the first event.
+        length_us : int, optional
+            Length [us]; by default one turn, or 0.1 s if the prism does not turn.
+        turns : float, optional
+            Length [turns], instead of ``length_us``.
+
+        Returns
+        -------
+        tuple of int
+            Start and length [us].
+
+        Raises
+        ------
+        AmiwarpError
+            If the window has no events, or both lengths are given, or ``turns`` is given and the prism does not turn.
+        """
         first, last = self.recording.events.t_first, self.recording.events.t_last
         if turns is not None:
-            if length_us is not None or self.turn_us is None:
-                raise AmiwarpError("turns: the prism does not turn, or a length is given too; give a length alone")
+            if length_us is not None:
+                raise AmiwarpError("turns is given, and a length is given too; give one of them")
+            if self.turn_us is None:
+                raise AmiwarpError("turns is given, but the prism does not turn; give a length")
             length_us = round(turns * self.turn_us)
         start = first if start_us is None else start_us
-        length = length_us or round(self.turn_us or STILL_US)
+        length = length_us or round(self.turn_us or STILL_WINDOW_US)
         if length < 1 or start > last or start + length <= first:
             where = f"{start} .. {start + length} us"
-            raise AmiwarpError(f"{self.recording.name}: no events in {where}; they are at {first} .. {last} us")
+            raise AmiwarpError(
+                f"{self.recording.name}: no events in {where}; give a window that overlaps {first} .. {last} us"
+            )
         return start, length
 
     def window(self, start_us: int, length_us: int, *, last: Picture | None = None) -> Picture:
-        """The picture of one window; it starts from that of the window before where that is given.
+        """Reconstruct the picture of one time window.
 
-        Raises :class:`AmiwarpError` where no pixel fires twice.
+        Parameters
+        ----------
+        start_us : int
+            Start [us].
+        length_us : int
+            Length [us].
+        last : Picture, optional
+            Picture of the window before, from which the solver starts.
+
+        Returns
+        -------
+        Picture
+            The picture.
+
+        Raises
+        ------
+        AmiwarpError
+            If no pixel fires twice in the window.
         """
         began = time.perf_counter()
         recording = self.recording
         width, height = recording.events.size
         table, count = self._table(start_us, length_us)
         pairs = self._pairs(table, start_us, length_us)
-        real = int((pairs.column("on") < 2).sum())
-        if not real:
+        pair_count = int((pairs.column("on") < 2).sum())
+        if not pair_count:
             where = f"{start_us} .. {start_us + length_us} us"
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
-        off = self._off_excess(start_us, length_us)
+        off = off_excess_by_counts(recording.events, self.turn_us, start_us, length_us)
         if self._smoothness is None:
             self._smoothness = self._choose(count, pairs, start_us, length_us, off)
         left, top, tiles = self._tile(start_us, length_us)
         solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
-        if last is not None:
-            unknowns = last.unknowns.copy()
-            unknowns[tiles.nodes :] = solver.unknowns[tiles.nodes :]
-            solver.unknowns = unknowns
-        for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
-            solver.solve(scale, steps=STEPS)
-        typical = solver.residuals.median(real)
-        covered = known_nodes(solver)
-        if covered.any():
-            solver.keep(grown(covered, NEAR)[None])
-        solver.solve(SCALES[-1], steps=STEPS)
+        residual, covered = _solve(solver, pair_count, last)
         cut = np.s_[top : top + height, left : left + width]
         unknowns = solver.unknowns
         log, known = unknowns[: tiles.nodes].reshape(tiles.rows, tiles.columns)[cut], covered[cut]
@@ -198,14 +207,29 @@ class Reconstruction:
             log = np.where(known, log, np.float32(np.nan))
         hot = int((table.tile_of.numpy() < 0).sum())
         return Picture(
-            log.astype(np.float32), known, start_us, length_us, real, off, self._smoothness,
-            typical, hot, time.perf_counter() - began, unknowns,
+            log=log.astype(np.float32), known=known, start_us=start_us, length_us=length_us, pairs=pair_count,
+            off_excess=off, smoothness=self._smoothness, residual=residual, hot=hot,
+            seconds=time.perf_counter() - began, unknowns=unknowns,
         )  # fmt: skip
 
     def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
-        """Pictures of windows that slide by ``step_us``, each started from the one before, to the last that is whole.
+        """Yield pictures of sliding windows, each started from the one before, up to the last complete window.
 
         A window without a pair of events repeats the picture before it.
+
+        Parameters
+        ----------
+        start_us : int
+            Start of the first window [us].
+        length_us : int
+            Length of each window [us].
+        step_us : float
+            Distance between the starts of windows [us].
+
+        Yields
+        ------
+        Picture
+            Picture of each window.
         """
         last: Picture | None = None
         for k in range(self.count(start_us, length_us, step_us=step_us)):
@@ -217,52 +241,59 @@ class Reconstruction:
             yield last
 
     def count(self, start_us: int, length_us: int, *, step_us: float) -> int:
-        """How many pictures :meth:`windows` gives."""
+        """Return the number of pictures that :meth:`windows` yields.
+
+        Parameters
+        ----------
+        start_us : int
+            Start of the first window [us].
+        length_us : int
+            Length of each window [us].
+        step_us : float
+            Distance between the starts of windows [us].
+
+        Returns
+        -------
+        int
+            Number of pictures, at least 1.
+        """
         room = self.recording.events.t_last + 1 - start_us - length_us
         return max(1, math.floor(room / step_us) + 1)
 
     def _table(self, start_us: int, length_us: int) -> tuple[EventTable, NDArray[np.int32]]:
-        """The window's events without those of hot pixels, and how many each pixel fired, shape (height, width)."""
+        """Return the window's events without hot pixels, and the events per pixel, shape (height, width)."""
         events = self.recording.events.between(start_us, start_us + length_us)
         width, height = self.recording.events.size
         table = EventTable([events], np.zeros((height, width), np.int32), self.device)
-        return table, table.leave_out_hot()
+        return table, table.exclude_hot_pixels()
 
     def _pairs(self, table: EventTable, start_us: int, length_us: int) -> PairSet:
-        """All equations of a window: pairs of events, open ends, and silence."""
+        """Return all equations of a window: pairs of events, open ends, and silence."""
         turn = min(self.turn_us or length_us, length_us)
-        spans = max(2, round(SPANS * length_us / turn))
+        spans = max(2, round(SPANS_PER_TURN * length_us / turn))
         edges = np.round(np.linspace(start_us, start_us + length_us, spans + 1)).astype(np.int64)
         return table.pairs(
-            self.encoder, longest_gap_us=length_us, middle_us=start_us + length_us // 2, weak=WEAK,
-            window=(start_us, start_us + length_us), quiet=(edges, min(spans, SPANS)),
+            self.encoder, longest_gap_us=length_us, middle_us=start_us + length_us // 2, weak=WEAK_WEIGHT,
+            window=(start_us, start_us + length_us), quiet=(edges, min(spans, SPANS_PER_TURN)),
         )  # fmt: skip
 
     def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:
-        prior = Smoothness(self._smoothness or SMOOTHNESS[0], EDGE if self.fill is Fill.EDGE else 0.0)
-        solver = BrightnessMap(pairs, tiles, off_excess=off, damping=MEAN_HOLD, smoothness=prior, middle_us=middle_us)
+        """Return a solver for pairs on the given tiles, with the pairs displaced by the model."""
+        prior = Smoothness(self._smoothness or SMOOTHNESS[0], EDGE_STEP if self.fill is Fill.EDGE else 0.0)
+        solver = BrightnessMap(
+            pairs, tiles, off_excess=off, damping=MEAN_DAMPING, smoothness=prior, middle_us=middle_us
+        )
         solver.place(self.model, camera_rotation=self.camera_rotation)
         return solver
 
-    def _off_excess(self, start_us: int, length_us: int) -> float:
-        """Over whole turns a pixel comes back to where it was: ONs times their threshold equal OFFs times theirs."""
-        first, last = self.recording.events.t_first, self.recording.events.t_last
-        if self.turn_us is None or last - first < self.turn_us:
-            return 0.0
-        length = max(1, math.floor(length_us / self.turn_us)) * self.turn_us
-        start = min(max(start_us, first), last - length)
-        p = self.recording.events.between(round(start), round(start + length)).p
-        on = int(p.sum())
-        return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0
-
     def _choose(self, count: NDArray[np.int32], pairs: PairSet, start_us: int, length_us: int, off: float) -> float:
-        """The prior's weight under which held-out equations come out best, on the busiest part of the image."""
-        x0, y0 = busiest(count)
-        part = pairs.of_square(x0, y0, PROBE)
-        if part.hold_out(HELD_OUT) < 50:
+        """Return the smoothness with the lowest cost of held-out equations, on the busiest part of the image."""
+        x0, y0 = busiest_square(count, CHOICE_SQUARE)
+        part = pairs.of_square(x0, y0, CHOICE_SQUARE)
+        if part.hold_out(HOLD_OUT_EVERY) < 50:
             return SMOOTHNESS[-1]
         left, top, _ = self._tile(start_us, length_us)
-        shape = (PROBE + 2 * top, PROBE + 2 * left)
+        shape = (CHOICE_SQUARE + 2 * top, CHOICE_SQUARE + 2 * left)
         tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), *shape, 1.0)
         solver = self._solver(part, tiles, off, start_us + length_us // 2)
         scores = []
@@ -274,14 +305,25 @@ class Reconstruction:
         return SMOOTHNESS[int(np.nanargmin(scores))]
 
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
-        """Columns and rows of the map before the image's first, and the map: all that the window's pixels can see."""
-        camera = self.model.camera
-        camera_rotation = self.camera_rotation.about(start_us + length_us // 2)
-        margin = np.max(np.abs(orbit(self.model)), axis=0) + camera_rotation.reach(camera, length_us * 0.5e-6)
-        limit = LARGEST_MARGIN * camera.width
-        left, top = (math.ceil(min(float(m), limit)) + 2 for m in margin)
-        origin = np.array([[-left, -top]], np.float32)
-        return left, top, Tiles(origin, camera.height + 2 * top, camera.width + 2 * left, 1.0)
+        """Return the margin before the image (columns, rows), and the map of a window."""
+        return map_tile(self.model, self.camera_rotation.about(start_us + length_us // 2), length_us)
+
+
+def _solve(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tuple[float, NDArray[np.bool_]]:
+    """Solve for the map, from that of the window before if given; return the median residual and the known nodes."""
+    nodes = solver.tiles.nodes
+    if last is not None:
+        unknowns = last.unknowns.copy()
+        unknowns[nodes:] = solver.unknowns[nodes:]
+        solver.unknowns = unknowns
+    for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
+        solver.solve(scale, steps=STEPS)
+    residual = solver.residuals.median(pair_count)
+    covered = known_nodes(solver)
+    if covered.any():
+        solver.keep(dilated(covered, NOISE_DISTANCE)[None])
+    solver.solve(SCALES[-1], steps=STEPS)
+    return residual, covered
 
 
 def reconstruct(
@@ -297,9 +339,52 @@ def reconstruct(
     fill: Fill = Fill.SMOOTH,
     device: Any = "cpu",
 ) -> Picture:
-    """The picture of a window, from a quarter turn up: of ``length_us`` or ``turns`` (default: one) from ``start_us``.
+    """Reconstruct the picture of one time window, from a quarter turn upwards.
 
-    See :class:`Reconstruction` for the rest, and for several windows.
+    Use :class:`Reconstruction` for several windows.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording with events.
+    calibration : Calibration, optional
+        Calibration of the same sensor size. It provides model, encoder and camera rotation.
+    model : Model, optional
+        Optical model of the prism, if there is no calibration.
+    encoder : Encoder, optional
+        Encoder, if neither calibration nor recording provides one.
+    start_us : int, optional
+        Start of the window [us]; by default the first event.
+    length_us : int, optional
+        Length of the window [us]; by default one turn, or 0.1 s if the prism does not turn.
+    turns : float, optional
+        Length of the window [turns], instead of ``length_us``.
+    camera_rotation : CameraRotation, optional
+        The camera's own rotation; by default that of the calibration.
+    fill : Fill, optional
+        How to fill unknown parts.
+    device : str or warp.Device, optional
+        Device to compute on.
+
+    Returns
+    -------
+    Picture
+        The picture.
+
+    Raises
+    ------
+    AmiwarpError
+        If the recording has no events in the window, the sensor sizes differ, or there is no model or no encoder.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> picture = np.random.default_rng(0).random((64, 64)).astype(np.float32)
+    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.03)
+    >>> recording = amiwarp.simulate(picture, camera, prism, duration_s=0.1)
+    >>> found = amiwarp.reconstruct(recording, model=amiwarp.ExactModel.from_prism(camera, prism, 0.0))
+    >>> found.known.shape
+    (24, 32)
     """
     work = Reconstruction(
         recording, calibration, model=model, encoder=encoder, camera_rotation=camera_rotation, fill=fill, device=device
@@ -307,51 +392,4 @@ def reconstruct(
     return work.window(*work.span(start_us, length_us, turns))
 
 
-def known_nodes(solver: BrightnessMap) -> NDArray[np.bool_]:
-    """Nodes of the map that events determine: enough equations hold there, and most of those that there are."""
-    hold, everything = solver.coverage(HOLDS)[0], solver.coverage(1e6)[0]
-    return without_pinholes(without_specks((hold >= COVERED) & (hold >= AGREED * everything)))
-
-
-def grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """The mask and all within so many steps to a neighbour, sideways or up and down."""
-    for _ in range(by):
-        out = mask.copy()
-        for one, other in ((out, mask), (out.T, mask.T)):
-            one[1:] |= other[:-1]
-            one[:-1] |= other[1:]
-        mask = out
-    return mask
-
-
-def without_specks(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask without regions under :data:`SPECK` pixels."""
-    label, count = ndimage.label(known)
-    size = np.bincount(label.ravel(), minlength=count + 1)
-    size[0] = 0
-    return np.asarray((size >= SPECK)[label])
-
-
-def without_pinholes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask with the holes of up to :data:`PINHOLE` pixels closed."""
-    label, count = ndimage.label(~known)
-    size = np.bincount(label.ravel(), minlength=count + 1)
-    return np.asarray(known | (size[label] <= PINHOLE))
-
-
-def busiest(count: NDArray[np.int32]) -> tuple[int, int]:
-    """First column and row of the :data:`PROBE` pixels' square with the most events (``count``, by pixel)."""
-    rows = np.add.reduceat(count, np.arange(0, count.shape[0], PROBE), axis=0)
-    cells = np.add.reduceat(rows, np.arange(0, count.shape[1], PROBE), axis=1)
-    row, column = np.unravel_index(int(cells.argmax()), cells.shape)
-    return int(column) * PROBE, int(row) * PROBE
-
-
-def orbit(model: Model) -> NDArray[np.float64]:
-    """How far the prism moves pixels of the image's border over a turn [px], shape (n, 2)."""
-    xy = border(model.camera)
-    theta = np.arange(24) * (TURN / 24)
-    at = np.repeat(xy, 24, axis=0)
-    moved = model.compensate_points(at.astype(np.float32), np.tile(theta, len(xy)))
-    away = np.asarray(moved, np.float64) - at
-    return away[np.isfinite(away).all(axis=1)]
+__all__ = ["Picture", "Reconstruction", "reconstruct"]

@@ -1,1 +1,1 @@
-"""The simulator: recordings with ground truth from pictures and video."""
+"""Simulator of event cameras behind a rotating prism: recordings with ground truth from pictures and video."""

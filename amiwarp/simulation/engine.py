@@ -1,4 +1,4 @@
-"""The simulator's engine: host tables, launches and sorting, behind :class:`amiwarp.Simulation`."""
+"""The simulator's engine behind :class:`amiwarp.Simulation`: tables on the host, kernel launches, and sorting."""
 
 from __future__ import annotations
 
@@ -23,41 +23,44 @@ from amiwarp.simulation.worlds.sight import SeenSurfaces, WorldSight, interval_l
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import SensorModel, Simulation
+    from amiwarp.simulation.sensor import SensorModel
+    from amiwarp.simulation.simulator import Simulation
 
 FRAMES_PER_CHUNK = 8
+"""Largest number of pictures per chunk."""
 
 CHUNK_US = {True: 100_000, False: 500_000}
-"""Span of a chunk [us] on a CPU (True) and on CUDA, for up to 640x480 pixels; shorter for more."""
+"""Span of a chunk [us] on a CPU (True) and on CUDA (False), for up to 640x480 pixels; shorter for more pixels."""
 
 LATEST_US = 1 << 16
-"""More than a stamp can lie past its chunk's end."""
+"""Upper bound of the time by which a time stamp can exceed the end of its chunk [us]."""
 
 CPU_RUN = 8192
-"""Consecutive pixels that a CPU thread takes together."""
+"""Number of consecutive pixels per task of a CPU thread."""
 
 CUDA_SEGMENTS = 1024
-"""Buffers of events on CUDA, each for every 1024th pixel."""
+"""Number of event buffers on CUDA; each serves every 1024th pixel."""
 
 CACHE_LINE = 64
-"""Bytes between the counters of CPU threads, which else would wait for each other."""
+"""Bytes between the counters of CPU threads; in a shared cache line, threads would wait for each other."""
 
 EVENTS_PER_PIXEL = 128
-"""Room for events in a chunk at first; it grows where it must."""
+"""Initial capacity of a chunk; it grows if necessary."""
 
 
 @dataclass(slots=True)
 class DeviceBlock:
-    """Sorted events of one span, on the device."""
+    """Sorted events of one time span on the device."""
 
     arrays: Any
-    """The struct :class:`amiwarp.kernels.event_generation.Block`."""
+    """The kernels' struct :class:`amiwarp.kernels.event_generation.Block`."""
     count: int
+    """Number of events."""
     seen: SeenSurfaces | None = None
     """What the events saw of a world."""
 
     def to_host(self) -> tuple[Events, NDArray[np.float32]]:
-        """Events and their points without the prism, shape (n, 2)."""
+        """Return the events, and their scene points without the prism, shape (n, 2)."""
         if not self.count:
             return Events.empty(), np.empty((0, 2), np.float32)
         b = self.arrays
@@ -65,9 +68,10 @@ class DeviceBlock:
 
 
 class Engine:
-    """One run of a simulation, from its start to its end."""
+    """One run of a simulation from start to end."""
 
     def __init__(self, simulation: Simulation, chunk_us: int | None = None) -> None:
+        """Place the scene and allocate the pixels. ``chunk_us``: span of a chunk [us]; None for the default."""
         self._simulation = simulation
         self._device = wp.get_device(simulation.device)
         self._pixels = simulation.camera.width * simulation.camera.height
@@ -76,9 +80,10 @@ class Engine:
         self._maps: MapRing | WorldMapRing | None = None
         if isinstance(scene, WorldScene):
             world = DeviceWorld(scene.world, self._device)
-            self._step = step_us(simulation, largest_speed(world, simulation, scene), interval_limit_us(scene))
+            speed = largest_speed(world, simulation, scene)
+            self._step = step_us(simulation, world_speed=speed, longest=interval_limit_us(scene))
             self._sight = WorldSight(simulation, scene, world)
-            if not scene.rays(self._device.is_cpu):
+            if not scene.uses_rays(on_cpu=self._device.is_cpu):
                 self._maps = WorldMapRing(simulation, scene, world, seen_bearings(simulation))
         else:
             self._step = step_us(simulation)
@@ -101,6 +106,7 @@ class Engine:
         self.now_us = 0
 
     def _steps_per_chunk(self, chunk_us: int | None) -> int:
+        """Return the number of steps per chunk."""
         longest = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
         scene = self._simulation.scene
         interval = None if isinstance(scene, WorldScene) else scene.frames.interval_us
@@ -109,27 +115,27 @@ class Engine:
         return max(1, longest // self._step)
 
     def prepare(self) -> None:
-        """Read the first pictures and load the kernels, which else happens in the first span."""
-        launching.load(kernels.run_pixels if self._maps is not None else world_events.run_world_pixels, self._device)
+        """Read the first pictures and load the kernels. Otherwise, this happens in the first chunk."""
+        launching.load(self._kernel(), self._device)
         if self._maps is not None:
             self._maps.cover(0, self._chunk_steps * self._step)
 
     def run(self) -> Iterator[DeviceBlock]:
-        """Blocks of successive spans."""
+        """Yield the blocks of successive chunks."""
         self.prepare()
         total = -(-self._simulation.duration_us // self._step)
         for first in range(0, total, self._chunk_steps):
             count = min(self._chunk_steps, total - first)
             steps = self._tables(first, count)
             if first == 0:
-                self._start(steps)
-            keys = self._gather(steps, count)
+                self._start_pixels(steps)
+            keys = self._generate_keys(steps, count)
             block = self._unpack(keys, steps, first, count)
             self.now_us = (first + count) * self._step
             yield block
 
     def _tables(self, first: int, count: int) -> Any:
-        """Tables of a chunk's steps, made in float64."""
+        """Return the tables of a chunk's steps, computed in float64."""
         simulation, margin = self._simulation, self._margin
         t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
         angle = simulation.motion.phase + simulation.motion.angle(t)
@@ -142,7 +148,7 @@ class Engine:
             self._sight.set_instants(t, self._view)
         steps.at = wp.array(table, dtype=sight.Step, device=self._device)
         if self._device.is_cpu:
-            steps.ahead = wp.array(instants_ahead(table[margin + 1 :]), dtype=sight.Instants, device=self._device)
+            steps.ahead = wp.array(instants_in_blocks(table[margin + 1 :]), dtype=sight.Instants, device=self._device)
         steps.angle = self._upload(wrap_angle(angle))
         steps.turn = self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
         steps.per_tick = 1.0 / (self._step * int(kernels.TICKS))
@@ -153,54 +159,57 @@ class Engine:
     def _fill_maps(
         self, maps: MapRing | WorldMapRing, table: NDArray[Any], t: NDArray[np.float64], first: int, count: int
     ) -> None:
-        """Fill in the maps before and after each instant, and the way onto them."""
+        """Fill in the maps before and after each instant, and the projection onto them."""
         times, slots = maps.cover(first * self._step, (first + count) * self._step)
         self._view.maps = maps.maps
         before = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
         after = np.minimum(before + 1, len(times) - 1)
         weight = np.clip((t - times[before]) / np.maximum(times[after] - times[before], 1.0), 0.0, 1.0)
-        weight[before == after] = 0.0  # one look-up is enough
+        weight[before == after] = 0.0  # then one look-up is enough
         orientation = maps.orientations(t)
         to_texel = maps.placement.to_texel()
         table["to_texel"] = to_texel @ self._axis if orientation is None else to_texel @ orientation @ self._axis
         table["before"], table["after"], table["weight"] = slots[before], slots[after], weight
 
-    def _upload(self, values: NDArray[np.float64]) -> wp.array:
-        return wp.array(values.astype(np.float32), dtype=float, device=self._device)
-
-    def _start(self, steps: Any) -> None:
-        inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, self._state]
-        kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
-        wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
-
-    def _views(self) -> list[Any]:
-        """First inputs of the kernels that walk through the steps."""
-        return [self._view] if self._maps is not None or self._sight is None else self._sight.inputs()
-
     def _kernel(self) -> Any:
+        """Return the kernel that runs the pixels."""
         if self._maps is None:
             return world_events.run_world_pixels
         return kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
 
-    def _gather(self, steps: Any, count: int) -> wp.array:
-        """Walk through the steps; the keys of the chunk's events, sorted, those before its end."""
+    def _views(self) -> list[Any]:
+        """Return the first inputs of the kernels that run the pixels."""
+        return [self._view] if self._maps is not None or self._sight is None else self._sight.inputs()
+
+    def _upload(self, values: NDArray[np.float64]) -> wp.array:
+        """Copy values to the device as float32."""
+        return wp.array(values.astype(np.float32), dtype=float, device=self._device)
+
+    def _start_pixels(self, steps: Any) -> None:
+        """Initialise the pixels."""
+        inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, self._state]
+        kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
+        wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
+
+    def _generate_keys(self, steps: Any, count: int) -> wp.array:
+        """Run the steps; return the sorted keys of the events before the chunk's end. Later ones are carried over."""
         keys = self._buffer.run(self._kernel(), [*self._views(), steps, self._sensor, self._state], self._carry)
         limit = min(count * self._step, self._simulation.duration_us - self.now_us)
         total = len(keys) // 2
-        if not total:  # an empty array has no slices
+        if not total:  # Warp cannot slice an empty array
             return keys
         top = (limit + LATEST_US).bit_length() + steps.shift
         cut = self._sort(keys, total, limit << steps.shift, top)
         keys, self._carry = keys[:cut], wp.clone(keys[cut:total]) if cut < total else self._nothing
-        if len(self._carry):  # on the next chunk's clock
+        if len(self._carry):  # times relative to the next chunk
             wp.launch(kernels.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
                       device=self._device)  # fmt: skip
         return keys
 
     def _sort(self, keys: wp.array, total: int, limit: int, top: int) -> int:
-        """Sort the first ``total`` keys, of ``top`` bits; how many are below ``limit``."""
+        """Sort the first ``total`` keys, of ``top`` bits; return the number of keys below ``limit``."""
         if self._device.is_cpu:
-            values = keys.numpy()[:total]  # the same memory
+            values = keys.numpy()[:total]  # shares the memory of keys
             values.sort()
             return int(np.searchsorted(values, limit))
         # no two events of a pixel share a microsecond, so the bits below the pixel need no sorting
@@ -211,6 +220,7 @@ class Engine:
         return int(found.numpy()[0])
 
     def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
+        """Convert keys to events."""
         n = len(keys)
         block = kernels.Block()
         for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8),
@@ -222,9 +232,10 @@ class Engine:
 
 
 class KeyBuffer:
-    """Room for the keys of a chunk, by segments of pixels; it grows when a chunk has more events."""
+    """Buffer for the keys of a chunk, by segments of pixels. It grows if a chunk has more events."""
 
     def __init__(self, pixels: int, device: Any) -> None:
+        """Allocate the buffer for a number of pixels."""
         self._pixels, self._device = pixels, device
         self._segments = -(-pixels // CPU_RUN) if device.is_cpu else min(CUDA_SEGMENTS, pixels)
         self._sink = kernels.Sink()
@@ -234,13 +245,15 @@ class KeyBuffer:
         self._reserve(EVENTS_PER_PIXEL * -(-pixels // self._segments))
 
     def _reserve(self, capacity: int) -> None:
+        """Allocate ``capacity`` keys per segment."""
         self._capacity = capacity
         self._sink.keys = wp.empty((self._segments, capacity), dtype=wp.int64, device=self._device)
 
     def run(self, kernel: Any, inputs: list[Any], carry: wp.array) -> wp.array:
-        """Run the pixels, whose state is the last of ``inputs``; the keys of their events and ``carry``, unsorted.
+        """Run the pixels, whose state is the last of ``inputs``; return the keys of their events, unsorted.
 
-        As many places again lie behind them, which the sorting on CUDA needs.
+        ``carry`` is appended. The array has twice the needed length, because sorting on CUDA needs scratch memory
+        behind the keys.
         """
         state = inputs[-1]
         before = wp.clone(state)
@@ -250,10 +263,11 @@ class KeyBuffer:
             counts = self._sink.count.numpy()[:, 0]
             if counts.max() <= self._capacity:
                 return self._pack(counts, carry)
-            wp.copy(state, before)  # no room: once more from the start
+            wp.copy(state, before)  # the buffer was too small: restore the state and run again
             self._reserve(int(counts.max()) * 5 // 4)
 
     def _pack(self, counts: NDArray[np.int32], carry: wp.array) -> wp.array:
+        """Concatenate the segments and ``carry``."""
         ends = np.cumsum(counts, dtype=np.int64)
         n = int(ends[-1]) + len(carry)
         keys = wp.empty(2 * n, dtype=wp.int64, device=self._device)
@@ -270,6 +284,7 @@ class KeyBuffer:
         return keys
 
     def _launch(self, kernel: Any, inputs: list[Any]) -> None:
+        """Run all pixels."""
 
         def run(start: int, stop: int) -> None:
             wp.launch(kernel, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)
@@ -281,8 +296,11 @@ class KeyBuffer:
         list(launching.pool().map(run, starts, [min(start + CPU_RUN, self._pixels) for start in starts]))
 
 
-def instants_ahead(table: NDArray[Any]) -> NDArray[np.float32]:
-    """Azimuths and matrices of a table of instants, in blocks, shape (n, 11, 16); the last is repeated to fill up."""
+def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
+    """Return azimuths and matrices of a table of instants in blocks, shape (n, 11, 16).
+
+    The last instant fills the last block.
+    """
     ahead = int(sight.AHEAD)
     columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9)], axis=1)
     filled = np.concatenate([columns, np.repeat(columns[-1:], -len(columns) % ahead, axis=0)])
@@ -290,7 +308,7 @@ def instants_ahead(table: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def sensor_params(sensor: SensorModel, step: int) -> Any:
-    """The sensor in the kernels' units: ticks of 1/16 us, and steps of ``step`` [us]."""
+    """Return the sensor in the kernels' units: ticks of 1/16 us, and steps of ``step`` [us]."""
     ticks = float(kernels.TICKS)
     s = kernels.SensorParams()
     s.on, s.off, s.mismatch = sensor.contrast_on, sensor.contrast_off, sensor.mismatch

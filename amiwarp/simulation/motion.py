@@ -1,4 +1,4 @@
-"""What moves in a simulation: the prism, the camera, and the encoder that watches the prism."""
+"""What moves in a simulation: the prism, the camera, and the encoder that measures the prism."""
 
 from __future__ import annotations
 
@@ -15,25 +15,35 @@ from amiwarp.optics.prism import check_phase, check_tilt
 from amiwarp.validation import array, real, whole
 
 ROTATION_INTERVAL = 1e-3
-"""Interval at which a changing rate of rotation is integrated [s]."""
+"""Interval at which a changing angular velocity is integrated [s]."""
 LARGEST_SPEED = 1e9
-"""Largest speed of a prism [turns/min], and of a camera's rotation [rad/s]: more is a mistake."""
+"""Largest accepted speed of a prism [turns/min] and of a camera's rotation [rad/s]; higher values are mistakes."""
 LONGEST_S = 86400.0
 """Longest simulation [s]."""
 LARGEST_OFFSET_US = 1e7
-"""Largest offset between the clocks [us]: the encoder is sampled for so much longer on either side."""
+"""Largest clock offset [us]: the encoder is sampled for that much longer on either side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrismMotion:
-    """How the prism turns: its tilt azimuth is ``phase + angle(t)``, and ``angle(0) = 0``."""
+    """Motion of the prism: its tilt azimuth is ``phase + angle(t)``, with ``angle(0) = 0``.
+
+    Examples
+    --------
+    >>> motion = amiwarp.PrismMotion(600.0)
+    >>> motion.angle([0.0, 50_000.0]).round(4)
+    array([0.    , 3.1416])
+    """
 
     rpm: float | ArrayLike = 720.0
-    """Speed [turns/min], negative backwards; or a table of rows (time [s], speed), linear between, constant outside."""
+    """Speed [turns/min], negative for backward rotation.
+
+    Or a table of rows (time [s], speed), interpolated linearly and constant outside, shape (n, 2).
+    """
     phase: float = 0.0
     """Azimuth at angle 0, θ_b [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
-    """Tilt of the axis of rotation about the camera's x and y [rad], as in :class:`amiwarp.ExactModel`."""
+    """Tilt of the axis of rotation about the camera's x and y axes [rad], as in :class:`amiwarp.ExactModel`."""
 
     def __post_init__(self) -> None:
         _check_table("prism speed", self._table())
@@ -49,7 +59,29 @@ class PrismMotion:
         phase: float = 0.0,
         tilt: tuple[float, float] = (0.0, 0.0),
     ) -> PrismMotion:
-        """Speed as a function of times [s], sampled each millisecond from 0 to past ``duration_s``."""
+        """Sample the speed from a function.
+
+        Parameters
+        ----------
+        rpm : callable
+            Function of times [s], shape ``(n,)``, that returns speeds [turns/min].
+        duration_s : float
+            Duration [s]; samples extend from 0 to just past it, one per millisecond.
+        phase : float, optional
+            Azimuth at angle 0 [rad].
+        tilt : tuple of float, optional
+            Tilt of the axis of rotation about the camera's x and y axes [rad].
+
+        Returns
+        -------
+        PrismMotion
+            Motion with a table of speeds.
+
+        Raises
+        ------
+        AmiwarpError
+            If the function returns another shape.
+        """
         duration_s = real(duration_s, "duration_s", 0.0, LONGEST_S, " s")
         t = np.arange(math.ceil(duration_s * 1e3) + 2, dtype=np.float64) * 1e-3
         speed = array(rpm(t), "prism speed")
@@ -58,13 +90,24 @@ class PrismMotion:
         return cls(np.column_stack([t, np.broadcast_to(speed, t.shape)]), phase, tilt)
 
     def _table(self) -> NDArray[np.float64]:
-        """Rows (time [s], speed [rad/s])."""
+        """Return rows (time [s], speed [rad/s])."""
         rpm = array(self.rpm, "prism speed").astype(np.float64)
         table = np.array([[0.0, rpm], [1.0, rpm]]) if rpm.ndim == 0 else rpm
         return table * np.array([1.0, TURN / 60.0]) if table.ndim == 2 and table.shape[1] == 2 else table
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Unwrapped angle [rad] at times [us]: the exact integral of the speed."""
+        """Return the unwrapped angle, the exact integral of the speed.
+
+        Parameters
+        ----------
+        t_us : array_like
+            Times [us], shape ``(n,)``.
+
+        Returns
+        -------
+        ndarray
+            Angles [rad], shape ``(n,)``.
+        """
         at, speed = self._table().T
         before = np.concatenate([[0.0], np.cumsum(np.diff(at) * (speed[1:] + speed[:-1]) / 2.0)])
 
@@ -84,10 +127,19 @@ class PrismMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMotion:
-    """How the camera turns about its own axes, from the orientation in which it faces the picture at t = 0."""
+    """Rotation of the camera about its own axes. At t = 0 it faces the picture.
+
+    Examples
+    --------
+    >>> amiwarp.CameraMotion((0.0, 0.5, 0.0)).constant
+    True
+    """
 
     rates: ArrayLike = (0.0, 0.0, 0.0)
-    """Angular velocity in the camera's frame [rad/s]; or rows (time [s], ωx, ωy, ωz), as the speed of the prism."""
+    """Angular velocity in the camera's frame [rad/s], shape (3,).
+
+    Or a table of rows (time [s], ωx, ωy, ωz), interpolated linearly and constant outside, shape (n, 4).
+    """
 
     def __post_init__(self) -> None:
         _check_table("camera rotation", self._table(), columns=4)
@@ -98,16 +150,28 @@ class CameraMotion:
 
     @property
     def largest_rates(self) -> NDArray[np.float64]:
-        """Largest magnitude of each rate [rad/s], shape (3,)."""
+        """Largest magnitude of each component [rad/s], shape (3,)."""
         return np.asarray(np.abs(self._table()[:, 1:]).max(axis=0))
 
     @property
     def constant(self) -> bool:
-        """Whether the rates never change."""
+        """Whether the angular velocity never changes."""
         return bool((self._table()[:, 1:] == self._table()[0, 1:]).all())
 
     def orientation(self, duration_s: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-        """Function of times [s], 0 to ``duration_s``: matrices (n, 3, 3) from the camera's frame to the picture's."""
+        """Return the orientation as a function of time.
+
+        Parameters
+        ----------
+        duration_s : float
+            Duration [s].
+
+        Returns
+        -------
+        callable
+            Function of times [s], 0 to ``duration_s``, shape ``(n,)``. It returns rotation matrices from the camera's
+            frame to the picture's, shape ``(n, 3, 3)``.
+        """
         from scipy.spatial.transform import Rotation
 
         table = self._table()
@@ -130,31 +194,41 @@ class CameraMotion:
 
 
 def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> None:
+    """Raise :class:`AmiwarpError` for a wrong shape, values out of range, and times that do not rise."""
     if table.ndim != 2 or table.shape[1] != columns or len(table) < 2:
-        raise AmiwarpError(f"{what} has shape {table.shape}; give one value or at least 2 rows of {columns} numbers")
+        raise AmiwarpError(f"{what} has shape {table.shape}; give one value, or at least 2 rows of {columns} numbers")
     if not (np.abs(table) <= LARGEST_SPEED).all():  # NaN fails
         worst = table[~(np.abs(table) <= LARGEST_SPEED)][0]
-        raise AmiwarpError(f"{what} holds {worst:g}; expected finite numbers within {LARGEST_SPEED:g} either way")
+        raise AmiwarpError(f"{what} contains {worst:g}; expected numbers in {-LARGEST_SPEED:g} .. {LARGEST_SPEED:g}")
     if not (np.diff(table[:, 0]) > 0).all():
         raise AmiwarpError(f"{what}: the times of its rows do not rise; sort them")
 
 
 @dataclass(frozen=True, slots=True)
 class EncoderModel:
-    """What is wrong with an encoder. Raises :class:`AmiwarpError` for values that make no sense."""
+    """Errors of a simulated encoder.
+
+    Raises :class:`AmiwarpError` for values out of range.
+
+    Examples
+    --------
+    >>> encoder = amiwarp.EncoderModel.ideal().sample(amiwarp.PrismMotion(600.0), duration_us=1000, seed=0)
+    >>> encoder.angle_at([500]).round(6)
+    array([0.031416])
+    """
 
     counts_per_turn: int | None = 8192
-    """Resolution: the angle is rounded to the nearest count; None for none."""
+    """Resolution: the angle is rounded to the nearest count; None disables rounding."""
     rate_hz: float = 1000.0
-    """Samples per second."""
+    """Samples per second [Hz]."""
     jitter_us: float = 1.0
     """Standard deviation of a sample's time stamp [us]."""
     clock_offset_us: float = 0.0
-    """Encoder's clock minus the camera's [us]."""
+    """Encoder clock minus camera clock [us]."""
     dropouts_hz: float = 0.0
-    """Mean number of drop-outs per second."""
+    """Mean number of drop-outs per second [Hz]."""
     dropout_us: float = 5000.0
-    """Time for which a drop-out loses all samples [us]."""
+    """Duration of a drop-out, in which all samples are lost [us]."""
 
     def __post_init__(self) -> None:
         if self.counts_per_turn is not None:
@@ -167,15 +241,33 @@ class EncoderModel:
 
     @classmethod
     def ideal(cls) -> EncoderModel:
-        """No rounding, no jitter."""
+        """Return an encoder without rounding and jitter.
+
+        Returns
+        -------
+        EncoderModel
+            The encoder.
+        """
         return cls(counts_per_turn=None, jitter_us=0.0)
 
     def sample(self, motion: PrismMotion, duration_us: int, seed: int) -> Encoder:
-        """The samples of a recording from 0 to ``duration_us`` on the camera's clock, with some to spare.
+        """Sample the encoder from 0 to ``duration_us`` on the camera's clock, with a margin at both ends.
 
-        Their times are the encoder's; the offset between the clocks is not told, :class:`Encoder` starts from 0.
+        Parameters
+        ----------
+        motion : PrismMotion
+            Motion of the prism.
+        duration_us : int
+            Duration [us].
+        seed : int
+            Seed of the random errors.
+
+        Returns
+        -------
+        Encoder
+            Samples with times on the encoder's clock. Its clock offset is 0: calibration has to find it.
         """
-        rng = np.random.default_rng([seed, 0xE2C])  # its own stream, apart from the pixels'
+        rng = np.random.default_rng([seed, 0xE2C])  # independent of the pixels' random numbers
         interval = 1e6 / self.rate_hz
         spare = math.ceil((abs(self.clock_offset_us) + 8.0 * self.jitter_us) / interval) + 2
         true_t = np.rint(np.arange(-spare, math.ceil(duration_us / interval) + spare + 1) * interval).astype(np.int64)

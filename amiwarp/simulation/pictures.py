@@ -1,4 +1,4 @@
-"""Pictures: reading them, light from pixel values, and the maps of log intensity that the simulator looks at."""
+"""Pictures: read files, convert pixel values to light, and make the maps of log intensity for the simulator."""
 
 from __future__ import annotations
 
@@ -17,29 +17,35 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue (ITU-R BT.709)."""
 
 DARK = 0.02
-"""Added to the intensity (white is 1) before the logarithm: stray light and dark current, which tame the shadows."""
+"""Intensity added before the logarithm, relative to white.
+
+It stands for stray light and dark current, and limits the contrast of shadows.
+"""
 
 MOST_PIXELS = 1 << 26
-"""Largest picture that is read, 67 megapixels: a small file may unpack to one of any size."""
+"""Largest picture that is read, 67 megapixels: a small file may unpack to a huge picture."""
 
 BAND = 1 << 24
-"""Values that are converted at a time."""
+"""Number of values converted at a time."""
 
 PICTURE_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
-"""Formats in Pillow's names. Others are left out, because some of them run other programs."""
+"""Accepted formats, by Pillow's names. Others are excluded because some of them run external programs."""
 
 LARGEST_MAP = 8192
-"""Texels along a side of a map; a wider scene is resampled more coarsely."""
+"""Largest number of texels along a side of a map; a wider scene is resampled more coarsely."""
 
 
 def read_picture(path: str | Path) -> NDArray[np.float32]:
-    """Linear luminance of a picture file, shape (height, width), white is 1. Raises :class:`AmiwarpError`."""
+    """Return the linear luminance of a picture file, shape (height, width); white is 1.
+
+    Raises :class:`AmiwarpError` if the file cannot be read.
+    """
     from PIL import Image
 
     check_regular(Path(path))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of Pillow's own, larger limits, and of damage that it reads over
+            warnings.simplefilter("ignore")  # about Pillow's own, larger limits, and about damage that it tolerates
             with Image.open(path, formats=PICTURE_FORMATS) as image:
                 if image.width * image.height > MOST_PIXELS:
                     raise ValueError(f"{image.width}x{image.height} is over {MOST_PIXELS} pixels; make it smaller")
@@ -48,15 +54,15 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
     except Exception as error:  # Pillow raises errors of many types for damaged files
         what = " ".join(str(error).split()) or type(error).__name__
         raise AmiwarpError(f"{path} cannot be read as a picture ({what}); give a JPEG, PNG, TIFF ...") from error
-    if pixels.dtype.kind == "i":  # Pillow hands 16-bit pictures out as int32
+    if pixels.dtype.kind == "i":  # Pillow returns 16-bit pictures as int32
         pixels = pixels.astype(np.uint16)
     return linear_luminance(pixels, name=str(path))
 
 
 def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[np.float32]:
-    """Linear luminance of pixel values, shape (height, width) or (height, width, 3 or 4).
+    """Return the linear luminance of pixel values, shape (height, width) or (height, width, 3 or 4).
 
-    uint8 and uint16 are sRGB-encoded, as files are; floating values are linear intensities already, white being 1.
+    uint8 and uint16 values are sRGB-encoded, as in files. Floating values are linear intensities, with white at 1.
     Raises :class:`AmiwarpError` for other shapes and types, and for values that are negative or not finite.
     """
     pixels = np.asarray(pixels)
@@ -84,20 +90,20 @@ def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[
 
 
 def srgb_to_linear(value: NDArray[Any]) -> NDArray[np.float32]:
-    """Decode sRGB, 0 .. 1 (IEC 61966-2-1)."""
+    """Decode sRGB values 0 .. 1 (IEC 61966-2-1)."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a map lies on the picture plane, at z = 1 in front of the camera, and what part of the picture it shows."""
+    """Placement of a map on the picture plane, which is at z = 1 in front of the camera."""
 
     width: int
-    """Texels along x."""
+    """Number of texels along x."""
     height: int
-    """Texels along y."""
+    """Number of texels along y."""
     box: tuple[float, float, float, float]
-    """Part of the picture: left, top, right, bottom edges [picture pixels]."""
+    """Part of the picture that the map shows: left, top, right, bottom edges [picture px]."""
     left: float
     """Plane coordinate of the map's left edge."""
     top: float
@@ -106,12 +112,12 @@ class Placement:
     """Texels per unit of the plane along x and y."""
 
     def to_texel(self) -> NDArray[np.float64]:
-        """Matrix (3, 3) from plane to texel coordinates, whose whole numbers are texel centres."""
+        """Return the matrix (3, 3) from plane to texel coordinates, in which texel centres are whole numbers."""
         (px, py), left, top = self.pitch, self.left, self.top
         return np.array([[px, 0.0, -left * px - 0.5], [0.0, py, -top * py - 0.5], [0.0, 0.0, 1.0]])
 
 
-def place(
+def place_picture(
     size: tuple[int, int],
     view: tuple[float, float, float, float],
     pitch: float,
@@ -120,8 +126,9 @@ def place(
 ) -> Placement:
     """Place a picture of ``size`` (width, height) so that it covers ``view`` (left, top, right, bottom on the plane).
 
-    Its proportions are kept and what is never seen is cut off. With ``fov`` [rad], its horizontal extent, it is put on
-    the optical axis instead, and mirrored at its edges if the view goes past them. ``pitch``: texels per unit.
+    Its aspect ratio is kept, and parts that are never seen are cut off. With ``fov`` [rad], its horizontal extent, it
+    is centred on the optical axis instead, and mirrored at its edges if the view extends beyond. ``pitch``: texels per
+    unit.
     """
     width, height = size
     left, top, right, bottom = view
@@ -138,16 +145,17 @@ def place(
         min((bottom - y0) / scale, float(height)),
     )
     if box[2] - box[0] < 1.0 or box[3] - box[1] < 1.0:
-        box = (0.0, 0.0, float(width), float(height))  # seen through its mirror images only
+        box = (0.0, 0.0, float(width), float(height))  # only mirror images of the picture are seen
     texels = [int(np.clip(round(n * scale * pitch), 2, LARGEST_MAP)) for n in (box[2] - box[0], box[3] - box[1])]
     pitches = (texels[0] / ((box[2] - box[0]) * scale), texels[1] / ((box[3] - box[1]) * scale))
     return Placement(texels[0], texels[1], box, x0 + box[0] * scale, y0 + box[1] * scale, pitches)
 
 
 def log_map(light: NDArray[np.float32], placement: Placement, blur: float) -> NDArray[np.float32]:
-    """Log intensity of a picture resampled to a map, shape (height, width).
+    """Return the log intensity of a picture resampled to a map, shape (height, width).
 
-    Cubic, low-passed where the picture is finer than the map; then blurred by a Gaussian of ``blur`` [texels].
+    Resampling is cubic, with a low-pass filter if the picture is finer than the map. A Gaussian blur of ``blur``
+    [texels] follows.
     """
     from PIL import Image
     from scipy.ndimage import gaussian_filter

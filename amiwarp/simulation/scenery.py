@@ -1,4 +1,4 @@
-"""What is seen in a simulation: where the picture lies, how fast the image moves, the maps on the device."""
+"""What the simulated camera sees: the picture's placement, the speed of the image, the maps on the device."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ from amiwarp.kernels import sight
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel
-from amiwarp.simulation.pictures import Placement, log_map, place
+from amiwarp.simulation.pictures import Placement, log_map, place_picture
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 LARGEST_MOTION = 0.5
-"""Nothing moves further in one step [px]."""
+"""Largest motion of the image per step [px]."""
 
 LONGEST_STEP = 2000
-"""Steps are no longer than this even where nothing moves [us]."""
+"""Longest step, even if nothing moves [us]."""
 
 STEPS_PER_FRAME = 4
-"""Steps between two pictures of a sequence, at least."""
+"""Smallest number of steps between two pictures of a sequence."""
 
 TEXELS_PER_PIXEL = 1.75
+"""Resolution of a map relative to the sensor."""
 SMALLEST_COSINE = 0.25
-"""Of the angle between a bearing and the picture's axis: a plane does not reach round the camera."""
+"""Cosine of the largest angle between a bearing and the picture's axis: a plane does not extend around the camera."""
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
-    """Speeds across the image."""
+class ImageMotion:
+    """Speeds of the image."""
 
     prism: float
     """Largest motion per angle of the prism [px/rad]."""
@@ -44,10 +45,10 @@ class Motion:
     """Largest motion per angle of the camera about each of its axes [px/rad], shape (3,)."""
 
 
-def step_us(simulation: Simulation, world_speed: float = 0.0, longest: float = math.inf) -> int:
-    """Length of a step [us] in which nothing moves more than half a pixel.
+def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float = math.inf) -> int:
+    """Return the length of a step [us] in which nothing moves by more than half a pixel.
 
-    ``world_speed``: of a world in the image [px/s]; ``longest``: what its lamps allow [us].
+    ``world_speed``: speed of a world in the image [px/s]; ``longest``: upper bound [us].
     """
     motion = image_motion(simulation)
     rates = simulation.camera_motion.largest_rates
@@ -57,12 +58,12 @@ def step_us(simulation: Simulation, world_speed: float = 0.0, longest: float = m
     if frames is not None and frames.interval_us is not None:
         step = min(step, frames.interval_us / STEPS_PER_FRAME)
     if step < 1.0:
-        raise AmiwarpError(f"the image moves at {speed:.3g} px/s, over half a pixel a microsecond; slow it down")
+        raise AmiwarpError(f"the image moves at {speed:.3g} px/s, over half a pixel per microsecond; slow it down")
     return int(step)
 
 
-def image_motion(simulation: Simulation) -> Motion:
-    """Motion on a grid of pixels that includes the corners, over one turn."""
+def image_motion(simulation: Simulation) -> ImageMotion:
+    """Compute the motion on a grid of pixels that includes the corners, over one turn."""
     camera, device = simulation.camera, simulation.device
     grid = np.stack(
         [m.ravel() for m in np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))], 1
@@ -76,10 +77,11 @@ def image_motion(simulation: Simulation) -> Motion:
     arc = (theta[1] / 2.0) / math.sin(theta[1] / 2.0)  # a step along a circle is longer than its chord
     along = np.linalg.norm(np.diff(path, axis=1), axis=2)
     prism = float(np.max(along, initial=0.0, where=np.isfinite(along))) * arc / theta[1]
-    return Motion(prism, _camera_motion(simulation, grid))
+    return ImageMotion(prism, _camera_image_motion(simulation, grid))
 
 
-def _camera_motion(simulation: Simulation, grid: NDArray[np.float64]) -> NDArray[np.float64]:
+def _camera_image_motion(simulation: Simulation, grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the largest motion per angle of the camera about each axis [px/rad]."""
     camera = simulation.camera
     rays = camera.pixels_to_rays(wp.array(grid.astype(np.float32), dtype=wp.vec2, device=simulation.device)).numpy()
     angle = 1e-2
@@ -88,11 +90,11 @@ def _camera_motion(simulation: Simulation, grid: NDArray[np.float64]) -> NDArray
         turned = wp.array(rays + angle * np.cross(axis, rays), dtype=wp.vec3, device=simulation.device)
         distance = np.linalg.norm(camera.rays_to_pixels(turned).numpy() - grid, axis=1) / angle
         result.append(float(np.max(distance, initial=0.0, where=np.isfinite(distance))))
-    return np.array(result) * 1.02  # the grid and the finite angle may miss the very largest
+    return np.array(result) * 1.02  # margin, because the grid and the finite angle may miss the largest value
 
 
 def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
-    """Bearings in the camera's frame that the border of the image sees over a turn of the prism, shape (n, 3)."""
+    """Return the bearings in the camera's frame that the image's border sees over one turn, shape (n, 3)."""
     camera, device = simulation.camera, simulation.device
     right, bottom = camera.width - 1.0, camera.height - 1.0
     along = np.linspace(0.0, 1.0, 33)
@@ -113,7 +115,10 @@ def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
 
 
 def place_scene(simulation: Simulation) -> Placement:
-    """Where the picture lies, so that all that is ever seen is on it. Raises where the camera turns away from it."""
+    """Place the picture so that it covers everything that is ever seen.
+
+    Raises :class:`AmiwarpError` if the camera turns away from it.
+    """
     bearings = seen_bearings(simulation)
     if not len(bearings):
         raise AmiwarpError("no pixel at the image's border has a ray; check the camera's distortion and the prism")
@@ -125,23 +130,24 @@ def place_scene(simulation: Simulation) -> Placement:
         if z.min() < SMALLEST_COSINE:
             angle = math.degrees(math.acos(max(-1.0, float(z.min()))))
             limit = math.degrees(math.acos(SMALLEST_COSINE))
-            raise AmiwarpError(f"the camera looks up to {angle:.0f} deg away from the picture's centre, which ends at "
+            raise AmiwarpError(f"the camera looks up to {angle:.0f} deg away from the picture's centre; the limit is "
                                f"{limit:.0f} deg; turn it less far, or narrow its field of view")  # fmt: skip
         plane = np.stack([x / z, y / z])
         low, high = np.minimum(low, plane.min(axis=1)), np.maximum(high, plane.max(axis=1))
     focal = max(simulation.camera.fx, simulation.camera.fy)
-    spare = 2.0 / focal
-    view = (*(low - spare).tolist(), *(high + spare).tolist())
-    return place(simulation.scene.frames.size, view, TEXELS_PER_PIXEL * focal, fov=simulation.scene.fov)
+    margin = 2.0 / focal
+    view = (*(low - margin).tolist(), *(high + margin).tolist())
+    return place_picture(simulation.scene.frames.size, view, TEXELS_PER_PIXEL * focal, fov=simulation.scene.fov)
 
 
 class MapRing:
-    """The maps of the pictures around a span of time, read as they are needed; each has a slot on the device."""
+    """Maps of the pictures around the current time span, read when needed. Each map has a slot on the device."""
 
     def __init__(self, simulation: Simulation, placement: Placement) -> None:
+        """Open the pictures."""
         focal = max(simulation.camera.fx, simulation.camera.fy)
         self._blur = simulation.scene.blur * math.sqrt(placement.pitch[0] * placement.pitch[1]) / focal
-        self.placement = self._placement = placement
+        self.placement = placement
         turns = bool(simulation.camera_motion.largest_rates.any())
         self._orientation = simulation.camera_motion.orientation(simulation.duration_s) if turns else None
         self._frames = simulation.scene.frames.read()
@@ -152,7 +158,7 @@ class MapRing:
         self.maps: wp.array = wp.empty(0, dtype=wp.vec4, device=self._device)
 
     def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Times [us] and slots of the maps around ``start`` .. ``stop``, at least one."""
+        """Return times [us] and slots of the maps around ``start`` .. ``stop``, at least one."""
         while not self._held or self._held[-1][0] < stop:
             following = next(self._frames, None)
             if following is None:
@@ -160,7 +166,7 @@ class MapRing:
             if len(self._held) > 1 and self._held[1][0] <= start:
                 self._free.append(self._held.pop(0)[1])
             slot = self._slot()
-            pieces = bilinear_pieces(log_map(following[1], self._placement, self._blur)).reshape(-1, 4)
+            pieces = bilinear_pieces(log_map(following[1], self.placement, self._blur)).reshape(-1, 4)
             wp.copy(self.maps, wp.array(pieces, dtype=wp.vec4, device=self._device), dest_offset=slot * self._texels)
             self._held.append((following[0], slot))
         while len(self._held) > 1 and self._held[1][0] <= start:
@@ -169,10 +175,11 @@ class MapRing:
         return np.array(times, np.float64), np.array(slots, np.int32)
 
     def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Matrices (n, 3, 3) from the camera's frame to the picture's at times [us]; None if the camera rests."""
+        """Return matrices (n, 3, 3) from the camera's frame to the pictures' at times [us]; None for a resting camera."""
         return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
 
     def _slot(self) -> int:
+        """Return a free slot; double their number if there is none."""
         if not self._free:
             slots = len(self.maps) // self._texels
             grown = wp.empty((2 * slots or 1) * self._texels, dtype=wp.vec4, device=self._device)
@@ -183,7 +190,10 @@ class MapRing:
 
 
 def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Coefficients of 1, x, y, xy between each texel and its right and lower neighbours, shape (height, width, 4)."""
+    """Return coefficients of 1, x, y, xy between each texel and its right and lower neighbours.
+
+    Shape (height, width, 4).
+    """
     pieces = np.zeros((*texels.shape, 4), np.float32)
     pieces[..., 0] = texels
     pieces[:, :-1, 1] = np.diff(texels, axis=1)
@@ -193,7 +203,10 @@ def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def log_view(simulation: Simulation) -> NDArray[np.float32]:
-    """The first picture as the camera would see it with no prism, at t = 0: log intensity, shape (height, width)."""
+    """Return the first picture as the camera would see it without the prism at t = 0.
+
+    Log intensity, shape (height, width).
+    """
     camera, device = simulation.camera, wp.get_device(simulation.device)
     placement = place_scene(simulation)
     ring = MapRing(simulation, placement)

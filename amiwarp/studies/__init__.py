@@ -1,1 +1,1 @@
-"""Studies that run the library many times and report: chart, stability, design, demo."""
+"""Studies that run the library many times and report: chart, stability, design and demo."""

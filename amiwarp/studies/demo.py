@@ -1,4 +1,7 @@
-"""The demo: a real picture becomes a recording, is calibrated without a guess, compensated, and a picture again."""
+"""Demo: a picture is turned into a recording, calibrated, compensated and reconstructed.
+
+The calibration starts without a guess of the phase.
+"""
 
 from __future__ import annotations
 
@@ -34,91 +37,131 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import ExactModel
 
 APEX, PHASE = math.radians(1.0), math.radians(126.0)
-"""The truth."""
+"""True apex angle and phase [rad]."""
 NOMINAL_APEX = math.radians(1.2)
-"""What the calibration is told, so that no box it searches is centred on the truth."""
+"""Nominal apex angle of the recording [rad]. It differs from the truth, so that no search box is centred on the truth.
+"""
 KNOWN_SENSOR = SensorTiming(SensorModel().latency_us, SensorModel().refractory_us)
-"""What a data sheet would tell of the sensor."""
+"""Latency and refractory period of the sensor, as a data sheet would state them."""
 MEASURED = 1_000_000
-"""At most so many events, thinned evenly, measure blur."""
-
-"""Called with what is being done and the share of it that is."""
+"""Largest number of events that blur is measured on; more are thinned evenly."""
 
 
 @dataclass(frozen=True, slots=True)
 class Demo:
-    """What the demo does it with."""
+    """Settings of the demo."""
 
     out: Path
+    """Folder for the results."""
     picture: Path | None = None
-    """None for the map of the earth that PyVista carries."""
+    """Picture file that the scene shows; None for the map of the earth that comes with PyVista."""
     width: int = 640
+    """Width of the image [px]."""
     height: int = 480
+    """Height of the image [px]."""
     duration_s: float = 0.5
+    """Length of the recording [s]."""
     seed: int = 0
+    """Seed of the simulator and of the search."""
     device: str = "cpu"
+    """Warp device."""
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What the demo found."""
+class DemoResult:
+    """Results of the demo."""
 
     events: int
+    """Number of events of the recording."""
     apex_deg: float
+    """Calibrated apex angle [deg]."""
     apex_true_deg: float
+    """True apex angle [deg]."""
     sharpness_model_error_px: float
-    """Of the first stage alone: rms over image and turn, the constant lag removed."""
+    """Model error after the first stage, by sharpness [px rms over image and turn]; the constant lag is removed."""
     model_error_px: float
-    """Of both stages, likewise."""
+    """Model error after both stages [px rms over image and turn]; the constant lag is removed."""
     phase_error_deg: float
-    """The lag that was removed, beyond the sensor's known one."""
+    """Phase error [deg], the lag that is removed from the model errors, beyond the sensor's known lag."""
     blur_before_px: float
+    """Standard deviation of the events across edges before compensation [px]."""
     blur_after_px: float
+    """The same after compensation with the calibrated model [px]."""
     blur_with_truth_px: float
+    """The same after compensation with the true model [px]."""
     picture_correlation: float
-    """Of the picture from one turn with what the camera sees without the prism, log intensity, the whole image."""
+    """Correlation of the picture from one turn with the view without the prism: log intensity, whole image."""
     picture_psnr_db: float
-    """Likewise; see :func:`amiwarp.imaging.metrics.picture_quality`."""
+    """Peak signal-to-noise ratio of that picture [dB]; see :func:`amiwarp.imaging.metrics.picture_quality`."""
     simulate_s: float
+    """Time to simulate and write the recording [s]."""
     calibrate_s: float
+    """Time of the calibration [s]."""
     reconstruct_s: float
+    """Time of the reconstruction [s]."""
     compensate_mev_per_s: float
+    """Speed of the motion compensation [million events/s], files included."""
     files: dict[str, str]
+    """Paths of the written files by name."""
     notes: tuple[str, ...]
+    """Warnings of the calibration, and notes on the figure."""
 
 
-def run_demo(demo: Demo, progress: Progress | None = None) -> Outcome:
-    """Runs the whole main job into the folder ``demo.out``. Raises :class:`AmiwarpError` for an unusable file."""
-    tell = progress or silent
+def run_demo(demo: Demo, progress: Progress | None = None) -> DemoResult:
+    """Run the demo into the folder ``demo.out``.
+
+    Raises :class:`AmiwarpError` if a file cannot be used.
+    """
+    report = progress or silent
     files = _files(demo.out)
     for path in files.values():
         check_output(path)
     began = time.perf_counter()
-    made = simulation(demo)
-    made.write(files["recording"], progress=tell)
+    simulated = simulation(demo)
+    simulated.write(files["recording"], progress=report)
     simulated_s = time.perf_counter() - began
     recording = open_recording(files["recording"])
     found = calibrate(
         recording, seed=demo.seed, device=demo.device, photometric=PhotometricSettings(sensor=KNOWN_SENSOR),
-        progress=tell,
+        progress=report,
     )  # fmt: skip
     found.save(files["calibration"])
-    done = compensate(
+    compensated = compensate(
         recording, found, files["compensated"], device=demo.device,
-        progress=tell,
+        progress=report,
     )  # fmt: skip
-    tell("reconstructing", 0.0)
+    report("reconstructing", 0.0)
     picture = middle_turn(recording, found, demo.device)
-    save_picture(picture, files["picture"], contrast=made.sensor.contrast_on)
-    tell("measuring and drawing", 0.0)
-    original = made.log_view()
+    save_picture(picture, files["picture"], contrast=simulated.sensor.contrast_on)
+    report("measuring and drawing", 0.0)
+    original = simulated.log_view()
     quality = metrics.picture_quality(picture.log, original)
     assert recording.camera is not None
     assert recording.truth is not None
     truth = metrics.truth_model(recording.camera, recording.truth, found.prism.flat_side)
-    before, after, with_truth = blurs(recording, found, truth, demo.device)
-    values: dict[str, Any] = {
-        "events": done.events,
+    values = {"events": compensated.events, **_accuracy(recording, found, truth, quality, demo.device)}
+    report("measuring and drawing", 0.5)
+    notes = draw_demo(
+        files["figure"], recording, found, Reconstructed(picture, original, quality),
+        headline=headline(values), truth=(truth.prism.apex, truth.phase), device=demo.device,
+    )  # fmt: skip
+    return DemoResult(
+        **values,
+        simulate_s=simulated_s,
+        calibrate_s=found.seconds,
+        reconstruct_s=picture.seconds,
+        compensate_mev_per_s=compensated.mev_per_s,
+        files={name: str(path) for name, path in files.items()},
+        notes=found.warnings + notes,
+    )
+
+
+def _accuracy(
+    recording: Recording, found: Calibration, truth: ExactModel, quality: metrics.PictureQuality, device: Any
+) -> dict[str, Any]:
+    """Return the fields of :class:`DemoResult` that compare the results with the ground truth."""
+    before, after, with_truth = blurs(recording, found, truth, device)
+    return {
         "apex_deg": math.degrees(found.exact.parameters["apex"]),
         "apex_true_deg": math.degrees(truth.prism.apex),
         "sharpness_model_error_px": metrics.model_error(sharpest(found).model, truth).rms,
@@ -130,24 +173,13 @@ def run_demo(demo: Demo, progress: Progress | None = None) -> Outcome:
         "picture_correlation": quality.correlation,
         "picture_psnr_db": quality.psnr_db,
     }
-    tell("measuring and drawing", 0.5)
-    notes = draw_demo(
-        files["figure"], recording, found, Reconstructed(picture, original, quality),
-        headline=headline(values), truth=(truth.prism.apex, truth.phase), device=demo.device,
-    )  # fmt: skip
-    return Outcome(
-        **values,
-        simulate_s=simulated_s,
-        calibrate_s=found.seconds,
-        reconstruct_s=picture.seconds,
-        compensate_mev_per_s=done.mev_per_s,
-        files={name: str(path) for name, path in files.items()},
-        notes=found.warnings + notes,
-    )
 
 
 def middle_turn(recording: Recording, found: Calibration, device: Any) -> Picture:
-    """The picture from the turn in the middle, where the pixels' first references are long gone."""
+    """Return the picture from the turn in the middle of the recording.
+
+    By then every pixel's initial reference level no longer matters.
+    """
     work = Reconstruction(recording, found, device=device)
     _, turn_us = work.span()
     first, last = recording.events.t_first, recording.events.t_last
@@ -155,12 +187,13 @@ def middle_turn(recording: Recording, found: Calibration, device: Any) -> Pictur
 
 
 def sharpest(found: Calibration) -> Calibration:
-    """The answer of the first stage alone."""
+    """Return the calibration after the first stage, by sharpness alone."""
     exact = found.exact
     return exact if exact.photometric is None else replace(exact, parameters=exact.photometric.sharpness_parameters)
 
 
 def _files(out: Path) -> dict[str, Path]:
+    """Create the folder, and return the paths of the files by name."""
     make_folder(out)
     names = {
         "recording": "recording.h5",
@@ -173,7 +206,7 @@ def _files(out: Path) -> dict[str, Path]:
 
 
 def simulation(demo: Demo) -> Simulation:
-    """The demo's recording, noise included."""
+    """Return the simulation of the demo's recording, noise included."""
     return Simulation(
         Scene.from_picture(demo.picture or earth()),
         Camera.from_fov(demo.width, demo.height, math.radians(60.0)),
@@ -187,14 +220,17 @@ def simulation(demo: Demo) -> Simulation:
 
 
 def earth() -> Path:
-    """The map of the earth that comes with PyVista."""
+    """Return the path of the map of the earth that comes with PyVista."""
     import pyvista.examples
 
     return Path(pyvista.examples.mapfile)
 
 
 def blurs(recording: Recording, found: Calibration, truth: ExactModel, device: Any) -> tuple[float, float, float]:
-    """Standard deviation of events across edges [px]: raw, compensated as found, compensated with the truth."""
+    """Return the standard deviation of events across edges [px].
+
+    In order: before compensation, compensated as calibrated, and compensated with the true model.
+    """
     events = thin(recording, MEASURED)
     encoder = found.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
     after: NDArray[np.float32] = compensate_events(events, found.model, encoder, device=device)
@@ -209,9 +245,9 @@ def blurs(recording: Recording, found: Calibration, truth: ExactModel, device: A
 
 
 def headline(values: dict[str, Any]) -> str:
-    """The figure's title."""
+    """Return the title of the figure."""
     return (
         f"{values['events'] / 1e6:.1f} million events: apex found {values['apex_deg']:.3f}°, "
-        f"true {values['apex_true_deg']:.3f}°, told {math.degrees(NOMINAL_APEX):.3f}°; "
+        f"true {values['apex_true_deg']:.3f}°, nominal {math.degrees(NOMINAL_APEX):.3f}°; "
         f"blur {values['blur_before_px']:.2f} px before, {values['blur_after_px']:.2f} px after"
     )

@@ -1,4 +1,4 @@
-"""What a figure was measured on: the processor or GPU, and versions of the packages that matter."""
+"""Description of the machine of a measurement: processor or GPU, and versions of the relevant packages."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from amiwarp.kernels.cores import cpu_threads
 
 
 def processor() -> str:
-    """Name of the CPU."""
+    """Return the name of the CPU."""
     info = Path("/proc/cpuinfo")
     found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
     return (found.group(1) if found else platform.processor() or platform.machine()).strip()
 
 
 def machine(device: str) -> str:
-    """The GPU's name, or the processor's with the cores that may be used."""
+    """Return the name of the GPU, or that of the CPU with the number of cores that this process may use."""
     there = wp.get_device(device)
     return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Of amiwarp, Python and those of the packages that are installed."""
+    """Return the versions of amiwarp, of Python, and of those ``packages`` that are installed."""
     out = {"amiwarp": __version__, "python": platform.python_version()}
     for name in packages:
         try:

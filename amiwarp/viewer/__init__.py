@@ -1,1 +1,1 @@
-"""The interactive viewer: recordings, events and their compensation in a browser."""
+"""The inspector: an interactive page that shows a recording's events and their motion compensation."""

@@ -1,7 +1,7 @@
-"""The inspector's fronts: in a browser, in a window of its own, in a notebook, and as a picture without any of them.
+"""Ways to open the inspector: in a browser, in a window, in a notebook, or as a picture file.
 
-The window is the same page in a browser's own window without tabs: one panel to keep, nothing more to install than what
-every desktop has, and the same over SSH.
+The window is a browser window without tabs or address bar that shows the same page. So there is only one user interface
+to maintain, nothing extra to install, and the inspector works in the same way over SSH.
 """
 
 from __future__ import annotations
@@ -34,58 +34,70 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge", "brave-browser")
-"""Those that open a page in a window of its own."""
-HERE = "127.0.0.1"
+"""Commands of the browsers that can show a page in a window without tabs (``--app``), in order of preference."""
+LOCALHOST = "127.0.0.1"
 
 
 def has_display() -> bool:
-    """Whether a window can open."""
+    """Return whether this machine can open a window."""
     return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def serve_panel(
-    make: Callable[[], Inspector], folder: Path, *, host: str = HERE, port: int = 0, ready: Callable[[str], None]
+    make_inspector: Callable[[], Inspector],
+    folder: Path,
+    *,
+    host: str = LOCALHOST,
+    port: int = 0,
+    ready: Callable[[str], None],
 ) -> None:
-    """Serve the panel until interrupted, each tab with its own inspector.
+    """Serve the inspector's page until interrupted; each browser tab gets its own inspector.
 
-    ``folder``: of exports. ``ready`` gets the address. Raises :class:`AmiwarpError` if nothing can be served there.
+    Exports are written to ``folder``. ``ready`` is called with the page's address as soon as it can be opened.
+    Raises :class:`AmiwarpError` if the host or the port cannot be used.
     """
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make, folder, host, port, ready))
+        asyncio.run(_serve(make_inspector, folder, host, port, ready))
 
 
 async def _serve(
-    make: Callable[[], Inspector], folder: Path, host: str, port: int, ready: Callable[[str], None]
+    make_inspector: Callable[[], Inspector], folder: Path, host: str, port: int, ready: Callable[[str], None]
 ) -> None:
     token = secrets.token_urlsafe(16)
-    await serve(partial(_tab, make, folder), settable=SETTABLE, host=host, port=port, token=token, ready=ready)
+    build = partial(_build_tab, make_inspector, folder)
+    await serve(build, settable=SETTABLE, host=host, port=port, token=token, ready=ready)
 
 
-def _tab(make: Callable[[], Inspector], folder: Path, server: Any) -> Callable[[], None]:
-    return Panel(server, make(), folder).close
+def _build_tab(make_inspector: Callable[[], Inspector], folder: Path, server: Any) -> Callable[[], None]:
+    return Panel(server, make_inspector(), folder).close
 
 
 def export_folder(recording: Path | None, given: Path | None) -> Path:
-    """Return where a page's exports go: to ``given``, else to the recording's folder, else where the command runs.
+    """Return the folder for exports: ``given``, else the recording's folder, else the current folder.
 
-    Raises :class:`AmiwarpError` if that is no folder.
+    Raises :class:`AmiwarpError` if this folder does not exist.
     """
     folder = given or (recording.parent if recording is not None else Path())
     if not folder.is_dir():
-        raise AmiwarpError(f"{folder}: is no folder; make it first, or give another --out-dir")
+        raise AmiwarpError(f"{folder}: is not a folder; create it first, or give another --out-dir")
     return folder.resolve()
 
 
-def open_window(make: Callable[[], Inspector], folder: Path, ready: Callable[[str], None]) -> None:
-    """Opens the panel in a window and serves it until that is closed; in a tab where no browser has such windows."""
+def open_window(make_inspector: Callable[[], Inspector], folder: Path, ready: Callable[[str], None]) -> None:
+    """Open the page in a window and serve it until the window is closed.
 
-    async def both() -> None:
-        found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        serving: asyncio.Future[Any] = asyncio.create_task(_serve(make, folder, HERE, 0, found.set_result))
-        await asyncio.wait([serving, found], return_when=asyncio.FIRST_COMPLETED)
+    If none of :data:`BROWSERS` is installed, open a tab of the default browser and serve until interrupted.
+    """
+
+    async def serve_and_show() -> None:
+        address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        serving: asyncio.Future[Any] = asyncio.create_task(
+            _serve(make_inspector, folder, LOCALHOST, 0, address.set_result)
+        )
+        await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
         if serving.done():
             serving.result()
-        url = found.result()
+        url = address.result()
         ready(url)
         browser = next(filter(None, map(shutil.which, BROWSERS)), None)
         if browser is None:
@@ -103,7 +115,7 @@ def open_window(make: Callable[[], Inspector], folder: Path, ready: Callable[[st
             await serving
 
     with suppress(KeyboardInterrupt):
-        asyncio.run(both())
+        asyncio.run(serve_and_show())
 
 
 def view(
@@ -114,25 +126,52 @@ def view(
     height: int = 700,
     out_dir: str | os.PathLike[str] | None = None,
 ) -> Any:
-    """Show the panel below a notebook's cell, served by the notebook's own loop until the kernel ends.
+    """Show the inspector below a notebook cell.
 
-    ``height`` [px]. ``out_dir``: folder of the files that the page exports; without it the recording's, or the current
-    one. Raises :class:`AmiwarpError` for a recording without events, another camera's calibration, or no folder.
+    Parameters
+    ----------
+    recording : Recording
+        Events to show. Encoder, camera and prism may be missing.
+    calibration : Calibration or None
+        Parameters of the prism at the start. Without it, the page starts with the nominal prism.
+    device : str or warp.Device
+        Device that compensates the events.
+    height : int
+        Height of the page in the notebook [px].
+    out_dir : str or path-like or None
+        Folder for the files that the page exports. Without it, the folder of the recording's file is used, or the
+        current folder for a recording in memory.
+
+    Returns
+    -------
+    asyncio.Task
+        Task that serves the page in the notebook's event loop until the kernel ends. Cancel it to close the page.
+
+    Raises
+    ------
+    AmiwarpError
+        If the recording holds no events, the calibration belongs to a camera of another size, or the folder does not
+        exist.
+
+    Examples
+    --------
+    >>> amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
     """
     from IPython.display import IFrame, display
 
     folder = export_folder(getattr(recording.events, "path", None), None if out_dir is None else Path(out_dir))
 
-    Inspector(recording, calibration, device=device)  # what is wrong is said here
-    make = partial(Inspector, recording, calibration, device=device)
-    show = _serve(make, folder, HERE, 0, lambda url: display(IFrame(url, "100%", height)))
-    return asyncio.get_running_loop().create_task(show)
+    Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
+    make_inspector = partial(Inspector, recording, calibration, device=device)
+    serving = _serve(make_inspector, folder, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
+    return asyncio.get_running_loop().create_task(serving)
 
 
 def save_screenshot(
     inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
 ) -> None:
-    """Writes both clouds as PNG; ``size``: of the picture [px]."""
+    """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
+
     check_output(path)
     look = look or Look()
     scene = Scene(size)

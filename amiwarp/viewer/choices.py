@@ -1,29 +1,29 @@
-"""The closed sets of choices for the clouds."""
+"""Options of the event clouds: colour, third axis and view."""
 
 import enum
 
 
 class Colour(enum.StrEnum):
-    """What a point's colour tells."""
+    """Quantity that the colour of a point shows."""
 
     POLARITY = "polarity"
     ANGLE = "angle"
     TIME = "time"
     DENSITY = "density"
-    """Events in the pixel where it lies, up to the 99th percentile."""
+    """Number of events in the point's pixel; the scale ends at the 99th percentile."""
     RESIDUAL = "residual"
-    """Distance from the middle of the events about it, up to 2 px: of an edge, from its crest."""
+    """Distance from the centre of the neighbouring events, up to 2 px; for an edge, the distance from its crest."""
 
 
 class Axis(enum.StrEnum):
-    """The third axis."""
+    """Third axis of the clouds, next to x and y."""
 
     ANGLE = "angle"
     TIME = "time"
 
 
 class View(enum.StrEnum):
-    """Where the camera stands."""
+    """Direction of view."""
 
     FREE = "free"
     XY = "x-y"

@@ -1,4 +1,4 @@
-"""Pictures of the clouds on their way to one page: no more of them at a time than it takes."""
+"""Delivery of rendered pictures to one page, limited to the rate at which the page takes them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import asyncio
 from typing import Any
 
 MOST_IN_FLIGHT = 8
-"""Messages that wait to be sent; while there are more, nothing is drawn."""
+"""Largest number of unsent messages; while more are waiting, nothing is drawn."""
 WAIT_S = 0.02
+"""Interval between two checks of the number of unsent messages [s]."""
 FRAME_S = 1.0 / 30.0
-"""Between two pictures while the mouse turns the clouds."""
-BREATH_S = 0.01
-"""Left to other pages between two pictures, however long they take."""
+"""Shortest interval between two pictures while the mouse rotates the clouds [s]."""
+PAUSE_S = 0.01
+"""Shortest pause between two pictures [s]. It leaves time for other pages, however long drawing takes."""
 
 
-async def room(server: Any) -> None:
-    """Wait until the page has taken most of what was sent to it."""
+async def wait_until_page_keeps_up(server: Any) -> None:
+    """Wait until at most :data:`MOST_IN_FLIGHT` messages to the page are unsent."""
     while _in_flight(server) > MOST_IN_FLIGHT:
         await asyncio.sleep(WAIT_S)
 
@@ -24,28 +25,28 @@ def _in_flight(server: Any) -> int:
     return 0 if server.protocol is None else int(server.protocol.network_monitor.pending)
 
 
-class Frames:
-    """Stands between VTK's delivery of pictures and the page.
+class PictureThrottle:
+    """Replacement of VTK's picture delivery that waits while the page is slow.
 
-    VTK's own sends each picture at once, and starts one more animation with each press of the mouse.
+    VTK itself sends every picture immediately, and starts one more animation at each press of a mouse button.
     """
 
     def __init__(self, server: Any, delivery: Any) -> None:
-        """``delivery``: the protocol ``vtkWebPublishImageDelivery`` of the ``server``."""
+        """Replace the sending methods of ``delivery``, the server's ``vtkWebPublishImageDelivery`` protocol."""
         self._server, self._delivery = server, delivery
         self._send = delivery.push_render
-        self._late: asyncio.TimerHandle | None = None
+        self._retry: asyncio.TimerHandle | None = None
         self._next: asyncio.TimerHandle | None = None
-        self._turning = ""
+        self._animated_view = ""
         delivery.push_render = self._push
         delivery.start_view_animation = self._start
         delivery.stop_view_animation = self._stop
 
     def close(self) -> None:
-        """Draw no more, and end what VTK keeps of the page."""
-        for timer in filter(None, (self._late, self._next)):
+        """Stop drawing, and remove VTK's observers and records of the page."""
+        for timer in filter(None, (self._retry, self._next)):
             timer.cancel()
-        delivery, self._turning = self._delivery, ""
+        delivery, self._animated_view = self._delivery, ""
         for observed in delivery.tracking_views.values():
             for tag in observed["tags"]:
                 delivery.app.RemoveObserver(tag)
@@ -55,30 +56,30 @@ class Frames:
             vars(delivery).pop(name, None)
 
     def _push(self, view: str, ignore_animation: bool = False, stale_count: int = 0) -> None:
-        if self._turning and not ignore_animation:
+        if self._animated_view and not ignore_animation:
             return
         if _in_flight(self._server) > MOST_IN_FLIGHT:
-            if self._late is None:
-                self._late = asyncio.get_running_loop().call_later(WAIT_S, self._push_late, view)
+            if self._retry is None:
+                self._retry = asyncio.get_running_loop().call_later(WAIT_S, self._push_again, view)
             return
         self._send(view, True, stale_count)
 
-    def _push_late(self, view: str) -> None:
-        self._late = None
+    def _push_again(self, view: str) -> None:
+        self._retry = None
         self._push(view)
 
     def _start(self, view: str = "-1") -> None:
-        self._turning = view
+        self._animated_view = view
         if self._next is None:
             self._animate()
 
     def _stop(self, view: str = "-1") -> None:
-        self._turning = ""
+        self._animated_view = ""
 
     def _animate(self) -> None:
         self._next, loop = None, asyncio.get_running_loop()
-        if self._turning:
-            began = loop.time()
-            self._push(self._turning, ignore_animation=True)
-            took = loop.time() - began
-            self._next = loop.call_later(max(FRAME_S - took, BREATH_S), self._animate)
+        if self._animated_view:
+            start_s = loop.time()
+            self._push(self._animated_view, ignore_animation=True)
+            drawing_s = loop.time() - start_s
+            self._next = loop.call_later(max(FRAME_S - drawing_s, PAUSE_S), self._animate)

@@ -1,4 +1,4 @@
-"""What a panel does for longer: a calibration that can be cancelled, a recording that plays, films."""
+"""Long-running jobs of a page: calibration, playback of the recording, and films."""
 
 from __future__ import annotations
 
@@ -21,36 +21,39 @@ if TYPE_CHECKING:
     from amiwarp.viewer.panel import Panel
 
 FRAMES, FPS = 90, 25.0
-"""Of a film."""
-LEAST_S, LIVE_S = 0.05, 0.25
-"""Between the pictures of a recording that is played, and of a live stream."""
+"""Number of pictures of a film, and pictures per second."""
+PLAY_S, FOLLOW_S = 0.05, 0.25
+"""Shortest interval between two pictures of a recording that is played, and of a live stream [s]."""
 PROGRESS_S = 0.1
-"""Between two words of a calibration's progress: a small recording has eighty in a second, a page draws all of them."""
+"""Shortest interval between two progress messages of a calibration [s].
+
+A small recording causes eighty per second, and the page would draw each of them.
+"""
 
 
-class Cancelled(Exception):
-    """Raised inside work that nobody waits for any more."""
+class JobCancelled(Exception):
+    """Raised to stop work whose result is no longer needed."""
 
 
-class Calibrating:
-    """A calibration of the panel's recording, in a thread."""
+class CalibrationJob:
+    """Calibration of the panel's recording, in a thread."""
 
     def __init__(self, panel: Panel) -> None:
         self._panel, self.cancelled = panel, False
         self.found: Calibration | None = None
-        """What waits to be accepted."""
+        """Result that waits to be accepted."""
 
     def toggle(self) -> None:
-        """Starts it, or cancels the one that runs."""
+        """Start a calibration, or cancel the running one."""
         state = self._panel.state
         if state.busy:
             if state.busy.startswith("calibrating"):
                 self.cancelled = True
-                state.busy = "calibrating: about to be cancelled"
+                state.busy = "calibrating: cancelling"
             return
         self.cancelled, self.found = False, None
         state.update({"busy": "calibrating", "progress": 0, "found": ""})
-        self._panel.begin(self._run())
+        self._panel.start_job(self._run())
 
     def cancel(self) -> None:
         self.cancelled = True
@@ -60,14 +63,15 @@ class Calibrating:
         rpm = inspector.knobs.rpm
         settings = Settings(start={} if inspector.has_encoder or not rpm else {"rpm": rpm})
         try:
-            async with panel.warp:
+            async with panel.device_lock:
+                progress = _progress_callback(self)
                 found = await panel.in_thread(
-                    _calibrate, inspector.recording, settings, device=inspector.device, progress=_teller(self)
+                    _calibrate, inspector.recording, settings, device=inspector.device, progress=progress
                 )
             if self.cancelled:
-                panel.say("calibration cancelled", "info")
+                panel.show_message("calibration cancelled", "info")
             elif isinstance(found, str):
-                panel.say(found, "error")
+                panel.show_message(found, "error")
             else:
                 self.found = found
                 with panel.state:
@@ -76,48 +80,54 @@ class Calibrating:
             with panel.state:
                 panel.state.busy = ""
 
-    def tell(self, what: str, share: float) -> None:
-        """Shows how far it is."""
+    def show_progress(self, what: str, share: float) -> None:
+        """Show the current step and the finished share, 0 to 1."""
         if self.cancelled:
             return
         with self._panel.state:
             self._panel.state.update({"busy": what, "progress": round(100 * min(share, 1.0))})
 
 
-def _teller(job: Calibrating) -> Progress:
-    """What a calibration calls in its thread. NLopt never lets go of what it calls, so this knows the job weakly."""
-    known, loop, told = weakref.ref(job), asyncio.get_running_loop(), -math.inf
+def _progress_callback(job: CalibrationJob) -> Progress:
+    """Return the progress callback of a calibration, which stops the calibration once the job is cancelled.
 
-    def tell(what: str, share: float) -> None:
-        nonlocal told
+    It holds the job by a weak reference, because NLopt never releases its callbacks.
+    """
+    job_reference, loop, last_s = weakref.ref(job), asyncio.get_running_loop(), -math.inf
+
+    def progress(what: str, share: float) -> None:
+        nonlocal last_s
         if not wanted():
-            raise Cancelled
-        if (now := loop.time()) >= told + PROGRESS_S:
-            told = now
+            raise JobCancelled
+        if (now := loop.time()) >= last_s + PROGRESS_S:
+            last_s = now
             loop.call_soon_threadsafe(show, what, share)
 
     def wanted() -> bool:
-        job = known()
+        job = job_reference()
         return job is not None and not job.cancelled
 
     def show(what: str, share: float) -> None:
-        if (job := known()) is not None:
-            job.tell(what, share)
+        if (job := job_reference()) is not None:
+            job.show_progress(what, share)
 
-    return tell
+    return progress
 
 
 def _calibrate(*args: Any, **options: Any) -> Calibration | str:
-    """What :func:`calibrate` finds, or why nothing: NLopt also keeps what was raised, and with it every frame."""
+    """Return the result of :func:`calibrate`, or the text of its error.
+
+    NLopt also keeps the last error, and its traceback would keep all local variables alive.
+    """
     try:
         return calibrate(*args, **options)
-    except (AmiwarpError, Cancelled) as error:
+    except (AmiwarpError, JobCancelled) as error:
         traceback.clear_frames(error.__traceback__)
         return str(error)
 
 
 def summary(c: Calibration) -> str:
-    """A calibration in a line."""
+    """Return a description of a calibration in one line."""
     p, exact = c.parameters, c.exact.parameters
     warnings = "".join(f"; {text}" for text in c.warnings)
     apex, phase = (math.degrees(x) for x in (exact.get("apex", 0.0), p["phase"]))
@@ -127,28 +137,28 @@ def summary(c: Calibration) -> str:
     )
 
 
-class Playing:
-    """The panel's window moving through the recording, on the page or into a film."""
+class Playback:
+    """Playback: moves the panel's window through the recording, on the page or for a film."""
 
     def __init__(self, panel: Panel) -> None:
         self._panel, self._ended = panel, False
         self.runs = False
-        """Until it has noticed that it was stopped, too."""
+        """Whether the playback task is running; after a stop it runs until it notices the stop."""
 
     def end(self) -> None:
-        """Also of a film that is being written."""
+        """Stop for good; a film that is being written is stopped too."""
         self._ended = True
 
     def toggle(self) -> None:
-        """Runs through the recording from here, or follows a live stream, or stops."""
+        """Play the recording from the current window, or follow a live stream; stop if already playing."""
         state = self._panel.state
         state.playing = not state.playing
         if not state.playing or self.runs:
             return
         if self._panel.inspector.latest is None and self._panel.move(float(state.start_ms)):
-            self._panel.move(0.0)  # at the end: from the beginning
+            self._panel.move(0.0)  # restart after the end
         self.runs = True
-        self._panel.begin(self._play())
+        self._panel.start_job(self._play())
 
     async def _play(self) -> None:
         try:
@@ -158,45 +168,45 @@ class Playing:
 
     async def _run(self) -> None:
         panel, state, loop = self._panel, self._panel.state, asyncio.get_running_loop()
-        took = LEAST_S
+        elapsed_s = PLAY_S
         while state.playing:
-            began = loop.time()
+            start_s = loop.time()
             with state:
-                if panel.move(float(state.start_ms) + 1e3 * took * float(state.speed)):
+                if panel.move(float(state.start_ms) + 1e3 * elapsed_s * float(state.speed)):
                     state.playing = False
-                panel.ask("window")
-            await panel.settled()
-            await asyncio.sleep(max(0.0, LEAST_S - (loop.time() - began)))
-            took = loop.time() - began
-        panel.released()
+                panel.request("window")
+            await panel.wait_until_drawn()
+            await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
+            elapsed_s = loop.time() - start_s
+        panel.slider_released()
 
     async def _follow(self) -> None:
         panel, state = self._panel, self._panel.state
         while state.playing:
             with state:
                 panel.renew()
-            await panel.settled()
-            await asyncio.sleep(LIVE_S)
-        panel.released()
+            await panel.wait_until_drawn()
+            await asyncio.sleep(FOLLOW_S)
+        panel.slider_released()
 
     def turntable(self) -> None:
-        """Writes a film of one turn about the clouds."""
-        self._panel.begin(self._film("turntable", lambda: self._panel.scene.turntable(FRAMES)))
+        """Write a film in which the camera moves once around the clouds."""
+        self._panel.start_job(self._film("turntable", lambda: self._panel.scene.turntable(FRAMES)))
 
     def film(self) -> None:
-        """Writes a film of the recording from here on."""
-        self._panel.begin(self._film("film", self._frames))
+        """Write a film of the recording, starting at the current window."""
+        self._panel.start_job(self._film("film", self._frames))
 
     async def _film(self, what: str, frames: Callable[[], Iterator[NDArray[np.uint8]]]) -> None:
-        """Drawn one by one in this loop, which serves the pages in between, and written in a thread."""
+        """Draw the pictures one by one in the event loop, which serves pages in between; write them in a thread."""
         panel, state, loop, pictures = self._panel, self._panel.state, asyncio.get_running_loop(), frames()
         if state.busy:
             return
 
         async def draw() -> NDArray[np.uint8] | None:
-            await panel.settled()
+            await panel.wait_until_drawn()
             if self._ended:
-                raise Cancelled
+                raise JobCancelled
             with state:
                 state.progress += 100.0 / FRAMES
                 return next(pictures, None)
@@ -208,10 +218,10 @@ class Playing:
         with state:
             state.update({"busy": f"writing the {what}", "progress": 0})
         try:
-            with panel.reported("export"):
+            with panel.errors_shown("export"):
                 path = panel.path(what, ".mp4", ".gif")
                 count = await panel.in_thread(save_film, drawn(), path, fps=FPS)
-                panel.say(f"{path}: {count} frames written", "success")
+                panel.show_message(f"{path}: {count} frames written", "success")
             panel.server.controller.view_update()
         finally:
             with state:
@@ -222,7 +232,8 @@ class Playing:
         for _ in range(FRAMES):
             picture = panel.scene.picture()
             ended = panel.move(float(panel.state.start_ms) + 1e3 / FPS * float(panel.state.speed))
-            panel.ask("window")  # drawn when the next picture is asked for
+            panel.request("window")  # drawn before the next picture is taken
+
             yield picture
             if ended:
                 return

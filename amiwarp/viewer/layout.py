@@ -1,4 +1,4 @@
-"""The panel's widgets and where they stand."""
+"""Widgets of the page and their arrangement."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ UNITS = {
     "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0, "tilt_x": math.radians(1.0),
     "tilt_y": math.radians(1.0), "rpm": 1.0,
 }  # fmt: skip
-"""What one of the page's numbers is in the knob's unit: degrees for angles."""
+"""Conversion from the page's units (angles in degrees) to the parameters' units (radians): factor per parameter."""
 NAMES = tuple(UNITS)
+"""Names of the prism parameters with a slider."""
 SLIDERS = (
     ("apex", "apex", "°", ("0", "apex_most", 0.005), None),
     ("phase", "phase θ_b", "°", ("-180", "180", 0.25), None),
@@ -25,27 +26,27 @@ SLIDERS = (
     ("tilt_x", "tilt x", "°", ("-5", "5", 0.05), "model == 'exact' || model == 'ellipse'"),
     ("tilt_y", "tilt y", "°", ("-5", "5", 0.05), "model == 'exact' || model == 'ellipse'"),
 )
-"""Name, label, unit, (least, most, step) and where it makes sense, of each knob."""
+"""Name, label, unit, (minimum, maximum, step) and condition for showing it, of each slider."""
 SPEEDS = (0.01, 0.1, 0.5, 1)
-"""Of a recording that is played."""
+"""Choices of the playback speed, relative to real time."""
 KEYS = (
-    ("ArrowRight", ("step", 1.0), "on by one turn"),
+    ("ArrowRight", ("step", 1.0), "forward by one turn"),
     ("ArrowLeft", ("step", -1.0), "back by one turn"),
-    (" ", ("play",), "play, or follow a live stream, or stop"),
-    ("1", ("look_from", View.FREE.value), "look at the cloud from the corner"),
-    ("2", ("look_from", View.XY.value), "straight down θ: x-y, the image"),
-    ("3", ("look_from", View.X_AXIS.value), "straight down y: x-θ"),
-    ("4", ("look_from", View.Y_AXIS.value), "straight down x: y-θ"),
+    (" ", ("play",), "play (or follow a live stream), or stop"),
+    ("1", ("look_from", View.FREE.value), "view from the corner"),
+    ("2", ("look_from", View.XY.value), "view along the third axis: x-y, the image"),
+    ("3", ("look_from", View.X_AXIS.value), "view along y: x-θ"),
+    ("4", ("look_from", View.Y_AXIS.value), "view along x: y-θ"),
     ("t", ("toggle_axis",), "third axis: angle or time"),
     ("o", ("toggle", "overlaid"), "side by side or overlaid"),
     ("d", ("toggle", "dark"), "light or dark"),
     ("c", ("calibrate",), "calibrate, or cancel"),
-    ("a", ("accept",), "accept what calibration found"),
+    ("a", ("accept",), "accept the result of the calibration"),
     ("s", ("save",), "save the calibration"),
-    ("p", ("save_picture",), "save the picture"),
-    ("?", ("toggle", "help_shown"), "this help"),
+    ("p", ("save_picture",), "save a picture of the clouds"),
+    ("?", ("toggle", "help_shown"), "show or hide this help"),
 )
-"""Key, what the panel does, in words."""
+"""Key, method of the panel with its arguments, and help text."""
 STYLE = """
 html { overflow: hidden !important; }
 .panel { display: grid; grid-template: 40px minmax(0, 1fr) 214px / minmax(0, 1fr) 318px; height: 100vh; outline: none; }
@@ -85,7 +86,7 @@ window.addEventListener('keydown', (e) => {
 
 
 def build(server: Any, panel: Panel) -> None:
-    """Puts the page together. ``panel``'s state must have its first values."""
+    """Build the page. The state of ``panel`` must already hold its initial values."""
     from trame.ui.vuetify3 import VAppLayout
     from trame.widgets import client, html
     from trame.widgets import vuetify3 as v
@@ -133,8 +134,8 @@ def _cloud(server: Any, panel: Panel, html: Any, v: Any) -> None:
         view = vtk.VtkRemoteView(panel.scene.plotter.render_window, ref="view", interactive_ratio=1,
                                  interactive_quality=70, still_quality=92)  # fmt: skip
         server.controller.view_update = view.update
-        words = "drag: turn · wheel: zoom · shift and drag: move · click: an event and its orbit (green)"
-        html.Div(words, classes="hint", v_show="!message && !picked")
+        hint = "drag: rotate · wheel: zoom · shift + drag: move · click: describe an event and show its orbit (green)"
+        html.Div(hint, classes="hint", v_show="!message && !picked")
         with html.Div(classes="said"):
             v.VAlert("{{ picked }}", v_if="picked", density="compact", closable=True, id="picked",
                      click_close="picked = ''")  # fmt: skip
@@ -145,7 +146,7 @@ def _cloud(server: Any, panel: Panel, html: Any, v: Any) -> None:
 def _window(panel: Panel, html: Any, v: Any) -> None:
     html.H4("window")
     v.VSlider(v_model=("start_ms",), min=0, max=("whole_ms",), step=0.1, hide_details=True, density="compact",
-              id="start", update_modelValue="playing = false", end=(panel.released,))  # fmt: skip
+              id="start", update_modelValue="playing = false", end=(panel.slider_released,))  # fmt: skip
     with html.Div(classes="row"):
         _number(panel, v, "start_ms", "from [ms]", 102)
         _number(panel, v, "length_ms", "length [ms]", 102)
@@ -166,11 +167,11 @@ def _window(panel: Panel, html: Any, v: Any) -> None:
         with html.Div(style="display: grid; grid-template-columns: 84px 1fr; align-items: center"):
             html.Span(f"{axis} {{{{ region_{axis}[0] }}}} to {{{{ region_{axis}[1] }}}}", classes="small")
             v.VRangeSlider(v_model=(f"region_{axis}",), min=0, max=(f"size[{k}]",), step=1, strict=True,
-                           density="compact", hide_details=True, end=(panel.released,))  # fmt: skip
+                           density="compact", hide_details=True, end=(panel.slider_released,))  # fmt: skip
 
 
 def _number(panel: Panel, v: Any, name: str, label: str, width: int, *, shown: str = "", **more: Any) -> None:
-    """A field for a number; ``shown``: what stands in it, if not the state of its name."""
+    """Add a number field for the state variable ``name``; ``shown`` is an expression to show instead of it."""
     v.VTextField(model_value=(shown or name,), change=(panel.typed, f"['{name}', $event.target.value]"), type="number",
                  label=label, density="compact", hide_details=True, style=f"max-width: {width}px",
                  id=f"field-{name}", **more)  # fmt: skip
@@ -184,8 +185,8 @@ def _prism(panel: Panel, html: Any, v: Any) -> None:
         with html.Div(classes="knob", **({} if where is None else {"v_if": where})):
             html.Label(f"{label} [{unit}]")
             v.VSlider(v_model=(name,), min=(least,), max=(most,), step=step, hide_details=True, density="compact",
-                      id=f"slider-{name}", start=(panel.moved, f"['{name}']"), end=(panel.released,),
-                      focus=(panel.moved, f"['{name}']"))  # fmt: skip
+                      id=f"slider-{name}", start=(panel.select_curve, f"['{name}']"), end=(panel.slider_released,),
+                      focus=(panel.select_curve, f"['{name}']"))  # fmt: skip
             _number(panel, v, name, "", 92)
 
 
@@ -216,17 +217,17 @@ def _look(html: Any, v: Any) -> None:
         with html.Div(style="display: grid; grid-template-columns: 84px 1fr; align-items: center"):
             html.Span(label, classes="small")
             v.VSlider(v_model=(name,), min=step, max=most, step=step, hide_details=True, density="compact")
-    v.VCheckbox(v_model=("orbit_shown",), label="the model's orbit", density="compact", hide_details=True)
+    v.VCheckbox(v_model=("orbit_shown",), label="show the model's orbit", density="compact", hide_details=True)
 
 
 def _export(panel: Panel, html: Any, v: Any) -> None:
     html.H4("export")
-    v.VTextField(v_model=("out",), label="new file's name; default: the recording's", density="compact",
+    v.VTextField(v_model=("out",), label="file name (default: recording's name)", density="compact",
                  hide_details=True, maxlength=120, style="margin: 4px 0", id="out")  # fmt: skip
     with html.Div(classes="row"):
         _button(v, "picture", panel.save_picture, "picture")
-        _button(v, "turntable", panel.playing.turntable, "turntable", disabled=("!!busy",))
-        _button(v, "film from here", panel.playing.film, "film", disabled=("!!busy",))
+        _button(v, "turntable", panel.playback.turntable, "turntable", disabled=("!!busy",))
+        _button(v, "film from here", panel.playback.film, "film", disabled=("!!busy",))
 
 
 def _strip(html: Any) -> None:
@@ -238,13 +239,13 @@ def _strip(html: Any) -> None:
         with html.Div(classes="tile"):
             html.Span("log intensity {{ picture_note && picture ? '(' + picture_note + ')' : '' }}")
             html.Img(src=("picture",), v_if="picture", id="image-picture")
-            html.Div("{{ picture_note || 'made when a slider comes to rest' }}", v_else=True, classes="empty")
+            html.Div("{{ picture_note || 'computed when a slider is released' }}", v_else=True, classes="empty")
         with html.Div(classes="tile"):
             html.Span("sharpness over {{ knob }}")
             _plot(html, "curve", "<line :x1='curve_mark' :x2='curve_mark' y1='0' y2='40' stroke='#d55e00' "
                   "vector-effect='non-scaling-stroke'/>")  # fmt: skip
-            html.Span("{{ curve_text || 'drawn when a slider comes to rest' }}", id="curve-text")
-            html.Span("events a second, up to {{ rate_top }}")
+            html.Span("{{ curve_text || 'computed when a slider is released' }}", id="curve-text")
+            html.Span("event rate, maximum {{ rate_top }}")
             _plot(html, "rate", "<rect :x='100 * shown_from' :width='Math.max(100 * shown_part, 0.4)' y='0' "
                   "height='40' fill='#0072b2' fill-opacity='0.35'/>")  # fmt: skip
 
@@ -265,9 +266,9 @@ def _help(html: Any, v: Any) -> None:
                     html.Td({" ": "space"}.get(key, key), style="padding-right: 24px; font-weight: 600")
                     html.Td(words)
         html.P(
-            "Left the events as they came, right without the prism's motion as it is set. Drag apex and phase until "
-            "the right cloud stands in straight columns and the sharpness is highest, or let it be calibrated. The "
-            "green line is the orbit on which the model sees one scene point: with the right prism it follows the "
-            "cloud.",
+            "Left: events as recorded. Right: events after motion compensation with the current parameters. Drag apex "
+            "and phase until the right cloud forms straight columns and the sharpness is highest, or press calibrate. "
+            "The green line is the orbit on which the model sees one scene point; with the correct parameters it "
+            "follows the cloud.",
             style="margin-top: 12px",
         )

@@ -1,4 +1,4 @@
-"""A trame application for each tab of a browser, on one TCP port: every tab has a server and a state of its own."""
+"""Web server of the inspector: one TCP port that gives each browser tab its own trame server and state."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.frames import Frames
-from amiwarp.viewer.gate import MOST_BYTES, Check, Gate
-from amiwarp.viewer.hosts import ANYWHERE, Names, address, cannot_serve, plain
+from amiwarp.viewer.frames import PictureThrottle
+from amiwarp.viewer.hosts import ALL_INTERFACES, HostNames, address, cannot_serve, normalised
+from amiwarp.viewer.message_filter import MOST_BYTES, Check, MessageFilter
 
 if TYPE_CHECKING:
     from aiohttp import web
     from aiohttp.typedefs import Handler
 
 Closing = Callable[[], object] | None
+"""Function to call when a tab is closed, if any."""
 Session = Callable[[Any], Closing]
-"""Builds the page on a fresh ``trame_server.Server`` (vue3), in the event loop; gives what to run at the end."""
+"""Function that builds a page on a new ``trame_server.Server`` (vue3), in the event loop."""
 MOST_TABS = 16
-"""Open at a time: each holds a scene, a window of the recording and threads."""
-FULL = f"{MOST_TABS} tabs of this inspector are open, and it takes no more; close one, then reload this page"
+"""Largest number of open tabs. Each tab holds a scene, a window of the recording and threads."""
+TOO_MANY_TABS = f"{MOST_TABS} tabs of this inspector are open, which is the maximum; close one, then reload this page"
 HEARTBEAT_S = 30.0
-"""After which a page is asked whether it is there; it has half that time to answer, then it is closed."""
-TIDY_S = 0.5
-"""From a tab's end to when its memory is given back: of several that are closed together once."""
-LONGEST_S = 30.0
-"""Between two looks whether what a closed tab had begun has ended."""
+"""Interval between pings of a page [s]. A page that does not answer within half of it is closed."""
+CLEANUP_S = 0.5
+"""Delay between closing a tab and releasing its memory [s]; tabs closed within this time are released together."""
+LONGEST_CLEANUP_S = 30.0
+"""Longest interval between two attempts to release closed tabs whose threads still run [s]."""
 HEADERS = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
-"""The first keeps the token, which is in the page's address, from every other page."""
+"""Headers of every answer. The first one keeps the page's address, which contains the token, from other sites."""
 
 
 async def serve(
@@ -51,36 +52,37 @@ async def serve(
     token: str,
     ready: Callable[[str], None] | None = None,
 ) -> None:
-    """Serve until it is cancelled; then every tab is closed.
+    """Serve until cancelled; then close every tab.
 
-    ``build`` is called each time that a page is loaded; if it raises, the page shows the text. ``settable``: what of
-    its state a page may set, and to which values. ``port`` 0 takes a free one. ``ready`` gets the URL once it is open.
-    Raises AmiwarpError for an empty token, and for a host or a port that cannot be served.
+    ``build`` is called each time a page is loaded; if it raises an error, the page shows the error's text. ``settable``
+    maps the state variables that a page may set to the checks of their values. ``port`` 0 selects a free port.
+    ``ready`` is called with the URL once the server listens. Raises :class:`AmiwarpError` if the token is empty, or if
+    the host or the port cannot be used.
     """
     from aiohttp import web
 
     if not token:
         raise AmiwarpError("the token is empty: expected a secret, for example secrets.token_urlsafe()")
-    if not plain(host):
-        raise AmiwarpError("the host is empty: expected a name or an address of this machine, as 127.0.0.1")
-    application = _application(Tabs(build, settable), token, await asyncio.to_thread(Names, host))
+    if not normalised(host):
+        raise AmiwarpError("the host is empty: expected a name or an address of this machine, such as 127.0.0.1")
+    application = _application(Tabs(build, settable), token, await asyncio.to_thread(HostNames, host))
     runner = web.AppRunner(application, handle_signals=False, access_log=None, shutdown_timeout=5.0)
     await runner.setup()
     try:
         try:
-            await web.TCPSite(runner, plain(host), port).start()
+            await web.TCPSite(runner, normalised(host), port).start()
         except OSError as error:
             raise cannot_serve(error, host, port) from error
         bound, number = runner.addresses[0][:2]
         if ready is not None:
-            ready(address(bound if bound in ANYWHERE else host, number, token))
+            ready(address(bound if bound in ALL_INTERFACES else host, number, token))
         await asyncio.Event().wait()
     finally:
         await runner.cleanup()
 
 
 class Tabs:
-    """The tabs that are open, of one server: each has a page and a WebSocket."""
+    """Open tabs of one server; each tab has a page and a WebSocket."""
 
     def __init__(self, build: Session, settable: Mapping[str, Check]) -> None:
         from trame_client.module import vue3
@@ -88,76 +90,76 @@ class Tabs:
         self.folders = {"/": Path(vue3.www).resolve()}
         self._build, self._settable = build, settable
         self._sockets: set[web.WebSocketResponse] = set()
-        self._servers: WeakSet[Any] = WeakSet()  # of the open ones, and of closed ones that something still holds
-        self._tidying: asyncio.TimerHandle | None = None
+        self._servers: WeakSet[Any] = WeakSet()  # servers of open tabs, and of closed tabs still in use
+        self._cleanup: asyncio.TimerHandle | None = None
 
     async def open(self, request: web.Request) -> web.WebSocketResponse:
-        """Serve a tab until it is closed. Other sites' pages are refused, and clients that do not say where from."""
+        """Serve a tab until it is closed. Refuse pages of other sites and clients that send no ``Origin`` header."""
         from aiohttp import web
 
         if request.headers.get("Origin", "").lower() != f"{request.scheme}://{request.host}".lower():
             raise web.HTTPForbidden(text="Not allowed: the WebSocket is for this server's own pages.")
-        if len(self._sockets) >= 2 * MOST_TABS:  # from MOST_TABS on they only show why there is nothing
-            raise web.HTTPServiceUnavailable(text=FULL)
+        if len(self._sockets) >= 2 * MOST_TABS:  # tabs beyond MOST_TABS only show TOO_MANY_TABS
+            raise web.HTTPServiceUnavailable(text=TOO_MANY_TABS)
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, timeout=5.0, compress=False, max_msg_size=MOST_BYTES)
-        build = self._build if len(self._sockets) < MOST_TABS else _full
+        build = self._build if len(self._sockets) < MOST_TABS else _refuse_tab
         self._sockets.add(socket)
         try:
             await socket.prepare(request)
             await self._converse(socket, build)
         finally:
             self._sockets.discard(socket)
-            self._tidy_later(TIDY_S)
+            self._clean_up_later(CLEANUP_S)
         return socket
 
     async def close(self, _: web.Application) -> None:
-        """Close all of them."""
+        """Close all tabs."""
         from aiohttp import WSCloseCode
 
-        if self._tidying is not None:
-            self._tidying.cancel()
+        if self._cleanup is not None:
+            self._cleanup.cancel()
         await asyncio.gather(*(socket.close(code=WSCloseCode.GOING_AWAY) for socket in [*self._sockets]))
 
     async def _converse(self, socket: web.WebSocketResponse, build: Session) -> None:
         from aiohttp import WSMsgType
 
         async with _connection(build, self.folders, socket) as (server, connection):
-            gate = Gate(server, self._settable)
+            message_filter = MessageFilter(server, self._settable)
             self._servers.add(server)
             async for message in socket:
-                if message.type is WSMsgType.BINARY and gate.passes(message.data):
+                if message.type is WSMsgType.BINARY and message_filter.passes(message.data):
                     await connection.send(True, message)
 
-    def _tidy_later(self, wait_s: float) -> None:
-        if self._tidying is not None:
-            self._tidying.cancel()
-        self._tidying = asyncio.get_running_loop().call_later(wait_s, self._tidy, wait_s)
+    def _clean_up_later(self, wait_s: float) -> None:
+        if self._cleanup is not None:
+            self._cleanup.cancel()
+        self._cleanup = asyncio.get_running_loop().call_later(wait_s, self._clean_up, wait_s)
 
-    def _tidy(self, waited_s: float) -> None:
-        """Give back what closed tabs held; again, ever less often, while work of theirs still runs in a thread."""
-        self._tidying = None
-        _give_back()
+    def _clean_up(self, waited_s: float) -> None:
+        """Release the memory of closed tabs. Retry at growing intervals while their threads still run."""
+        self._cleanup = None
+        _release_memory()
         if len(self._servers) > len(self._sockets):
-            self._tidy_later(min(2.0 * waited_s, LONGEST_S))
+            self._clean_up_later(min(2.0 * waited_s, LONGEST_CLEANUP_S))
 
 
-def _full(_: Any) -> Closing:
-    raise AmiwarpError(FULL)
+def _refuse_tab(_: Any) -> Closing:
+    raise AmiwarpError(TOO_MANY_TABS)
 
 
-def _give_back() -> None:
-    """Give back the memory of closed tabs.
+def _release_memory() -> None:
+    """Return the memory of closed tabs to the operating system.
 
-    A page is a web of references that the collector alone takes apart, and glibc keeps what was freed: it holds free
-    memory in the arena of each thread, below whatever is still in use there.
+    The objects of a page refer to each other in cycles, so only the garbage collector frees them. glibc then keeps the
+    freed memory in the arena of each thread until ``malloc_trim`` is called.
     """
     gc.collect()
     if sys.platform.startswith("linux"):
-        with suppress(AttributeError):  # musl has none
+        with suppress(AttributeError):  # musl has no malloc_trim
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def _application(tabs: Tabs, token: str, names: Names) -> web.Application:
+def _application(tabs: Tabs, token: str, names: HostNames) -> web.Application:
     from aiohttp import web
 
     application = web.Application(middlewares=[_guard(token, names)], client_max_size=MOST_BYTES)
@@ -166,8 +168,11 @@ def _application(tabs: Tabs, token: str, names: Names) -> web.Application:
     return application
 
 
-def _guard(token: str, names: Names) -> Any:
-    """Middleware that lets pass who has the token, in the URL or in the cookie of this server, which that sets."""
+def _guard(token: str, names: HostNames) -> Any:
+    """Return middleware that requires the token in the URL or in this server's cookie.
+
+    A request with the token in its URL sets the cookie.
+    """
     from aiohttp import web
 
     cookie = "amiwarp_" + hashlib.sha256(token.encode()).hexdigest()[:16]
@@ -176,10 +181,10 @@ def _guard(token: str, names: Names) -> Any:
         return secrets.compare_digest(given.encode(errors="surrogatepass"), token.encode())
 
     async def answer(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if not names.are_of(request):
-            raise web.HTTPForbidden(text="Not allowed: this server has another name; open the URL that was printed.")
+        if not names.accept(request):
+            raise web.HTTPForbidden(text="Not allowed: unknown host name; open the URL that was printed.")
         if request.body_exists:
-            raise web.HTTPRequestEntityTooLarge(0, 0, text="Not allowed: this server takes no data but by its pages.")
+            raise web.HTTPRequestEntityTooLarge(0, 0, text="Not allowed: requests with a body are refused.")
         fresh = knows(request.query.get("token", ""))
         if not fresh and not knows(request.cookies.get(cookie, "")):
             raise web.HTTPForbidden(text="Not allowed: open the URL that was printed when this server was started.")
@@ -204,7 +209,10 @@ def _guard(token: str, names: Names) -> Any:
 
 
 async def _file(folders: dict[str, Path], request: web.Request) -> web.FileResponse:
-    """The file in the folder of the longest route that the path begins with; raises HTTPNotFound for one outside."""
+    """Return the requested file from the folder of the longest matching route.
+
+    Raises ``HTTPNotFound`` if the file does not exist or lies outside that folder.
+    """
     from aiohttp import web
 
     path = "/index.html" if request.path == "/" else request.path
@@ -220,15 +228,15 @@ async def _file(folders: dict[str, Path], request: web.Request) -> web.FileRespo
 async def _connection(
     build: Session, folders: dict[str, Path], socket: web.WebSocketResponse
 ) -> AsyncIterator[tuple[Any, Any]]:
-    """A new server, and its end of the tab's connection; what it sends goes to the socket."""
+    """Start a new trame server, and yield it with its connection to the tab; its messages go to the socket."""
     async with AsyncExitStack() as stack:
         server, closing = _build(build)
-        stack.callback(_forget, server)
+        stack.callback(_remove_from_trame, server)
         if closing is not None:
             stack.callback(closing)
         bound: list[Any] = []
         server.controller.on_server_bind.add(bound.append)
-        with _shielded():
+        with _trame_globals_restored():
             running = server.start(backend="generic", exec_mode="task", timeout=0, open_browser=False)
         stack.push_async_callback(asyncio.wait, [running])
         stack.push_async_callback(server.stop)
@@ -238,7 +246,7 @@ async def _connection(
         server.controller.on_error.add(_log_report)
         for delivery in server.protocol.getLinkProtocols():
             if hasattr(delivery, "push_render"):
-                stack.callback(Frames(server, delivery).close)
+                stack.callback(PictureThrottle(server, delivery).close)
 
         async def send(_: bool, content: bytes) -> None:
             with suppress(ConnectionResetError):
@@ -251,11 +259,11 @@ async def _connection(
 
 
 def _log_report(message: str) -> None:
-    logging.getLogger(__name__).error("the page reports %.1000r", message)  # terminals obey what is not escaped
+    logging.getLogger(__name__).error("the page reports %.1000r", message)  # %r escapes control characters
 
 
 def _build(build: Session) -> tuple[Any, Closing]:
-    """A server with its page or, where that cannot be built, with the reason."""
+    """Return a server with its page; if building the page fails, the page shows the reason."""
     from trame.ui.vuetify3 import VAppLayout
     from trame.widgets import vuetify3
 
@@ -265,7 +273,7 @@ def _build(build: Session) -> tuple[Any, Closing]:
     except Exception as error:
         if not isinstance(error, AmiwarpError):
             logging.getLogger(__name__).exception("the page cannot be built")
-        _forget(server)
+        _remove_from_trame(server)
         server = _server()
         server.state.failure = str(error) or type(error).__name__
         with VAppLayout(server):
@@ -277,15 +285,15 @@ def _server() -> Any:
     from trame_client.widgets.core import VirtualNode
     from trame_server import Server
 
-    with _shielded():
+    with _trame_globals_restored():
         server = Server(f"amiwarp_{secrets.token_hex(8)}", VirtualNode)
     server.client_type = "vue3"
     return server
 
 
 @contextmanager
-def _shielded() -> Iterator[None]:
-    """Hides the command line from trame, and undoes what it does to the environment and to its globals."""
+def _trame_globals_restored() -> Iterator[None]:
+    """Hide the command line from trame, and restore the environment and trame's globals afterwards."""
     from trame_server import protocol
 
     names = ("TRAME_ARGS", "WSLINK_HEART_BEAT", "WSLINK_MAX_MSG_SIZE", "WSLINK_READY_MSG")
@@ -300,8 +308,9 @@ def _shielded() -> Iterator[None]:
         os.environ.update(before)
 
 
-def _forget(server: Any) -> None:
-    """Removes the server from the globals of trame that would keep it."""
+def _remove_from_trame(server: Any) -> None:
+    """Remove the server from trame's global variables, which would keep it alive."""
+
     from trame_client.widgets.core import HTML_CTX
 
     getattr(sys.modules.get("trame_vtk.modules.vtk"), "HELPERS_PER_SERVER", {}).pop(server.name, None)

@@ -1,4 +1,4 @@
-"""A recording along its time: what a window holds, how many events come when; nothing else is read."""
+"""Events of a time window, and the event rate over a recording, read without loading the other events."""
 
 from __future__ import annotations
 
@@ -18,38 +18,42 @@ if TYPE_CHECKING:
     from amiwarp.events.events import EventSource
 
 RUNS = 64
-"""Stretches, evenly spaced, of which a window is read that holds more events than asked for."""
-POINTS = 128
-"""Of the event rate, at most."""
-SECONDS = 0.5
-"""For the event rate, about: where reading is slow it is drawn of fewer points."""
+"""Number of evenly spaced runs of events that are read from a window with too many events."""
+RATE_POINTS = 128
+"""Largest number of points of the event rate."""
+RATE_SECONDS = 0.5
+"""Approximate time to measure the event rate [s]. If reading is slow, the rate has fewer points."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Events of a window."""
+    """Events of a time window."""
 
     start_us: int
-    """On the events' clock."""
+    """Start of the window on the events' clock [us]."""
     length_us: int
+    """Length of the window [us]."""
     count: int
-    """True number of events, read or not."""
+    """Number of events in the window, including those that are not read."""
     events: Events
-    """All of them, or evenly spaced runs."""
+    """All events of the window, or evenly spaced runs of them."""
 
 
-def read_span(source: EventSource, start_us: int, length_us: int, most: int) -> Span:
-    """Events of ``start_us <= t < start_us + length_us``: all, or about ``most`` of them in evenly spaced runs."""
+def read_span(source: EventSource, start_us: int, length_us: int, *, most_events: int) -> Span:
+    """Read the events with ``start_us <= t < start_us + length_us``.
+
+    If the window holds more than ``most_events``, read about this number in evenly spaced runs.
+    """
     first, stop = (source.find(t) for t in (start_us, start_us + length_us))
     count = stop - first
-    if count <= most:
+    if count <= most_events:
         return Span(start_us, length_us, count, source.slice(first, stop))
-    starts, length = (first + np.arange(RUNS) * count // RUNS).tolist(), most // RUNS
+    starts, length = (first + np.arange(RUNS) * count // RUNS).tolist(), most_events // RUNS
     return Span(start_us, length_us, count, Events.concatenate(list(_runs(source, starts, length))))
 
 
 def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:
-    """Runs of events; a file that can only be read from its beginning is read once."""
+    """Yield runs of events. A file that can only be read from its beginning is read in one pass."""
     if not isinstance(source, FileEvents):
         yield from (source.slice(k, k + length) for k in starts)
         return
@@ -63,10 +67,14 @@ def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Event
 
 
 def event_rate(source: EventSource) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Times [us], shape (n + 1,), evenly spaced over the recording, and the rate between each two [1/s], shape (n,)."""
-    began, n, (first, last) = time.perf_counter(), 1, (source.t_first, source.t_last + 1)
+    """Return the event rate over the recording.
+
+    Returns evenly spaced times [us], shape ``(n + 1,)``, and the rate in each interval between them [1/s], shape
+    ``(n,)``.
+    """
+    start_s, n, (first, last) = time.perf_counter(), 1, (source.t_first, source.t_last + 1)
     index = {0.0: 0, 1.0: len(source)}
-    while n < min(POINTS, last - first) and time.perf_counter() - began < SECONDS / 3:
+    while n < min(RATE_POINTS, last - first) and time.perf_counter() - start_s < RATE_SECONDS / 3:
         n *= 2
         for k in range(1, n, 2):
             index[k / n] = source.find(first + (last - first) * k // n)

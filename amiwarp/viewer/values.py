@@ -1,4 +1,4 @@
-"""From numbers to what a page shows: pictures' addresses, curves' points, words."""
+"""Values of the page's state: numbers converted to text, image addresses and SVG points."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.gate import Check, flag, list_of, number, one_of, text
 from amiwarp.viewer.layout import NAMES, SPEEDS
+from amiwarp.viewer.message_filter import Check, flag, list_of, number, one_of, text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.viewer.inspector import Inspector, Shown
+    from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 
 JPEG_QUALITY = 90
 _pixels = number(0, 65536)
@@ -29,16 +29,16 @@ SETTABLE: dict[str, Check] = {
     "view": one_of(*(each.value for each in View)), "out": text(200), "playing": one_of(False), "picked": one_of(""),
     "message": one_of(""), **dict.fromkeys(("hide_hot", "dark", "overlaid", "orbit_shown", "help_shown"), flag),
 }  # fmt: skip
-"""What of its state the page sets by itself, and to which values; all else it changes by calls."""
+"""State variables that the page may set, with the check of their values. It changes all others through calls."""
 
 
-def first_values(inspector: Inspector) -> dict[str, Any]:
-    """The page's state before anything was touched; the knobs come on top."""
+def initial_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the page's state at the start, without the prism's parameters."""
     source, recording = inspector.recording.events, inspector.recording
     start, length = inspector.window or inspector.first_window()
     has_turns = math.isfinite(inspector.turn_us)
     return {
-        **of_source(inspector), "live": inspector.latest is not None,
+        **source_state(inspector), "live": inspector.latest is not None,
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "size": list(source.size),
         "start_ms": round((start - source.t_first) * 1e-3, 3),
         "length_ms": round(length * 1e-3, 3), "turn_ms": inspector.turn_us * 1e-3 if has_turns else 0.0,
@@ -54,8 +54,8 @@ def first_values(inspector: Inspector) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def of_source(inspector: Inspector) -> dict[str, Any]:
-    """What of the state follows from the events: of a live stream it changes."""
+def source_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the state variables that depend on the events; they change in a live stream."""
     source, (times, rates) = inspector.recording.events, inspector.rate
     return {
         "whole_ms": (source.t_last - source.t_first + 1) * 1e-3, "rate": polyline(times[:-1], rates),
@@ -63,8 +63,8 @@ def of_source(inspector: Inspector) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def event_text(shown: Shown, k: int) -> str:
-    """All that is known of a point."""
+def event_text(shown: DisplayedWindow, k: int) -> str:
+    """Return the description of point ``k``: pixel, time, angle, polarity and compensated position."""
     e, (x, y) = shown.events, shown.after[k]
     return (
         f"x {e.x[k]}, y {e.y[k]} px; t {e.t[k]} µs; θ {math.degrees(shown.theta[k]):.2f}°; "
@@ -73,7 +73,7 @@ def event_text(shown: Shown, k: int) -> str:
 
 
 def jpeg(values: NDArray[Any]) -> str:
-    """Values 0 .. 1, shape (height, width), as a picture's address."""
+    """Return an image with values from 0 to 1, shape (height, width), as the address (data URL) of a JPEG."""
     from PIL import Image
 
     data = io.BytesIO()
@@ -82,7 +82,7 @@ def jpeg(values: NDArray[Any]) -> str:
 
 
 def polyline(x: NDArray[Any], y: NDArray[Any]) -> str:
-    """A curve in a box of 100 x 40, as SVG's points."""
+    """Return the SVG points of a curve, scaled to a box of 100 x 40."""
     if not len(x):
         return ""
     across = 100.0 * (x - x[0]) / max(float(x[-1] - x[0]), 1e-12)
@@ -91,6 +91,7 @@ def polyline(x: NDArray[Any], y: NDArray[Any]) -> str:
     return " ".join(f"{a:.2f},{b:.2f}" for a, b in zip(across, up, strict=True))
 
 
-def share(value: float, low: float, high: float) -> float:
-    """Where a value stands in a range, 0 .. 100."""
+def percent_of_range(value: float, low: float, high: float) -> float:
+    """Return the position of a value between ``low`` and ``high``, from 0 to 100."""
+
     return min(max(100.0 * (value - low) / max(high - low, 1e-12), 0.0), 100.0)

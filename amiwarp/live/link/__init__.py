@@ -1,1 +1,1 @@
-"""The link to the controller of the prism's motor and encoder."""
+"""Serial link to the controller that drives the prism's motor and reads its encoder."""

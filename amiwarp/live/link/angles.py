@@ -1,4 +1,4 @@
-"""The prism's absolute angle from counts and the index pulse, as they come; what does not fit is found and mended."""
+"""Absolute prism angle from encoder counts and index pulses, with detection of encoder faults."""
 
 from __future__ import annotations
 
@@ -8,89 +8,95 @@ from dataclasses import dataclass
 
 from amiwarp.errors import AmiwarpError
 
-TOLERANCE = 0.01
-"""Of a turn: the index pulse has a width, and its count was latched a little late."""
-BACK = 0.1
-"""Of a turn: counts that went back by so much were turned back; less is a slip, or an encoder on an edge."""
-GAP = 0.5
-"""Of a turn: after counts so far apart nothing is said of the index pulse, it may have been in between."""
-LATE = 1.5
-"""Turns after the last index pulse when the next was missed."""
+INDEX_TOLERANCE_TURNS = 0.01
+"""Largest error of the count at an index pulse that is not a slip [turns]. The pulse has a width and a latch delay."""
+REVERSAL_TURNS = 0.1
+"""Distance that counts must run backwards to be a reversal [turns]. Less is a slip or an encoder on an edge."""
+UNSEEN_TURNS = 0.5
+"""Step between two counts beyond which an index pulse may have passed unseen [turns]."""
+MISSED_INDEX_TURNS = 1.5
+"""Distance from the last index pulse at which the next one counts as missed [turns]."""
 
 
-class Fault(enum.StrEnum):
-    """What does not fit."""
+class EncoderFault(enum.StrEnum):
+    """Kind of fault in the encoder's counts or index pulses."""
 
     SLIP = "slip"
-    """The index pulse came where the counts do not say: counts were lost, or the disc moved."""
+    """The index pulse and the count disagree: counts were lost, or the encoder disc moved."""
     MISSED_INDEX = "missed index"
+    """No index pulse for :data:`MISSED_INDEX_TURNS`."""
     REVERSED = "reversed"
-    """The counts run the other way than before."""
+    """The prism changed its direction of rotation."""
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
-    """A fault, when it was found and how large it is."""
+class FaultReport:
+    """One fault, with its time and size."""
 
-    fault: Fault
+    fault: EncoderFault
     t_us: int
+    """Time of the fault [us], on the clock of the counts."""
     counts: int
-    """Of a slip those that were too many; of a missed index those since the last; of a reversal 0."""
+    """Slip: surplus counts, negative if lost. Missed index: counts since the last pulse. Reversal: 0."""
 
 
-class Angles:
-    """Counts to angles [rad] that go on over turns: whole turns at index pulses, 0 at the first count until one."""
+class AngleTracker:
+    """Converts encoder counts to unwrapped angles [rad].
+
+    Angles are relative to the first count until an index pulse comes. From then on, an angle at an index pulse is a
+    whole number of turns.
+    """
 
     def __init__(self, counts_per_turn: int) -> None:
-        """Raises :class:`AmiwarpError` for a turn of no counts."""
+        """Raise :class:`AmiwarpError` if ``counts_per_turn`` is below 1."""
         if counts_per_turn < 1:
             raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; give 1 or more")
         self.counts_per_turn = counts_per_turn
         self.absolute = False
-        """Whether an index pulse has told where the turn begins."""
+        """Whether an index pulse has defined the zero of the angle."""
         self._zero: int | None = None
         self._index: int | None = None
-        self._furthest: int | None = None
+        self._extreme: int | None = None
         self._last = 0
-        self._way = 0
+        self._direction = 0
         self._missed = False
 
-    def count(self, t_us: int, count: int) -> tuple[float, tuple[Report, ...]]:
-        """The angle at a count, and what was found out by it."""
+    def count(self, t_us: int, count: int) -> tuple[float, tuple[FaultReport, ...]]:
+        """Return the angle at a count [rad], and the faults that this count reveals."""
         if self._zero is None:
             self._zero = count
-        if self._index is not None and abs(count - self._last) > GAP * self.counts_per_turn:
+        if self._index is not None and abs(count - self._last) > UNSEEN_TURNS * self.counts_per_turn:
             self._index = count
         self._last = count
         reports = []
-        if self._furthest is None or (count - self._furthest) * self._way >= 0:
-            self._way = self._way or (
-                0 if self._furthest is None else (count > self._furthest) - (count < self._furthest)
+        if self._extreme is None or (count - self._extreme) * self._direction >= 0:
+            self._direction = self._direction or (
+                0 if self._extreme is None else (count > self._extreme) - (count < self._extreme)
             )
-            self._furthest = count
-        elif abs(count - self._furthest) > BACK * self.counts_per_turn:
-            reports.append(Report(Fault.REVERSED, t_us, 0))
-            self._way, self._furthest = -self._way, count
+            self._extreme = count
+        elif abs(count - self._extreme) > REVERSAL_TURNS * self.counts_per_turn:
+            reports.append(FaultReport(EncoderFault.REVERSED, t_us, 0))
+            self._direction, self._extreme = -self._direction, count
             self._index = None if self._index is None else count
         since = 0 if self._index is None else count - self._index
-        if abs(since) > LATE * self.counts_per_turn and not self._missed:
+        if abs(since) > MISSED_INDEX_TURNS * self.counts_per_turn and not self._missed:
             self._missed = True
-            reports.append(Report(Fault.MISSED_INDEX, t_us, since))
+            reports.append(FaultReport(EncoderFault.MISSED_INDEX, t_us, since))
         return self.angle(count), tuple(reports)
 
-    def index(self, t_us: int, count: int) -> tuple[Report, ...]:
-        """The index pulse at a count: tells the zero, or whether it was right; angles after it are mended."""
+    def index(self, t_us: int, count: int) -> tuple[FaultReport, ...]:
+        """Set or check the zero by an index pulse at a count. After a slip, later angles use the corrected zero."""
         self._index, self._last, self._missed = count, count, False
-        known, self.absolute = self.absolute, True
+        was_absolute, self.absolute = self.absolute, True
         if self._zero is None:
             self._zero = count
-        away = (count - self._zero + self.counts_per_turn // 2) % self.counts_per_turn - self.counts_per_turn // 2
-        if known and abs(away) <= TOLERANCE * self.counts_per_turn:
+        error = (count - self._zero + self.counts_per_turn // 2) % self.counts_per_turn - self.counts_per_turn // 2
+        if was_absolute and abs(error) <= INDEX_TOLERANCE_TURNS * self.counts_per_turn:
             return ()
-        self._zero += away
-        return (Report(Fault.SLIP, t_us, away),) if known else ()
+        self._zero += error
+        return (FaultReport(EncoderFault.SLIP, t_us, error),) if was_absolute else ()
 
     def angle(self, count: int) -> float:
-        """At a count, by what is known now. There must have been a count or an index pulse."""
+        """Return the angle at a count [rad] for the present zero. Needs an earlier count or index pulse."""
         assert self._zero is not None
         return math.tau * (count - self._zero) / self.counts_per_turn

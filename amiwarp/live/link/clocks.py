@@ -1,4 +1,4 @@
-"""Two clocks: a 32-bit one made whole, and how one runs beside another, from common pulses or from round trips."""
+"""Clocks: a 32-bit clock unwrapped, and linear maps between two clocks, fitted to common pulses or to round trips."""
 
 from __future__ import annotations
 
@@ -15,105 +15,120 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 WRAP = 1 << 32
-FEWEST = 3
-OUTLIER = 4.0
-"""Robust standard deviations beyond which a pair is left out: a pulse that was taken for another."""
-QUICK = 2.0
-"""Round trips up to so many times the shortest tell the offset; in the longer ones something waited."""
+"""Period of the controller's 32-bit clock [us]."""
+FEWEST_PAIRS = 3
+"""Smallest number of pairs of times for a fit."""
+OUTLIER_STD = 4.0
+"""Robust standard deviations beyond which a pair is rejected: it may combine two different pulses."""
+SHORT_TRIP = 2.0
+"""Round trips longer than this multiple of the shortest are ignored: their messages were delayed."""
 
 
 def monotonic_us() -> int:
-    """The host's clock [us]."""
+    """Return the time of the host's monotonic clock [us]."""
     return time.monotonic_ns() // 1000
 
 
-class Unwrapped:
-    """A clock of 32 bits [us] as one that goes on."""
+class UnwrappedClock:
+    """Unwraps the times of a 32-bit clock [us]."""
 
     def __init__(self) -> None:
         self.last: int | None = None
-        """The latest so far [us]."""
+        """Latest unwrapped time so far [us]."""
 
-    def ahead(self, t: int) -> int:
-        """By how much a time is after the last [us], over a wrap too; negative for one that comes late."""
+    def difference(self, t: int) -> int:
+        """Return the signed distance from the last time to ``t`` [us], across a wrap if that is shorter."""
         return 0 if self.last is None else (t - self.last + WRAP // 2) % WRAP - WRAP // 2
 
     def __call__(self, t: int) -> int:
-        """The time that is nearest to the last: forwards over a wrap, backwards for what comes late."""
-        now = t if self.last is None else self.last + self.ahead(t)
+        """Return the unwrapped time that is closest to the last one; it may be earlier."""
+        now = t if self.last is None else self.last + self.difference(t)
         self.last = now if self.last is None else max(self.last, now)
         return now
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
-    """Another clock beside one's own: other = own + offset + drift · (own − ``at_us``)."""
+class ClockMap:
+    """Linear map from one clock (own) to another: other = own + offset + drift · (own − ``at_us``)."""
 
     at_us: int
-    """Of one's own clock, in the middle of what it was found from."""
+    """Reference time on the own clock [us]: the mean time of the fitted pairs."""
     offset_us: float
-    """There."""
+    """Offset of the other clock at :attr:`at_us` [us]."""
     drift: float
-    """Relative: 1e-6 is a microsecond a second."""
+    """Relative rate difference: 1e-6 is one microsecond per second."""
     offset_std_us: float
+    """Standard deviation of the offset [us]."""
     drift_std: float
+    """Standard deviation of the drift."""
     pairs: int
-    """That agree with it."""
+    """Number of pairs used by the fit, outliers excluded."""
 
     def __call__(self, own_us: ArrayLike) -> NDArray[np.int64]:
-        """The other clock's times [us], rounded."""
+        """Return the other clock's times [us], rounded, same shape as ``own_us``."""
         own = np.asarray(own_us, np.int64)
         return own + np.rint(self.offset_us + self.drift * (own - self.at_us)).astype(np.int64)
 
     def std_us(self, own_us: float) -> float:
-        """Standard deviation at a time of one's own clock [us]: it grows with the distance from :attr:`at_us`."""
+        """Return the standard deviation of the mapped time [us]. It grows with the distance from :attr:`at_us`."""
         return math.hypot(self.offset_std_us, self.drift_std * (own_us - self.at_us))
 
 
-def from_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0) -> Clock:
-    """From pulses that both clocks saw, shape (n,) each [us]; ``sigma_us``: least deviation of a time stamp.
+def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0) -> ClockMap:
+    """Fit a clock map to pulses that both clocks recorded.
 
-    A line by least squares, pairs further than :data:`OUTLIER` from it left out. Raises :class:`AmiwarpError` for under
-    three pairs, or different numbers of them.
+    ``own_us``, ``other_us``: times of the same pulses [us], shape ``(n,)`` each. ``sigma_us``: smallest standard
+    deviation of a time stamp. The fit is a least-squares line without pairs beyond :data:`OUTLIER_STD`. Raises
+    :class:`AmiwarpError` for fewer than three pairs, or different lengths.
     """
     own, other = (np.asarray(t, np.int64) for t in (own_us, other_us))
-    if own.shape != other.shape or own.ndim != 1 or len(own) < FEWEST:
-        raise AmiwarpError(f"{own.size} and {other.size} pulses; give {FEWEST} or more that both clocks saw")
-    return _line(own, other, np.full(len(own), sigma_us))
+    if own.shape != other.shape or own.ndim != 1 or len(own) < FEWEST_PAIRS:
+        raise AmiwarpError(
+            f"{own.size} and {other.size} pulses; give the same {FEWEST_PAIRS} or more pulses on both clocks"
+        )
+    return _fit_line(own, other, np.full(len(own), sigma_us))
 
 
-def from_round_trips(sent_us: ArrayLike, other_us: ArrayLike, received_us: ArrayLike) -> Clock:
-    """From questions sent and answered, own time of both, the other's between, shape (n,) each [us].
+def fit_to_round_trips(sent_us: ArrayLike, other_us: ArrayLike, received_us: ArrayLike) -> ClockMap:
+    """Fit a clock map to requests and their answers.
 
-    The answer was somewhere between: its middle, uncertain by half of the way (uniform). Raises :class:`AmiwarpError`
-    for under three, or an answer before its question.
+    ``sent_us``, ``received_us``: own times of request and answer [us]; ``other_us``: time in the answer on the other
+    clock [us]; shape ``(n,)`` each. An answer is placed at the middle of its round trip; its error is uniform over the
+    round trip. Raises :class:`AmiwarpError` for fewer than three round trips, or an answer before its request.
     """
     sent, other, received = (np.asarray(t, np.int64) for t in (sent_us, other_us, received_us))
-    way = (received - sent).astype(np.float64)
-    if len(way) < FEWEST or (way < 0).any():
-        raise AmiwarpError(f"{len(way)} round trips, the shortest {way.min(initial=0.0):g} us; give {FEWEST} or more")
-    quick = way <= max(QUICK * way.min(), np.partition(way, FEWEST - 1)[FEWEST - 1])
+    duration = (received - sent).astype(np.float64)
+    if len(duration) < FEWEST_PAIRS or (duration < 0).any():
+        shortest = duration.min(initial=0.0)
+        raise AmiwarpError(
+            f"{len(duration)} round trips, the shortest {shortest:g} us; give {FEWEST_PAIRS} or more, none negative"
+        )
+    short = duration <= max(SHORT_TRIP * duration.min(), np.partition(duration, FEWEST_PAIRS - 1)[FEWEST_PAIRS - 1])
     middle = sent + (received - sent) // 2
-    return _line(middle[quick], other[quick], np.maximum(way[quick], 1.0) / math.sqrt(12.0))
+    return _fit_line(middle[short], other[short], np.maximum(duration[short], 1.0) / math.sqrt(12.0))
 
 
-def _line(own: NDArray[np.int64], other: NDArray[np.int64], sigma: NDArray[np.float64]) -> Clock:
-    ahead = (other - own).astype(np.float64)
+def _fit_line(own: NDArray[np.int64], other: NDArray[np.int64], sigma: NDArray[np.float64]) -> ClockMap:
+    """Fit a weighted line with iterative rejection of outliers; ``sigma``: standard deviation of each pair [us]."""
+    difference = (other - own).astype(np.float64)
     kept = np.ones(len(own), np.bool_)
     for _ in range(10):
         at = int(np.rint(np.average(own[kept] - own[0], weights=sigma[kept] ** -2.0))) + int(own[0])
         x = (own - at).astype(np.float64)
-        base = float(np.median(ahead[kept]))
+        base = float(np.median(difference[kept]))
         weight = sigma[kept] ** -2.0
         slope_weight = float(np.sum(weight * x[kept] ** 2))
-        offset = float(np.average(ahead[kept] - base, weights=weight))
-        drift = float(np.sum(weight * x[kept] * (ahead[kept] - base - offset)) / max(slope_weight, 1e-300))
-        left = (ahead - base - offset - drift * x) / sigma
-        spread = max(1.0, 1.4826 * float(np.median(np.abs(left[kept]))))
-        again = np.abs(left) <= OUTLIER * spread
-        if again.sum() < FEWEST or np.array_equal(again, kept):
+        offset = float(np.average(difference[kept] - base, weights=weight))
+        drift = float(np.sum(weight * x[kept] * (difference[kept] - base - offset)) / max(slope_weight, 1e-300))
+        residual = (difference - base - offset - drift * x) / sigma
+        spread = max(1.0, 1.4826 * float(np.median(np.abs(residual[kept]))))
+        again = np.abs(residual) <= OUTLIER_STD * spread
+        if again.sum() < FEWEST_PAIRS or np.array_equal(again, kept):
             break
         kept = again
-    scale = max(1.0, math.sqrt(float(np.mean(left[kept] ** 2))))
+    scale = max(1.0, math.sqrt(float(np.mean(residual[kept] ** 2))))
     std = scale / math.sqrt(float(np.sum(weight)))
-    return Clock(at, base + offset, drift, std, scale / math.sqrt(max(slope_weight, 1e-300)), int(kept.sum()))
+    drift_std = scale / math.sqrt(max(slope_weight, 1e-300))
+    return ClockMap(
+        at_us=at, offset_us=base + offset, drift=drift, offset_std_us=std, drift_std=drift_std, pairs=int(kept.sum())
+    )

@@ -1,4 +1,4 @@
-"""From the controller's bytes to times, angles, pulses and messages: what of the link needs no port and no thread."""
+"""Conversion of the controller's bytes to times, angles, pulses and messages, without a port or a thread."""
 
 from __future__ import annotations
 
@@ -8,360 +8,285 @@ from dataclasses import replace
 
 import numpy as np
 
-from amiwarp.live.link.angles import Angles, Fault, Report
-from amiwarp.live.link.clocks import FEWEST, WRAP, Clock, Unwrapped, from_round_trips
-from amiwarp.live.link.news import MOST_PARTS, MOST_PULSES, News, Part
-from amiwarp.live.link.protocol import FAULTS, Answer, Decoder, Index, Message, Pong, Samples, Status, Sync
+from amiwarp.live.link.angles import AngleTracker, EncoderFault, FaultReport
+from amiwarp.live.link.clocks import FEWEST_PAIRS, WRAP, ClockMap, fit_to_round_trips
+from amiwarp.live.link.follower_state import TRIPS, Connection, Epoch
+from amiwarp.live.link.protocol import FAULTS, Answer, ControllerStatus, Index, Message, Pong, Samples, Sync
+from amiwarp.live.link.updates import LinkUpdate, UpdateQueue
 
-MOST = 100_000
-"""Samples kept for who does not ask, over a minute and a half at 1 kHz; then the oldest are dropped."""
-TRIPS = 60
-"""Round trips kept."""
 LATE_US = 100_000
-"""A clock that goes back further was reset."""
+"""Step backwards of the controller's clock beyond which it counts as reset [us]."""
 AHEAD_US = 2_000_000
-"""A clock that goes ahead of the host's by more, all at once, was set anew."""
+"""Sudden advance of the controller's clock over the host's beyond which the clock counts as changed [us]."""
 SILENT_US = 1_800_000_000
-"""After such a silence nobody knows how often the clock wrapped."""
+"""Silence after which the number of wraps of the controller's clock is unknown [us]."""
 FASTEST = 200.0
-"""Turns a second: counts that run faster, by more than a turn, began anew."""
+"""Speed that no prism exceeds [turns/s]. A faster change of the count, by more than a turn, is a restart."""
 HOLD_TURNS = 2
-"""Within these the first index pulse is waited for."""
+"""Longest wait for the first index pulse [turns]."""
 STATUS_US = 2_000_000
-"""So long the controller's own counts per turn are waited for: it sends its status once a second."""
-OFTEN_US = 1_000_000
-"""Messages of losses and noise come no closer than this."""
-STALL_US, STALL_COUNTS = 300_000, 5.0
-"""Counts that stay for so long, and for the time of so many at the speed that the controller names, are stalled."""
-FROM_FIRST = "angles are from where the encoder was first read"
+"""Longest wait for the controller's own counts per turn [us]. It sends its status once per second."""
+FROM_FIRST = "angles are relative to the first encoder count"
 HOST_LOST = 1 << FAULTS.index("host lost")
 
 
 class Follower:
-    """Feed it what the port gives, take the news. ``name``: the port, for messages. Raises nothing, holds little.
+    """Converts a controller's bytes to updates. Accepts any bytes without raising; its memory is bounded.
 
-    Samples are held back until the first index pulse tells their absolute angle, for two turns at most; lines of text
-    are not, they have no index. ``counts_per_turn`` is for controllers that do not tell it.
+    ``name``: name of the port, for messages. ``counts_per_turn``: used if the controller does not report it. Samples
+    wait until the first index pulse makes their angles absolute, for :data:`HOLD_TURNS` at most. Text lines do not
+    wait, because they have no index pulse.
     """
 
     def __init__(self, name: str, counts_per_turn: int | None = None) -> None:
         self.name = name
-        self.status: Status | None = None
+        self.status: ControllerStatus | None = None
+        """Latest status of the controller."""
         self.trips: deque[tuple[int, int, int]] = deque(maxlen=TRIPS)
-        """Of pings: sent (host), answered (controller), received (host) [us]."""
+        """Round trips of pings: time sent (host), answered (controller), received (host) [us]."""
+        self.updates = UpdateQueue()
+        """Updates that wait to be fetched."""
         self._given_per_turn = counts_per_turn
         self._per_turn: int | None = None
-        self._parts: deque[Part] = deque([Part(False)])
-        self._kept = 0
-        self._dropped = 0
-        self._begin()
-        self.opened(0)
+        self._connection, self._epoch = Connection(0), Epoch(None)
 
     def opened(self, host_us: int) -> None:
-        """The port was opened, or opened again: what the decoder holds is void, what is known of the prism is not."""
-        self._decoder = Decoder()
-        self._opened_us, self._bytes, self._dumb = host_us, 0, False
-        self._damaged: int | None = None  # what is cut by the opening is no damage
-        self._lost = self._late = 0
-        self._noise_us = self._lost_us = -OFTEN_US
-        self._sequence: int | None = None
-        self._heard, self._reopened = False, True
-
-    def _begin(self) -> None:
-        self._clock, self._ahead, self._seen_us = Unwrapped(), -math.inf, 0
-        self._angles = None if self._per_turn is None else Angles(self._per_turn)
-        self._waiting: deque[tuple[bool, int, int]] = deque(maxlen=MOST)  # for the counts per turn: index?, time, count
-        self._holding: deque[tuple[int, int]] | None = deque(maxlen=MOST)  # for the index
-        self._pulses: deque[int] = deque(maxlen=MOST_PULSES)
-        self._suspect: tuple[int, int] | None = None
-        self._counted: tuple[int, int] | None = None  # time and count, made whole
-        self._given: int | None = None
-        self._still, self._stalled, self._status_us = (0, 0), False, -1
-        self._faults = 0
-        self._pings: dict[int, int] = {}
-        self.trips.clear()
+        """Note that the port was opened, or reopened. Only the state of the connection is reset."""
+        self._connection = Connection(host_us)
 
     @property
     def speaks(self) -> bool:
-        """Whether frames came since the port was opened: pings and commands make sense."""
-        return self._decoder.received.frames > 0
+        """Whether frames have arrived since the port was opened, so that the controller takes pings and commands."""
+        return self._connection.decoder.received.frames > 0
 
     @property
     def text(self) -> bool:
-        """Whether lines came: there is nothing to ask, and no answer."""
-        return self._decoder.received.lines > 0
+        """Whether text lines have arrived: their sender answers nothing."""
+        return self._connection.decoder.received.lines > 0
 
     def pinged(self, number: int, host_us: int) -> None:
-        """A ping was sent."""
-        self._pings[number] = host_us
-        self._pings.pop(number - TRIPS, None)
+        """Note that a ping was sent."""
+        self._epoch.pings[number] = host_us
+        self._epoch.pings.pop(number - TRIPS, None)
 
-    def clock(self) -> Clock | None:
-        """The controller's clock beside the host's; None until three pings were answered.
+    def clock(self) -> ClockMap | None:
+        """Return the map from the host's clock to the controller's; None until three pings are answered.
 
-        How much longer than the way there the way back always takes is not known: that does not average out.
+        A constant asymmetry between the two directions is unobservable and does not average out. The standard
+        deviation of the offset includes it.
         """
-        if len(self.trips) < FEWEST:
+        if len(self.trips) < FEWEST_PAIRS:
             return None
         sent, answered, received = np.array(self.trips, np.int64).T
-        clock = from_round_trips(sent, answered, received)
+        clock = fit_to_round_trips(sent, answered, received)
         shared = float((received - sent).min()) / math.sqrt(12.0)
         return replace(clock, offset_std_us=math.hypot(clock.offset_std_us, shared))
 
     def say(self, sentence: str) -> None:
-        """A message, in its place among the samples."""
-        self._parts[-1].messages.append(sentence)
+        """Add a message, in order with the samples."""
+        self.updates.say(sentence)
 
-    def take(self) -> News:
-        """What came since the last call; where the controller began anew in between, first what was before that."""
-        part = self._parts.popleft()
-        if not self._parts:
-            self._parts.append(Part(False))
-        self._kept -= len(part.samples)
-        if self._dropped:
-            part.messages.append(f"{self._dropped:,} samples were dropped, the oldest: nobody asked for them")
-            self._dropped = 0
-        return part.news()
+    def take(self) -> LinkUpdate:
+        """Return the oldest update; after a restart of the controller, first the data from before it."""
+        return self.updates.take()
 
     def feed(self, data: bytes, host_us: int) -> list[Answer]:
-        """Bytes that were read at a time of the host [us], none where nothing came; the answers to commands in them."""
-        self._bytes += len(data)
+        """Process bytes that were read at a host time [us]; return the answers to commands among them."""
+        connection = self._connection
+        connection.received_bytes += len(data)
         answers = []
-        for sequence, message in self._decoder.feed(data):
-            if sequence is not None:
-                before, self._sequence = self._sequence, sequence
-                if before is not None and (sequence - before) & 0xFFFF >= 1 << 15:
-                    self._restart("the controller was reset")
+        for sequence, message in connection.decoder.feed(data):
+            if sequence is not None and connection.runs_back(sequence):
+                self._restart("the controller was reset")
             if isinstance(message, Answer):
                 answers.append(message)
             else:
-                self._take_in(message, host_us, text=sequence is None)
-        self._account(host_us)
+                self._process(message, host_us, text=sequence is None)
+        self._report_losses(host_us)
         return answers
 
-    def _take_in(self, message: Message, host_us: int, *, text: bool) -> None:
+    def _process(self, message: Message, host_us: int, *, text: bool) -> None:
         if isinstance(message, Samples):
             for raw_t, raw_count in zip(message.t_us, message.count, strict=True):
-                self._sample(raw_t, raw_count, host_us, text)
+                self._sample(raw_t, raw_count, host_us, text=text)
         elif isinstance(message, Index):
-            t, count = self._place(message.t_us, message.count, host_us)
-            self._now_or_later(True, t, count)
+            t, count = self._unwrap(message.t_us, message.count, host_us)
+            self._convert(t, count, pulse=True)
         elif isinstance(message, Sync):
-            t = self._time(message.t_us, host_us)
-            self._parts[-1].sync.append((message.number, t, host_us))
+            self.updates.add_sync(message.number, self._unwrap_time(message.t_us, host_us), host_us)
         elif isinstance(message, Pong):
-            t = self._time(message.t_us, host_us)
-            self._heard = True
-            if message.number in self._pings:
-                self.trips.append((self._pings.pop(message.number), t, host_us))
-        elif isinstance(message, Status):
-            self._state(message, self._time(message.t_us, host_us))
+            t = self._unwrap_time(message.t_us, host_us)
+            self._connection.ping_answered = True
+            if message.number in self._epoch.pings:
+                self.trips.append((self._epoch.pings.pop(message.number), t, host_us))
+        elif isinstance(message, ControllerStatus):
+            self._take_status(message, self._unwrap_time(message.t_us, host_us))
 
-    def _sample(self, raw_t: int, raw_count: int, host_us: int, text: bool) -> None:
-        """A line of text may be wrong: what does not follow is believed once the next follows it."""
+    def _sample(self, raw_t: int, raw_count: int, host_us: int, *, text: bool) -> None:
+        """Process a sample. An implausible text line is accepted only once the next line continues it."""
         if text and self._per_turn is None:
-            self._decide(self._given_per_turn)
-        before, self._suspect = self._suspect, None
-        if text and self._odd(raw_t, raw_count, host_us):
-            if before is None or not self._follows(before, raw_t, raw_count):
-                self._suspect = raw_t, raw_count
-                self._decoder.received.damaged += 1
+            self._decide_counts(self._given_per_turn)
+        suspect, self._epoch.suspect = self._epoch.suspect, None
+        if text and self._discontinuity(raw_t, raw_count, host_us):
+            if suspect is None or not self._continues(suspect, raw_t, raw_count):
+                self._epoch.suspect = raw_t, raw_count
+                self._connection.decoder.received.damaged += 1
                 return
-            self._now_or_later(False, *self._place(*before, host_us))
-        t, count = self._place(raw_t, raw_count, host_us)
-        if text and self._holding is not None and self._per_turn is not None:
+            self._convert(*self._unwrap(*suspect, host_us), pulse=False)
+        t, count = self._unwrap(raw_t, raw_count, host_us)
+        epoch = self._epoch
+        if text and epoch.unreferenced is not None and self._per_turn is not None:
             self.say(f"{self.name}: lines of text have no index pulse: {FROM_FIRST}")
             self._release()
-        if not text and self._per_turn is None and self._waiting and t - self._waiting[0][1] > STATUS_US:
-            self._decide(self._given_per_turn)
-        self._now_or_later(False, t, count)
+        if not text and self._per_turn is None and epoch.unscaled and t - epoch.unscaled[0][0] > STATUS_US:
+            self._decide_counts(self._given_per_turn)
+        self._convert(t, count, pulse=False)
 
-    def _follows(self, before: tuple[int, int], raw_t: int, raw_count: int) -> bool:
-        step = (raw_t - before[0]) % WRAP
-        return 0 < step < AHEAD_US and abs(raw_count - before[1]) <= self._farthest(step)
+    def _continues(self, suspect: tuple[int, int], raw_t: int, raw_count: int) -> bool:
+        """Return whether a text line plausibly continues an implausible one."""
+        step = (raw_t - suspect[0]) % WRAP
+        return 0 < step < AHEAD_US and abs(raw_count - suspect[1]) <= self._largest_step(step)
 
-    def _farthest(self, step_us: int) -> float:
-        """Counts that a prism can turn by, and a turn."""
+    def _largest_step(self, step_us: int) -> float:
+        """Return the largest plausible change of the count over a time."""
         return (self._per_turn or math.inf) * (1.0 + FASTEST * max(step_us, 0) * 1e-6)
 
-    def _odd(self, raw_t: int, raw_count: int | None, host_us: int) -> str:
-        """Why a sample does not go on from the one before; empty where it does."""
-        if self._clock.last is None:
+    def _discontinuity(self, raw_t: int, raw_count: int | None, host_us: int) -> str:
+        """Return why a sample does not continue the previous ones; an empty string if it does."""
+        epoch = self._epoch
+        if epoch.clock.last is None:
             return ""
-        ahead = self._clock.ahead(raw_t)
-        beside = self._clock.last + ahead - host_us - self._ahead  # negative for what waited somewhere
-        behind = self._reopened and beside < -AHEAD_US  # nothing waited in a port that was closed
-        if ahead < -LATE_US or behind or host_us - self._seen_us > SILENT_US:
-            return "the controller's clock began anew, it was reset"
-        if beside > AHEAD_US:
+        step_us = epoch.clock.difference(raw_t)
+        lead_us = epoch.clock.last + step_us - host_us - epoch.largest_lead_us  # negative for data that were delayed
+        behind = self._connection.unread and lead_us < -AHEAD_US  # a closed port delays no data
+        if step_us < -LATE_US or behind or host_us - epoch.heard_us > SILENT_US:
+            return "the controller's clock restarted, it was reset"
+        if lead_us > AHEAD_US:
             return "the controller's clock jumped ahead"
-        if raw_count is not None and self._counted is not None:
-            step = self._step(raw_count)
-            if abs(step) > self._farthest(self._clock.last + ahead - self._counted[0]):
+        if raw_count is not None and epoch.counted is not None:
+            step = epoch.count_step(raw_count)
+            if abs(step) > self._largest_step(epoch.clock.last + step_us - epoch.counted[0]):
                 return f"the counts jumped by {step:,}"
         return ""
 
-    def _step(self, raw_count: int) -> int:
-        """To a count from the last, over a wrap of 32 bits."""
-        assert self._counted is not None
-        return (raw_count - self._counted[1] + WRAP // 2) % WRAP - WRAP // 2
-
-    def _time(self, raw_t: int, host_us: int) -> int:
-        why = self._odd(raw_t, None, host_us)
+    def _unwrap_time(self, raw_t: int, host_us: int) -> int:
+        """Return the unwrapped time [us]; restart at a discontinuity."""
+        why = self._discontinuity(raw_t, None, host_us)
         if why:
             self._restart(why)
-        t = self._clock(raw_t)
-        self._ahead, self._seen_us, self._reopened = max(self._ahead, t - host_us), host_us, False
+        t = self._epoch.note_time(raw_t, host_us)
+        self._connection.unread = False
         return t
 
-    def _place(self, raw_t: int, raw_count: int, host_us: int) -> tuple[int, int]:
-        """Time and count, made whole."""
-        why = self._odd(raw_t, raw_count, host_us)
+    def _unwrap(self, raw_t: int, raw_count: int, host_us: int) -> tuple[int, int]:
+        """Return unwrapped time [us] and count; restart at a discontinuity."""
+        why = self._discontinuity(raw_t, raw_count, host_us)
         if why:
             self._restart(why)
-        t = self._time(raw_t, host_us)
-        count = raw_count if self._counted is None else self._counted[1] + self._step(raw_count)
-        self._counted = t, count
-        return t, count
+        t = self._unwrap_time(raw_t, host_us)
+        return t, self._epoch.note_count(t, raw_count)
 
     def _restart(self, why: str) -> None:
+        """Begin a new epoch: the controller's clock or counts restarted."""
         self._release()
-        if self._parts[-1].samples:
-            self._parts.append(Part(True))
-        if len(self._parts) > MOST_PARTS:
-            gone = len(self._parts[0].samples)
-            self._kept, self._dropped = self._kept - gone, self._dropped + gone
-            self._join()
-        self._parts[-1].restarted = True
-        self._parts[-1].sync.clear()  # by the clock that is void
-        self.say(f"{self.name}: {why}; angles begin anew")
-        self._lost = self._decoder.received.lost
-        self._begin()
+        self.updates.restart()
+        self.say(f"{self.name}: {why}; angles restart")
+        self._connection.losses.forget_lost(self._connection.decoder.received)
+        self._epoch = Epoch(self._per_turn)
+        self.trips.clear()
 
-    def _decide(self, per_turn: int | None) -> None:
-        """The counts per turn are known, or there is nowhere to know them from."""
+    def _decide_counts(self, per_turn: int | None) -> None:
+        """Use these counts per turn and convert what waited for them; None: no source knows them."""
         if per_turn is None:
-            if not self._dumb:
-                self.say(f"{self.name}: it does not tell the encoder's counts per turn; give counts_per_turn")
-            self._dumb = True
+            if not self._connection.unusable:
+                self.say(f"{self.name}: the controller does not report its counts per turn; give counts_per_turn")
+            self._connection.unusable = True
         elif per_turn != self._per_turn:
             before, self._per_turn = self._per_turn, per_turn
             if before is not None:
-                self._restart(f"the controller counts {per_turn:,} a turn now, not {before:,}")
-            self._angles = Angles(per_turn)
-            while self._waiting:
-                self._now_or_later(*self._waiting.popleft())
+                self._restart(f"the controller now has {per_turn:,} counts per turn, not {before:,}")
+            self._epoch.angles = AngleTracker(per_turn)
+            while self._epoch.unscaled:
+                t, count, pulse = self._epoch.unscaled.popleft()
+                self._convert(t, count, pulse=pulse)
 
-    def _now_or_later(self, pulse: bool, t: int, count: int) -> None:
-        if self._angles is None:
-            self._waiting.append((pulse, t, count))
+    def _convert(self, t: int, count: int, *, pulse: bool) -> None:
+        """Convert the count of a sample or index pulse to an angle, once the counts per turn are known."""
+        angles = self._epoch.angles
+        if angles is None:
+            self._epoch.unscaled.append((t, count, pulse))
         elif pulse:
-            self._index(self._angles, t, count)
+            self._convert_pulse(angles, t, count)
         else:
-            self._turned(self._angles, t, count)
+            self._convert_sample(angles, t, count)
 
-    def _turned(self, angles: Angles, t: int, count: int) -> None:
+    def _convert_sample(self, angles: AngleTracker, t: int, count: int) -> None:
         angle, reports = angles.count(t, count)
-        self._tell(angles, reports)
-        self._watch(angles, t, count)
-        if self._holding is None:
+        self._report_faults(angles, reports)
+        sentence = self._epoch.stall.check(t, count, self.status, angles.counts_per_turn)
+        if sentence is not None:
+            self.say(sentence)
+        waiting = self._epoch.unreferenced
+        if waiting is None:
             self._give(t, angle)
             return
-        self._holding.append((t, count))
-        if abs(count - self._holding[0][1]) > HOLD_TURNS * angles.counts_per_turn:
+        waiting.append((t, count))
+        if abs(count - waiting[0][1]) > HOLD_TURNS * angles.counts_per_turn:
             self.say(f"no index pulse in {HOLD_TURNS} turns: {FROM_FIRST}")
             self._release()
 
-    def _index(self, angles: Angles, t: int, count: int) -> None:
-        late = self._holding is None and not angles.absolute
+    def _convert_pulse(self, angles: AngleTracker, t: int, count: int) -> None:
+        late = self._epoch.unreferenced is None and not angles.absolute
         before = angles.angle(count) if late else 0.0
-        self._tell(angles, angles.index(t, count))
+        self._report_faults(angles, angles.index(t, count))
         if late:
             moved = math.degrees(angles.angle(count) - before)
-            self.say(f"the index pulse came: angles are absolute from here, and move by {moved:+.1f} deg")
-        self._pulses.append(t)
+            self.say(f"first index pulse: angles are absolute from now on, and change by {moved:+.1f} deg")
+        self._epoch.pulses.append(t)
         self._release()
 
     def _release(self) -> None:
-        held, self._holding = self._holding or (), None
-        for t, count in held:
-            assert self._angles is not None
-            self._give(t, self._angles.angle(count))
+        """Give out the samples that waited for the first index pulse."""
+        waiting, self._epoch.unreferenced = self._epoch.unreferenced or (), None
+        for t, count in waiting:
+            assert self._epoch.angles is not None
+            self._give(t, self._epoch.angles.angle(count))
 
     def _give(self, t: int, angle: float) -> None:
-        if self._given is not None and t <= self._given:
-            self._late += 1
+        """Give out a sample with the index pulses before it; drop it if it is out of order."""
+        epoch = self._epoch
+        if epoch.given_us is not None and t <= epoch.given_us:
+            self._connection.losses.out_of_order += 1
             return
-        self._given = t
-        part = self._parts[-1]
-        while self._pulses and self._pulses[0] <= t:
-            part.index.append(self._pulses.popleft())
-        part.samples.append((t, angle))
-        self._kept += 1
-        if self._kept > MOST:
-            gone, _ = self._parts[0].samples.popleft()
-            while (pulses := self._parts[0].index) and pulses[0] <= gone:
-                pulses.popleft()
-            self._kept, self._dropped = self._kept - 1, self._dropped + 1
-            if not self._parts[0].samples:
-                self._join()
+        epoch.given_us = t
+        self.updates.add_sample(t, angle, epoch.pulses_until(t))
 
-    def _join(self) -> None:
-        """Merge the first part, whose samples are dropped, into the next."""
-        gone, part = self._parts.popleft(), self._parts[0]
-        part.restarted |= gone.restarted
-        part.messages.extendleft(reversed(gone.messages))
-
-    def _tell(self, angles: Angles, reports: tuple[Report, ...]) -> None:
+    def _report_faults(self, angles: AngleTracker, reports: tuple[FaultReport, ...]) -> None:
         for report in reports:
-            if report.fault is Fault.SLIP:
+            if report.fault is EncoderFault.SLIP:
                 what = f"{abs(report.counts):,} counts {'were lost' if report.counts < 0 else 'too many'}"
-                self.say(f"slip: {what} by the index pulse; angles are right again from there")
-            elif report.fault is Fault.MISSED_INDEX:
+                self.say(f"slip: {what} at the index pulse; angles are correct again from there")
+            elif report.fault is EncoderFault.MISSED_INDEX:
                 self.say(f"no index pulse for {abs(report.counts) / angles.counts_per_turn:.1f} turns")
             else:
                 self.say("the prism turns the other way")
 
-    def _watch(self, angles: Angles, t: int, count: int) -> None:
-        """Counts that stay, while the controller said meanwhile that it turns."""
-        if self._still[0] == 0 or count != self._still[1]:
-            self._still, self._stalled = (t, count), False
-            return
-        status = self.status
-        if self._stalled or status is None or self._status_us < self._still[0]:
-            return
-        rpm = max(abs(status.rpm), abs(status.target_rpm) if status.state == 1 else 0.0)
-        rate = rpm / 60e6 * angles.counts_per_turn
-        if rpm > 0 and t - self._still[0] > max(STALL_US, STALL_COUNTS / rate):
-            self._stalled = True
-            self.say(f"the encoder stays at count {count:,} while the controller says {status.rpm:g} rpm")
-
-    def _state(self, status: Status, t: int) -> None:
-        self.status, self._status_us = status, t
-        self._decide(status.counts_per_turn or self._per_turn or self._given_per_turn)
-        # It had not heard of this host before the first ping: that is no news.
-        faults = status.faults if self._heard else status.faults & ~HOST_LOST
+    def _take_status(self, status: ControllerStatus, t: int) -> None:
+        self.status, self._epoch.stall.status_us = status, t
+        self._decide_counts(status.counts_per_turn or self._per_turn or self._given_per_turn)
+        # Before the first ping the controller cannot know the host: this is not a fault.
+        faults = status.faults if self._connection.ping_answered else status.faults & ~HOST_LOST
         for bit, name in enumerate(FAULTS):
-            if faults & ~self._faults & 1 << bit:
+            if faults & ~self._epoch.faults & 1 << bit:
                 self.say(f"the controller reports a fault: {name}")
-        self._faults = faults
+        self._epoch.faults = faults
 
-    def _account(self, host_us: int) -> None:
-        """Losses and noise, said not too often."""
-        received = self._decoder.received
-        if not (self.speaks or self.text):
-            if self._bytes and host_us - self._opened_us > STATUS_US and not self._dumb:
-                self.say(f"{self.name}: what it sends is neither frames nor lines of samples; wrong port or baud rate?")
-                self._dumb = True
-            return
-        if self._damaged is not None and received.damaged > self._damaged:
-            if host_us - self._noise_us > OFTEN_US:
-                self.say(f"{self.name}: damaged frames or lines, dropped; is the cable noisy?")
-            self._noise_us = host_us
-        self._damaged = received.damaged
-        if host_us - self._lost_us > OFTEN_US and (received.lost > self._lost or self._late):
-            if received.lost > self._lost:
-                self.say(f"{self.name}: frames lost: {received.lost - self._lost:,}")
-            if self._late:
-                self.say(f"{self.name}: samples out of order, dropped: {self._late:,}")
-            self._lost, self._late, self._lost_us = received.lost, 0, host_us
+    def _report_losses(self, host_us: int) -> None:
+        """Report losses and noise, at a limited rate; once if nothing is understood at all."""
+        connection = self._connection
+        if self.speaks or self.text:
+            for sentence in connection.losses.check(connection.decoder.received, host_us):
+                self.say(f"{self.name}: {sentence}")
+        elif connection.received_bytes and host_us - connection.opened_us > STATUS_US and not connection.unusable:
+            self.say(f"{self.name}: receives neither frames nor lines of samples; is the port or baud rate wrong?")
+            connection.unusable = True

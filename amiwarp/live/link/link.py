@@ -1,4 +1,4 @@
-"""The link to the prism's controller: a port read in the background, reopened when it is lost; commands and pings."""
+"""Link to the prism's controller: reads its port in the background, reopens a lost port, sends commands and pings."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from types import TracebackType
 
-    from amiwarp.live.link.clocks import Clock
-    from amiwarp.live.link.news import News
-    from amiwarp.live.link.protocol import Status
+    from amiwarp.live.link.clocks import ClockMap
+    from amiwarp.live.link.protocol import ControllerStatus
+    from amiwarp.live.link.updates import LinkUpdate
 
 READ_BYTES = 1 << 16
-"""Most that is taken from the port at once."""
+"""Largest number of bytes read at once."""
 RETRY_S = 0.2
-"""Between attempts to open a port that is gone."""
+"""Interval between attempts to reopen a lost port [s]."""
 ANSWER_S = 1.0
-"""Longest wait for the answer to a command."""
-QUICK, QUICK_US, PING_US = 10, 50_000, 1_000_000
-"""The first pings come quickly, the others once a second."""
+"""Longest wait for the answer to a command [s]."""
+QUICK_PINGS, QUICK_PING_US, PING_US = 10, 50_000, 1_000_000
+"""Number of the first, quick pings, their interval [us], and the interval of later pings [us]."""
 
 
 class Link:
-    """Follows a controller until it is closed. No call blocks for longer than about a second.
+    """Connection to a controller, open until closed. No call blocks for longer than about a second.
 
-    ``port``: a name, a USB id ``VID:PID``, a URL of pySerial, or None to look for one. ``counts_per_turn``: for a
-    controller that does not tell it (lines of text). ``host_us``: the host's clock [us], increasing. Raises
-    :class:`AmiwarpError` where the port cannot be opened now; one that is lost later is opened again.
+    ``port``: name, USB id ``VID:PID``, pySerial URL, or None to detect the controller. ``counts_per_turn``: for a
+    controller that does not report it (text lines). ``host_us``: the host's clock [us], increasing. Raises
+    :class:`AmiwarpError` if the port cannot be opened at first; a port that is lost later is reopened.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Link:
         self._follower.opened(host_us())
         self._changed = threading.Condition()  # guards the follower and the answers
         self._writing = threading.Lock()  # guards the port and the sequence
-        self._answers: dict[int, int | None] = {}  # by the sequence number of the command; None: not come yet
+        self._answers: dict[int, int | None] = {}  # by the command's sequence number; None: not yet received
         self._sequence = self._number = 0
         self._ping_us = host_us()
         self._ended = threading.Event()
@@ -67,7 +67,7 @@ class Link:
         self.close()
 
     def close(self) -> None:
-        """Ends it; the motor goes on as it was told."""
+        """Close the port. The motor keeps its last commanded speed."""
         self._ended.set()
         self._thread.join()
 
@@ -77,35 +77,39 @@ class Link:
         return self._port is not None
 
     @property
-    def status(self) -> Status | None:
-        """What the controller said of itself last."""
+    def status(self) -> ControllerStatus | None:
+        """Latest status of the controller, None before the first."""
         return self._follower.status
 
-    def poll(self) -> News:
-        """What came since the last call; at once."""
+    def poll(self) -> LinkUpdate:
+        """Return the data received since the last call, without waiting."""
         with self._changed:
             return self._follower.take()
 
-    def clock(self) -> Clock | None:
-        """The controller's clock (as in :attr:`News.t_us`) beside the host's; None until three pings came back."""
+    def clock(self) -> ClockMap | None:
+        """Return the map from the host's clock to the controller's (that of :attr:`LinkUpdate.t_us`).
+
+        Returns None until three pings are answered.
+        """
         with self._changed:
             return self._follower.clock()
 
     def set_speed(self, rpm: float, ramp: float) -> None:
-        """Turn at ``rpm``, negative backwards, changed by ``ramp`` [rpm/s]. Raises :class:`AmiwarpError` if refused."""
+        """Ramp to ``rpm`` (negative: backwards) at ``ramp`` [rpm/s]. Raises :class:`AmiwarpError` if refused."""
         self._command(SetSpeed(rpm, ramp), f"set speed {rpm:g} rpm")
 
     def stop(self) -> None:
-        """Come to rest. Raises :class:`AmiwarpError` if refused."""
+        """Stop the motor. Raises :class:`AmiwarpError` if refused."""
         self._command(Stop(), "stop")
 
     def set_counts(self, per_turn: int) -> None:
-        """Tell the encoder's counts per turn. Raises :class:`AmiwarpError` if refused."""
+        """Set the encoder's counts per turn in the controller. Raises :class:`AmiwarpError` if refused."""
         self._command(SetCounts(per_turn), f"set {per_turn} counts per turn")
 
     def _command(self, message: Message, what: str) -> None:
+        """Send a command and wait for its answer."""
         if self._follower.text:
-            raise AmiwarpError(f"{self.name}: {what}: it sends lines of text, which take no commands")
+            raise AmiwarpError(f"{self.name}: {what}: the controller sends lines of text, which take no commands")
         try:
             sequence = self._send(message, answered=True)
         except ValueError as error:
@@ -122,9 +126,9 @@ class Link:
             raise AmiwarpError(f"{self.name}: {what}: refused by the controller, {why}")
 
     def _send(self, message: Message, *, answered: bool = False) -> int:
-        """Its sequence number; ``answered``: its answer is kept.
+        """Send a message and return its sequence number; ``answered``: store its answer.
 
-        Raises OSError where the port is gone or takes nothing, ValueError for bad numbers.
+        Raises OSError if the port is gone or blocks, ValueError for numbers outside their range.
         """
         with self._writing:
             sequence = self._sequence
@@ -147,28 +151,28 @@ class Link:
         while True:
             try:
                 while not self._ended.is_set():
-                    self._turn()
+                    self._read_port()
             except OSError:
-                self._lost()
-            self._shut()
+                self._note_loss()
+            self._close_port()
             if self._ended.is_set() or not self._reopen():
                 return
 
-    def _turn(self) -> None:
-        """Reads what is there, waiting a little; pings when it is time."""
+    def _read_port(self) -> None:
+        """Read what has arrived, for a short time; ping if due."""
         data = self._port.read(1)
         if data:
             data += self._port.read(min(self._port.in_waiting, READ_BYTES))
         now = self._host_us()
         with self._changed:
             for answer in self._follower.feed(data, now):
-                if answer.sequence in self._answers:  # any other answers nothing that waits
+                if answer.sequence in self._answers:  # ignore answers to commands that nobody waits for
                     self._answers[answer.sequence] = answer.refused
             self._changed.notify_all()
             due = self._follower.speaks and now >= self._ping_us
-            quick = len(self._follower.trips) < QUICK
+            quick = len(self._follower.trips) < QUICK_PINGS
         if due:
-            self._ping_us = now + (QUICK_US if quick else PING_US)
+            self._ping_us = now + (QUICK_PING_US if quick else PING_US)
             self._ping()
 
     def _ping(self) -> None:
@@ -177,21 +181,21 @@ class Link:
         self._number = (self._number + 1) & 0xFFFFFFFF
         with self._changed:
             self._follower.pinged(self._number, self._host_us())
-        with contextlib.suppress(SerialTimeoutException):  # a port that takes nothing for a while is not gone
+        with contextlib.suppress(SerialTimeoutException):  # a port that blocks for a while is not gone
             self._send(Ping(self._number))
 
-    def _lost(self) -> None:
+    def _note_loss(self) -> None:
         with self._changed:
             self._follower.say(f"{self.name}: the port is gone; trying again until it is back")
 
-    def _shut(self) -> None:
+    def _close_port(self) -> None:
         with self._writing:
             port, self._port = self._port, None
         with contextlib.suppress(OSError):
             port.close()
 
     def _reopen(self) -> bool:
-        """Whether it was opened, not ended."""
+        """Open the port again; return False if the link was closed meanwhile."""
         while not self._ended.wait(RETRY_S):
             with contextlib.suppress(AmiwarpError):
                 port = open_port(self._where)

@@ -1,4 +1,4 @@
-"""Serial ports: opened by name, by USB id, or found by what they send."""
+"""Serial ports, opened by name, by USB id, or by detection of the controller."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ import time
 from typing import Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.protocol import Decoder
+from amiwarp.live.link.protocol import FrameDecoder
 
 BAUD = 460_800
-"""Of a UART; a port over USB alone takes any."""
+"""Baud rate of a UART. USB CDC ports ignore it."""
 READ_S, WRITE_S = 0.05, 0.5
-"""Longest wait for a byte, and for a port to take some."""
+"""Time-outs of a read and of a write [s]."""
 LISTEN_S = 1.0
-"""Before a port that sends nothing that is understood is left."""
+"""Time to wait for controller data during detection, per port [s]."""
 _USB = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
 
 
 def open_port(where: str | None) -> Any:
-    """The opened ``serial.Serial``: by name or URL of pySerial, by USB id ``VID:PID`` (hexadecimal), or None: found.
+    """Open a port and return its ``serial.Serial``.
 
-    Raises :class:`AmiwarpError` where it is not there or cannot be opened, naming the ports that there are.
+    ``where``: name, pySerial URL, USB id ``VID:PID`` (hexadecimal), or None to detect the controller. Raises
+    :class:`AmiwarpError`, with the available ports, if there is no such port or it cannot be opened.
     """
     if where is None:
         return _find()
@@ -32,12 +33,12 @@ def open_port(where: str | None) -> Any:
     wanted = int(match[1], 16), int(match[2], 16)
     names = [p.device for p in _ports() if (p.vid, p.pid) == wanted]
     if len(names) != 1:
-        raise AmiwarpError(f"USB id {where}: {len(names)} ports have it; {_there_are()}")
+        raise AmiwarpError(f"USB id {where}: {len(names)} ports have it; {_available()}")
     return _open(names[0])
 
 
 def usb_id(name: str) -> str | None:
-    """``VID:PID`` of a port, where it is the only one with it."""
+    """Return ``VID:PID`` of a port, or None if it has none or shares it with another port."""
     ports = _ports()
     ids = [(p.vid, p.pid) for p in ports if p.device == name and p.vid is not None]
     if len(ids) != 1 or sum((p.vid, p.pid) == ids[0] for p in ports) != 1:
@@ -51,9 +52,9 @@ def _ports() -> list[Any]:
     return sorted(list_ports.comports(), key=lambda p: p.device)
 
 
-def _there_are() -> str:
-    told = [p.device if p.vid is None else f"{p.device} ({p.vid:04x}:{p.pid:04x} {p.product})" for p in _ports()]
-    return f"there are {', '.join(told)}" if told else "there is no serial port; is the controller plugged in?"
+def _available() -> str:
+    listed = [p.device if p.vid is None else f"{p.device} ({p.vid:04x}:{p.pid:04x} {p.product})" for p in _ports()]
+    return f"there are {', '.join(listed)}" if listed else "there is no serial port; is the controller plugged in?"
 
 
 def _open(name: str) -> Any:
@@ -61,34 +62,35 @@ def _open(name: str) -> Any:
 
     try:
         return serial.serial_for_url(name, BAUD, timeout=READ_S, write_timeout=WRITE_S, exclusive=True)
-    except Exception as error:  # termios.error too, which is no OSError
+    except Exception as error:  # includes termios.error, which is not an OSError
         number = getattr(error, "errno", None)
         if number in (errno.EAGAIN, errno.EBUSY):
-            raise AmiwarpError(f"{name}: another program has this port open; end that first") from error
+            raise AmiwarpError(f"{name}: another program has this port open; close that program first") from error
         if number == errno.EACCES:
-            raise AmiwarpError(f"{name}: no permission; on Linux join the group of the port (ls -l {name})") from error
+            raise AmiwarpError(f"{name}: no permission; on Linux join the port's group (see ls -l {name})") from error
         why = "no such port" if number == errno.ENOENT else f"cannot be opened ({error})"
-        raise AmiwarpError(f"{name}: {why}; {_there_are()}") from error
+        raise AmiwarpError(f"{name}: {why}; {_available()}") from error
 
 
 def _find() -> Any:
-    """The first port on which frames or lines come."""
-    said = []
+    """Return the first port that sends controller frames or lines, opened."""
+    errors = []
     for candidate in _ports():
         try:
             port = _open(candidate.device)
         except AmiwarpError as error:
-            said.append(str(error))
+            errors.append(str(error))
             continue
-        if _sends(port):
+        if _is_controller(port):
             return port
         port.close()
-    detail = "".join(f" ({line})" for line in said)
-    raise AmiwarpError(f"no port sends what a controller sends; {_there_are()}{detail}; give one by name")
+    detail = "".join(f" ({line})" for line in errors)
+    raise AmiwarpError(f"no port sends controller data; {_available()}{detail}; give a port by name")
 
 
-def _sends(port: Any) -> bool:
-    decoder, end = Decoder(), time.monotonic() + LISTEN_S
+def _is_controller(port: Any) -> bool:
+    """Return whether controller frames or lines arrive within :data:`LISTEN_S`."""
+    decoder, end = FrameDecoder(), time.monotonic() + LISTEN_S
     while time.monotonic() < end:
         try:
             decoder.feed(port.read(max(1, port.in_waiting)))

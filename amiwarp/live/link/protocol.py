@@ -1,7 +1,7 @@
-"""What travels over the serial port: frames, messages and their check; ``docs/link-protocol.md`` says it for firmware.
+"""Serial protocol of the controller: messages, frames and their checksum, see ``docs/reference/link-protocol.md``.
 
-A frame is a packet in COBS, closed by a zero. A packet is version, type, sequence number, payload and CRC-32, all
-numbers little endian. A controller that cannot do that may send lines ``t_us,count``.
+A frame is a COBS-encoded packet, closed by a zero byte. A packet is version, type, sequence number, payload and CRC-32,
+in little-endian byte order. A simple controller may send text lines ``t_us,count`` instead.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from typing import ClassVar
 
 VERSION = 1
 LONGEST = 512
-"""Bytes of a frame, zero included: more without one is garbage."""
+"""Longest frame, zero byte included [bytes]. More bytes without a zero are garbage."""
 MOST_SAMPLES = 32
+"""Largest number of samples in one message."""
 STATES = ("stopped", "at speed", "on the way to its speed", "fault")
-"""What :attr:`Status.state` counts."""
+"""Meaning of each value of :attr:`ControllerStatus.state`."""
 FAULTS = ("stall", "over-current", "encoder lost", "index missed", "host lost")
-"""The bits of :attr:`Status.faults`, from the lowest."""
-REFUSALS = ("accepted", "unknown to it", "out of its range", "not possible now")
-"""What :attr:`Answer.refused` counts."""
+"""Meaning of each bit of :attr:`ControllerStatus.faults`, lowest bit first."""
+REFUSALS = ("accepted", "unknown command", "out of range", "not possible now")
+"""Meaning of each value of :attr:`Answer.refused`."""
 _HEADER = struct.Struct("<BBH")
 _CRC = struct.Struct("<I")
 _SAMPLE = struct.Struct("<Ii")
@@ -31,87 +32,98 @@ _LINE = re.compile(rb"(\d{1,10}),(-?\d{1,10})\r?")
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Encoder counts at times of the controller's clock."""
+    """Encoder counts, with the times when they were latched."""
 
     KIND: ClassVar[int] = 0x01
     t_us: tuple[int, ...]
-    """Wraps at 2**32."""
+    """Controller's clock [us], modulo 2**32."""
     count: tuple[int, ...]
+    """Encoder counts, wrapped to 32 bits, signed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Index:
-    """The index pulse, once a turn."""
+    """Index pulse of the encoder, once per turn."""
 
     KIND: ClassVar[int] = 0x02
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<Ii")
     t_us: int
+    """Controller's clock [us], modulo 2**32."""
     count: int
+    """Encoder count at the pulse."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """A pulse that the camera records as a trigger event too."""
+    """Sync pulse, which the camera also records as a trigger event."""
 
     KIND: ClassVar[int] = 0x03
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<II")
     t_us: int
+    """Controller's clock [us], modulo 2**32."""
     number: int
-    """Counts from 0."""
+    """Sequence number of the pulse, starting at 0."""
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
-    """State of the motor, at least once a second."""
+class ControllerStatus:
+    """State of the motor. The controller sends it at least once per second."""
 
     KIND: ClassVar[int] = 0x04
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<IBHffI")
     t_us: int
+    """Controller's clock [us], modulo 2**32."""
     state: int
-    """Of :data:`STATES`."""
+    """Index into :data:`STATES`."""
     faults: int
-    """Bits of :data:`FAULTS`."""
+    """Bit field, see :data:`FAULTS`."""
     rpm: float
+    """Measured speed [turns/min], negative backwards."""
     target_rpm: float
+    """Commanded speed [turns/min]."""
     counts_per_turn: int
+    """Encoder counts per turn; 0 if the controller does not know them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pong:
-    """The answer to a :class:`Ping`."""
+    """Answer to a :class:`Ping`."""
 
     KIND: ClassVar[int] = 0x05
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<II")
     number: int
+    """Number of the ping."""
     t_us: int
+    """Controller's clock [us], modulo 2**32."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Whether a command was accepted."""
+    """Answer to a command: accepted or refused."""
 
     KIND: ClassVar[int] = 0x06
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<HB")
     sequence: int
-    """Of the command."""
+    """Sequence number of the command."""
     refused: int
-    """Of :data:`REFUSALS`: 0 is accepted."""
+    """Index into :data:`REFUSALS`; 0 if accepted."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetSpeed:
-    """Turn at a speed, negative backwards."""
+    """Command to ramp to a speed."""
 
     KIND: ClassVar[int] = 0x81
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<ff")
     rpm: float
+    """Target speed [turns/min], negative backwards."""
     ramp: float
-    """[rpm/s]"""
+    """Acceleration [rpm/s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Come to rest."""
+    """Command to stop the motor."""
 
     KIND: ClassVar[int] = 0x82
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<")
@@ -119,31 +131,36 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class SetCounts:
-    """Counts of the encoder in a turn."""
+    """Command to set the encoder's counts per turn."""
 
     KIND: ClassVar[int] = 0x83
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<I")
     per_turn: int
+    """Counts per turn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """Asks for a :class:`Pong`."""
+    """Request for a :class:`Pong`, which relates the controller's clock to the host's."""
 
     KIND: ClassVar[int] = 0x84
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<I")
     number: int
+    """Number that the pong repeats."""
 
 
-Plain = Index | Sync | Status | Pong | Answer | SetSpeed | Stop | SetCounts | Ping
+Plain = Index | Sync | ControllerStatus | Pong | Answer | SetSpeed | Stop | SetCounts | Ping
 Message = Samples | Plain
 _PLAIN: dict[int, type[Plain]] = {
-    m.KIND: m for m in (Index, Sync, Status, Pong, Answer, SetSpeed, Stop, SetCounts, Ping)
+    m.KIND: m for m in (Index, Sync, ControllerStatus, Pong, Answer, SetSpeed, Stop, SetCounts, Ping)
 }
 
 
 def encode(message: Message, sequence: int) -> bytes:
-    """A message as a frame. Raises ValueError for numbers that do not fit, or more than :data:`MOST_SAMPLES`."""
+    """Encode a message as a frame.
+
+    Raises ValueError for numbers outside a field's range, or for other than 1 to :data:`MOST_SAMPLES` samples.
+    """
     from cobs import cobs
 
     if isinstance(message, Samples):
@@ -162,38 +179,39 @@ def encode(message: Message, sequence: int) -> bytes:
 
 
 @dataclass(slots=True)
-class Received:
-    """What a decoder has met."""
+class FrameCounters:
+    """Statistics of a :class:`FrameDecoder`."""
 
     frames: int = 0
-    """Whole, with the right check."""
+    """Complete frames with a valid checksum and a known message."""
     damaged: int = 0
-    """No COBS, too short or long, or the wrong check."""
+    """Frames or lines that were too short, too long, not COBS, or had a wrong checksum."""
     unknown: int = 0
-    """Of another version or type, or a payload that does not fit it."""
+    """Frames of another version or an unknown type, or whose payload has a wrong size."""
     lost: int = 0
-    """Frames whose numbers are missing."""
+    """Frames that are missing by their sequence numbers."""
     restarts: int = 0
-    """Numbers that went backwards: the controller was reset."""
+    """Sequence numbers that went backwards, which means that the controller was reset."""
     lines: int = 0
-    """Of text that were samples."""
+    """Text lines with a sample."""
 
 
-class Decoder:
-    """Bytes as they come to messages: frames, or lines of text where the first whole line is one.
+class FrameDecoder:
+    """Decodes bytes into messages: from frames, or from text lines if the first complete unit is a line.
 
-    Never raises for bytes of any kind, holds :data:`LONGEST` of them at most, and finds the next frame after garbage.
+    Accepts any bytes without raising, buffers at most :data:`LONGEST` bytes, and resynchronises at the next frame after
+    garbage.
     """
 
     def __init__(self) -> None:
-        self.received = Received()
+        self.received = FrameCounters()
         self._held = bytearray()
         self._next: int | None = None
         self._text: bool | None = None
-        self._whole = False  # what came before the first end of a line may be its rest
+        self._whole = False  # the bytes before the first line end may be the rest of a line
 
     def feed(self, data: bytes) -> list[tuple[int | None, Message]]:
-        """Messages that ``data`` completes, each with its sequence number; None for a line of text."""
+        """Return the messages completed by ``data``, each with its sequence number, or None for a text line."""
         out: list[tuple[int | None, Message]] = []
         for byte in data:
             if byte == 0 and self._text is not True:
@@ -214,7 +232,7 @@ class Decoder:
         held = bytes(self._held)
         self._held.clear()
         if not held:
-            return  # a second zero is no frame
+            return  # two zero bytes in a row enclose no frame
         packet = _checked(held)
         if packet is None:
             self.received.damaged += 1
@@ -244,14 +262,14 @@ class Decoder:
             self.received.damaged += 1
             self._held.clear()
         elif self._held and all(32 <= b < 127 or b in b"\r\n\t" for b in self._held):
-            self._held.clear()  # a heading, or the rest of a first line
+            self._held.clear()  # a header line, or the rest of a first line
             self._whole = True
         else:
-            self._hold(byte)  # inside a frame, or its first byte
+            self._hold(byte)  # a line feed at the start of a frame or inside it
 
 
 def _checked(held: bytes) -> bytes | None:
-    """The packet without its check, or None."""
+    """Decode COBS and verify the checksum; return the packet without its checksum, or None if damaged."""
     from cobs import cobs
 
     try:
@@ -265,7 +283,7 @@ def _checked(held: bytes) -> bytes | None:
 
 
 def _message(kind: int, payload: bytes) -> Message | None:
-    """None for a kind that is unknown, and for a payload of another length."""
+    """Return the decoded message, or None for an unknown type or a wrong payload size."""
     if kind == Samples.KIND:
         if not payload or len(payload) % _SAMPLE.size or len(payload) > MOST_SAMPLES * _SAMPLE.size:
             return None

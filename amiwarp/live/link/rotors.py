@@ -1,4 +1,4 @@
-"""What turns behind an emulated controller: a motor, or a rotation that was recorded."""
+"""Rotations for the emulated controller: a simulated motor, or the rotation of a recording."""
 
 from __future__ import annotations
 
@@ -14,42 +14,47 @@ if TYPE_CHECKING:
 
     from amiwarp.events.encoder import Encoder
 
-MOST_PIECES = 1024
-"""Of a motor's past that are kept: speeds it was set to. What came before them is taken for even."""
+MOST_SEGMENTS = 1024
+"""Largest number of motor segments in memory. The oldest kept segment also describes all earlier times."""
 RPM = math.tau / 60.0
-"""A turn a minute [rad/s]."""
+"""One turn per minute in rad/s."""
 
 
 class Rotor(Protocol):
-    """Turns; the index is at whole turns. All times are the world's [us]."""
+    """Rotation of the emulated prism, with the index pulse at whole turns. All times are emulation times [us]."""
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Unwrapped angle [rad], any shape; of the future as if no command came."""
+        """Return unwrapped angles [rad], same shape as ``t_us``. Future angles assume no further command."""
 
     def target_rpm(self, t_us: int) -> float:
-        """The speed it is to have."""
+        """Return the commanded speed [turns/min]."""
 
     def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
-        """From now on to a speed, by ``ramp`` [rpm/s]; whether it can."""
+        """Ramp from now on to a speed, at ``ramp`` [rpm/s]; return False if the rotor takes no commands."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """From a time on: the wanted speed is a line, the motor follows it with a lag. Seconds, rad, rad/s."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Segment:
+    """Motor state from ``start`` on: the target speed changes linearly, the motor follows it with a lag."""
 
     start: float
+    """Time [s]."""
     angle: float
+    """Angle at the start [rad]."""
     speed: float
-    wanted: float
+    """Speed at the start [rad/s]."""
+    target: float
+    """Target speed at the start [rad/s]."""
     slope: float
+    """Rate of change of the target speed [rad/s²]."""
 
 
 class Motor:
-    """A motor whose speed follows the ramped target with the lag ``inertia_s``; angle 0 at t = 0.
+    """Motor whose speed follows the ramped target with time constant ``inertia_s`` [s]; its angle is 0 at t = 0.
 
-    ``ripple``: share of the speed by which it changes within each turn (once and six times: poles); ``noise``: share,
-    rms, by which friction changes it at random, seeded. Both depend on the angle: a motor at rest stays at rest. The
-    angle is a formula, not integrated: any time can be asked for in any order.
+    ``ripple``: relative speed variation at once and six times per turn, as from magnet poles. ``noise``: relative rms
+    speed variation by random friction, from ``seed``. Both are functions of the angle, so a motor at rest stays at
+    rest. The angle is a closed formula: angles can be computed for any times, in any order.
     """
 
     def __init__(
@@ -57,52 +62,53 @@ class Motor:
     ) -> None:
         rng = np.random.default_rng(seed)
         self._inertia = inertia_s
-        self._often = np.concatenate([[1.0, 6.0], np.exp(rng.uniform(math.log(0.05), math.log(3.0), 8))])
-        share = np.concatenate([np.full(2, ripple / 2.0), np.full(8, noise * 0.5)])
-        self._swing, self._phase = share / self._often, rng.uniform(0.0, math.tau, 10)
-        self._pieces = [_Piece(0.0, 0.0, rpm * RPM, rpm * RPM, 0.0)]
+        self._frequency = np.concatenate([[1.0, 6.0], np.exp(rng.uniform(math.log(0.05), math.log(3.0), 8))])
+        amplitude = np.concatenate([np.full(2, ripple / 2.0), np.full(8, noise * 0.5)])
+        self._amplitude, self._phase = amplitude / self._frequency, rng.uniform(0.0, math.tau, 10)
+        self._segments = [_Segment(start=0.0, angle=0.0, speed=rpm * RPM, target=rpm * RPM, slope=0.0)]
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """See :class:`Rotor`; constant speed before t = 0."""
+        """Return unwrapped angles [rad], see :class:`Rotor`. The speed is constant before t = 0."""
         t = np.asarray(t_us, np.float64) * 1e-6
-        even = np.empty(t.shape)
-        at = np.maximum(np.searchsorted([p.start for p in self._pieces], t, side="right") - 1, 0)
-        for k in np.unique(at):
-            even[at == k] = self._moved(self._pieces[k], t[at == k])[0]
-        swing = np.sin(even[..., None] * self._often + self._phase) - np.sin(self._phase)
-        return np.asarray(even + swing @ self._swing, np.float64)
+        smooth = np.empty(t.shape)
+        index = np.maximum(np.searchsorted([p.start for p in self._segments], t, side="right") - 1, 0)
+        for k in np.unique(index):
+            smooth[index == k] = self._state_at(self._segments[k], t[index == k])[0]
+        ripple_angle = np.sin(smooth[..., None] * self._frequency + self._phase) - np.sin(self._phase)
+        return np.asarray(smooth + ripple_angle @ self._amplitude, np.float64)
 
     def target_rpm(self, t_us: int) -> float:
-        """See :class:`Rotor`."""
-        last = self._pieces[-1]
-        return last.wanted / RPM
+        """Return the commanded speed [turns/min], see :class:`Rotor`."""
+        last = self._segments[-1]
+        return last.target / RPM
 
     def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
-        """See :class:`Rotor`."""
+        """Ramp from now on to a speed, see :class:`Rotor`."""
         t = t_us * 1e-6
-        before = self._pieces[max(bisect.bisect_right([p.start for p in self._pieces], t) - 1, 0)]
-        self._pieces = [p for p in self._pieces if p.start <= t][-MOST_PIECES:]
-        wanted = before.wanted + before.slope * (t - before.start)
-        slope = math.copysign(ramp * RPM, rpm * RPM - wanted)
-        angle, speed = self._moved(before, np.asarray(t))
-        ramped = _Piece(t, float(angle), float(speed), wanted, slope)
-        end = t + (rpm * RPM - wanted) / slope
-        angle, speed = self._moved(ramped, np.asarray(end))
-        self._pieces += [ramped, _Piece(end, float(angle), float(speed), rpm * RPM, 0.0)]
+        current = self._segments[max(bisect.bisect_right([p.start for p in self._segments], t) - 1, 0)]
+        self._segments = [p for p in self._segments if p.start <= t][-MOST_SEGMENTS:]
+        target = current.target + current.slope * (t - current.start)
+        slope = math.copysign(ramp * RPM, rpm * RPM - target)
+        angle, speed = self._state_at(current, np.asarray(t))
+        ramped = _Segment(start=t, angle=float(angle), speed=float(speed), target=target, slope=slope)
+        end = t + (rpm * RPM - target) / slope
+        angle, speed = self._state_at(ramped, np.asarray(end))
+        final = _Segment(start=end, angle=float(angle), speed=float(speed), target=rpm * RPM, slope=0.0)
+        self._segments += [ramped, final]
         return True
 
-    def _moved(self, piece: _Piece, t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Angle and speed without ripple at times of a piece [s]."""
-        elapsed, lag = t - piece.start, self._inertia
-        behind = piece.speed - piece.wanted + piece.slope * lag
-        # before the first piece nothing decays: its speed is the wanted one
+    def _state_at(self, segment: _Segment, t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return angle [rad] and speed [rad/s], both without ripple, at times of a segment [s]."""
+        elapsed, lag = t - segment.start, self._inertia
+        behind = segment.speed - segment.target + segment.slope * lag
+        # Before the first segment nothing decays: its speed equals its target.
         decay = behind * np.exp(-np.maximum(elapsed, 0.0) / lag)
-        angle = piece.angle + elapsed * (piece.wanted - piece.slope * lag + piece.slope * elapsed / 2.0)
-        return angle + lag * (behind - decay), piece.wanted + piece.slope * (elapsed - lag) + decay
+        angle = segment.angle + elapsed * (segment.target - segment.slope * lag + segment.slope * elapsed / 2.0)
+        return angle + lag * (behind - decay), segment.target + segment.slope * (elapsed - lag) + decay
 
 
 class Played:
-    """A recorded rotation, its first sample at the world's time ``start_us``; at rest before and after it."""
+    """Rotation of a recording. Its first sample is at ``start_us``; the prism is at rest before and after it."""
 
     def __init__(self, encoder: Encoder, start_us: int = 0) -> None:
         self._elapsed = (encoder.t - encoder.t[0]).astype(np.float64)
@@ -110,17 +116,17 @@ class Played:
         self.begin(start_us)
 
     def begin(self, start_us: int) -> None:
-        """Begins at another time: of one that has not begun."""
+        """Set another start time [us]. Only valid before the rotation has begun."""
         self._t = self._elapsed + start_us
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """See :class:`Rotor`."""
+        """Return unwrapped angles [rad], see :class:`Rotor`."""
         return np.asarray(np.interp(np.asarray(t_us, np.float64), self._t, self._angle))
 
     def target_rpm(self, t_us: int) -> float:
-        """Its mean speed while it lasts."""
+        """Return the recording's mean speed [turns/min] while it lasts, else 0."""
         return self._rpm if self._t[0] <= t_us <= self._t[-1] else 0.0
 
     def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
-        """It cannot."""
+        """Return False: a recorded rotation takes no commands."""
         return False

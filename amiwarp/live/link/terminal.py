@@ -1,4 +1,4 @@
-"""An emulated controller behind a pseudo-terminal: a serial port to whoever opens it."""
+"""Pseudo-terminal that offers an emulated controller as a serial port."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ if TYPE_CHECKING:
     from amiwarp.live.link.emulator import Controller
 
 STEP_S = 1e-3
+"""Interval between updates of the controller [s]."""
 RETRY_S = 0.2
-"""Between attempts to open a pseudo-terminal while none can be had."""
+"""Interval between attempts to open a pseudo-terminal after a failure [s]."""
 
 
 class PseudoTerminal:
-    """Runs a controller in real time until it is closed, in a thread of its own.
+    """Runs a controller in real time, in a background thread, until closed.
 
-    ``path``: a symbolic link to the port, kept while the cable is in and made anew with it, so that a lost port comes
-    back by the same name. ``now_us``: the world's time; default: since now. Raises :class:`AmiwarpError` where ``path``
-    is taken, or where the system has no pseudo-terminals.
+    ``path``: symbolic link to the port. It exists while the emulated cable is plugged in, and points to the new port
+    after a reconnection, so that programs find it under the same name. ``now_us``: emulation time [us]; default: time
+    since the creation of this object. Raises :class:`AmiwarpError` if ``path`` exists, or if the system has no
+    pseudo-terminals.
     """
 
     def __init__(
@@ -38,21 +40,21 @@ class PseudoTerminal:
         if not hasattr(os, "openpty"):
             raise AmiwarpError("this system has no pseudo-terminals; the emulator needs Linux or macOS")
         self._path = None if path is None else Path(path)
-        # a link that leads nowhere was left by one that was killed
+        # A dangling link is the remnant of a killed process and may be replaced.
         if self._path is not None and self._path.exists():
-            raise AmiwarpError(f"{path}: is there already; give another path for the link, or remove it")
+            raise AmiwarpError(f"{path}: already exists; give another path for the link, or remove it")
         origin = monotonic_us()
         self._now_us = now_us or (lambda: monotonic_us() - origin)
         self._controller = controller
         self._ended = threading.Event()
         self._master: int | None = None
-        self._plug()
+        self._open()
         self._thread = threading.Thread(target=self._run, name="amiwarp-emulator", daemon=True)
         self._thread.start()
 
     @property
     def name(self) -> str:
-        """To open it by: the link, or the port where there is none."""
+        """Name to open: the link if there is one, else the port."""
         return self._port if self._path is None else str(self._path)
 
     def __enter__(self) -> PseudoTerminal:
@@ -64,10 +66,10 @@ class PseudoTerminal:
         self.close()
 
     def close(self) -> None:
-        """Ends it; port and link are gone."""
+        """Stop the thread, and remove the port and the link."""
         self._ended.set()
         self._thread.join()
-        self._unplug()
+        self._close()
 
     def _run(self) -> None:
         while not self._ended.is_set():
@@ -77,19 +79,19 @@ class PseudoTerminal:
             out = self._controller.advance(now)
             if self._controller.plugged and self._master is None:
                 try:
-                    self._plug()
-                except OSError:  # no descriptor is free now
+                    self._open()
+                except OSError:  # no free file descriptor: try again later
                     self._ended.wait(RETRY_S)
             elif not self._controller.plugged and self._master is not None:
-                self._unplug()
-            # Nobody there, or too slow: bytes are lost, as on any line without flow control.
-            if out and self._master is not None and not self._alone(self._master):
+                self._close()
+            # Without a reader, or with a slow one, bytes are lost, as on any serial line without flow control.
+            if out and self._master is not None and not self._without_peer(self._master):
                 with contextlib.suppress(OSError):
                     os.write(self._master, out)
 
     def _read(self, master: int | None) -> bytes:
-        """Bytes from the other end, waited for until the next step."""
-        if master is None or self._alone(master):
+        """Return the bytes that the peer sent, after waiting for them for at most one step."""
+        if master is None or self._without_peer(master):
             self._ended.wait(STEP_S)
             return b""
         poll = select.poll()
@@ -100,12 +102,12 @@ class PseudoTerminal:
             return os.read(master, 4096)
         return b""
 
-    def _alone(self, master: int) -> bool:
+    def _without_peer(self, master: int) -> bool:
         poll = select.poll()
         poll.register(master, 0)
         return any(event & select.POLLHUP for _, event in poll.poll(0))
 
-    def _plug(self) -> None:
+    def _open(self) -> None:
         import tty
 
         master, port = os.openpty()
@@ -124,10 +126,10 @@ class PseudoTerminal:
             self._path.symlink_to(self._port)
 
     def _remove_link(self) -> None:
-        if self._path is not None and self._path.is_symlink():  # a file that was put there meanwhile stays
+        if self._path is not None and self._path.is_symlink():  # leave a file that replaced the link
             self._path.unlink()
 
-    def _unplug(self) -> None:
+    def _close(self) -> None:
         self._remove_link()
         if self._master is not None:
             os.close(self._master)

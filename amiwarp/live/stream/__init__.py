@@ -1,1 +1,1 @@
-"""Live streams of events: their packets, where they come from and where they go."""
+"""Live streams of events: packets, sources, sinks, sessions and the adaptive prism speed."""

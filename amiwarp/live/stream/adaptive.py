@@ -1,8 +1,8 @@
-"""The prism's speed from the stream: as fast as the edges need it, no faster.
+"""Adaptive prism speed: as fast as the scene's edges need, no faster.
 
-A window of events sees an edge where the image moves across it. The prism moves it, and so does the camera:
-:class:`CoverageMeter` follows both and tells the share of the scene's edges that the window sees,
-:class:`SpeedController` makes a speed of it. ``docs/adaptive.md`` says how well that works.
+A window of events shows an edge only if the image moves across it, by the prism or by the camera's own motion.
+:class:`CoverageMeter` estimates both motions and the share of the scene's edges that a window shows (the coverage).
+:class:`SpeedController` derives the prism's speed from it. ``docs/explanation/adaptive-speed.md`` shows the results.
 """
 
 from __future__ import annotations
@@ -23,57 +23,61 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 DIRECTIONS = 18
-"""Bins of edge directions over half a turn."""
+"""Number of bins of edge directions over 180 deg."""
 _BINS = (np.arange(DIRECTIONS) + 0.5) * (math.pi / DIRECTIONS)
 NORMALS = np.stack([np.cos(_BINS), np.sin(_BINS)])
-"""Of edges in the bins' middles, shape (2, DIRECTIONS)."""
-SWING = 0.25
-"""An edge moved across itself by s is seen with probability 1 - exp(-s / SWING), as found in simulations [px]."""
-TOLD = 1.0
-"""Swing from which a window tells how much texture there is in a direction [px]."""
-SIDE = 192
-"""Of the middle of the image that is looked at [px]."""
+"""Normals of edges at the bin centres, shape (2, DIRECTIONS)."""
+SEEN_TRAVEL = 0.25
+"""Scale of the travel of an edge along its normal [px]. After a travel s the edge is seen with probability
+1 - exp(-s / SEEN_TRAVEL), as found in simulations."""
+TEXTURE_TRAVEL = 1.0
+"""Travel from which a window gives the amount of texture in a direction [px]."""
+PATCH_SIDE = 192
+"""Side of the central image patch that is analysed [px]."""
 BLOCK = 4
 """Side of the blocks that have one edge direction each [px]."""
 SLICE_US = 4_000
-"""Of a window's end: so short that the camera's motion smears nothing, long enough for the next slice to look alike."""
-LONGEST_US = 100_000
-"""Between two slices that are compared."""
+"""Duration of the slice at a window's end [us]. It is short enough to avoid motion blur by the camera, and long enough
+for two slices to be similar."""
+SLICE_GAP_US = 100_000
+"""Longest time between two slices that are compared [us]."""
 SLICE_EVENTS, WINDOW_EVENTS = 1 << 14, 1 << 15
-"""More are thinned evenly."""
-CLEAR = 8.0
-"""Standard deviations by which two slices must agree on a shift; with less the camera counts as still."""
+"""Largest number of events used of a slice and of a window. More are thinned evenly."""
+CLEAR_STD = 8.0
+"""Height of the correlation peak of two slices, in standard deviations. Below it the camera counts as still."""
 TEXTURE_S = 0.5
-"""Memory of which edge directions the scene has [s]."""
+"""Time constant of the memory of the scene's edge directions [s]."""
 ANGLES = 17
-"""Places of the prism's path over a window."""
+"""Number of samples of the prism's path over a window."""
 PHASES, ORBIT = 8, 1024
-"""Of the prism at which a window to come may begin, and places of its orbit."""
+"""Number of prism phases at which a predicted window may begin, and number of samples of the prism's orbit."""
 SPEEDS = 32
-"""Between the limits, for which coverage is foretold."""
+"""Number of speeds between the limits for which coverage is predicted."""
 MEMORY_S = 0.25
-"""Of what is foretold and of the rate, in the controller: windows see now these directions, now those [s]."""
+"""Time constant of the average of predictions and of the event rate [s]. Edge directions vary between windows."""
 FOLLOW_S, LIMITED_S = 0.2, 1.5
-"""In which the speed comes nearer by a factor e to that which is enough, and to where the event rate has its limit."""
-THERE = 0.01
-"""Relative distance from the speed that is enough at which it has been reached."""
+"""Time constants [s] of the speed's approach to the sufficient speed, and to the limit set by the event rate."""
+SPEED_TOLERANCE = 0.01
+"""Relative difference from the sufficient speed at which it counts as reached."""
 NEAR_LIMIT, BELOW_LIMIT = 0.9, 0.8
-"""Shares of the largest event rate: down to the first falls a speed that was too much, under the second it may rise."""
+"""Shares of the largest event rate. A speed that was too fast is lowered until the first; below the second it may
+rise."""
 
 
 def prism_path(model: Model, encoder: Encoder, start_us: int, end_us: int) -> NDArray[np.float64]:
-    """Where the prism puts the image's middle at even times of a window, both ends included, shape (m, 2) [px].
+    """Return the positions of the image centre behind the prism, at regular times of a window, shape (m, 2) [px].
 
-    Raises :class:`AmiwarpError` where the encoder does not cover it, or the middle has no ray.
+    Both ends are included. Raises :class:`AmiwarpError` if the encoder does not cover the window, or if the image
+    centre has no ray.
     """
     times = np.rint(np.linspace(start_us, end_us, ANGLES)).astype(np.int64)
     return _middle(model, np.asarray(encoder.angle_at(times), np.float64))
 
 
 def prism_orbit(model: Model) -> NDArray[np.float64]:
-    """Where the prism puts the image's middle at even angles of a turn, shape (n, 2) [px].
+    """Return the positions of the image centre behind the prism, at regular angles of a turn, shape (n, 2) [px].
 
-    Raises :class:`AmiwarpError` where it has no ray.
+    Raises :class:`AmiwarpError` if the image centre has no ray.
     """
     return _middle(model, np.linspace(0.0, math.tau, ORBIT, endpoint=False))
 
@@ -82,71 +86,75 @@ def _middle(model: Model, angles: NDArray[np.float64]) -> NDArray[np.float64]:
     middle = np.array([[0.5 * (model.camera.width - 1), 0.5 * (model.camera.height - 1)]])
     path = model.deflect_points(np.repeat(middle, len(angles), axis=0), angles)
     if not np.isfinite(path).all():
-        raise AmiwarpError("the image's middle has no ray through the prism at some angle; check the model")
+        raise AmiwarpError("the image centre has no ray through the prism at some angle; check the model")
     return np.asarray(path, np.float64)
 
 
-def _drifted(drift: NDArray[np.float64], turn: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
-    """Where a drift that changes evenly takes the image over a window, shape (ANGLES, 2) [px]."""
+def _drift_path(drift: NDArray[np.float64], drift_change: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+    """Return the image's path during a window for a linearly changing drift, shape (ANGLES, 2) [px]."""
     along = np.linspace(0.0, 1.0, ANGLES)[:, None]
-    return np.asarray(seconds * (along * drift + 0.5 * (along * along - along) * turn))
+    return np.asarray(seconds * (along * drift + 0.5 * (along * along - along) * drift_change))
 
 
-def _seen(swing: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of edges with a swing [px] that are seen."""
-    return np.asarray(-np.expm1(-swing / SWING))
+def _seen_share(travel: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the share of edges that are seen after a travel [px]."""
+    return np.asarray(-np.expm1(-travel / SEEN_TRAVEL))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coverage:
-    """What a window of events saw."""
+    """Coverage of one window of events."""
 
     share: float
-    """Of the scene's edges that are seen, by their directions and what moved them, 0 .. 1."""
+    """Share of the scene's edges that the window shows, 0 .. 1."""
     drift: NDArray[np.float64]
-    """The image's velocity by the camera's motion alone, shape (2,) [px/s]; 0 where none is clear."""
-    turn: NDArray[np.float64]
-    """By how much the drift changes over the window, shape (2,) [px/s]; 0 where that is not known."""
-    swing: NDArray[np.float64]
-    """How far edges were moved across themselves, by the direction of their normal, shape (n,) [px]."""
+    """Image velocity by the camera's motion alone, shape (2,) [px/s]; 0 if there is no clear estimate."""
+    drift_change: NDArray[np.float64]
+    """Change of the drift over the window, shape (2,) [px/s]; 0 if unknown."""
+    travel: NDArray[np.float64]
+    """Travel of edges along their normal, for each edge direction, shape (n,) [px]."""
     texture: NDArray[np.float64]
-    """Share of the edges in each direction over the last while, shape (n,), sum 1; even where there are none."""
+    """Share of the scene's recent edges in each direction, shape (n,), sum 1; uniform without any edges."""
 
-    def foretold(self, rpm: NDArray[np.float64], orbit: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
-        """Share that such a window would see at other speeds, in the worst of the prism's phases, shape (n,).
+    def predict(self, rpm: NDArray[np.float64], orbit: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+        """Return the share that a window would show at other speeds, for the worst prism phase, shape (n,).
 
-        ``rpm``: shape (n,); ``orbit``: see :func:`prism_orbit`; ``seconds``: the window's length.
+        ``rpm``: speeds [turns/min], shape (n,). ``orbit``: see :func:`prism_orbit`. ``seconds``: length of the window.
         """
         along = np.linspace(0.0, 1.0, ANGLES)
         turns = (seconds / 60.0) * rpm[:, None, None] * along + np.arange(PHASES)[:, None] / PHASES
-        way = orbit[np.rint(turns * len(orbit)).astype(np.int64) % len(orbit)] + _drifted(
-            self.drift, self.turn, seconds
+        path = orbit[np.rint(turns * len(orbit)).astype(np.int64) % len(orbit)] + _drift_path(
+            self.drift, self.drift_change, seconds
         )
-        return np.asarray((_seen(np.ptp(way @ NORMALS, axis=2)) @ self.texture).min(axis=1))
+        return np.asarray((_seen_share(np.ptp(path @ NORMALS, axis=2)) @ self.texture).min(axis=1))
 
 
 @dataclass(slots=True, eq=False)
 class SpeedController:
-    """A speed from coverage and event rate. Raises :class:`AmiwarpError` for limits that leave no speed or no band.
+    """Derives the prism's speed from coverage and event rate.
 
-    What a window would see at the worst of the prism's phases is foretold for all speeds. Where that is under
-    :attr:`low` or above :attr:`high` for the speed now, it goes to the lowest one for which what is unseen is half-way
-    between by ratio, or to the best there is.
+    It predicts the coverage at the worst prism phase for all speeds. If the prediction for the present speed is below
+    :attr:`low` or above :attr:`high`, the controller moves to the lowest speed whose unseen share is at most the
+    geometric mean of the two limits' unseen shares, or else to the speed with the best coverage. Raises
+    :class:`AmiwarpError` for empty ranges of speed or coverage.
     """
 
     orbit: NDArray[np.float64]
-    """See :func:`prism_orbit`."""
+    """Orbit of the image centre, see :func:`prism_orbit`."""
     rpm: float = 720.0
-    """The speed now: to start with, then what was last asked for [turns/min]."""
+    """Present speed: the initial one, then the last one commanded [turns/min]."""
     least_rpm: float = 120.0
+    """Lowest speed [turns/min]."""
     most_rpm: float = 1440.0
+    """Highest speed [turns/min]."""
     ramp_rpm_s: float = 600.0
-    """What the motor follows [turns/min/s]."""
+    """Acceleration that the motor can follow [turns/min/s]."""
     most_mev_s: float = math.inf
-    """What sensor, cable and computer carry [million events/s]; comes before coverage."""
+    """Largest event rate of sensor, cable and computer [million events/s]. It has priority over coverage."""
     low: float = 0.9988
+    """Coverage below which the speed changes."""
     high: float = 0.9996
-    """The band of coverage in which the speed stays as it is."""
+    """Coverage above which the speed changes."""
     _t_us: int | None = field(default=None, init=False)
     _speeds: NDArray[np.float64] = field(init=False)
     _unseen: NDArray[np.float64] = field(init=False)
@@ -157,7 +165,7 @@ class SpeedController:
     def __post_init__(self) -> None:
         if not 0.0 < self.least_rpm <= self.rpm <= self.most_rpm < math.inf:
             given = f"{self.rpm:g} rpm to start with is not in {self.least_rpm:g} .. {self.most_rpm:g} rpm"
-            raise AmiwarpError(f"adaptive speed: {given}; give limits above 0 around it")
+            raise AmiwarpError(f"adaptive speed: {given}; give limits above 0 that include the initial speed")
         if not 0.0 < self.low < self.high < 1.0:
             raise AmiwarpError(f"adaptive speed: coverage from {self.low:g} to {self.high:g}; give 0 < low < high < 1")
         for name in ("ramp_rpm_s", "most_mev_s"):
@@ -166,47 +174,47 @@ class SpeedController:
         self._unseen, self._speeds = np.zeros(SPEEDS), np.geomspace(self.least_rpm, self.most_rpm, SPEEDS)
 
     def update(self, start_us: int, end_us: int, coverage: Coverage, rate_mev_s: float) -> float | None:
-        """The speed to ask for after a window [us] [turns/min]; None: leave it as it is.
+        """Return the speed to command after a window [turns/min]; None to keep the speed.
 
-        ``rate_mev_s``: million events a second. Raises :class:`AmiwarpError` where windows are not in order, or for
-        what is no rate.
+        ``start_us``, ``end_us``: window [us]; ``rate_mev_s``: event rate [million events/s]. Raises
+        :class:`AmiwarpError` for windows out of order, or for a rate that is negative or not finite.
         """
         if not 0.0 <= rate_mev_s < math.inf:
-            raise AmiwarpError(f"adaptive speed: {rate_mev_s:g} Mev/s; give a rate")
+            raise AmiwarpError(f"adaptive speed: {rate_mev_s:g} Mev/s; give a finite rate of 0 or more")
         first = self._t_us is None
         if not start_us < end_us or (self._t_us is not None and start_us < self._t_us):
             given = f"window {start_us} .. {end_us} us after one that ended at {self._t_us} us"
-            raise AmiwarpError(f"adaptive speed: {given}; give windows one after the other")
+            raise AmiwarpError(f"adaptive speed: {given}; give windows in order of time")
         seconds = (end_us - (start_us if self._t_us is None else self._t_us)) * 1e-6
         self._t_us = end_us
         new = 1.0 if first else 1.0 - math.exp(-seconds / MEMORY_S)
-        unseen = 1.0 - coverage.foretold(self._speeds, self.orbit, (end_us - start_us) * 1e-6)
+        unseen = 1.0 - coverage.predict(self._speeds, self.orbit, (end_us - start_us) * 1e-6)
         self._unseen += new * (unseen - self._unseen)
         self._rate += new * (rate_mev_s - self._rate)
         return None if first else self._step(seconds)
 
     def _step(self, seconds: float) -> float | None:
-        """Towards where it should be."""
-        rate, within = self._rate / self.most_mev_s, FOLLOW_S
+        """Move the speed one step towards the sufficient speed."""
+        rate, time_constant = self._rate / self.most_mev_s, FOLLOW_S
         self._limited = rate > (NEAR_LIMIT if self._limited else 1.0)
-        logs = np.log(np.maximum(self._unseen, 1e-12))  # between two speeds it goes evenly by ratio
+        logs = np.log(np.maximum(self._unseen, 1e-12))  # interpolate geometrically between speeds
         now = math.exp(np.interp(math.log(self.rpm), np.log(self._speeds), logs))
         self._moving = self._moving or not 1.0 - self.high <= now <= 1.0 - self.low
-        enough = self._enough(logs) if self._moving else self.rpm
+        sufficient = self._sufficient_speed(logs) if self._moving else self.rpm
         if self._limited:
-            enough, within = min(enough, self.rpm * NEAR_LIMIT / rate), LIMITED_S
-        elif enough > self.rpm and rate > BELOW_LIMIT:
-            enough = self.rpm
-        if abs(enough / self.rpm - 1.0) < THERE:
+            sufficient, time_constant = min(sufficient, self.rpm * NEAR_LIMIT / rate), LIMITED_S
+        elif sufficient > self.rpm and rate > BELOW_LIMIT:
+            sufficient = self.rpm
+        if abs(sufficient / self.rpm - 1.0) < SPEED_TOLERANCE:
             self._moving = False
             return None
         largest = self.ramp_rpm_s * seconds
-        step = min(max((enough - self.rpm) * -math.expm1(-seconds / within), -largest), largest)
-        before, self.rpm = self.rpm, min(max(self.rpm + step, self.least_rpm), self.most_rpm)
-        return self.rpm if self.rpm != before else None
+        step = min(max((sufficient - self.rpm) * -math.expm1(-seconds / time_constant), -largest), largest)
+        previous, self.rpm = self.rpm, min(max(self.rpm + step, self.least_rpm), self.most_rpm)
+        return self.rpm if self.rpm != previous else None
 
-    def _enough(self, logs: NDArray[np.float64]) -> float:
-        """The lowest speed with what may be unseen, between those looked at; the best where there is none."""
+    def _sufficient_speed(self, logs: NDArray[np.float64]) -> float:
+        """Return the lowest speed with an acceptable unseen share, interpolated; the best speed if there is none."""
         aim = 0.5 * math.log((1.0 - self.low) * (1.0 - self.high))
         good = np.flatnonzero(logs <= aim)
         k = int(good[0]) if len(good) else int(logs.argmin())
@@ -218,118 +226,127 @@ class SpeedController:
 
 
 class CoverageMeter:
-    """Edge directions seen, window by window."""
+    """Measures the coverage of consecutive windows of events."""
 
     def __init__(self, width: int, height: int) -> None:
-        self._corner = np.array([(width - SIDE) // 2, (height - SIDE) // 2], np.float32)
+        self._corner = np.array([(width - PATCH_SIDE) // 2, (height - PATCH_SIDE) // 2], np.float32)
         self._texture = np.full(DIRECTIONS, np.nan)
         self._end_us = -(1 << 62)
-        self._last: NDArray[np.float64] | None = None
-        self._before: tuple[float, NDArray[np.complex64]] | None = None
-        along = np.exp(-2.0 * (math.pi * np.fft.fftfreq(SIDE)) ** 2).astype(np.float32)
-        self._smooth = along[:, None] * along[None, : SIDE // 2 + 1]
+        self._last_drift: NDArray[np.float64] | None = None
+        self._previous_slice: tuple[float, NDArray[np.complex64]] | None = None
+        along = np.exp(-2.0 * (math.pi * np.fft.fftfreq(PATCH_SIDE)) ** 2).astype(np.float32)
+        self._smooth = along[:, None] * along[None, : PATCH_SIDE // 2 + 1]
 
     def __call__(self, events: Events, start_us: int, end_us: int, path: NDArray[np.float64]) -> Coverage:
-        """The next window's.
+        """Return the coverage of the next window.
 
-        ``events``: compensated, in order, those of ``start_us`` .. ``end_us``; ``path``: see :func:`prism_path`.
-        Raises :class:`AmiwarpError` for windows that are empty or not in order.
+        ``events``: compensated events from ``start_us`` to ``end_us`` [us], in order. ``path``: see
+        :func:`prism_path`. Raises :class:`AmiwarpError` for empty windows, or windows out of order.
         """
         if not self._end_us <= start_us < end_us:
             given = f"window {start_us} .. {end_us} us after one that ended at {self._end_us} us"
-            raise AmiwarpError(f"coverage: {given}; give windows one after the other")
+            raise AmiwarpError(f"coverage: {given}; give windows in order of time")
         seconds, follows = (end_us - start_us) * 1e-6, start_us - self._end_us < SLICE_US
-        before, found = self._last, self._drift(events, end_us)
-        turn = found - before if follows and before is not None and found is not None else np.zeros(2)
+        previous, found = self._last_drift, self._drift(events, end_us)
+        drift_change = found - previous if follows and previous is not None and found is not None else np.zeros(2)
         drift = np.zeros(2) if found is None else found
-        self._end_us, self._last = end_us, found
-        across = (path + _drifted(drift, turn, seconds)) @ NORMALS
-        swing = np.ptp(across, axis=0)
-        self._learn(events, (start_us + end_us) // 2, drift, seconds, across)
+        self._end_us, self._last_drift = end_us, found
+        across = (path + _drift_path(drift, drift_change, seconds)) @ NORMALS
+        travel = np.ptp(across, axis=0)
+        self._update_texture(events, (start_us + end_us) // 2, drift, seconds, across)
         known = np.isfinite(self._texture)
         weight = np.where(known, self._texture, self._texture[known].mean() if known.any() else 1.0)
         weight = weight / weight.sum() if weight.sum() > 0.0 else np.full(DIRECTIONS, 1.0 / DIRECTIONS)
-        return Coverage(float(_seen(swing) @ weight), drift, turn, swing, weight)
+        return Coverage(
+            share=float(_seen_share(travel) @ weight),
+            drift=drift,
+            drift_change=drift_change,
+            travel=travel,
+            texture=weight,
+        )
 
     def _drift(self, events: Events, end_us: int) -> NDArray[np.float64] | None:
-        """Velocity of the image without the prism [px/s]: the shift of this window's end from the last window's.
+        """Return the image velocity without the prism [px/s], from the shift between the last slices of two windows.
 
-        None where none is clear.
+        Returns None if there is no clear shift.
         """
         from scipy import fft
 
         first = int(np.searchsorted(events.t, end_us - SLICE_US))
-        some = slice(first, None, 1 + (len(events) - first) // SLICE_EVENTS)
-        image = self._image(events.x[some], events.y[some])
+        thinned = slice(first, None, 1 + (len(events) - first) // SLICE_EVENTS)
+        image = self._image(events.x[thinned], events.y[thinned])
         spectrum = fft.rfft2(np.minimum(image, 3.0) - image.mean())
         middle = end_us - 0.5 * SLICE_US
-        before, self._before = self._before, (middle, spectrum)
-        if before is None or middle - before[0] > LONGEST_US:
+        previous, self._previous_slice = self._previous_slice, (middle, spectrum)
+        if previous is None or middle - previous[0] > SLICE_GAP_US:
             return None
-        cross = spectrum * np.conj(before[1])
+        cross = spectrum * np.conj(previous[1])
         cross *= self._smooth / np.sqrt(np.abs(cross) + 1e-6)
-        likeness = fft.irfft2(cross, (SIDE, SIDE))
-        row, column = divmod(int(likeness.argmax()), SIDE)
-        if likeness[row, column] < CLEAR * likeness.std():
+        correlation = fft.irfft2(cross, (PATCH_SIDE, PATCH_SIDE))
+        row, column = divmod(int(correlation.argmax()), PATCH_SIDE)
+        if correlation[row, column] < CLEAR_STD * correlation.std():
             return None
         shift = [
-            _signed(column + _summit(likeness[row, (column + np.arange(-1, 2)) % SIDE])),
-            _signed(row + _summit(likeness[(row + np.arange(-1, 2)) % SIDE, column])),
+            _wrapped_shift(column + _peak_offset(correlation[row, (column + np.arange(-1, 2)) % PATCH_SIDE])),
+            _wrapped_shift(row + _peak_offset(correlation[(row + np.arange(-1, 2)) % PATCH_SIDE, column])),
         ]
-        return np.array(shift) * (1e6 / (middle - before[0]))
+        return np.array(shift) * (1e6 / (middle - previous[0]))
 
-    def _learn(
+    def _update_texture(
         self, events: Events, middle_us: int, drift: NDArray[np.float64], seconds: float, across: NDArray[np.float64]
     ) -> None:
-        """Which directions the window's edges have; a direction that nothing moved across itself keeps what it had."""
+        """Update the amount of edges in each direction; directions without travel keep their value."""
         step = 1 + len(events) // WINDOW_EVENTS
-        some = events[::step]
-        later = (some.t - middle_us).astype(np.float32) * np.float32(1e-6)
-        image = self._image(some.x - later * np.float32(drift[0]), some.y - later * np.float32(drift[1]))
-        amount = step * _edges(image) / np.maximum(np.abs(np.diff(across, axis=0)).sum(axis=0), TOLD)
-        moved = np.ptp(across, axis=0) >= TOLD
+        thinned = events[::step]
+        later = (thinned.t - middle_us).astype(np.float32) * np.float32(1e-6)
+        image = self._image(thinned.x - later * np.float32(drift[0]), thinned.y - later * np.float32(drift[1]))
+        amount = (
+            step * _edge_directions(image) / np.maximum(np.abs(np.diff(across, axis=0)).sum(axis=0), TEXTURE_TRAVEL)
+        )
+        moved = np.ptp(across, axis=0) >= TEXTURE_TRAVEL
         old = np.where(np.isfinite(self._texture), self._texture, amount)
         share = 1.0 - math.exp(-seconds / TEXTURE_S)
         self._texture = np.where(moved, old + share * (amount - old), self._texture)
 
     def _image(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32]:
-        """Events per pixel of the image's middle, shape (SIDE, SIDE)."""
+        """Return the number of events per pixel of the central patch, shape (PATCH_SIDE, PATCH_SIDE)."""
         column, row = x - (self._corner[0] - 0.5), y - (self._corner[1] - 0.5)
-        inside = (column >= 0.0) & (column < SIDE) & (row >= 0.0) & (row < SIDE)
-        place = row[inside].astype(np.int64) * SIDE + column[inside].astype(np.int64)
-        return np.bincount(place, minlength=SIDE * SIDE).astype(np.float32).reshape(SIDE, SIDE)
+        inside = (column >= 0.0) & (column < PATCH_SIDE) & (row >= 0.0) & (row < PATCH_SIDE)
+        place = row[inside].astype(np.int64) * PATCH_SIDE + column[inside].astype(np.int64)
+        return np.bincount(place, minlength=PATCH_SIDE * PATCH_SIDE).astype(np.float32).reshape(PATCH_SIDE, PATCH_SIDE)
 
 
-def _edges(image: NDArray[np.float32]) -> NDArray[np.float64]:
-    """How much edge there is by the direction of its normal, shape (n,): blocks by their structure tensors.
+def _edge_directions(image: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the amount of edges by the direction of their normal, shape (n,), from structure tensors of blocks.
 
-    Each counts by the root of the difference of the tensor's eigenvalues, so that specks count for nothing.
+    A block counts with the square root of the difference of its tensor's eigenvalues, so that isolated points, which
+    have no direction, count nothing.
     """
-    padded = np.zeros((SIDE + 2, SIDE + 2), np.float32)
+    padded = np.zeros((PATCH_SIDE + 2, PATCH_SIDE + 2), np.float32)
     padded[1:-1, 1:-1] = image
     rows = padded[:-2] + 2.0 * padded[1:-1] + padded[2:]
     columns = padded[:, :-2] + 2.0 * padded[:, 1:-1] + padded[:, 2:]
     gx, gy = rows[:, 2:] - rows[:, :-2], columns[2:] - columns[:-2]
-    half, skew = 0.5 * _blocks(gx * gx - gy * gy), _blocks(gx * gy)
+    half, skew = 0.5 * _block_sums(gx * gx - gy * gy), _block_sums(gx * gy)
     angle = 0.5 * np.arctan2(skew, half) % math.pi
     place = np.minimum((angle * (DIRECTIONS / math.pi)).astype(np.int64), DIRECTIONS - 1)
     amount = np.sqrt(2.0 * np.hypot(half, skew))
     return np.asarray(np.bincount(place.ravel(), amount.ravel(), DIRECTIONS), np.float64)
 
 
-def _blocks(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sums over blocks."""
+def _block_sums(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the sums over blocks."""
     rows = np.add.reduce([image[k::BLOCK] for k in range(BLOCK)])
     return np.asarray(np.add.reduce([rows[:, k::BLOCK] for k in range(BLOCK)]))
 
 
-def _summit(values: NDArray[np.float32]) -> float:
-    """Where the parabola through three values has its top, from the middle one."""
+def _peak_offset(values: NDArray[np.float32]) -> float:
+    """Return the position of the maximum of the parabola through three values, relative to the middle one."""
     left, middle, right = values.tolist()
     bend = left - 2.0 * middle + right
     return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
 
 
-def _signed(shift: float) -> float:
-    """A shift on the ring of SIDE pixels, the short way."""
-    return (shift + SIDE / 2) % SIDE - SIDE / 2
+def _wrapped_shift(shift: float) -> float:
+    """Return the shortest equivalent of a shift modulo PATCH_SIDE."""
+    return (shift + PATCH_SIDE / 2) % PATCH_SIDE - PATCH_SIDE / 2

@@ -1,4 +1,4 @@
-"""What a session hands on is worked through in threads of its own."""
+"""Background thread that runs a session's jobs for a file, server or other consumer."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from collections.abc import Callable
 from amiwarp.compensation.streams import OVERHEAD
 
 QUEUE_BYTES = 1 << 27
-"""Room between the source and the compensator, and before each file or server [bytes]: about eight million events."""
+"""Memory bound of the queue before the compensator, and of each consumer's queue [bytes]: about 8 million events."""
 LAST_JOB_S = 5.0
-"""Longest wait for the job at work when the others are given up."""
+"""Longest wait for the running job when the others are dropped [s]."""
 
 
 class BackgroundWorker:
-    """Runs jobs one after the other in a background thread. :meth:`put` waits while ``most_bytes`` of them are held.
+    """Runs jobs in order in a background thread. :meth:`put` blocks while the jobs hold ``most_bytes``.
 
-    Each job counts for the bytes it is put with and :data:`~amiwarp.compensation.streams.OVERHEAD`, so that jobs
-    without events are bounded too. A single job larger than the bound still passes, alone.
+    A job counts with its given memory plus :data:`~amiwarp.compensation.streams.OVERHEAD`, so that jobs without events
+    are bounded too. A single job larger than the bound runs alone.
     """
 
     def __init__(self, most_bytes: int = QUEUE_BYTES) -> None:
         self._most_bytes = most_bytes
         self.held_bytes = 0
-        """Memory that the jobs take that wait or are at work [bytes]."""
+        """Memory of the waiting and running jobs [bytes]."""
         self._jobs: deque[tuple[Callable[[], object], int]] = deque()
         self._error: BaseException | None = None
         self._ended = False
         self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name="amiwarp-beside", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="amiwarp-worker", daemon=True)
         self._thread.start()
 
     def put(self, job: Callable[[], object], held_bytes: int = 0) -> None:
-        """Add a job, once there is room. Raises what an earlier job raised; after that no job runs any more."""
+        """Add a job as soon as memory allows. Raises the error of an earlier job; after an error no job runs."""
         count = OVERHEAD + held_bytes
         with self._changed:
             self._changed.wait_for(
@@ -46,14 +46,14 @@ class BackgroundWorker:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Wait until all jobs have run."""
+        """Run all jobs and stop."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
         self._thread.join()
 
     def abandon(self) -> None:
-        """Drop the jobs that wait, and wait for the job at work, at most :data:`LAST_JOB_S`."""
+        """Drop the waiting jobs, and wait for the running job for at most :data:`LAST_JOB_S`."""
         with self._changed:
             self._ended = True
             self._jobs.clear()
@@ -61,7 +61,7 @@ class BackgroundWorker:
         self._thread.join(LAST_JOB_S)
 
     def close(self) -> None:
-        """Wait as :meth:`end` does; raises as :meth:`put`."""
+        """Run all jobs and stop. Raises the error of a job."""
         self.end()
         if self._error is not None:
             raise self._error

@@ -1,6 +1,6 @@
-"""Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB, both optional.
+"""Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB. Both libraries are optional.
 
-Tested with stand-ins for these libraries, not yet with cameras.
+Tested with substitutes for these libraries, not yet with cameras.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.packets import Packet, packet
+from amiwarp.live.stream.packets import Packet, make_packet
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 POLL_S = 0.0005
+"""Pause between two requests for events [s]."""
 IDLE_S = 0.05
-"""Longest time without a packet, empty or not."""
+"""Longest time without a packet [s]. After it, an empty packet is delivered."""
 
 
 def _library(name: str, camera: str, remedy: str) -> Any:
@@ -39,7 +40,7 @@ def _library(name: str, camera: str, remedy: str) -> Any:
 
 @contextlib.contextmanager
 def _named(camera: str, doing: str) -> Iterator[None]:
-    """Whatever a camera's library raises as one line."""
+    """Turn any exception of a camera's library into an :class:`AmiwarpError` of one line."""
     try:
         yield
     except (AmiwarpError, KeyboardInterrupt, SystemExit, GeneratorExit):
@@ -51,7 +52,7 @@ def _named(camera: str, doing: str) -> Iterator[None]:
 
 class _CameraSource:
     camera: Camera | None = None
-    """Not known to the device; its calibration is the user's."""
+    """Unknown: the device does not store its calibration."""
     prism: NominalPrism | None = None
     has_encoder = False
     size: tuple[int, int]
@@ -59,9 +60,9 @@ class _CameraSource:
 
 
 class DvSource(_CameraSource):
-    """An iniVation camera (DVXplorer, DAVIS) by dv-processing 2; None: the first one found.
+    """iniVation camera (DVXplorer, DAVIS) through dv-processing 2; serial number None: the first camera found.
 
-    Rising edges at its signal input come as triggers. Raises :class:`AmiwarpError` without the library or the camera.
+    Rising edges at its signal input become triggers. Raises :class:`AmiwarpError` if library or camera is missing.
     """
 
     def __init__(self, serial: str | None = None, *, packet_us: int = 1000) -> None:
@@ -80,25 +81,25 @@ class DvSource(_CameraSource):
         self._rising = dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE
 
     def packets(self) -> Iterator[Packet]:
-        """See :meth:`Source.packets`; :class:`AmiwarpError` when the camera stops."""
-        given = time.monotonic()
+        """Yield packets, see :meth:`Source.packets`. Raises :class:`AmiwarpError` when the camera stops."""
+        yielded_s = time.monotonic()
         while True:
             with _named(self.name, "stopped"):
                 running = self._camera.isRunning()
                 store, triggers = self._camera.getNextEventBatch(), self._triggers()
             if store is not None or triggers.size:
-                yield packet(monotonic_us(), _dv_events(store), triggers)
-                given = time.monotonic()
+                yield make_packet(monotonic_us(), _dv_events(store), triggers)
+                yielded_s = time.monotonic()
             elif not running:
                 raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
-            elif time.monotonic() - given >= IDLE_S:
-                yield packet(monotonic_us())
-                given = time.monotonic()
+            elif time.monotonic() - yielded_s >= IDLE_S:
+                yield make_packet(monotonic_us())
+                yielded_s = time.monotonic()
             else:
                 time.sleep(POLL_S)
 
     def close(self) -> None:
-        """See :meth:`Source.close`."""
+        """Release the camera, see :meth:`Source.close`."""
         self._camera = None
 
     def _triggers(self) -> NDArray[np.int64]:
@@ -114,15 +115,15 @@ def _dv_events(store: Any) -> Events | None:
 
 
 def _events(x: Any, y: Any, t: Any, p: Any) -> Events:
-    """Columns of a library's rows, whose memory is the library's, as events."""
+    """Copy the columns of a library's rows into events, because the library reuses its memory."""
     return Events(x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), (p > 0).astype(np.uint8))
 
 
 class PropheseeSource(_CameraSource):
-    """A Prophesee camera by Metavision's or OpenEB's Python binding; None: the first one found.
+    """Prophesee camera through Metavision's or OpenEB's Python binding; serial number None: the first camera found.
 
-    Rising edges at its main trigger input come as triggers. A camera that falls silent altogether blocks: the library
-    waits for it. Raises :class:`AmiwarpError` without the library or the camera.
+    Rising edges at its main trigger input become triggers. While the camera sends nothing at all, the library blocks.
+    Raises :class:`AmiwarpError` if library or camera is missing.
     """
 
     def __init__(self, serial: str | None = None, *, packet_us: int = 1000) -> None:
@@ -143,7 +144,7 @@ class PropheseeSource(_CameraSource):
         self.size = (int(width), int(height))
 
     def packets(self) -> Iterator[Packet]:
-        """See :meth:`Source.packets`; :class:`AmiwarpError` when the camera stops."""
+        """Yield packets, see :meth:`Source.packets`. Raises :class:`AmiwarpError` when the camera stops."""
         slices = iter(self._iterator)
         while True:
             with _named(self.name, "stopped"):
@@ -152,10 +153,10 @@ class PropheseeSource(_CameraSource):
             if events is None:
                 raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
             now = monotonic_us()
-            yield packet(now, _events(events["x"], events["y"], events["t"], events["p"]), triggers)
+            yield make_packet(now, _events(events["x"], events["y"], events["t"], events["p"]), triggers)
 
     def close(self) -> None:
-        """See :meth:`Source.close`."""
+        """Release the camera, see :meth:`Source.close`."""
         self._iterator = None
 
     def _triggers(self) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""The camera's clock beside the controller's: from pulses that both saw or, without any, from when things arrived."""
+"""Relation of the camera's clock to the controller's: by common pulses, else by arrival times at the host."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.live.link.clocks import FEWEST, Clock, from_pulses
+from amiwarp.live.link.clocks import FEWEST_PAIRS, ClockMap, fit_to_pulses
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -17,125 +17,127 @@ if TYPE_CHECKING:
     from amiwarp.live.link.link import Link
     from amiwarp.live.stream.packets import Source
 
-PULSES = 100
-"""That are remembered, the last ones."""
-UNPAIRED = 16
-"""Pulses of either side that wait for their other."""
-ALIKE_US = 300.0
-"""Two distances between pulses are the same within this: a pulse's delay varies, and clocks drift by 1e-4 a second."""
-APART_US = 5_000_000
-"""The two reports of one pulse reach the host within this, and within half the time between two pulses [us]."""
-ARRIVALS = 2000
-"""Packets whose delays are remembered: the shortest tells how the camera's clock and the host's lie."""
+MOST_PAIRS = 100
+"""Number of latest pulse pairs in memory."""
+MOST_UNPAIRED = 16
+"""Largest number of unpaired pulses in memory, on either side."""
+MATCH_US = 300.0
+"""Tolerance between the shifts of two pairs [us]: a pulse's delay varies, and clocks drift by 1e-4 per second."""
+REPORTS_US = 5_000_000
+"""Longest time between the two reports of a pulse at the host [us]. Half the interval of the pulses also bounds it."""
+MOST_DELAYS = 2000
+"""Number of latest packets whose delays are in memory. The shortest delay relates the camera's clock to the host's."""
 
 
 def clock_offset(source: Source, link: Link | None) -> float:
-    """Of the encoder that came along with a file [us]: what is recorded has it too, so that calibrations fit both."""
+    """Return the clock offset of a file's own encoder [us], so that a new recording has the same one; 0 with a link."""
     return 0.0 if link is not None else float(getattr(source, "clock_offset_us", 0.0))
 
 
 class CameraClock:
-    """Follows both clocks; :meth:`clock` takes the controller's times to the camera's."""
+    """Relates the clocks of controller and camera."""
 
     def __init__(self) -> None:
-        self._sync: deque[tuple[int, int]] = deque(maxlen=UNPAIRED)  # controller's time, host's
-        self._trigger: deque[tuple[int, int]] = deque(maxlen=UNPAIRED)  # camera's time, host's
-        self._pairs: deque[tuple[int, int]] = deque(maxlen=PULSES)
-        self._ahead: deque[int] = deque(maxlen=ARRIVALS)
-        self._found: Clock | None = None
+        self._sync: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)  # controller's time, host's time
+        self._trigger: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)  # camera's time, host's time
+        self._pairs: deque[tuple[int, int]] = deque(maxlen=MOST_PAIRS)
+        self._delays: deque[int] = deque(maxlen=MOST_DELAYS)
+        self._map: ClockMap | None = None
 
     @property
     def pulses(self) -> int:
-        """Pulses that both clocks saw, of those remembered."""
+        """Number of pulse pairs in memory."""
         return len(self._pairs)
 
     def restart(self) -> None:
-        """The controller's clock began anew: what was known of it is void."""
+        """Forget everything about the controller's clock, because it restarted."""
         self._sync.clear()
         self._pairs.clear()
-        self._found = None
+        self._map = None
 
     def returned(self) -> None:
-        """Forget what is known of the camera's clock: it was away and may have begun anew."""
+        """Forget everything about the camera's clock too, because the camera was lost and returned."""
         self.restart()
         self._trigger.clear()
-        self._ahead.clear()
+        self._delays.clear()
 
     def sync(self, t_us: int, host_us: int) -> None:
-        """The controller sent a pulse at ``t_us`` of its clock; the host heard of it at ``host_us``."""
+        """Add a pulse that the controller sent at its time ``t_us`` and reported to the host at ``host_us`` [us]."""
         self._sync.append((t_us, host_us))
-        self._pair()
+        self._match()
 
     def triggers(self, t_us: ArrayLike, host_us: int) -> None:
-        """The camera saw pulses at ``t_us`` of its clock; the host heard of them at ``host_us``.
+        """Add pulses that the camera recorded at its times ``t_us`` and reported to the host at ``host_us`` [us].
 
-        Of more than :data:`UNPAIRED` at once, the last ones count: no earlier one would still wait.
+        Only the last :data:`MOST_UNPAIRED` of them are used.
         """
-        for t in np.atleast_1d(np.asarray(t_us, np.int64))[-UNPAIRED:].tolist():
+        for t in np.atleast_1d(np.asarray(t_us, np.int64))[-MOST_UNPAIRED:].tolist():
             self._trigger.append((t, host_us))
-            self._pair()
+            self._match()
 
     def packet(self, t_last: int, host_us: int) -> None:
-        """The camera's events up to ``t_last`` arrived at ``host_us``."""
-        self._ahead.append(host_us - t_last)
+        """Note that camera events up to ``t_last`` arrived at ``host_us`` [us]."""
+        self._delays.append(host_us - t_last)
 
-    def clock(self, host: Clock | None) -> Clock | None:
-        """The camera's clock beside the controller's, by pulses; without, by ``host``: the controller's beside it.
+    def clock(self, host: ClockMap | None) -> ClockMap | None:
+        """Return the map from the controller's clock to the camera's, by pulses if possible; None while unknown.
 
-        By the host it is off by the shortest way of the camera's packets, which nothing tells. None while unknown.
+        ``host``: map from the host's clock to the controller's, used without pulses. The result then has an unknown
+        error: the shortest delay of the camera's packets.
         """
-        if self._found is not None or host is None or len(self._ahead) < FEWEST:
-            return self._found
-        ahead = np.array(self._ahead)
-        shortest = int(ahead.min())
-        spread = float(np.median(ahead) - shortest)
+        if self._map is not None or host is None or len(self._delays) < FEWEST_PAIRS:
+            return self._map
+        delays = np.array(self._delays)
+        shortest = int(delays.min())
+        spread = float(np.median(delays) - shortest)
         at = host.at_us + round(host.offset_us)
         return replace(
             host, at_us=at, offset_us=-host.offset_us - shortest, drift=-host.drift,
             offset_std_us=math.hypot(host.offset_std_us, spread),
         )  # fmt: skip
 
-    def _pair(self) -> None:
-        """Finds the one shift of the camera's clock under which pulses meet, and takes the pairs out."""
+    def _match(self) -> None:
+        """Find the common shift between the two clocks, and move the pulses that match under it to the pairs."""
         if not (self._sync and self._trigger):
             return
         t, s = (np.array(pulses, np.int64) for pulses in (self._trigger, self._sync))
-        if self._found is not None:
-            meet = np.abs(t[:, None, 0] - self._found(s[:, 0])[None, :]) <= ALIKE_US
+        if self._map is not None:
+            matches = np.abs(t[:, None, 0] - self._map(s[:, 0])[None, :]) <= MATCH_US
         else:
-            meet = _first_meeting(t, s)
-        where = np.argwhere(meet)
-        if not len(where):
-            if self._found is not None and min(len(t), len(s)) == UNPAIRED:
-                self._found = None  # one of the clocks jumped
+            matches = _first_matches(t, s)
+        indices = np.argwhere(matches)
+        if not len(indices):
+            if self._map is not None and min(len(t), len(s)) == MOST_UNPAIRED:
+                self._map = None  # one of the clocks jumped
                 self._pairs.clear()
             return
-        pairs = {int(j): int(i) for i, j in where}
+        pairs = {int(j): int(i) for i, j in indices}
         self._pairs.extend((int(s[j, 0]), int(t[i, 0])) for j, i in sorted(pairs.items()))
         last_t, last_s = max(pairs.values()), max(pairs)
-        self._trigger = deque(list(self._trigger)[last_t + 1 :], UNPAIRED)
-        self._sync = deque(list(self._sync)[last_s + 1 :], UNPAIRED)
-        if len(self._pairs) >= FEWEST:
+        self._trigger = deque(list(self._trigger)[last_t + 1 :], MOST_UNPAIRED)
+        self._sync = deque(list(self._sync)[last_s + 1 :], MOST_UNPAIRED)
+        if len(self._pairs) >= FEWEST_PAIRS:
             own, other = np.array(self._pairs).T
-            self._found = from_pulses(own, other)
+            self._map = fit_to_pulses(own, other)
 
 
-def _first_meeting(trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which pairs of pulses share the shift between their clocks, three or more; shape (triggers, syncs).
+def _first_matches(trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which pulses match under the most plausible shift between the clocks, shape (triggers, syncs).
 
-    Pulses at even distances meet under many shifts: theirs is where they were heard of at the same time. Reports come
-    late, many at once where the host was busy, but never early: the promptest of either side tell, where three agree.
+    At least three pairs must match. Pulses at regular intervals match under many shifts: the shift is chosen under
+    which the two reports of a pulse arrive at the same time. Reports may be late, in bursts if the host was busy, but
+    never early: so the reports with the shortest delay decide, if there are three of them on both sides.
     """
-    apart = trigger[:, None, 0] - sync[None, :, 0]
-    intervals = np.concatenate([np.diff(trigger[:, 0]), np.diff(sync[:, 0]), [2 * APART_US]])
-    reach, best = int(intervals.min()) // 2, np.zeros(apart.shape, np.bool_)
+    shift = trigger[:, None, 0] - sync[None, :, 0]
+    intervals = np.concatenate([np.diff(trigger[:, 0]), np.diff(sync[:, 0]), [2 * REPORTS_US]])
+    reach, best = int(intervals.min()) // 2, np.zeros(shift.shape, np.bool_)
     delays = trigger[:, 1] - trigger[:, 0], sync[:, 1] - sync[:, 0]
-    if any(np.count_nonzero(some <= some.min() + reach) < FEWEST for some in delays):
+    if any(np.count_nonzero(some <= some.min() + reach) < FEWEST_PAIRS for some in delays):
         return best
-    away = np.abs(apart - (delays[1].min() - delays[0].min()))
+    disagreement = np.abs(shift - (delays[1].min() - delays[0].min()))
     nearest = reach
-    for i, j in np.argwhere(away <= reach):
-        meet = np.abs(apart - apart[i, j]) <= ALIKE_US
-        if meet.any(axis=0).sum() >= FEWEST and away[i, j] <= nearest:
-            best, nearest = meet, int(away[i, j])
+    for i, j in np.argwhere(disagreement <= reach):
+        matches = np.abs(shift - shift[i, j]) <= MATCH_US
+        if matches.any(axis=0).sum() >= FEWEST_PAIRS and disagreement[i, j] <= nearest:
+            best, nearest = matches, int(disagreement[i, j])
     return best

@@ -1,4 +1,4 @@
-"""An emulated camera beside an emulated controller: a recording played to who connects, with the pulses of both."""
+"""Emulated camera for the emulated controller: serves a recording's events, with triggers at the sync pulses."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ if TYPE_CHECKING:
     from amiwarp.live.link.emulator import Controller
     from amiwarp.live.link.rotors import Played
 
-STEP_US, LATE_STEP_S = 2000, 2e-4
-"""Events that are sent together, by their time; and how often one looks again whether who is behind has room."""
+STEP_US, RETRY_S = 2000, 2e-4
+"""Duration of an event packet [us], and interval between attempts to send while a client is slow [s]."""
 LEAD_US = 1_000_000
-"""From the first client to the first event: time for pulses that tie the clocks."""
-NEVER = 1 << 60
+"""Time from the first client to the first event [us], for sync pulses that relate the clocks."""
+NEVER_US = 1 << 60
+"""Start time of an emulation that has not begun [us]."""
 
 
 class EmulatedCamera:
-    """Serves a recording's events at their own pace, and triggers at the controller's sync pulses.
+    """Serves a recording's events at their recorded pace, and triggers at the controller's sync pulses.
 
-    It begins, and ``rotor`` with it, when the first client has come. Where reading, sending or a client is slower than
-    the recording was, events are sent late, and none is lost. ``now_us``: the world's time, the controller's.
-    Raises :class:`AmiwarpError` for a recording without encoder or events, or an address that is taken.
+    Camera and ``rotor`` begin once the first client connects. If reading, sending or a client is slower than the
+    recording, events are sent late, but none is lost. ``now_us``: emulation time [us], shared with the controller.
+    Raises :class:`AmiwarpError` for a recording without encoder or events, or an address in use.
     """
 
     def __init__(
@@ -39,20 +40,22 @@ class EmulatedCamera:
     ) -> None:
         encoder, events = recording.encoder, recording.events
         if encoder is None or not len(events):
-            raise AmiwarpError(f"{recording.name}: has no {'events' if encoder else 'encoder'}; give one that has")
+            raise AmiwarpError(
+                f"{recording.name}: has no {'events' if encoder else 'encoder'}; give a recording with both"
+            )
         self._events, self._rotor, self._controller, self._now_us = events, rotor, controller, now_us
         self._origin = round(int(encoder.t[0]) - encoder.clock_offset_us)
-        """On the events' clock when the rotor begins."""
-        rotor.begin(NEVER)
-        self._start, self._told_us = NEVER, -1
+        """Time on the events' clock at which the rotor begins [us]."""
+        rotor.begin(NEVER_US)
+        self._start, self._pulses_until_us = NEVER_US, -1
         self.late_us = 0
-        """By how much events were sent late at most."""
+        """Largest delay of events so far [us]."""
         self._sink = SocketSink(address, encode_hello(*events.size, recording.camera, recording.prism))
         self.address = self._sink.address
         self._ended = threading.Event()
         self.done = threading.Event()
-        """Set when all has been sent, or the recording cannot be read any further."""
-        self._failed: Exception | None = None
+        """Set when everything was sent, or the recording cannot be read further."""
+        self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="amiwarp-camera", daemon=True)
         self._thread.start()
 
@@ -65,18 +68,18 @@ class EmulatedCamera:
         self.close()
 
     def close(self) -> None:
-        """End it, and the stream of whoever listens. Raises what reading the recording raised."""
+        """Stop the emulation and end its stream. Raises the error of a failed recording."""
         self._ended.set()
         self._thread.join()
-        failed, self._failed = self._failed, None
-        if failed is not None:
-            raise failed
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
 
     def _run(self) -> None:
         try:
             self._play()
         except Exception as error:
-            self._failed = error
+            self._failure = error
             self.done.set()
 
     def _play(self) -> None:
@@ -88,27 +91,27 @@ class EmulatedCamera:
             self._start = self._now_us() + LEAD_US
             self._rotor.begin(self._start)
             for block in self._events.blocks(duration_us=STEP_US):
-                while (early := int(block.t[-1]) - self._time(self._now_us())) >= 0 or self._sink.waiting:
-                    if self._pause(min(early, STEP_US) * 1e-6 if early > 0 else LATE_STEP_S):
+                while (ahead_us := int(block.t[-1]) - self._time(self._now_us())) >= 0 or self._sink.waiting:
+                    if self._pause(min(ahead_us, STEP_US) * 1e-6 if ahead_us > 0 else RETRY_S):
                         return
-                self.late_us = max(self.late_us, -early)
+                self.late_us = max(self.late_us, -ahead_us)
                 self._sink.send(encode_events(block))
             while self._sink.waiting:
-                if self._pause(LATE_STEP_S):
+                if self._pause(RETRY_S):
                     return
         self.done.set()
 
     def _pause(self, seconds: float) -> bool:
-        """Waits, then sends what pulses there were and what waits; whether it is to end."""
+        """Wait, then send the new triggers and the waiting packets; return True if the camera was closed."""
         if self._ended.wait(seconds):
             return True
-        # by their time: a controller that was reset counts its pulses from 0 again
-        pulses = [world for _, world in list(self._controller.pulses) if world > self._told_us]
+        # Select pulses by time, not by number: after a reset the controller numbers them from 0 again.
+        pulses = [world for _, world in list(self._controller.pulses) if world > self._pulses_until_us]
         if pulses:
-            self._told_us = pulses[-1]
+            self._pulses_until_us = pulses[-1]
         self._sink.send(encode_triggers(np.array([self._time(world) for world in pulses], np.int64)))
         return False
 
     def _time(self, world_us: int) -> int:
-        """On the camera's clock."""
+        """Return a time on the camera's clock [us]."""
         return world_us - self._start + self._origin

@@ -1,4 +1,4 @@
-"""A stream handed on as it came: events and encoder samples, to whoever connects."""
+"""Forwarding of a stream's events and encoder samples to a sink, unchanged."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 class Forward:
-    """Takes what a :class:`LiveWriter` takes, and sends it."""
+    """Sends events and encoder samples to a sink. It has the methods of a :class:`LiveWriter`."""
 
     def __init__(self, sink: SocketSink | PipeSink) -> None:
         self._sink = sink
 
     def append(self, events: Events) -> None:
-        """A sensor's events."""
+        """Send a sensor's events."""
         self._sink.send(encode_events(events))
 
     def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
-        """Samples on the events' clock; index pulses are in the angles."""
+        """Send samples on the events' clock. The angles already include the index pulses."""
         self._sink.send(encode_encoder(t_us, angle))
 
     def tick(self) -> None:
-        """Goes on with what waits."""
+        """Let the sink continue to send the waiting packets."""
         self._sink.tick()

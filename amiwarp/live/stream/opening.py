@@ -1,4 +1,4 @@
-"""Sources of live events by their names."""
+"""Opening of live sources by name."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def open_source(
 ) -> Source:
     """Open a source by its name.
 
-    FILE: a recording, ``pace`` times as fast as it was (None: as fast as it can be read), in packets of ``packet_us``.
-    ``-``, ``tcp:HOST:PORT``, ``unix:PATH``: a stream of packets (``docs/stream-format.md``); ``tcp-listen:HOST:PORT``,
-    ``unix-listen:PATH`` wait for its sender. ``dv`` or ``dv:SERIAL``, ``prophesee`` or ``prophesee:SERIAL``: a camera.
-    ``wait_s``: how long the sender of a socket is waited for when its stream broke off [s]; ``say`` then gets a
-    sentence.
-    Raises :class:`AmiwarpError` for a source that cannot be opened, or not waited for.
+    The name of a file replays a recording at ``pace`` times its speed (None: as fast as possible), in packets of
+    ``packet_us`` [us]. ``-``, ``tcp:HOST:PORT`` and ``unix:PATH`` read a stream (``docs/reference/stream-format.md``);
+    ``tcp-listen:HOST:PORT`` and ``unix-listen:PATH`` wait for its sender to connect. ``dv``, ``dv:SERIAL``,
+    ``prophesee`` and ``prophesee:SERIAL`` open a camera. ``wait_s``: how long to wait for the sender of a socket to
+    return after its stream broke off [s]; ``say`` then gets messages.
+    Raises :class:`AmiwarpError` if the source cannot be opened, or if ``wait_s`` is given for other than a socket.
     """
     kind, _, rest = spec.partition(":")
     if wait_s > 0.0:
         return ReturningSource(spec, wait_s, say)
     if spec == "-":
-        # past the buffer of sys.stdin, and without closing the descriptor at the end
+        # Read the descriptor directly, without the buffer of sys.stdin, and leave it open at the end.
         return StreamSource("standard input", open(0, "rb", buffering=0, closefd=False))
     if kind in SOCKETS:
         return open_stream(spec)

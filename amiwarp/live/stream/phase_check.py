@@ -1,4 +1,4 @@
-"""A watch beside a stream: looks from time to time whether the prism's phase is still what it was."""
+"""Check during a stream that the prism's phase has not changed since the calibration."""
 
 from __future__ import annotations
 
@@ -19,115 +19,124 @@ from amiwarp.events.recording import Recording
 
 if TYPE_CHECKING:
     from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder, EncoderStream
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.encoder_stream import EncoderStream
 
-REACH = math.radians(20.0)
-"""A phase further off is not sought: then the answer lies at the edge, and is further off than anyone bears anyway."""
-MUCH, FAR = math.radians(1.5), math.radians(5.0)
-"""Changes since the first look, and distances from the calibrated phase, that are told; its bias is up to 3 deg."""
-LEAST = 20_000
-"""Events, and at least half a turn of them, without which nothing is said."""
+SEARCH_RAD = math.radians(20.0)
+"""Range of the search around the calibrated phase [rad]. A phase beyond it is found at its edge and reported anyway."""
+CHANGE_RAD, OFFSET_RAD = math.radians(1.5), math.radians(5.0)
+"""Change since the first estimate, and offset from the calibrated phase, that are reported [rad]. The bias of the
+estimate is up to 3 deg."""
+FEWEST_EVENTS = 20_000
+"""Smallest number of events for an estimate. They must also cover half a turn."""
 MOST_BYTES = 1 << 24
-"""Memory of the events that are remembered, the last ones: about a million."""
+"""Memory bound of the latest events [bytes]: about a million events."""
 EVALUATIONS = 40
+"""Number of evaluations of the sharpness."""
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
-    """What was found."""
+class PhaseEstimate:
+    """Estimate of the prism's phase."""
 
-    away: float
-    """From the calibrated phase [rad]."""
+    offset: float
+    """Offset from the calibrated phase [rad]."""
     std: float
-    """[rad]"""
+    """Standard deviation [rad]."""
 
 
 class PhaseCheck:
-    """Finds the phase anew by sharpness, on the CPU and in a thread of its own; give it what the compensator gets.
+    """Estimates the phase repeatedly by sharpness, on the CPU in a background thread.
 
-    Sharpness has a bias that the sensor gives it, so what counts is the change since the first look.
+    It needs the events that the compensator gets. The sharpness has a bias that depends on the sensor. Therefore the
+    change since the first estimate is judged.
     """
 
     def __init__(self, calibration: Calibration, every_s: float, say: Callable[[str], None]) -> None:
-        """``say`` gets a sentence where the phase has changed."""
+        """``every_s``: interval between estimates [s]; ``say`` gets a sentence when the phase has changed."""
         self._calibration, self._every_s, self._say = calibration, every_s, say
         self._due, self._closed = 0.0, False
         self._recent: deque[Events] = deque()
         self.held_bytes = 0
-        """Memory that these take [bytes]."""
+        """Memory of the latest events [bytes]."""
         self._thread: threading.Thread | None = None
-        self._found: Phase | None = None
-        self._first: Phase | None = None
-        self._away: float | None = None
-        self._told: float | None = None
+        self._estimated: PhaseEstimate | None = None
+        self._first_estimate: PhaseEstimate | None = None
+        self._offset: float | None = None
+        self._reported: float | None = None
 
-    def look(self, encoder: EncoderStream) -> float | None:
-        """Starts a look where it is time; what the last one found, from the calibrated phase [rad], None before it."""
-        found = self.result()
-        if found is not None:
-            self._first = self._first or found
-            self._away = found.away
-            self._judge(found, self._first)
-        if time.monotonic() >= self._due and self.begin(encoder):
+    def update(self, encoder: EncoderStream) -> float | None:
+        """Start an estimate if one is due. Return the latest offset from the calibrated phase [rad], None at first."""
+        estimate = self.result()
+        if estimate is not None:
+            self._first_estimate = self._first_estimate or estimate
+            self._offset = estimate.offset
+            self._report(estimate, self._first_estimate)
+        if time.monotonic() >= self._due and self.start_check(encoder):
             self._due = time.monotonic() + self._every_s
-        return self._away
+        return self._offset
 
-    def _judge(self, found: Phase, first: Phase) -> None:
-        changed = found.away - first.away
-        if self._told is not None and abs(found.away - self._told) < MUCH:
+    def _report(self, estimate: PhaseEstimate, first: PhaseEstimate) -> None:
+        """Report a large offset from the calibrated phase, or a significant change since the first estimate."""
+        changed = estimate.offset - first.offset
+        if self._reported is not None and abs(estimate.offset - self._reported) < CHANGE_RAD:
             return
-        self._told = None
-        if abs(found.away) > FAR:
-            self._told = found.away
-            self._say(f"the phase is {math.degrees(found.away):+.1f} deg from the calibrated one: calibrate anew")
-        elif abs(changed) > max(MUCH, 4.0 * math.hypot(found.std, first.std)):
-            self._told = found.away
-            since = f"since the first look, {math.degrees(found.away):+.1f} from the calibrated one"
-            self._say(f"the phase has moved by {math.degrees(changed):+.1f} deg {since}: has the index slipped?")
+        self._reported = None
+        if abs(estimate.offset) > OFFSET_RAD:
+            self._reported = estimate.offset
+            offset = f"{math.degrees(estimate.offset):+.1f} deg"
+            self._say(f"the phase differs from the calibrated one by {offset}: calibrate again")
+        elif abs(changed) > max(CHANGE_RAD, 4.0 * math.hypot(estimate.std, first.std)):
+            self._reported = estimate.offset
+            since = f"since the first check, to {math.degrees(estimate.offset):+.1f} deg from the calibrated one"
+            self._say(f"the phase has moved by {math.degrees(changed):+.1f} deg {since}: has the index pulse slipped?")
 
     def put(self, events: Events) -> None:
-        """Events as the sensor gave them."""
+        """Add events of the sensor."""
         self._recent.append(events)
         self.held_bytes += held_bytes(events)
         while self.held_bytes - held_bytes(self._recent[0]) > MOST_BYTES:
             self.held_bytes -= held_bytes(self._recent.popleft())
 
-    def begin(self, encoder: EncoderStream) -> bool:
-        """Starts a look at the last turn, unless one is under way or there is too little; whether it did."""
+    def start_check(self, encoder: EncoderStream) -> bool:
+        """Start an estimate from the last turn. Return False if one is running or the data do not suffice."""
         last = encoder.last
         if self._closed or self._thread is not None or last is None or not self._recent:
             return False
         events = Events.concatenate(list(self._recent))
         events = events[: int(events.t.searchsorted(last, side="right"))]
-        if len(events) < LEAST:
+        if len(events) < FEWEST_EVENTS:
             return False
         samples = encoder.over(int(events.t[0]), int(events.t[-1]))
         speed = abs(samples.rpm) * TURN / 60e6
         begin = int(events.t[-1]) - round(1.2 * TURN / speed) if speed else int(events.t[0])
         events = events[int(events.t.searchsorted(begin)) :]
         swept = speed * float(events.t[-1] - events.t[0]) if len(events) else 0.0
-        if len(events) < LEAST or swept < TURN / 2.0 or encoder.guessed(events.t).any():
+        if len(events) < FEWEST_EVENTS or swept < TURN / 2.0 or encoder.guessed(events.t).any():
             return False
-        self._thread = threading.Thread(target=self._look, args=(events, samples), name="amiwarp-watch", daemon=True)
+        self._thread = threading.Thread(
+            target=self._estimate, args=(events, samples), name="amiwarp-phase-check", daemon=True
+        )
         self._thread.start()
         return True
 
-    def result(self) -> Phase | None:
-        """What the last look found, once; None while there is nothing new."""
+    def result(self) -> PhaseEstimate | None:
+        """Return a new estimate once; None if there is none."""
         if self._thread is None or self._thread.is_alive():
             return None
         self._thread.join()
         self._thread = None
-        found, self._found = self._found, None
-        return found
+        estimate, self._estimated = self._estimated, None
+        return estimate
 
     def close(self) -> None:
-        """Waits for a look that is under way; there is no other."""
+        """Wait for a running estimate; start no other."""
         self._closed = True
         if self._thread is not None:
             self._thread.join()
 
-    def _look(self, events: Events, encoder: Encoder) -> None:
+    def _estimate(self, events: Events, encoder: Encoder) -> None:
+        """Estimate the phase by a calibration in which everything else is fixed."""
         known = self._calibration
         phase = known.parameters["phase"]
         recording = Recording(MemoryEvents(events, known.camera.width, known.camera.height), known.camera, encoder,
@@ -136,9 +145,9 @@ class PhaseCheck:
         try:
             found = calibrate(
                 recording, model=known.model_name, free=("phase",), start=start, stages=("sharpness",), events=100_000,
-                bounds={"phase": (phase - REACH, phase + REACH)}, global_evaluations=EVALUATIONS,
+                bounds={"phase": (phase - SEARCH_RAD, phase + SEARCH_RAD)}, global_evaluations=EVALUATIONS,
                 local_algorithm="LN_SBPLX", device="cpu",
             )  # fmt: skip
         except AmiwarpError:
-            return  # no texture, say: the next look may see more
-        self._found = Phase(found.parameters["phase"] - phase, found.uncertainty["phase"])
+            return  # for example without texture: a later estimate may succeed
+        self._estimated = PhaseEstimate(found.parameters["phase"] - phase, found.uncertainty["phase"])

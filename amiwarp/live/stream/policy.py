@@ -1,14 +1,14 @@
-"""The policy of a full queue."""
+"""Policies for a full queue."""
 
 import enum
 
 
 class Policy(enum.StrEnum):
-    """What a queue does that is full."""
+    """What a full queue does with further events."""
 
     BLOCK = "block"
-    """The source waits, and with it whoever sends: nothing is lost here."""
+    """Make the source and its sender wait. No event is lost here."""
     DROP_OLDEST = "drop-oldest"
-    """The events that have waited longest go: what comes out is late by no more than the queue is long."""
+    """Drop the oldest events. The size of the queue then bounds the delay."""
     THIN = "thin"
-    """Events are left out evenly, so that all places and times are still seen."""
+    """Drop events evenly, so that all pixels and times remain represented."""

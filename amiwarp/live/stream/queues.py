@@ -1,4 +1,4 @@
-"""A queue of packets, bounded in events and in bytes, between a source and a consumer."""
+"""Queue of packets between a source and a consumer, bounded in events and in memory."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Packet
 
 THIN_FROM = 0.5
-"""Fill from which on events are thinned, the more the fuller the queue is."""
+"""Fill level above which :attr:`Policy.THIN` drops events; it drops more as the queue fills."""
 
 
 class PacketQueue:
-    """Hold at most ``most_events`` and ``most_bytes``, whichever is less.
+    """Bounded queue of packets: at most ``most_events`` events and ``most_bytes`` bytes.
 
-    The policy decides over events alone: triggers and encoder samples are never dropped. If these alone fill the bytes,
-    the source waits under every policy. A single packet larger than the bounds still passes, alone.
-    For one thread that puts and one that gets. Raises :class:`AmiwarpError` for a size under 1.
+    The policy applies to events only: triggers and encoder samples are never dropped. If these alone fill the memory,
+    the source waits under every policy. A single packet larger than the bounds passes alone.
+    One thread may put and one may get. Raises :class:`AmiwarpError` for a size below 1.
     """
 
     def __init__(self, most_events: int, policy: Policy, most_bytes: int = QUEUE_BYTES) -> None:
@@ -34,42 +34,42 @@ class PacketQueue:
         self.most_bytes = whole(most_bytes, "queue's most_bytes", 1, 1 << 40)
         self.policy = choice(Policy, policy, "policy")
         self.received = self.dropped = 0
-        """Events put, and those of them that never come out."""
+        """Number of events put, and number of them dropped."""
         self._packets: deque[Packet] = deque()
         self._held = 0
-        self._spent = 0
-        """Packets at the front whose events were dropped."""
+        self._emptied = 0
+        """Number of packets at the front whose events were dropped."""
         self.held_bytes = 0
-        """Memory that the packets take [bytes], see :attr:`Packet.held_bytes`."""
+        """Memory of the packets [bytes], see :attr:`Packet.held_bytes`."""
         self._phase = 0.0
         self._closed = False
         self._changed = threading.Condition()
 
     @property
     def held(self) -> int:
-        """Events that wait in it."""
+        """Number of waiting events."""
         return self._held
 
     @property
     def fill(self) -> float:
-        """Share of the room that is taken; above 1 while a single packet is larger than all of it."""
+        """Fill level, 0 .. 1; above 1 while a single packet is larger than the bounds."""
         return self._share(self._held, self.held_bytes)
 
     @property
     def ended(self) -> bool:
-        """Whether it was closed and all has come out."""
+        """Whether the queue is closed and empty."""
         with self._changed:
             return self._closed and not self._packets
 
     def put(self, packet: Packet) -> None:
-        """Take a packet once there is room, which dropping makes if the policy says so, or the queue is closed."""
+        """Add a packet once it fits or the queue is closed. The policy may drop events to make it fit."""
         with self._changed:
             self.received += len(packet.events)
             if self.policy is Policy.THIN:
                 packet = self._thinned(packet)
             while self.policy is Policy.DROP_OLDEST and self._held and not self._fits(packet):
                 self._drop_oldest()
-            if packet.bare:  # a source's sign of life: nothing to consume
+            if packet.empty:  # an empty packet only shows that the source is alive
                 return
             self._changed.wait_for(lambda: not self._packets or self._fits(packet) or self._closed)
             self._packets.append(packet)
@@ -78,20 +78,20 @@ class PacketQueue:
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> Packet | None:
-        """The next packet, or None where none came in time or the queue has ended."""
+        """Return the next packet; None on time-out or if the queue has ended."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._packets) or self._closed, timeout_s)
             if not self._packets:
                 return None
             packet = self._packets.popleft()
-            self._spent = max(0, self._spent - 1)
+            self._emptied = max(0, self._emptied - 1)
             self._held -= len(packet.events)
             self.held_bytes -= packet.held_bytes
             self._changed.notify_all()
             return packet
 
     def close(self) -> None:
-        """Nothing more comes; what is held can still be got."""
+        """Close the queue: no more packets are expected. Those held can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -103,18 +103,18 @@ class PacketQueue:
         return max(events / self.most_events, held_bytes / self.most_bytes)
 
     def _drop_oldest(self) -> None:
-        """Empty the first packet that has events; what else it carries stays."""
-        while not len(self._packets[self._spent].events):
-            self._spent += 1
-        packet = self._packets[self._spent]
+        """Drop the events of the first packet that has any; keep its triggers and encoder samples."""
+        while not len(self._packets[self._emptied].events):
+            self._emptied += 1
+        packet = self._packets[self._emptied]
         self._held -= len(packet.events)
         self.dropped += len(packet.events)
         rest = replace(packet, events=Events.empty())
-        self.held_bytes -= packet.held_bytes - (0 if rest.bare else rest.held_bytes)
-        if rest.bare:
-            del self._packets[self._spent]
+        self.held_bytes -= packet.held_bytes - (0 if rest.empty else rest.held_bytes)
+        if rest.empty:
+            del self._packets[self._emptied]
         else:
-            self._packets[self._spent] = rest
+            self._packets[self._emptied] = rest
 
     def _thinned(self, packet: Packet) -> Packet:
         n = len(packet.events)

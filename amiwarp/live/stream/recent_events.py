@@ -1,4 +1,4 @@
-"""The last seconds of a stream in memory, as a recording at any moment."""
+"""The last seconds of a stream in memory, available as a recording at any time."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 SECONDS, MOST_BYTES = 2.0, 1 << 27
-"""Kept of events, whichever is less: about eight million. Samples may take as many bytes again."""
+"""Bounds of the events kept: their duration [s] and their memory, about eight million events. Encoder samples have a
+memory bound of the same size."""
 FIRST_S = 15.0
-"""Longest wait for the first turn."""
+"""Longest wait for the first turn of the prism [s]."""
 
 
 class RecentEvents:
-    """Takes what a :class:`LiveWriter` takes; for one thread that appends and any that ask."""
+    """Keeps the latest events and encoder samples. One thread may append while others call :meth:`recording`."""
 
     def __init__(self, source: Source, camera: Camera | None = None, prism: NominalPrism | None = None) -> None:
         self._size, self._name = source.size, source.name
@@ -42,11 +43,11 @@ class RecentEvents:
         self._events: deque[Events] = deque()
         self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self.event_bytes = self.sample_bytes = 0
-        """Memory that events and samples take [bytes]."""
+        """Memory of the events and of the encoder samples [bytes]."""
         self._lock = threading.Lock()
 
     def append(self, events: Events) -> None:
-        """Events in order."""
+        """Append events, in order of time."""
         with self._lock:
             self._events.append(events)
             self.event_bytes += held_bytes(events)
@@ -55,7 +56,7 @@ class RecentEvents:
                 self.event_bytes -= held_bytes(self._events.popleft())
 
     def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
-        """Samples in order, on the events' clock; index pulses are in the angles."""
+        """Append samples in order of time, on the events' clock. The angles already include the index pulses."""
         if len(t_us):
             with self._lock:
                 self._samples.append((t_us, angle))
@@ -66,10 +67,10 @@ class RecentEvents:
                     self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
 
     def tick(self) -> None:
-        """Nothing waits here."""
+        """Do nothing: no data wait here."""
 
     def recording(self) -> Recording | None:
-        """What the encoder covers of it; None while that is under a turn."""
+        """Return the part that the encoder covers; None if it is shorter than one turn."""
         with self._lock:
             events, samples = list(self._events), list(self._samples)
         if not samples or not events:
@@ -78,7 +79,8 @@ class RecentEvents:
         if len(t) < 2:
             return None
         joined = Events.concatenate(events)
-        since = max(min(int(np.searchsorted(t, joined.t[0])) - 2, len(t) - 2), 0)  # its speed is that of the events
+        # Encoder samples from before the events would distort the mean speed.
+        since = max(min(int(np.searchsorted(t, joined.t[0])) - 2, len(t) - 2), 0)
         encoder = Encoder(t[since:], angle[since:])
         first, last = np.searchsorted(joined.t, encoder.coverage)
         covered = joined[first:last]
@@ -88,34 +90,35 @@ class RecentEvents:
 
 
 @contextlib.contextmanager
-def followed(source: Source, link: Link | None, ring: RecentEvents, say: Callable[[str], None]) -> Iterator[None]:
-    """Fills the ring from a source, in a thread, for as long as the ``with`` block lasts.
+def followed(source: Source, link: Link | None, recent: RecentEvents, say: Callable[[str], None]) -> Iterator[None]:
+    """Fill ``recent`` from a source, in a background thread, during the ``with`` block.
 
-    Waits for the first turn. Raises :class:`AmiwarpError` where none comes in time, or what the source raised.
+    Waits for the first turn of the prism. Raises :class:`AmiwarpError` if it does not come in time, or the error of the
+    source.
     """
-    stop, failed = threading.Event(), []
+    stop, failures = threading.Event(), []
 
     def run() -> None:
-        session = Session(source, link=link, raw=[ring], policy=Policy.DROP_OLDEST, say=say)
+        session = Session(source, link=link, raw=[recent], policy=Policy.DROP_OLDEST, say=say)
         try:
             ended = session.run(stop, lambda status: None)
             problem = getattr(source, "problem", None)
             how = "has ended" if problem is None else f"broke off: {problem}"
-            say(f"{source.name}: the stream {how}; what is shown are the last of its {ended.events:,} events")
+            say(f"{source.name}: the stream {how}; the last of its {ended.events:,} events are shown")
         except Exception as error:
-            failed.append(error)
+            failures.append(error)
             say(str(error))
 
     thread = threading.Thread(target=run, name="amiwarp-follow", daemon=True)
     thread.start()
     try:
         until = time.monotonic() + FIRST_S
-        while ring.recording() is None:
+        while recent.recording() is None:
             if not thread.is_alive() or time.monotonic() > until:
                 how = f"in {FIRST_S:g} s" if thread.is_alive() else "before the stream ended"
                 problem = getattr(source, "problem", None)
                 why = "" if problem is None else f": it broke off, {problem}"
-                raise failed[0] if failed else AmiwarpError(f"{source.name}: gave no whole turn {how}{why}")
+                raise failures[0] if failures else AmiwarpError(f"{source.name}: delivered no whole turn {how}{why}")
             time.sleep(0.05)
         yield
     finally:

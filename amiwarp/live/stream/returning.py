@@ -1,4 +1,4 @@
-"""A stream over a socket whose sender may go away and come back."""
+"""Stream over a socket that continues when a lost sender returns."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.packets import packet
-from amiwarp.live.stream.sockets import Unreachable, accepting, connecting
-from amiwarp.live.stream.sources import HELLO_S, StreamSource, from_connection, open_stream
+from amiwarp.live.stream.connections import Unreachable, iter_accepted, iter_connected
+from amiwarp.live.stream.packets import make_packet
+from amiwarp.live.stream.sources import HELLO_S, StreamSource, open_connection, open_stream
 
 if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Packet
 
 LATE_US = 10_000
-"""By which a returning sender's first event may be before the last one: as much as is put in order."""
+"""Largest step backwards of the event time when a sender returns [us]: events within it are sorted."""
 CLOCK_US = 2_000_000
-"""Difference between the camera's and the host's time over a gap from which on it is said."""
+"""Difference between the camera's and the host's duration of a gap above which a message warns the user [us]."""
 
 
 SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
@@ -27,18 +27,18 @@ SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
 
 
 class ReturningSource:
-    """A stream that is opened again when it broke off, for as long as its sender is back within ``wait_s`` [s].
+    """Stream that is opened again after a break, if its sender returns within ``wait_s`` [s].
 
-    The sender must be the same camera, and its clock must have gone on: events that begin before the last one raise
-    :class:`AmiwarpError`, because no order of the two parts would be true. ``say`` gets a sentence when the stream
-    breaks off, when it is back, and when the camera's clock does not fit the host's over the gap.
-    Raises :class:`AmiwarpError` for a source other than a socket, or a sender that is not there at first.
+    The sender must be the same camera, and its clock must have continued. Otherwise events of the two parts could not
+    be ordered, and :class:`AmiwarpError` is raised. ``say`` gets a sentence when the stream breaks off, when it
+    returns, and when the durations of the gap on the camera's and the host's clock disagree.
+    Raises :class:`AmiwarpError` for a source other than a socket, or if no sender is there at first.
     """
 
     def __init__(self, spec: str, wait_s: float, say: Callable[[str], None]) -> None:
         kind = spec.partition(":")[0]
         if kind not in SOCKETS:
-            what = "give tcp:, unix:, tcp-listen: or unix-listen:, or leave it out"
+            what = "give tcp:, unix:, tcp-listen: or unix-listen:, or omit it"
             raise AmiwarpError(
                 f"{spec}: --wait-for-source applies to sockets only, a file or pipe does not return; {what}"
             )
@@ -47,14 +47,14 @@ class ReturningSource:
         self.name, self.size, self.camera, self.prism = spec, source.size, source.camera, source.prism
         self.has_encoder = source.has_encoder
         self.problem: str | None = None
-        """How the stream ended, if it did not end as it should: one line."""
+        """How the stream ended, in one line; None if it ended properly."""
         self.returns = 0
-        """Times that the sender came back."""
+        """Number of times that the sender returned."""
         self._events = 0
-        self._last: tuple[int, int] | None = None  # time of the last event, and when it arrived
+        self._last: tuple[int, int] | None = None  # latest event time, and the host's time of its arrival [us]
 
     def packets(self) -> Iterator[Packet]:
-        """See :meth:`Source.packets`."""
+        """Yield packets, see :meth:`Source.packets`."""
         while True:
             yield from self._part()
             self.problem = self._source.problem
@@ -73,63 +73,63 @@ class ReturningSource:
             self._say(f"{self.name}: the stream is back after {time.monotonic() - began:.1f} s")
 
     def close(self) -> None:
-        """See :meth:`Source.close`."""
+        """Close the connection, see :meth:`Source.close`."""
         self._source.close()
 
     def _part(self) -> Iterator[Packet]:
-        """Packets until the stream ends or breaks off."""
+        """Yield packets until the stream ends or breaks off."""
         fresh = unchecked = self.returns > 0
-        for given in self._source.packets():
-            if len(given.events):
+        for packet in self._source.packets():
+            if len(packet.events):
                 if unchecked:
-                    self._check_clock(given)
+                    self._check_clock(packet)
                     unchecked = False
-                self._events += len(given.events)
-                newest = int(given.events.t.max())
-                self._last = max(newest, self._last[0] if self._last else newest), given.arrived_us
-            yield replace(given, returned=True) if fresh else given
+                self._events += len(packet.events)
+                newest = int(packet.events.t.max())
+                self._last = max(newest, self._last[0] if self._last else newest), packet.arrived_us
+            yield replace(packet, returned=True) if fresh else packet
             fresh = False
 
-    def _check_clock(self, given: Packet) -> None:
+    def _check_clock(self, packet: Packet) -> None:
         if self._last is None:
             return
-        (last, then), first = self._last, int(given.events.t.min())
+        (last, then), first = self._last, int(packet.events.t.min())
         if first < last - LATE_US:
-            what = f"its clock began anew ({first:,} us, the last event before was at {last:,} us)"
-            raise AmiwarpError(f"{self.name}: is back, but {what}; record what follows into another file")
-        gap, passed = first - last, given.arrived_us - then
+            what = f"its clock restarted ({first:,} us, the last event before was at {last:,} us)"
+            raise AmiwarpError(f"{self.name}: is back, but {what}; record the new events to another file")
+        gap, passed = first - last, packet.arrived_us - then
         if abs(gap - passed) > CLOCK_US:
-            what = f"{gap * 1e-6:.1f} s went by on the camera's clock, {passed * 1e-6:.1f} s here"
-            self._say(f"{self.name}: {what}: its clock may have begun anew, times across the gap may be wrong")
+            what = f"{gap * 1e-6:.1f} s passed on the camera's clock, {passed * 1e-6:.1f} s on the host's"
+            self._say(f"{self.name}: {what}: its clock may have restarted, times across the gap may be wrong")
 
     def _wait(self, until: float) -> Iterator[Packet]:
-        """Empty packets while the sender is away; :attr:`problem` is None once it is back."""
-        place = self.name.replace("-listen", "", 1)
-        attempts = (accepting if self._listens else connecting)(place)
+        """Yield empty packets until the sender returns (:attr:`problem` is then None) or the time is over."""
+        address = self.name.replace("-listen", "", 1)
+        attempts = (iter_accepted if self._listens else iter_connected)(address)
         try:
             for connection in attempts:
                 if connection is not None:
                     try:
                         left = max(until - time.monotonic(), 1.0)
-                        self._take(from_connection(self.name, connection, hello_s=min(HELLO_S, left)))
+                        self._continue_with(open_connection(self.name, connection, hello_s=min(HELLO_S, left)))
                         return
-                    except Unreachable:  # it left before its hello
+                    except Unreachable:  # it left before its hello: wait for the next one
                         pass
                 if time.monotonic() >= until:
                     return
-                yield packet(monotonic_us())
+                yield make_packet(monotonic_us())
         finally:
             attempts.close()
 
-    def _take(self, source: StreamSource) -> None:
-        """Go on with a new connection of the same camera."""
+    def _continue_with(self, source: StreamSource) -> None:
+        """Continue with a new connection, if it is from the same camera."""
         if source.size != self.size:
             source.close()
             sizes = f"{source.size[0]}x{source.size[1]} pixels, before it had {self.size[0]}x{self.size[1]}"
-            raise AmiwarpError(f"{self.name}: is back with a camera of {sizes}; record it into another file")
+            raise AmiwarpError(f"{self.name}: is back with a camera of {sizes}; record it to another file")
         if (source.camera, source.prism) != (self.camera, self.prism):
             source.close()
-            raise AmiwarpError(f"{self.name}: is back with another camera or prism; record it into another file")
+            raise AmiwarpError(f"{self.name}: is back with another camera or prism; record it to another file")
         self._source.close()
         self._source, self.problem = source, None
         self.returns += 1

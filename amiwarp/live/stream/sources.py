@@ -1,4 +1,4 @@
-"""Where live events come from: a file at its own pace, a stream of packets, a camera; :func:`open_source` by name."""
+"""Sources of live events: replayed recordings and streams of packets."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.stream.connections import Unreachable, accept, connect, ready
 from amiwarp.live.stream.packets import (
-    Angles,
-    Decoder,
+    EncoderSamples,
     End,
     Hello,
     Message,
     Packet,
+    PacketDecoder,
     Triggers,
-    packet,
+    make_packet,
 )
-from amiwarp.live.stream.sockets import Unreachable, accept, connect, ready
 
 IDLE_S = 0.05
-"""Longest time without a packet, empty or not."""
-LAST_US, LARGEST_RAD = 1 << 60, 1e12
-"""Largest time [us] and angle [rad] of a stream, either sign: differences stay exact; thirty thousand years, turns."""
+"""Longest time without a packet [s]. After it, an empty packet is delivered."""
+LARGEST_US, LARGEST_RAD = 1 << 60, 1e12
+"""Largest absolute time [us] and angle [rad] in a stream, so that differences stay exact."""
 HELLO_S = 10.0
-"""How long a sender may take to say what it sends."""
+"""Longest wait for the hello of a sender [s]."""
 
 
 def open_stream(spec: str) -> StreamSource:
-    """Connect to, or wait for, the sender of the stream at ``tcp:``, ``unix:``, ``tcp-listen:`` or ``unix-listen:``."""
+    """Open the stream at ``tcp:`` or ``unix:`` (connect) or ``tcp-listen:`` or ``unix-listen:`` (wait for a sender)."""
     kind = spec.partition(":")[0]
     connection = accept(spec.replace("-listen", "", 1)) if kind.endswith("-listen") else connect(spec)
-    return from_connection(spec, connection)
+    return open_connection(spec, connection)
 
 
-def from_connection(spec: str, connection: socket.socket, *, hello_s: float | None = None) -> StreamSource:
-    """Read the stream that comes over a connection, which the source closes."""
+def open_connection(spec: str, connection: socket.socket, *, hello_s: float | None = None) -> StreamSource:
+    """Read the stream from a connection. The source closes it."""
     with connection:
         connection.settimeout(None)
         return StreamSource(spec, connection.makefile("rb", buffering=0), hello_s=hello_s)
 
 
 class FileSource:
-    """A recording as if it happened now: packets of ``packet_us``, each when its time is over.
+    """Replays a recording in real time, in packets of ``packet_us`` [us], each at the end of its period.
 
-    Packets without events are left out, but for an empty one each 50 ms of waiting. Encoder samples come up to the
-    packet's end and one more. ``clock`` [us] and ``sleep`` [s] are the host's unless a test has others.
+    Periods without events give no packet, but waiting gives an empty one every 50 ms. A packet carries the encoder
+    samples up to its end and one more. ``clock`` [us] and ``sleep`` [s] are the host's; tests replace them.
     """
 
     def __init__(
@@ -66,29 +66,29 @@ class FileSource:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         if pace is not None and not 0.0 < pace < float("inf"):
-            raise AmiwarpError(f"pace = {pace}; give a positive number, or None for as fast as can be")
+            raise AmiwarpError(f"pace = {pace}; give a positive number, or None for as fast as possible")
         if packet_us < 1:
             raise AmiwarpError(f"packet_us = {packet_us}; give 1 or more")
         self.name = str(path)
         recording = open_recording(path)
         self._events, encoder = recording.events, recording.encoder
         if len(self._events) and self._events.slice(0, 1).x.dtype != np.uint16:
-            raise AmiwarpError(f"{path}: is compensated already; give the recording of a sensor")
+            raise AmiwarpError(f"{path}: is compensated already; give a recording with the sensor's events")
         self.size, self.camera, self.prism = self._events.size, recording.camera, recording.prism
         self.has_encoder = encoder is not None
         self._encoder_t, self._encoder_angle = np.zeros(0, np.int64), np.zeros(0)
         self.clock_offset_us = 0.0 if encoder is None else encoder.clock_offset_us
-        """By which the samples were moved to be on the events' clock."""
+        """Clock offset subtracted from the encoder's times to put them on the events' clock [us]."""
         if encoder is not None:
-            # whole microseconds: at 3000 rpm half of one is less than 0.01 deg
+            # A rounding error of half a microsecond is less than 0.01 deg at 3000 rpm.
             self._encoder_t, self._encoder_angle = encoder.t - round(encoder.clock_offset_us), encoder.angle
         self._pace, self._packet_us, self._clock, self._sleep = pace, packet_us, clock, sleep
-        self._sampled = 0
+        self._samples_sent = 0
 
     def packets(self) -> Iterator[Packet]:
-        """See :meth:`Source.packets`."""
+        """Yield packets, see :meth:`Source.packets`."""
         began = self._clock()
-        self._sampled = 0
+        self._samples_sent = 0
         if len(self._events):
             first = self._events.t_first
             for block in self._events.blocks(duration_us=self._packet_us):
@@ -98,40 +98,42 @@ class FileSource:
                     due = began + round(window * self._packet_us / self._pace)
                     yield from self._wait(due)
                 yield self._packet(due, block, first + window * self._packet_us)
-        if self._sampled < len(self._encoder_t):
+        if self._samples_sent < len(self._encoder_t):
             yield self._packet(self._clock(), Events.empty(), int(self._encoder_t[-1]))
 
     def close(self) -> None:
-        """See :meth:`Source.close`; the file is closed when nothing refers to it any more."""
+        """Do nothing: the file is closed with the last reference to it."""
 
     def _wait(self, due: int) -> Iterator[Packet]:
         while (left := (due - self._clock()) * 1e-6) > 0.0:
             self._sleep(min(left, IDLE_S))
             if left > IDLE_S:
-                yield packet(self._clock())
+                yield make_packet(self._clock())
 
     def _packet(self, arrived_us: int, events: Events, end_us: int) -> Packet:
-        start = self._sampled
-        self._sampled = max(start, min(int(np.searchsorted(self._encoder_t, end_us)) + 1, len(self._encoder_t)))
-        which = slice(start, self._sampled)
-        return packet(arrived_us, events, encoder_t=self._encoder_t[which], encoder_angle=self._encoder_angle[which])
+        start = self._samples_sent
+        self._samples_sent = max(start, min(int(np.searchsorted(self._encoder_t, end_us)) + 1, len(self._encoder_t)))
+        which = slice(start, self._samples_sent)
+        return make_packet(
+            arrived_us, events, encoder_t=self._encoder_t[which], encoder_angle=self._encoder_angle[which]
+        )
 
 
 class StreamSource:
-    """A stream of packets from a file without a buffer: a pipe, or a socket's ``makefile("rb", buffering=0)``.
+    """Reads a stream of packets from an unbuffered file: a pipe, or a socket's ``makefile("rb", buffering=0)``.
 
-    Raises :class:`AmiwarpError` for a stream that is none, or does not begin with a hello within :data:`HELLO_S`.
+    Raises :class:`AmiwarpError` for an invalid stream, or one without a hello within :data:`HELLO_S`.
     """
 
     def __init__(self, name: str, file: Any, *, hello_s: float | None = None) -> None:
         self.name, self._file = name, file
         self._hello_s = HELLO_S if hello_s is None else hello_s
-        self._decoder = Decoder(name)
+        self._decoder = PacketDecoder(name)
         self._ended = False
         self.problem: str | None = None
-        """How the stream ended, where it did not end as it should: one line."""
+        """How the stream ended, in one line; None if it ended properly."""
         try:
-            self._said = hello = self._hello()
+            self._first_hello = hello = self._hello()
         except BaseException:
             self.close()
             raise
@@ -139,69 +141,73 @@ class StreamSource:
         self.has_encoder = True
 
     def packets(self) -> Iterator[Packet]:
-        """See :meth:`Source.packets`."""
-        given = time.monotonic()
+        """Yield packets, see :meth:`Source.packets`."""
+        yielded_s = time.monotonic()
         while not self._ended:
             message = self._next(IDLE_S)
-            if isinstance(message, Hello) and message != self._said:
-                raise AmiwarpError(f"{self.name}: a second hello says another camera; correct its sender")
+            if isinstance(message, Hello) and message != self._first_hello:
+                raise AmiwarpError(f"{self.name}: a second hello describes another camera; correct its sender")
             if message is not None and not isinstance(message, (Hello, End)):
                 yield self._packet(message)
-                given = time.monotonic()
-            elif time.monotonic() - given >= IDLE_S:
-                yield packet(monotonic_us())
-                given = time.monotonic()
+                yielded_s = time.monotonic()
+            elif time.monotonic() - yielded_s >= IDLE_S:
+                yield make_packet(monotonic_us())
+                yielded_s = time.monotonic()
 
     def close(self) -> None:
-        """See :meth:`Source.close`."""
+        """Close the file, see :meth:`Source.close`."""
         self._file.close()
 
     def _hello(self) -> Hello:
+        """Return the first message, which must be a hello."""
         until = time.monotonic() + self._hello_s
         while time.monotonic() < until and not self._ended:
             message = self._next(IDLE_S)
             if isinstance(message, Hello):
                 return message
             if message is not None:
-                raise AmiwarpError(f"{self.name}: begins without a hello; see docs/stream-format.md")
-        raise Unreachable(f"{self.name}: {self.problem or 'sent no hello'}; see docs/stream-format.md")
+                raise AmiwarpError(f"{self.name}: begins without a hello; see docs/reference/stream-format.md")
+        raise Unreachable(f"{self.name}: {self.problem or 'sent no hello'}; see docs/reference/stream-format.md")
 
     def _next(self, timeout_s: float) -> Message | None:
-        """The next message; None where it is not complete in time, or the stream has ended."""
+        """Return the next message; None if it is incomplete after the timeout, or if the stream has ended."""
         if not ready(self._file, timeout_s):
             return None
         try:
-            count = self._file.readinto(self._decoder.room())
+            count = self._file.readinto(self._decoder.free_buffer())
         except OSError as error:
-            self._end(f"ended after an error: {error.strerror or error}")
+            self._break_off(f"ended after an error: {error.strerror or error}")
             return None
         if not count:
-            begun = self._decoder.within
-            self._end("ended without an end packet" if begun is None else f"ended within the packet at byte {begun}")
+            offset = self._decoder.unfinished_at
+            self._break_off(
+                "ended without an end packet" if offset is None else f"ended within the packet at byte {offset}"
+            )
             return None
-        message = self._decoder.filled(count)
+        message = self._decoder.commit(count)
         self._ended |= isinstance(message, End)
         return message
 
-    def _end(self, problem: str) -> None:
+    def _break_off(self, problem: str) -> None:
         self._ended, self.problem = True, problem
 
-    def _packet(self, message: Events | Compensated | Triggers | Angles) -> Packet:
+    def _packet(self, message: Events | Compensated | Triggers | EncoderSamples) -> Packet:
+        """Check a message's values and return it as a packet."""
         now = monotonic_us()
         if isinstance(message, Compensated):
             raise AmiwarpError(f"{self.name}: sends compensated events; give the stream of a sensor")
-        if len(message.t) and not (message.t.min() >= -LAST_US and message.t.max() <= LAST_US):
-            given = f"times of {message.t.min()} .. {message.t.max()} us, not in +-{LAST_US}"
-            raise AmiwarpError(f"{self.name}: {given}; correct its sender")
+        if len(message.t) and not (message.t.min() >= -LARGEST_US and message.t.max() <= LARGEST_US):
+            what = f"times of {message.t.min()} .. {message.t.max()} us, not in +-{LARGEST_US}"
+            raise AmiwarpError(f"{self.name}: {what}; correct its sender")
         if isinstance(message, Triggers):
-            return packet(now, triggers=message.t)
-        if isinstance(message, Angles):
+            return make_packet(now, triggers=message.t)
+        if isinstance(message, EncoderSamples):
             if not (np.abs(message.angle) <= LARGEST_RAD).all():
                 what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
                 raise AmiwarpError(f"{self.name}: {what}; correct its sender")
-            return packet(now, encoder_t=message.t, encoder_angle=message.angle)
+            return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
         width, height = self.size
         if len(message) and (message.x.max() >= width or message.y.max() >= height or message.p.max() > 1):
-            what = f"an event outside the {width}x{height} frame, or of a polarity that is neither 0 nor 1"
+            what = f"an event outside the {width}x{height} frame, or with a polarity that is neither 0 nor 1"
             raise AmiwarpError(f"{self.name}: {what}; correct its sender")
-        return packet(now, message)
+        return make_packet(now, message)

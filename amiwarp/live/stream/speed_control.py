@@ -1,4 +1,4 @@
-"""The prism's speed kept to what the stream needs: windows of compensated events in, commands to the motor out."""
+"""Adaptive speed in a session: measures windows of compensated events and commands the motor."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_p
 
 if TYPE_CHECKING:
     from amiwarp.compensation.streams import Compensated
-    from amiwarp.events.encoder import EncoderStream
+    from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.optics.models import Model
 
 WINDOW_US, MOST_WINDOWS = 33_333, 10
-"""Length of a window [us], and how many are measured of what comes at once: the last ones, the others are long past."""
+"""Length of a window [us], and largest number of windows measured at once. Older windows are skipped as outdated."""
 MOST_BYTES = 1 << 26
-"""Memory of the packets of a window that is not over; of more, the oldest are left out of its coverage."""
+"""Memory bound of the unfinished window's packets [bytes]. Beyond it, its oldest packets are left out."""
 
 
 class SpeedKeeper:
-    """Measures each window and asks for another speed where it should be; in a thread of its own waits for the answer.
+    """Measures the coverage of each window and commands a new speed if needed. A thread waits for the answer.
 
-    ``set_speed``: takes rpm and ramp [rpm/s], as :meth:`Link.set_speed`. ``say`` gets what goes wrong there.
+    ``set_speed``: called with speed [rpm] and ramp [rpm/s], as :meth:`Link.set_speed`. ``say`` gets its errors.
     """
 
     def __init__(
@@ -43,58 +43,60 @@ class SpeedKeeper:
         self._meter = CoverageMeter(model.camera.width, model.camera.height)
         self._packets: deque[Events] = deque()
         self.held_bytes = 0
-        """Memory that the packets take whose window is not over [bytes]."""
-        self._begins: int | None = None
-        self._asking: threading.Thread | None = None
-        self._asked = controller.rpm
+        """Memory of the packets of the unfinished window [bytes]."""
+        self._window_start_us: int | None = None
+        self._command_thread: threading.Thread | None = None
+        self._commanded_rpm = controller.rpm
         self.coverage: float | None = None
-        """Share of the edges that the last window saw."""
+        """Share of the scene's edges that the last window showed."""
 
     def put(self, packets: list[Compensated], encoder: EncoderStream) -> None:
-        """Compensated packets, in order."""
-        self._begins = int(packets[0].events.t[0]) if self._begins is None else self._begins
+        """Add compensated packets, in order of time."""
+        self._window_start_us = int(packets[0].events.t[0]) if self._window_start_us is None else self._window_start_us
         for packet in packets:
             self._packets.append(packet.events)
             self.held_bytes += held_bytes(packet.events)
             while self.held_bytes > MOST_BYTES and len(self._packets) > 1:
                 self.held_bytes -= held_bytes(self._packets.popleft())
         last = int(self._packets[-1].t[-1])
-        windows = (last - self._begins) // WINDOW_US
+        windows = (last - self._window_start_us) // WINDOW_US
         if windows < 1:
             return
         events = Events.concatenate(list(self._packets))
-        self._begins += WINDOW_US * max(0, windows - MOST_WINDOWS)
-        while last - self._begins >= WINDOW_US:
-            end = self._begins + WINDOW_US
-            first, after = np.searchsorted(events.t, [self._begins, end])
-            self._window(events[first:after], self._begins, end, encoder)
-            events, self._begins = events[after:], end
+        self._window_start_us += WINDOW_US * max(0, windows - MOST_WINDOWS)
+        while last - self._window_start_us >= WINDOW_US:
+            end = self._window_start_us + WINDOW_US
+            first, after = np.searchsorted(events.t, [self._window_start_us, end])
+            self._measure(events[first:after], self._window_start_us, end, encoder)
+            events, self._window_start_us = events[after:], end
         self._packets, self.held_bytes = deque([events]), held_bytes(events)
 
-    def _window(self, events: Events, start: int, end: int, encoder: EncoderStream) -> None:
+    def _measure(self, events: Events, start: int, end: int, encoder: EncoderStream) -> None:
         if encoder.first is None:
             return
         samples = encoder.over(start, end)
-        if not samples.covers(start, end):  # before the first samples
+        if not samples.covers(start, end):  # the window begins before the first encoder sample
             return
         path = prism_path(self._model, samples, start, end)
         coverage = self._meter(events, start, end, path)
         self.coverage = coverage.share
         self.controller.update(start, end, coverage, len(events) / (end - start))
         rpm = self.controller.rpm
-        # what changed while the answer to the last command was waited for is asked for with the next window
-        if rpm != self._asked and (self._asking is None or not self._asking.is_alive()):
-            self._asked = rpm
-            self._asking = threading.Thread(target=self._ask, args=(rpm,), name="amiwarp-speed", daemon=True)
-            self._asking.start()
+        # While a command waits for its answer, a further change of speed waits for the next window.
+        if rpm != self._commanded_rpm and (self._command_thread is None or not self._command_thread.is_alive()):
+            self._commanded_rpm = rpm
+            self._command_thread = threading.Thread(
+                target=self._command, args=(rpm,), name="amiwarp-speed", daemon=True
+            )
+            self._command_thread.start()
 
-    def _ask(self, rpm: float) -> None:
+    def _command(self, rpm: float) -> None:
         try:
             self._set_speed(rpm, self.controller.ramp_rpm_s)
         except AmiwarpError as error:
             self._say(str(error))
 
     def close(self) -> None:
-        """Waits for an answer that is due."""
-        if self._asking is not None:
-            self._asking.join()
+        """Wait for the answer to the last command."""
+        if self._command_thread is not None:
+            self._command_thread.join()

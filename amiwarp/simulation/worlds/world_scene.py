@@ -51,6 +51,6 @@ class WorldScene:
         if self.samples is not None:
             one_of(str(self.samples), [str(n) for n in SAMPLES], "samples")
 
-    def rays(self, on_cpu: bool) -> bool:
+    def uses_rays(self, *, on_cpu: bool) -> bool:
         """Whether rays are cast for every step on a device."""
         return self.seeing is Seeing.RAYS or (self.seeing is Seeing.AUTO and not on_cpu)

@@ -1,4 +1,4 @@
-"""What each bit of speed costs: compensation and calibration, measured every sensible way on one recording."""
+"""Charts of speed against error: compensation and calibration in many settings, measured on one recording."""
 
 from amiwarp.studies.chart.charts import Charts, make, simulated
 

@@ -1,4 +1,7 @@
-"""The calibration's rows: models, algorithms, events, folding and the photometric stage, each against the truth."""
+"""Rows of the calibration chart: models, algorithms, numbers of events, folding and the photometric stage.
+
+Each result is compared with the ground truth.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +21,20 @@ from amiwarp.imaging.metrics import model_error
 from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import Row, Task, Timed, measure, near_front
-from amiwarp.studies.chart.truth import Known
+from amiwarp.studies.chart.truth import KnownRecording
 
 JOB = "calibration"
+"""Job of all rows."""
 SHARP = STAGES[:1]
+"""Stages of a calibration by sharpness alone."""
 EVENTS = (100_000, 300_000, 1_000_000, 10**9)
+"""Numbers of events; the last one means all."""
 FOLDS = (1024, 512, 256)
+"""Numbers of angle bins per turn to which the events are folded."""
 PAIRS = (150_000, 300_000, 600_000, 1_200_000)
+"""Numbers of event pairs of the photometric stage."""
 GUESS = math.radians(10.0)
-"""How far off the phase is from which the search without a global stage starts."""
+"""Phase error of the guess from which the search without a global stage starts [rad]."""
 PAIRS_OF_ALGORITHMS = (
     ("GN_DIRECT_L", "LN_SBPLX"),
     ("GN_DIRECT_L", "LN_COBYLA"),
@@ -35,19 +43,24 @@ PAIRS_OF_ALGORITHMS = (
     ("GN_CRS2_LM", "LN_BOBYQA"),
     ("GN_MLSL_LDS", "LN_BOBYQA"),
 )
+"""Global and local algorithm."""
 
 
 @dataclass(frozen=True)
-class Setting:
-    """One way to calibrate."""
+class CalibrationSetting:
+    """Setting of the calibration chart."""
 
     label: str
+    """Name for people."""
     family: str
+    """Family, which sets the colour."""
     settings: Settings
+    """Settings of the calibration."""
     comparable: bool = True
+    """False if it needs a guess."""
 
     def fields(self, device: str) -> dict[str, Any]:
-        """Of the row."""
+        """Return the fixed fields of the row."""
         both = "both stages" if self.settings.stages == STAGES else "sharpness alone"
         plain = settings_to(self.settings)
         return {"chart": "calibration", "job": JOB, "label": self.label, "family": self.family,
@@ -55,24 +68,26 @@ class Setting:
                 "default": plain == settings_to(Settings()), "comparable": self.comparable}  # fmt: skip
 
 
-def settings(known: Known, *, quick: bool) -> list[Setting]:
-    """The sensible combinations, the default first."""
+def settings(known: KnownRecording, *, quick: bool) -> list[CalibrationSetting]:
+    """Return the settings of the chart, the default first."""
     if quick:
         few = Settings(events=50_000, global_evaluations=60)
         return [
-            Setting("default", "default", Settings()),
-            Setting("50 k events, sharpness", "events", replace(few, stages=SHARP)),
-            Setting("circle, 50 k events, sharpness", "model", replace(few, model="circle", stages=SHARP)),
+            CalibrationSetting("default", "default", Settings()),
+            CalibrationSetting("50 k events, sharpness", "events", replace(few, stages=SHARP)),
+            CalibrationSetting("circle, 50 k events, sharpness", "model", replace(few, model="circle", stages=SHARP)),
         ]
     return [*_stages(known), *_events(), *_folds(), *_algorithms(), *_photometric(), *_mixed()]
 
 
-def _both(label: str, family: str, s: Settings) -> Iterator[Setting]:
-    yield Setting(label, family, s)
-    yield Setting(f"{label}, sharpness", family, replace(s, stages=SHARP))
+def _both(label: str, family: str, s: Settings) -> Iterator[CalibrationSetting]:
+    """Yield a setting with both stages, and the same by sharpness alone."""
+    yield CalibrationSetting(label, family, s)
+    yield CalibrationSetting(f"{label}, sharpness", family, replace(s, stages=SHARP))
 
 
-def _stages(known: Known) -> Iterator[Setting]:
+def _stages(known: KnownRecording) -> Iterator[CalibrationSetting]:
+    """Yield the default, every model, and the local search from a guess."""
     yield from _both("default", "default", Settings())
     for model in MODELS:
         yield from _both(model, "model", Settings(model=model))
@@ -81,60 +96,66 @@ def _stages(known: Known) -> Iterator[Setting]:
         yield replace(way, comparable=False)
 
 
-def _events() -> Iterator[Setting]:
+def _events() -> Iterator[CalibrationSetting]:
+    """Yield other numbers of events."""
     for n in EVENTS[:-1]:
         if n != Settings().events:
             name = f"{n // 1000} k" if n < 1_000_000 else f"{n // 1_000_000} M"
             yield from _both(f"{name} events", "events", Settings(events=n))
-    # the photometric stage takes pairs of its own: more events would only take longer to start it
-    yield Setting("all events, sharpness", "events", Settings(events=EVENTS[-1], stages=SHARP))
+    # the photometric stage selects its own pairs, so more events would only delay its start
+    yield CalibrationSetting("all events, sharpness", "events", Settings(events=EVENTS[-1], stages=SHARP))
 
 
-def _folds() -> Iterator[Setting]:
-    """Folded, all events may cost little more than some."""
+def _folds() -> Iterator[CalibrationSetting]:
+    """Yield other foldings. Folded, all events may cost little more than a part of them."""
     for bins in (0, *FOLDS):
         if bins != Settings().fold:
-            yield Setting(f"{_folded(bins)}, sharpness", "folding", Settings(fold=bins, stages=SHARP))
+            yield CalibrationSetting(f"{_folded(bins)}, sharpness", "folding", Settings(fold=bins, stages=SHARP))
     if FOLDS[-1] != Settings().fold:
-        yield Setting(_folded(FOLDS[-1]), "folding", Settings(fold=FOLDS[-1]))
+        yield CalibrationSetting(_folded(FOLDS[-1]), "folding", Settings(fold=FOLDS[-1]))
     for bins in FOLDS:
         s = Settings(events=EVENTS[-1], fold=bins, stages=SHARP)
-        yield Setting(f"all events, {_folded(bins)}, sharpness", "folding", s)
+        yield CalibrationSetting(f"all events, {_folded(bins)}, sharpness", "folding", s)
 
 
 def _folded(bins: int) -> str:
+    """Return the text of a folding."""
     return f"folded to {bins} angles" if bins else "not folded"
 
 
-def _algorithms() -> Iterator[Setting]:
+def _algorithms() -> Iterator[CalibrationSetting]:
+    """Yield other algorithms and numbers of steps."""
     for first, second in PAIRS_OF_ALGORITHMS:
         s = Settings(global_algorithm=first, local_algorithm=second, stages=SHARP)
-        yield Setting(f"{first[3:]} + {second[3:]}, sharpness", "algorithms", s)
+        yield CalibrationSetting(f"{first[3:]} + {second[3:]}, sharpness", "algorithms", s)
     for budget in (60, 240):
-        yield Setting(f"{budget} global steps, sharpness", "algorithms",
+        yield CalibrationSetting(f"{budget} global steps, sharpness", "algorithms",
                       Settings(global_evaluations=budget, stages=SHARP))  # fmt: skip
 
 
-def _photometric() -> Iterator[Setting]:
+def _photometric() -> Iterator[CalibrationSetting]:
+    """Yield other settings of the photometric stage."""
     for pairs in PAIRS:
         if pairs != PhotometricSettings().pairs:
-            yield Setting(f"{pairs // 1000} k pairs", "pairs", Settings(photometric=PhotometricSettings(pairs=pairs)))
-    yield Setting("photometric by BOBYQA", "algorithms",
-                  Settings(photometric=PhotometricSettings(algorithm="LN_BOBYQA")))  # fmt: skip
+            yield CalibrationSetting(
+                f"{pairs // 1000} k pairs", "pairs", Settings(photometric=PhotometricSettings(pairs=pairs))
+            )
+    by_bobyqa = Settings(photometric=PhotometricSettings(algorithm="LN_BOBYQA"))
+    yield CalibrationSetting("photometric by BOBYQA", "algorithms", by_bobyqa)
 
 
-def _mixed() -> Iterator[Setting]:
-    """Few events for a start that the photometric stage mends."""
+def _mixed() -> Iterator[CalibrationSetting]:
+    """Yield few events for the first stage, whose error the photometric stage corrects."""
     for events, pairs in itertools.product(EVENTS[:2], PAIRS[:2]):
         if events != Settings().events and pairs != PhotometricSettings().pairs:
             s = Settings(events=events, photometric=PhotometricSettings(pairs=pairs))
-            yield Setting(f"{events // 1000} k events, {pairs // 1000} k pairs", "events and pairs", s)
+            yield CalibrationSetting(f"{events // 1000} k events, {pairs // 1000} k pairs", "events and pairs", s)
 
 
 def rows(
-    known: Known, device: str, *, repeats: int, quick: bool, seed: int, tell: Progress
+    known: KnownRecording, device: str, *, repeats: int, quick: bool, seed: int, progress: Progress
 ) -> tuple[list[Row], list[str]]:
-    """All rows, and notes on settings that the calibration refuses on this recording."""
+    """Measure all rows; return them with notes on settings that the calibration refuses on this recording."""
     ways = settings(known, quick=quick)
 
     def run(s: Settings) -> Calibration | AmiwarpError:
@@ -143,34 +164,35 @@ def rows(
         except AmiwarpError as error:
             return error
 
-    tell("calibrating", 0.0)
+    progress("calibrating", 0.0)
     for s in _kinds(ways):
         short = run(_shortened(s))
         if isinstance(short, AmiwarpError) or (s.stages == STAGES and short.photometric is None):
-            run(s)  # the short one may have ended before it came to every kernel
+            run(s)  # the short run may have ended before it used every kernel
     tasks = [Task(partial(run, way.settings), len(known.events), way.fields(device)) for way in ways]
 
     def row(t: Timed) -> Row | None:
         found: Calibration | AmiwarpError = t.result
         return None if isinstance(found, AmiwarpError) else t.row(model_error(found.model, known.model).rms)
 
-    timed = measure(tasks, repeats, partial(tell, "calibrating"), warm_up=False,
+    timed = measure(tasks, repeats, progress, "calibrating", warm_up=False,
                     again=lambda once: near_front([row(t) for t in once]))  # fmt: skip
     notes = []
     for t, way in zip(timed, ways, strict=True):
         if isinstance(t.result, AmiwarpError):
             notes.append(f"{way.label}: refused, {t.result}")
         elif way.settings.stages == STAGES and (t.result.photometric is None or not t.result.photometric.accepted):
-            notes.append(f"{way.label}: kept the answer of sharpness")
+            notes.append(f"{way.label}: the photometric stage kept the result of sharpness")
     return [found for found in map(row, timed) if found is not None], notes
 
 
-def _kinds(ways: list[Setting]) -> list[Settings]:
-    """One setting of each kind: its kernels are compiled off the clock."""
+def _kinds(ways: list[CalibrationSetting]) -> list[Settings]:
+    """Return one setting of each kind; they run before the measurement, so that their kernels are compiled."""
     every = (way.settings for way in ways)
     return list({(s.model, s.stages, s.fold > 0, s.photometric.algorithm): s for s in every}.values())
 
 
 def _shortened(s: Settings) -> Settings:
+    """Return the settings of a short run."""
     few = PhotometricSettings(pairs=20_000, algorithm=s.photometric.algorithm)
     return replace(s, events=20_000, global_evaluations=20, local_evaluations=10, photometric=few)

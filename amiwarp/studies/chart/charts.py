@@ -1,4 +1,4 @@
-"""Both charts from one recording: measured, drawn, written as figures, JSON and CSV, and asked for a budget."""
+"""Both charts of a recording: measured, drawn, and written as figures, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from amiwarp.simulation.simulator import SensorModel
 from amiwarp.studies.chart import calibration, compensation
 from amiwarp.studies.chart.drawing import draw
 from amiwarp.studies.chart.rows import Row, beaten_by, fastest_within, fronts, most_accurate_within
-from amiwarp.studies.chart.truth import Known
+from amiwarp.studies.chart.truth import KnownRecording
 from amiwarp.studies.demo import Demo, simulation
 from amiwarp.studies.machine import machine, versions
 
@@ -29,48 +29,57 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
 PACKAGES = ("warp-lang", "numpy", "nlopt", "numba", "torch", "cupy-cuda12x", "cupy-cuda13x")
+"""Packages whose versions are recorded."""
 ABOUT = ("format", "version", "date", "machine", "device", "processor", "versions", "recording")
+"""Keys of the description in ``chart.json``."""
 USUAL, QUICK = (640, 480, 2.0), (320, 240, 0.2)
-"""Size and length [s] of the simulated recording."""
+"""Width [px], height [px] and length [s] of the simulated recording; of a quick run."""
 CONTRAST = 0.54
-"""Threshold [log intensity] at which the map of the earth gives ten million events in those two seconds."""
+"""Contrast threshold [log intensity] at which the map of the earth gives ten million events in two seconds."""
 REPEATS = {"compensation": 5, "calibration": 3}
+"""Number of repeats per chart."""
 
 
 @dataclass(frozen=True)
 class Charts:
-    """What was measured, and where it was written."""
+    """Rows of both charts, and the written files."""
 
     compensation: tuple[Row, ...]
+    """Rows of the compensation chart."""
     calibration: tuple[Row, ...]
+    """Rows of the calibration chart."""
     files: dict[str, Path]
+    """Paths of the written files by name."""
     notes: tuple[str, ...]
-    """On what is missing, and on settings that were refused."""
+    """Notes on missing rows and refused settings."""
     about: dict[str, Any]
-    """Machine, versions, date, recording."""
+    """Machine, versions, date and recording."""
 
     @classmethod
     def load(cls, data: Path) -> Charts:
-        """Reads ``chart.json``. Raises :class:`AmiwarpError` where it is none."""
+        """Read ``chart.json``. Raises :class:`AmiwarpError` if it is damaged or another file."""
         names = [f.name for f in fields(Row)]
         try:
             held = json.loads(data.read_text())
             rows = {k: tuple(Row(**{n: r[n] for n in names}) for r in held[k]["rows"]) for k in REPEATS}
             about = {name: held[name] for name in ABOUT}
         except (OSError, ValueError, TypeError, LookupError) as error:
-            raise AmiwarpError(f"{data}: cannot be read as the data of charts ({error!r}); make it again") from error
+            raise AmiwarpError(
+                f"{data}: cannot be read as the data of charts ({error!r}); measure the charts again"
+            ) from error
         return cls(rows["compensation"], rows["calibration"], {"data": data}, tuple(held["notes"]), about)
 
     def draw(self, out: Path) -> Charts:
-        """Both figures in the folder ``out``. Where Matplotlib or Pillow is missing, a note says so instead."""
+        """Draw both figures into the folder ``out``; add a note if Matplotlib or Pillow is missing."""
         try:
             files = {name: path for chart in REPEATS for name, path in self._draw(chart, out).items()}
         except ModuleNotFoundError as missing:
             later = "python -m benchmarks.chart --from chart.json --out FOLDER"
-            return replace(self, notes=(*self.notes, f"charts: not drawn, {missing}; where it is there: {later}"))
+            return replace(self, notes=(*self.notes, f"charts: not drawn, {missing}; install it and run: {later}"))
         return replace(self, files=self.files | files)
 
     def _draw(self, chart: str, out: Path) -> dict[str, Path]:
+        """Draw one figure, and return the paths of its files."""
         rows: tuple[Row, ...] = getattr(self, chart)
         events = self.about["recording"]["events"] / 1e6
         title = f"{chart.capitalize()} on {self.about['machine']}: {events:.1f} M events"
@@ -80,15 +89,16 @@ class Charts:
     def answer(
         self, folder: Path, *, budget_px: float | None = None, budget_ms: float | None = None
     ) -> dict[str, Row | None]:
-        """For each command the best row within a budget, written to ``folder`` as a preset; None where there is none.
+        """Return for each command the best row within a budget, None if there is none, and write it as a preset to
+        ``folder``.
 
-        ``budget_px``: the fastest of both; ``budget_ms``: the most accurate calibration.
+        ``budget_px`` selects the fastest rows of both commands; ``budget_ms`` the most accurate calibration.
         """
         out: dict[str, Row | None] = {}
         files = [r for r in self.compensation if r.job == compensation.FILE]
         if budget_px is not None:
             out["calibration"] = fastest_within(self.calibration, budget_px)
-            # without files the images tell the models' order
+            # without whole files, the images give the order of the models
             out["compensation"] = fastest_within(files or _as_files(self.compensation), budget_px)
         if budget_ms is not None:
             out["calibration"] = most_accurate_within(self.calibration, budget_ms * 1e-3)
@@ -99,11 +109,13 @@ class Charts:
 
 
 def _as_files(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of images that use all events, all angles and bilinear votes."""
     whole = {"vote": "bilinear", "angles": TURNS, "share": 1.0}
     return [r for r in rows if "library" not in r.settings and all(r.settings[n] == v for n, v in whole.items())]
 
 
 def _preset(kind: str, row: Row) -> Preset:
+    """Return a row as a preset of a command."""
     settings = {n: v for n, v in row.settings.items() if n != "device"}
     if kind == "compensation":
         settings = {"model": settings["model"]}
@@ -111,6 +123,7 @@ def _preset(kind: str, row: Row) -> Preset:
 
 
 def _measured(row: Row) -> dict[str, float]:
+    """Return speed and error of a row."""
     speed = {"ms": row.seconds * 1e3} if row.chart == "calibration" else {"mev_per_s": row.mev_per_s}
     return {**speed, "error_px": row.error_px}
 
@@ -119,12 +132,15 @@ def simulated(
     picture: Path | None = None, *, seed: int = 0, device: str = "cpu", quick: bool = False,
     progress: Progress | None = None,
 ) -> Recording:  # fmt: skip
-    """As that of ``amiwarp demo``, but 24 turns, in memory; ``picture`` None for the map of the earth."""
+    """Simulate the recording of ``amiwarp demo`` in memory, with 24 turns.
+
+    ``picture`` None stands for the map of the earth.
+    """
     width, height, seconds = QUICK if quick else USUAL
-    made = simulation(Demo(Path(), picture, width, height, seconds, seed, device))
+    simulated_scene = simulation(Demo(Path(), picture, width, height, seconds, seed, device))
     if not quick:
-        made = replace(made, sensor=SensorModel(contrast_on=CONTRAST, contrast_off=CONTRAST))
-    return made.run(progress=progress)
+        simulated_scene = replace(simulated_scene, sensor=SensorModel(contrast_on=CONTRAST, contrast_off=CONTRAST))
+    return simulated_scene.run(progress=progress)
 
 
 def make(
@@ -137,18 +153,18 @@ def make(
     libraries: compensation.Libraries | None = None,
     progress: Progress | None = None,
 ) -> Charts:
-    """Measure a recording with truth; write both charts and their data into the folder ``out``.
+    """Measure a recording with ground truth; write both charts and their data into the folder ``out``.
 
     ``quick`` measures a few settings, once each. ``libraries`` adds rows of other libraries. Raises
-    :class:`AmiwarpError` for a recording without truth, a folder that cannot be made or holds these files, and an image
-    that is wrong.
+    :class:`AmiwarpError` for a recording without ground truth, a folder that cannot be created or that holds these
+    files, and a wrong image.
     """
-    known = Known.of(recording)
+    known = KnownRecording.of(recording)
     make_folder(out)
     files = {"data": out / "chart.json", "table": out / "chart.csv"}
     for path in (*files.values(), *(path for chart in REPEATS for path in _drawn(chart, out).values())):
         check_output(path)
-    tell = progress or silent
+    report = progress or silent
     repeats = dict.fromkeys(REPEATS, 1) if quick else REPEATS
     compensated, notes = compensation.rows(
         known,
@@ -156,41 +172,45 @@ def make(
         repeats=repeats["compensation"],
         quick=quick,
         folder=out,
-        tell=part(tell, 0.0, 0.3),
+        progress=part(report, 0.0, 0.3),
         libraries=libraries,
     )
     calibrated, more = calibration.rows(
-        known, device, repeats=repeats["calibration"], quick=quick, seed=seed, tell=part(tell, 0.3, 0.97)
+        known, device, repeats=repeats["calibration"], quick=quick, seed=seed, progress=part(report, 0.3, 0.97)
     )
-    tell("drawing", 0.97)
-    done = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), _about(known, device))
-    # the figures last: they need packages that a machine with a GPU may lack
-    write_text(files["data"], json.dumps({**done.about, **_data(done)}, indent=1, allow_nan=False) + "\n")
+    report("drawing", 0.97)
+    charts = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), _about(known, device))
+    # figures come last, because a GPU machine may lack their packages
+    write_text(files["data"], json.dumps({**charts.about, **_data(charts)}, indent=1, allow_nan=False) + "\n")
     write_text(files["table"], _csv([*compensated, *calibrated]))
-    return done.draw(out)
+    return charts.draw(out)
 
 
 def _drawn(chart: str, out: Path) -> dict[str, Path]:
+    """Return the paths of the figures of a chart."""
     return {chart: out / f"{chart}.png", f"{chart} (SVG)": out / f"{chart}.svg"}
 
 
 def _share_note(rows: Sequence[Row]) -> str:
+    """Return the note below the compensation chart."""
     errors = [f"{100 * r.image_error:.0f} % of its contrast for 1/{round(1 / r.settings['share'])}"
               for r in rows if not r.comparable and r.image_error is not None]  # fmt: skip
-    small = "Small marks: fewer angles a turn. " if any(r.settings.get("angles", 0) < TURNS
+    small = "Small markers: fewer angles per turn. " if any(r.settings.get("angles", 0) < TURNS
                                                         for r in rows if "angles" in r.settings) else ""  # fmt: skip
-    return f"{small}A share of the events leaves noise in the image: {', '.join(errors)}."
+    return f"{small}A share of the events adds noise to the image: {', '.join(errors)}."
 
 
 def _guess_note(rows: Sequence[Row]) -> str:
-    text = "Model error: rms over image and turn, the constant lag removed."
+    """Return the note below the calibration chart."""
+    text = "Model error: rms over image and turn, without the constant lag."
     guess = round(math.degrees(calibration.GUESS))
     if any(not r.comparable for r in rows):
-        text += f" With a guess: the phase known to {guess}°, so beside the front."
+        text += f" With a guess: the phase is known to {guess}°, so these points are not part of the front."
     return text
 
 
-def _about(known: Known, device: str) -> dict[str, Any]:
+def _about(known: KnownRecording, device: str) -> dict[str, Any]:
+    """Return the description of machine and recording."""
     return {
         "format": "amiwarp-chart",
         "version": 1,
@@ -206,7 +226,7 @@ def _about(known: Known, device: str) -> dict[str, Any]:
 
 
 def _data(charts: Charts) -> dict[str, Any]:
-    """Rows with their fronts, and what beats a default."""
+    """Return the rows, their fronts, and the rows that beat a default, as JSON data."""
     out: dict[str, Any] = {"notes": list(charts.notes)}
     for name in ("compensation", "calibration"):
         rows: tuple[Row, ...] = getattr(charts, name)
@@ -219,7 +239,7 @@ def _data(charts: Charts) -> dict[str, Any]:
 
 
 def _csv(rows: Sequence[Row]) -> str:
-    """One line a row; settings that a row has not are empty."""
+    """Return the rows as CSV, one line per row; settings that a row lacks are empty."""
     fixed = ("chart", "job", "label", "default", "on_front", "error_px", "mev_per_s", "ms", "spread",
              "repeats", "image_error")  # fmt: skip
     on = {id(r) for name in REPEATS for _, chosen in fronts([r for r in rows if r.chart == name]) for r in chosen}

@@ -1,4 +1,8 @@
-"""The compensation's rows: models, votes, angles and shares into an image; other libraries; whole files."""
+"""Rows of the compensation chart.
+
+They measure images of events with every model, vote, number of angles and share of events; other libraries; and whole
+files.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ from amiwarp.io.output import scratch_folder
 from amiwarp.optics.models import MODELS, Model, wrap_angle
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import Row, Task, measure
-from amiwarp.studies.chart.truth import Known, exact_image, exact_places, raw_places, rms
+from amiwarp.studies.chart.truth import KnownRecording, exact_image, exact_places, raw_places, rms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,53 +36,63 @@ if TYPE_CHECKING:
     from amiwarp.calib import Calibration
 
 IMAGE, FILE = "image of events", "file to file"
+"""Names of the jobs."""
 ANGLES = (TURNS, 4096, 1024, 256)
-"""Angles of a turn that are told apart."""
+"""Numbers of distinct prism angles per turn."""
 SHARES = (4, 16)
-"""Every so many events make the image."""
+"""The image uses every n-th event, for each n here."""
 SAMPLE = 200_000
-"""At most so many events, thinned evenly, measure an error."""
+"""Largest number of events that an error is measured on; more are thinned evenly."""
 MANY = 64_000_000
-"""On CUDA the recording is repeated to about so many events: fewer would measure the launches."""
+"""On CUDA the recording is repeated to about this number of events; with fewer, launch times would dominate."""
 REST_S = 0.02
-"""Threads of other libraries spin a while after their work."""
+"""Pause after a run [s], because threads of other libraries stay busy for a while."""
 WRONG = 0.02
-"""Difference of the exact model's bilinear image from the float64 one, above which something is broken."""
+"""Largest difference of the exact model's bilinear image from the float64 image; above it something is broken."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
-    """Some of the recording's events with their exact places."""
+class ErrorSample:
+    """Sample of the recording's events with their exact compensated positions."""
 
-    known: Known
+    known: KnownRecording
+    """Recording with ground truth."""
     step: int
+    """The sample holds every ``step``-th event."""
     xy: NDArray[np.float64]
+    """Recorded positions [px], shape ``(n, 2)``."""
     theta: NDArray[np.float64]
+    """Prism angles [rad], shape ``(n,)``."""
     exact: NDArray[np.float64]
+    """Exact compensated positions [px], shape ``(n, 2)``."""
 
     @classmethod
-    def of(cls, known: Known) -> Sample:
+    def of(cls, known: KnownRecording) -> ErrorSample:
+        """Draw the sample of a recording."""
         step = -(-len(known.events) // SAMPLE)
         some = known.events[::step]
         xy, theta = raw_places(some), known.encoder.angle_at(some.t)
         return cls(known, step, xy, theta, exact_places(known.model, xy, theta))
 
     def error(self, places: NDArray[np.floating[Any]], vote: Vote) -> float:
-        """Rms distance [px] of ``places`` (n, 2) from the exact ones; a nearest vote adds what it rounds."""
+        """Return the rms distance [px] of positions ``(n, 2)`` from the exact ones.
+
+        A nearest vote adds its rounding.
+        """
         voted = np.rint(places) if vote is Vote.NEAREST else places
         return rms(voted - self.exact)
 
 
 def coarse(theta: NDArray[np.float64], angles: int) -> NDArray[np.float64]:
-    """Angles [rad] rounded to so many a turn."""
+    """Return angles [rad] rounded to ``angles`` steps per turn."""
     step = 2.0 * math.pi / angles
     return np.asarray(np.rint(theta / step) * step)
 
 
 class Uploads:
-    """The recording's events on the device under different angles and shares, each uploaded once."""
+    """Events of the recording on the device, at several numbers of angles and shares; each is uploaded once."""
 
-    def __init__(self, known: Known, device: str) -> None:
+    def __init__(self, known: KnownRecording, device: str) -> None:
         self.known, self.device = known, device
         copies = 1 if wp.get_device(device).is_cpu else max(1, MANY // len(known.events))
         self.events = known.events if copies == 1 else _repeated(known, copies)
@@ -87,88 +101,99 @@ class Uploads:
         self._made: dict[tuple[int, int], Any] = {}
 
     def get(self, angles: int, share: int) -> Any:
+        """Return the uploaded events."""
         if (angles, share) not in self._made:
             theta = coarse(self.theta[::share], angles)
             self._made[angles, share] = upload_events(self.events[::share], theta, self.device)
         return self._made[angles, share]
 
 
-def _repeated(known: Known, copies: int) -> Any:
+def _repeated(known: KnownRecording, copies: int) -> Any:
+    """Return the events repeated ``copies`` times."""
     e = known.events
     return replace(e, **{n: np.tile(getattr(e, n), copies) for n in ("x", "y", "t", "p")})
 
 
 @dataclass(frozen=True)
-class Setting:
-    """One way to an image."""
+class ImageSetting:
+    """Setting of an image of events."""
 
     model: str
+    """Refraction model."""
     vote: Vote
+    """Vote."""
     angles: int = TURNS
+    """Number of angles per turn."""
     share: int = 1
+    """The image uses every ``share``-th event."""
 
     @property
     def label(self) -> str:
+        """Name for people."""
         words = [self.model, self.vote.value]
         words += [] if self.angles == TURNS else [f"{self.angles} angles"]
         words += [] if self.share == 1 else [f"1/{self.share} of events"]
         return ", ".join(words)
 
     def fields(self, device: str) -> dict[str, Any]:
-        """Of the row."""
+        """Return the fixed fields of the row."""
         settings = {"model": self.model, "vote": self.vote.value, "angles": self.angles, "share": 1.0 / self.share,
                     "device": device}  # fmt: skip
-        default = self == Setting("exact", Vote.BILINEAR)
+        default = self == ImageSetting("exact", Vote.BILINEAR)
         return {"chart": "compensation", "job": IMAGE, "label": self.label, "family": self.model, "mark": self._mark,
                 "settings": settings, "default": default, "comparable": self.share == 1}  # fmt: skip
 
     @property
     def _mark(self) -> str:
+        """Kind of the row, shown by the marker."""
         return self.vote.value if self.share == 1 else "share of events"
 
 
-def settings(*, quick: bool) -> list[Setting]:
-    """The sensible combinations."""
+def settings(*, quick: bool) -> list[ImageSetting]:
+    """Return the settings of the chart."""
     angles, models = (ANGLES[::2], ("circle", "exact")) if quick else (ANGLES, tuple(MODELS))
-    # a nearest vote rounds away what coarse angles cost
-    whole = [Setting(m, v, a) for m in models for v in Vote for a in (angles if v is Vote.BILINEAR else angles[:1])]
-    return whole + [Setting("exact", Vote.BILINEAR, TURNS, share) for share in SHARES]
+    # a nearest vote hides the error of coarse angles
+    whole = [
+        ImageSetting(m, v, a) for m in models for v in Vote for a in (angles if v is Vote.BILINEAR else angles[:1])
+    ]
+    return whole + [ImageSetting("exact", Vote.BILINEAR, TURNS, share) for share in SHARES]
 
 
 @dataclass(frozen=True, eq=False)
 class LibraryTask:
-    """The same image made by another library."""
+    """Task of another library, which makes the same image."""
 
     task: Task
+    """Task."""
     places: Callable[[slice], NDArray[np.float32]]
-    """Give the places [px], shape ``(n, 2)``, to which the library moves the events of a slice."""
+    """Function that returns the positions [px], shape ``(n, 2)``, to which the library moves the events of a slice."""
 
 
-Libraries: TypeAlias = Callable[["Sample", "Uploads", str], tuple[list[LibraryTask], list[str]]]
-"""Make the tasks of other libraries from a sample, its uploads and a device, and notes on those left out."""
+Libraries: TypeAlias = Callable[["ErrorSample", "Uploads", str], tuple[list[LibraryTask], list[str]]]
+"""Function that returns tasks of other libraries for a sample, its uploads and a device, and notes on missing ones."""
 
 
 def rows(
-    known: Known,
+    known: KnownRecording,
     device: str,
     *,
     repeats: int,
     quick: bool,
-    tell: Progress,
+    progress: Progress,
     folder: Path,
     libraries: Libraries | None = None,
 ) -> tuple[list[Row], list[str]]:
-    """Measure all rows; return them with notes on what is missing. Temporary files go to ``folder``.
+    """Measure all rows; return them with notes on missing ones. Temporary files go to ``folder``.
 
-    Raises :class:`AmiwarpError` where the exact model's image is not the float64 one.
+    Raises :class:`AmiwarpError` if the exact model's image differs from the float64 image.
     """
-    tell("measuring images of events: the truth", 0.0)
-    sample, truth = Sample.of(known), exact_image(known)
+    progress("measuring images of events: the truth", 0.0)
+    sample, truth = ErrorSample.of(known), exact_image(known)
     models = {name: simplified(known.calibration(), name).model for name in MODELS}
     uploads, ways = Uploads(known, device), settings(quick=quick)
     others, notes = libraries(sample, uploads, device) if libraries is not None else ([], [])
     tasks = [*_image_tasks(ways, models, uploads, device), *(other.task for other in others)]
-    timed = measure(tasks, repeats, partial(tell, "measuring images of events"), rest_s=REST_S)
+    timed = measure(tasks, repeats, progress, "measuring images of events", rest_s=REST_S)
     out = []
     for t, way in zip(timed, ways, strict=False):
         places = _places(models[way.model], sample, way.angles, device)
@@ -179,18 +204,19 @@ def rows(
         image = _image_error(t.result, truth, t.task.events / len(known.events))
         out.append(t.row(sample.error(places, Vote.BILINEAR), image_error=image))
     _check(out)
-    files, missing = _file_rows(sample, device, repeats, quick, tell, folder)
+    files, missing = _file_rows(sample, device, repeats, quick, progress, folder)
     return out + files, notes + missing
 
 
-def _image_tasks(ways: list[Setting], models: dict[str, Model], uploads: Uploads, device: str) -> Iterator[Task]:
+def _image_tasks(ways: list[ImageSetting], models: dict[str, Model], uploads: Uploads, device: str) -> Iterator[Task]:
+    """Yield the tasks of the images."""
     camera = uploads.known.camera
     buffers = {}
     for vote in Vote:
         canvas = CanvasShape(camera.width, camera.height, vote=vote)
         buffers[vote] = Votes(canvas, device), Image(canvas, 1, device)
 
-    def run(way: Setting) -> Image:
+    def run(way: ImageSetting) -> Image:
         votes, image = buffers[way.vote]
         votes.clear()
         votes.add_events(models[way.model], uploads.get(way.angles, way.share))
@@ -203,40 +229,43 @@ def _image_tasks(ways: list[Setting], models: dict[str, Model], uploads: Uploads
         yield Task(partial(run, way), len(uploads.theta), fields, lambda image: image.numpy()[0])
 
 
-def _places(model: Model, sample: Sample, angles: int, device: str) -> NDArray[np.float64]:
-    """By the functions that the votes call, on the same device, at the angles that the events have."""
+def _places(model: Model, sample: ErrorSample, angles: int, device: str) -> NDArray[np.float64]:
+    """Return compensated positions by the device functions that the votes call, at the rounded angles."""
     theta = wrap_angle(coarse(sample.theta, angles)).astype(np.float32)
     xy = wp.array(sample.xy.astype(np.float32), dtype=wp.vec2, device=device)
     return model.compensate_points(xy, wp.array(theta, dtype=float, device=device)).numpy().astype(np.float64)
 
 
 def _image_error(image: NDArray[Any], truth: NDArray[np.float64], times: float) -> float:
-    """Rms difference of an image of ``times`` the events, over the true one's standard deviation."""
+    """Return the rms difference of an image of ``times`` the events from the truth, relative to the contrast of the
+    truth.
+    """
     return float(np.sqrt(np.mean((image / times - truth) ** 2)) / np.std(truth))
 
 
 def _check(rows: list[Row]) -> None:
+    """Raise an error if the default's image is wrong."""
     default = next(row for row in rows if row.default)
     if default.image_error is None or not default.image_error < WRONG:
         raise AmiwarpError(
             f"the image by {default.label} differs from the float64 one by {default.image_error} of its contrast; "
-            "this device computes something else: run the tests on it"
+            "this device gives wrong results; run the tests on it"
         )
 
 
-def circle(sample: Sample) -> tuple[float, float]:
-    """Radius [px] and phase [rad] of the pixels' circle that is nearest to the exact displacement of the events."""
+def circle(sample: ErrorSample) -> tuple[float, float]:
+    """Return radius [px] and phase [rad] of the circle that fits the exact displacements of the events best."""
     moved = (sample.xy - sample.exact) @ (1.0, 1.0j)
     best = complex(np.nanmean(moved * np.exp(-1j * sample.theta)))
     return abs(best), float(np.angle(best))
 
 
 def _file_rows(
-    sample: Sample, device: str, repeats: int, quick: bool, tell: Progress, folder: Path
+    sample: ErrorSample, device: str, repeats: int, quick: bool, progress: Progress, folder: Path
 ) -> tuple[list[Row], list[str]]:
-    """Whole files by each model, reading and writing included; the error is that of the file that was written."""
+    """Measure whole files with each model, reading and writing included; the error is that of the written file."""
     if missing := [name for name in ("h5py", "hdf5plugin") if find_spec(name) is None]:
-        return [], [f"files: left out, {' and '.join(missing)} not installed"]
+        return [], [f"files: not measured, because {' and '.join(missing)} is not installed"]
     known = sample.known
 
     def error(path: Path) -> float:
@@ -257,5 +286,5 @@ def _file_rows(
                       "mark": FILE, "settings": {"model": model, "device": device},
                       "default": model == "exact"}  # fmt: skip
             tasks.append(Task(partial(run, calibration), len(known.events), fields, error))
-        timed = measure(tasks, repeats, partial(tell, "measuring files"))
+        timed = measure(tasks, repeats, progress, "measuring files")
         return [t.row(t.result) for t in timed], []

@@ -1,4 +1,4 @@
-"""The two charts as PNG and SVG: every row a point, the fronts numbered and listed below."""
+"""Drawing of the two charts as PNG and SVG: a point per row; the rows of the fronts are numbered and listed below."""
 
 from __future__ import annotations
 
@@ -11,45 +11,51 @@ from typing import Any
 import numpy as np
 
 from amiwarp.imaging.device_events import TURNS
+from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.plotting import figures
 from amiwarp.studies.chart.rows import Row, beaten_by, fronts, told_apart
 
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 11.0, 4.4, 0.85, 0.3, 0.3
-"""Of the figure, height of a panel, margins and what is between panels [inch]."""
+"""Figure width, panel height, left and right margins, and gap between panels [inch]."""
 TITLE, AXIS, LINE, KEY, NOTE = 0.42, 0.82, 0.225, 0.2, 0.42
-"""Heights above and below a panel, of a line of the lists, of one of the legend, and of the note [inch]."""
+"""Heights above and below a panel, of a list line, of a legend line, and of the note [inch]."""
 COLUMNS = 5
-"""Of the legend."""
+"""Number of columns of the legend."""
 LETTERS, SMALL, TINY = 12.5, 10.5, 9.5
-"""[point]: readable where the figure is shown at two thirds of its size."""
+"""Font sizes [point], legible when the figure is shown at two thirds of its size."""
 QUANTISATION, PAPER = 0.29, (1.5, 2.0)
-"""A pixel's rounding, one axis, and what the paper reports [px]."""
+"""Rounding error of a pixel along one axis, and error that the paper reports [px]."""
 REFERENCES = ((f"quantisation {QUANTISATION} px", QUANTISATION), (f"paper {PAPER[0]} to {PAPER[1]} px", PAPER[0]))
+"""Text and error [px] of the reference lines."""
 COLOURS = {
-    "circle": "#e69f00", "radial": "#009e73", "ellipse": "#0072b2", "exact": "#d55e00", "other libraries": "#6b6b6b",
-    "default": "#000000", "model": "#e69f00", "algorithms": "#0072b2", "events": "#009e73", "folding": "#cc79a7",
-    "pairs": "#56b4e9", "events and pairs": "#d55e00",
+    "circle": ORANGE, "radial": GREEN, "ellipse": BLUE, "exact": VERMILION, "other libraries": "#6b6b6b",
+    "default": BLACK, "model": ORANGE, "algorithms": BLUE, "events": GREEN, "folding": PINK, "pairs": SKY_BLUE,
+    "events and pairs": VERMILION,
 }  # fmt: skip
-"""Okabe and Ito's, told apart by the colour-blind too."""
-WORDS = {"ellipse": "ellipse (table)", "exact": "exact (closed form)", "default": "all as by default",
+"""Colour of each family."""
+WORDS = {"ellipse": "ellipse (table)", "exact": "exact (closed form)", "default": "all settings default",
          "other libraries": "other libraries (circle)"}  # fmt: skip
+"""Legend text of a family if it differs from its name."""
 MARKS = {
     "bilinear": "o", "nearest": "s", "share of events": "^", "file to file": "D", "NumPy": "x", "Numba": "+",
     "PyTorch": "*", "CuPy": "P", "both stages": "o", "sharpness alone": "s", "with a guess": "^",
 }  # fmt: skip
+"""Marker of each kind of row."""
 HOLLOW, THIN = ("share of events", "with a guess"), "x+"
+"""Kinds with hollow markers, and markers without area."""
 LINES = ("-", (0, (5, 2)))
-"""Of the fronts."""
+"""Line styles of the fronts."""
 NAMED = "other libraries"
-"""The family whose points have their names beside them."""
+"""Family whose points are labelled with their names."""
 DIRECTIONS = ((1, 1), (1, -1), (-1, 1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0), (0.5, 1), (0.5, -1), (-0.5, 1),
               (-0.5, -1), (2, 1), (2, -1), (-2, 1), (-2, -1))  # fmt: skip
+"""Directions in which a label may be placed, in order of preference."""
 DIGITS = ((1, 2, 3, 4, 5, 6, 7, 8, 9), (1, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,))
-"""Of the numbers on an axis, the finest first."""
+"""Digits of the numbers on an axis, from finest to coarsest."""
 
 
-class Panel:
-    """Axes with points, and the boxes [screen px] that these and their letters take."""
+class ChartPanel:
+    """Axes with points and labels, and the boxes [screen px] that they occupy."""
 
     def __init__(self, ax: Any, rows: Sequence[Row], limits: tuple[float, float], errors: tuple[float, float]) -> None:
         self.ax, self.timed = ax, rows[0].chart == "calibration"
@@ -68,13 +74,15 @@ class Panel:
         self.taken += self.points
 
     def x(self, row: Row) -> float:
+        """Return the horizontal coordinate of a row: time [ms] or speed [million events/s]."""
         return row.seconds * 1e3 if self.timed else row.mev_per_s
 
     def at(self, row: Row) -> Any:
-        """Where the row's point is [screen px]."""
+        """Return the position of a row's point [screen px]."""
         return self.ax.transData.transform((self.x(row), row.error_px))
 
     def _axes(self) -> None:
+        """Set up ticks, grid and reference lines."""
         ax = self.ax
         for axis, limits, length in zip((ax.xaxis, ax.yaxis), (ax.get_xlim(), ax.get_ylim()),
                                         ax.get_window_extent().size / self.unit, strict=True):  # fmt: skip
@@ -82,7 +90,7 @@ class Panel:
             axis.set_ticks([value for value, _ in shown], [text for _, text in shown])
             axis.set_minor_formatter(lambda value, _: "")
         ax.tick_params(which="both", labelsize=SMALL)
-        ax.tick_params(axis="x", which="both", pad=8.0)  # clear of the lowest number of the other axis
+        ax.tick_params(axis="x", which="both", pad=8.0)  # keeps clear of the lowest number of the other axis
         ax.grid(True, color="#e4e4e4", linewidth=0.8)
         ax.set_axisbelow(True)
         ax.axhspan(*PAPER, color="#bdbdbd", alpha=0.55, linewidth=0)
@@ -90,6 +98,7 @@ class Panel:
         ax.set_xlabel("time of a calibration [ms]" if self.timed else "speed [million events/s]", fontsize=LETTERS)
 
     def _point(self, row: Row) -> None:
+        """Draw the point of a row."""
         colour, mark = COLOURS[row.family], MARKS[row.mark]
         size = 5.0 if row.settings.get("angles", TURNS) < TURNS else 12.0 if mark == "*" else 8.5
         lines = row.mark in HOLLOW or mark in THIN
@@ -102,11 +111,11 @@ class Panel:
                          markeredgewidth=1.6, zorder=4)  # fmt: skip
 
     def step(self, chosen: list[Row], style: Any) -> None:
-        """The front as steps: what a budget gets."""
+        """Draw a front as steps: the error that each budget allows."""
         low, high = self.ax.get_xlim()
         top = self.ax.get_ylim()[1]
         x, y = [self.x(row) for row in chosen], [row.error_px for row in chosen]
-        # fastest first: errors fall along the list; nothing is faster than the first, nothing better than the last
+        # fastest first, so errors fall along the list; no row is faster than the first or more accurate than the last
         end = high if self.timed else low
         x, y = [x[0], *x, end], [top, *y, y[-1]]
         self.ax.step(x, y, where="post", color="black", linewidth=1.1, linestyle=style, zorder=2)
@@ -115,13 +124,13 @@ class Panel:
             self.taken.append((*(np.minimum(a, b) - 1.5), *(np.maximum(a, b) + 1.5)))
 
     def write(self, text: str, row: Row, *, size: float = SMALL, **style: Any) -> None:
-        """Letters beside a point, where they hide neither a point nor other letters."""
+        """Write a label near a point, where it covers neither points nor other labels."""
         from matplotlib.patheffects import withStroke
 
         if row not in self.rows:
             return
         here, box = self.at(row), self.ax.get_window_extent()
-        wide = 0.34 if "fontweight" in style else 0.29  # bold or not
+        wide = 0.34 if "fontweight" in style else 0.29  # bold or regular
         half = np.array([wide * size * len(text) + 1.0, 0.52 * size]) * self.unit
         near = half + (9.0 if row.default else 5.0) * self.unit
         away = np.array([0.0, 4.0, 9.0, 15.0, 22.0, 30.0, 40.0, 55.0, 70.0, 90.0]) * self.unit
@@ -141,18 +150,18 @@ class Panel:
         )  # fmt: skip
 
     def free(self, low: Any, high: Any, *, letters: bool = False) -> bool:
-        """Whether a box [screen px] hides nothing, or no ``letters``."""
+        """Return whether a box [screen px] covers nothing; with ``letters``, no other label."""
         boxes = self.letters if letters else self.taken
         return all(low[0] >= b[2] or high[0] <= b[0] or low[1] >= b[3] or high[1] <= b[1] for b in boxes)
 
     def open(self, here: Any, there: Any) -> bool:
-        """Whether a line from a point to its letters [screen px] crosses neither others nor other points."""
+        """Return whether the line from a point to its label [screen px] crosses neither labels nor other points."""
         others = [b for b in self.points if not (b[0] < here[0] < b[2] and b[1] < here[1] < b[3])]
         boxes = [*self.letters, *others]
         return not any(b[0] < x < b[2] and b[1] < y < b[3] for x, y in along(here, there) for b in boxes)
 
     def describe(self, text: str, error: float, *, anyhow: bool) -> bool:
-        """Says at a reference line what it is, where there is room, or ``anyhow``; whether it was said."""
+        """Write the text of a reference line if there is room, or ``anyhow``; return whether it was written."""
         ax, box = self.ax, self.ax.get_window_extent()
         size = np.array([0.56 * TINY * len(text), 1.15 * TINY]) * self.unit
         at = ax.transData.transform((ax.get_xlim()[0], error))[1]
@@ -169,12 +178,12 @@ class Panel:
 
 
 def along(here: Any, there: Any) -> list[Any]:
-    """Places on the line between two."""
+    """Return points on the line between two points."""
     return [here + share * (there - here) for share in np.linspace(0.05, 0.95, 19)]
 
 
 def numbers(limits: tuple[float, float], length: float, *, upright: bool) -> list[tuple[float, str]]:
-    """Values and words of a logarithmic axis of ``length`` [point], as many as stand apart."""
+    """Return values and texts of the ticks of a logarithmic axis of ``length`` [point], as many as fit."""
     low, high = limits
     found: list[tuple[float, str]] = []
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
@@ -193,16 +202,16 @@ def numbers(limits: tuple[float, float], length: float, *, upright: bool) -> lis
 
 
 def word(value: float) -> str:
-    """A number as people write it: 10,000 or 0.0001."""
+    """Return a number as text, such as 10,000 or 0.0001."""
     if value >= 1.0:
         return f"{value:,.10g}"
     return np.format_float_positional(value, precision=3, fractional=False, trim="-")
 
 
 def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
-    """Writes ``path`` with the endings .png and .svg, each whole or not at all; ``note``: a line below.
+    """Write the chart as ``path`` with the endings .png and .svg; each write is atomic. ``note`` is a line below.
 
-    Raises :class:`ModuleNotFoundError` where Matplotlib or Pillow is missing.
+    Raises :class:`ModuleNotFoundError` if Matplotlib or Pillow is missing.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -222,7 +231,7 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
             panel.step(chosen, style)
     figure.text(LEFT / WIDTH, (height - 0.3) / height, title, fontsize=LETTERS + 1.0)
 
-    def closest(row: Row) -> Panel:
+    def closest(row: Row) -> ChartPanel:
         return [panel for panel in panels if row in panel.rows][-1]
 
     for number, row in (pair for each in lists for pair in each if isinstance(pair[1], Row)):
@@ -232,7 +241,7 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
         for panel in reversed(panels):
             if panel.describe(text, error, anyhow=panel is panels[0]):
                 break
-    # from the right: names stand to the right of their points where they can
+    # from the right, because a name is placed to the right of its point if possible
     for row in sorted(rows, key=lambda r: r.cost):
         if row.family == NAMED:
             name = row.label.removesuffix(" (circle)").replace(" on the", ",")
@@ -247,8 +256,8 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
     figures.save_svg(figure, path.with_suffix(".svg"))
 
 
-def _panels(figure: Any, rows: Sequence[Row], height: float, top: float) -> list[Panel]:
-    """All rows; and where that leaves too little room for the models, these by themselves."""
+def _panels(figure: Any, rows: Sequence[Row], height: float, top: float) -> list[ChartPanel]:
+    """Return a panel of all rows, and for compensation an enlarged panel of the models."""
     timed = rows[0].chart == "calibration"
     x = [row.seconds * 1e3 if timed else row.mev_per_s for row in rows]
     errors = [row.error_px for row in rows]
@@ -263,19 +272,19 @@ def _panels(figure: Any, rows: Sequence[Row], height: float, top: float) -> list
     for k, span in enumerate(shown):
         place = ((LEFT + k * (width + BETWEEN)) / WIDTH, (top - PANEL) / height, width / WIDTH,
                  PANEL / height)  # fmt: skip
-        panels.append(Panel(figure.add_axes(place), rows, span, heights))
+        panels.append(ChartPanel(figure.add_axes(place), rows, span, heights))
     first = panels[0].ax
     first.set_ylabel("model error [px rms]" if timed else "displacement error [px rms]", fontsize=LETTERS)
     for panel in panels[1:]:
         first.axvspan(*near, color="#56b4e9", alpha=0.18, linewidth=0, zorder=0)
         panel.ax.tick_params(axis="y", labelleft=False)
         first.set_title("all", fontsize=LETTERS, loc="left")
-        panel.ax.set_title("the shaded part, enlarged", fontsize=LETTERS, loc="left")
+        panel.ax.set_title("shaded part, enlarged", fontsize=LETTERS, loc="left")
     return panels
 
 
 def _numbered(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) -> list[list[tuple[str, Any]]]:
-    """Two lists for two columns: headings, and rows of the fronts by number; the default where it is on none."""
+    """Return two lists for two columns: headings, numbered rows of the fronts, and the default if it is on no front."""
     lists: list[list[tuple[str, Any]]] = []
     number = 0
     for job, chosen, _ in lines:
@@ -295,6 +304,7 @@ def _numbered(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) 
 
 
 def _list(figure: Any, listed: list[tuple[str, Any]], column: int, timed: bool, top: float) -> None:
+    """Write one list below the panels."""
     width = (WIDTH - LEFT - RIGHT - BETWEEN) / 2.0
     left = LEFT + column * (width + BETWEEN)
     for k, (number, row) in enumerate(listed):
@@ -314,11 +324,12 @@ def _list(figure: Any, listed: list[tuple[str, Any]], column: int, timed: bool, 
 
 
 def _pixels(error: float) -> str:
+    """Return an error [px] as text."""
     return np.format_float_positional(error, precision=3 if error >= 0.001 else 1, fractional=False, trim="-")
 
 
 def _keys(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) -> list[Any]:
-    """Of the legend."""
+    """Return the handles of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -1,4 +1,4 @@
-"""Rows of a chart: what was run, how long it took, how far off it was; the Pareto front, and answers to a budget."""
+"""Rows of a chart: setting, time and error of a run; the Pareto front, and the best row within a budget."""
 
 from __future__ import annotations
 
@@ -8,79 +8,89 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-"""Called with what is being done and the share of it that is."""
+from amiwarp.progress import Progress
 
-ALIKE = 0.05
-"""Times that differ by a smaller share are taken for equal: so much they differ from run to run."""
-HOPELESS = 0.7
-"""What another beats in so small a share of its time, and in error too, no repeat brings to a front."""
-ALIKE_PX = 0.003
-"""Errors that differ by less are taken for equal: another seed of the noise would turn them round."""
+EQUAL_TIME_SHARE = 0.05
+"""Times that differ by a smaller share count as equal, because times vary this much between runs."""
+CLEARLY_FASTER = 0.7
+"""A row cannot reach the front by repeats if another row takes less than this share of its time and has no larger
+error.
+"""
+EQUAL_ERROR_PX = 0.003
+"""Errors that differ by less count as equal [px], because another seed of the noise could reverse their order."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One setting, with the speed and the error of the same run."""
+    """One setting, with speed and error of the same run."""
 
     chart: str
-    """"compensation" or "calibration"."""
+    """Chart: compensation or calibration."""
     job: str
-    """Rows of one job do the same work, so that one front holds them all."""
+    """Name of the job. Rows of one job do the same work and share one front."""
     label: str
+    """Name of the setting."""
     family: str
-    """What the colour tells."""
+    """Family, shown by the colour."""
     mark: str
-    """What the marker's shape tells."""
+    """Kind, shown by the marker."""
     settings: Mapping[str, Any]
+    """Settings of the run, as JSON data."""
     events: int
-    """Of the recording that was worked through, whatever share of them was used."""
+    """Number of events of the recording, whichever share of them the setting uses."""
     seconds: float
-    """Median of the repeats."""
+    """Median time of the repeats [s]."""
     spread: float
-    """Longest less shortest repeat, over the median."""
+    """Difference of longest and shortest repeat, relative to the median."""
     repeats: int
+    """Number of repeats."""
     error_px: float
-    """[px rms]."""
+    """Error [px rms]."""
     image_error: float | None = None
-    """Rms difference of the run's image from the float64 one, over that one's standard deviation."""
+    """Rms difference of the run's image from the float64 image, relative to the standard deviation of the latter."""
     default: bool = False
-    """What the commands do unless told otherwise."""
+    """Whether the commands use this setting by default."""
     comparable: bool = True
-    """Rows that pay in noise, or need a guess, stand beside the front."""
+    """False for rows that add noise or need a guess; these are not part of a front."""
 
     @property
     def mev_per_s(self) -> float:
-        """Million events of the recording a second."""
+        """Speed [million events of the recording per second]."""
         return self.events / self.seconds / 1e6
 
     @property
     def cost(self) -> float:
-        """Time per event [s]: the less the better."""
+        """Time per event [s]."""
         return self.seconds / self.events
 
 
 @dataclass(frozen=True)
 class Task:
-    """A row to be: what to run, and the row's fixed fields."""
+    """Task of a row: the function to measure, and the fixed fields of the row."""
 
     run: Callable[[], Any]
-    """Returns once the device is done."""
+    """Function to measure; it returns when the device has finished."""
     events: int
-    """Worked through by one run."""
+    """Number of events that one run processes."""
     fields: Mapping[str, Any] = field(default_factory=dict)
+    """Fixed fields of the row."""
     keep: Callable[[Any], Any] = lambda result: result
-    """What is kept of a run, off the clock."""
+    """Function that returns the part of a result to keep; its time does not count."""
 
 
 @dataclass(frozen=True)
 class Timed:
-    """A task's times and what was kept of its first timed run; the others do the same work."""
+    """Times of a task, and the kept result of its first timed run."""
 
     task: Task
+    """Task."""
     times: tuple[float, ...]
+    """Times of the repeats [s]."""
     result: Any
+    """Kept result."""
 
     def row(self, error_px: float, **more: Any) -> Row:
+        """Return the row, with the error and further fields."""
         median = statistics.median(self.times)
         spread = (max(self.times) - min(self.times)) / median
         return Row(**self.task.fields, events=self.task.events, seconds=median, spread=spread,
@@ -90,30 +100,31 @@ class Timed:
 def measure(
     tasks: Sequence[Task],
     repeats: int,
-    tell: Callable[[float], None],
+    progress: Progress,
+    what: str,
     *,
     warm_up: bool = True,
     limit_s: float = 180.0,
     rest_s: float = 0.0,
     again: Callable[[Sequence[Timed]], Sequence[bool]] | None = None,
 ) -> list[Timed]:
-    """Times of all tasks, taken round-robin: what slows the machine for a while slows all of them.
+    """Measure all tasks in rounds, so that a temporary slowdown of the machine affects all of them.
 
-    ``warm_up``: a first round, in which kernels are compiled, is left out. No new round begins after ``limit_s``.
-    ``rest_s``: before each run, where threads of the one before may still spin. ``again``: of tasks timed once, which
-    to repeat.
+    ``warm_up`` adds an untimed first round, in which kernels are compiled. No new round begins after ``limit_s`` [s].
+    ``rest_s`` [s] is a pause before each run, in which threads of the previous run may still be busy. ``again`` decides
+    from tasks that were timed once which of them to repeat.
     """
     times: list[list[float]] = [[] for _ in tasks]
     results: list[Any] = [None] * len(tasks)
-    worth: Sequence[bool] = [True] * len(tasks)
+    repeated: Sequence[bool] = [True] * len(tasks)
     rounds, began = repeats + int(warm_up), time.perf_counter()
     for turn in range(rounds):
         if turn > int(warm_up) and time.perf_counter() - began > limit_s:
             break
         if turn == int(warm_up) + 1 and again is not None:
-            worth = again(_timed(tasks, times, results))
+            repeated = again(_timed(tasks, times, results))
         for k, task in enumerate(tasks):
-            if not worth[k]:
+            if not repeated[k]:
                 continue
             time.sleep(rest_s)
             start = time.perf_counter()
@@ -122,16 +133,17 @@ def measure(
             results[k] = task.keep(result) if turn == int(warm_up) else results[k]
             if turn >= int(warm_up):
                 times[k].append(took)
-            tell((turn * len(tasks) + k + 1) / (rounds * len(tasks)))
+            progress(what, (turn * len(tasks) + k + 1) / (rounds * len(tasks)))
     return _timed(tasks, times, results)
 
 
 def _timed(tasks: Sequence[Task], times: list[list[float]], results: list[Any]) -> list[Timed]:
+    """Return the timed tasks."""
     return [Timed(task, tuple(each), result) for task, each, result in zip(tasks, times, results, strict=True)]
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
-    """The Pareto front, fastest first: nothing is faster and at least as accurate."""
+    """Return the Pareto front, fastest first: no other row is faster and at least as accurate."""
     best, chosen = float("inf"), []
     for row in sorted((r for r in rows if r.comparable), key=lambda r: (r.cost, r.error_px)):
         if row.error_px < best:
@@ -141,58 +153,62 @@ def front(rows: Sequence[Row]) -> list[Row]:
 
 
 def fronts(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """Each job's front."""
+    """Yield each job with its front."""
     for job in dict.fromkeys(row.job for row in rows):
         yield job, front([row for row in rows if row.job == job])
 
 
 def told_apart(chosen: Sequence[Row]) -> list[Row]:
-    """Of a front, fastest first, what is clearly faster than the next more accurate; and the default."""
+    """Return the rows of a front, fastest first, that are clearly faster than the next more accurate row, and the
+    default.
+    """
     kept: list[Row] = []
     for row in reversed(chosen):
-        if not kept or row.default or row.cost < kept[-1].cost * (1.0 - ALIKE):
+        if not kept or row.default or row.cost < kept[-1].cost * (1.0 - EQUAL_TIME_SHARE):
             kept.append(row)
     return kept[::-1]
 
 
 def beaten_by(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """Rows of the same job that are clearly better in one and no worse in the other."""
+    """Return rows of the same job that are clearly better in time or error and no worse in the other."""
     out = []
     for other in rows:
         if other.job != row.job or not other.comparable:
             continue
-        faster, slower = other.cost < row.cost * (1.0 - ALIKE), other.cost > row.cost
-        nearer, further = other.error_px < row.error_px - ALIKE_PX, other.error_px > row.error_px
+        faster, slower = other.cost < row.cost * (1.0 - EQUAL_TIME_SHARE), other.cost > row.cost
+        nearer, further = other.error_px < row.error_px - EQUAL_ERROR_PX, other.error_px > row.error_px
         if (faster and not further) or (nearer and not slower):
             out.append(other)
     return out
 
 
 def near_front(rows: Sequence[Row | None]) -> list[bool]:
-    """Whether a row may be on the front after all, once its time is known better; the default always counts."""
-    there = [row for row in rows if row is not None]
+    """Return for each row whether better timing may put it on the front; always True for the default."""
+    known = [row for row in rows if row is not None]
 
     def hopeful(row: Row) -> bool:
         return row.default or all(
-            other.cost > row.cost * HOPELESS or other.error_px > row.error_px for other in there if other.comparable
+            other.cost > row.cost * CLEARLY_FASTER or other.error_px > row.error_px
+            for other in known
+            if other.comparable
         )
 
     return [row is not None and hopeful(row) for row in rows]
 
 
 def fastest_within(rows: Sequence[Row], error_px: float) -> Row | None:
-    """The fastest row within an error; of those as fast, the most accurate."""
+    """Return the fastest row within an error; of rows of equal time, the most accurate."""
     within = [r for r in rows if r.comparable and r.error_px <= error_px]
     if not within:
         return None
-    limit = min(r.cost for r in within) * (1.0 + ALIKE)
+    limit = min(r.cost for r in within) * (1.0 + EQUAL_TIME_SHARE)
     return min((r for r in within if r.cost <= limit), key=lambda r: r.error_px)
 
 
 def most_accurate_within(rows: Sequence[Row], seconds: float) -> Row | None:
-    """The most accurate row within a time; of those as accurate, the fastest."""
+    """Return the most accurate row within a time; of rows of equal error, the fastest."""
     within = [r for r in rows if r.comparable and r.seconds <= seconds]
     if not within:
         return None
-    limit = min(r.error_px for r in within) + ALIKE_PX
+    limit = min(r.error_px for r in within) + EQUAL_ERROR_PX
     return min((r for r in within if r.error_px <= limit), key=lambda r: r.cost)

@@ -1,4 +1,4 @@
-"""What a chart is held against: the recording's truth, and the exact model in float64."""
+"""Ground truth of the charts: the recording's true parameters, and the exact model in float64."""
 
 from __future__ import annotations
 
@@ -25,34 +25,45 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import ExactModel
 
 MOST_EVENTS = 20_000_000
-"""So many events of a recording are taken, from its beginning: they are held in memory."""
+"""Largest number of events, taken from the beginning of the recording, because they are held in memory."""
 NEEDED = ("apex", "index", "phase")
+"""Parameters that the ground truth must contain."""
 PIECE = 1 << 20
+"""Number of events that are processed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """A recording in memory with all that is true of it."""
+class KnownRecording:
+    """Recording in memory with its ground truth."""
 
     recording: Recording
+    """Recording in memory."""
     events: Events
+    """Events of the recording."""
     camera: Camera
+    """Camera."""
     encoder: Encoder
-    """With the true clock offset."""
+    """Encoder with the true clock offset."""
     model: ExactModel
-    """The true one."""
+    """True model."""
 
     @classmethod
-    def of(cls, recording: Recording) -> Known:
-        """Raises :class:`AmiwarpError` where the recording lacks camera, encoder, prism or truth."""
+    def of(cls, recording: Recording) -> KnownRecording:
+        """Load a recording. Raises :class:`AmiwarpError` if it lacks camera, encoder, prism or ground truth."""
         truth, camera, encoder = recording.truth, recording.camera, recording.encoder
         if truth is None or not set(NEEDED) <= set(truth.parameters):
-            raise AmiwarpError(f"{recording.name}: carries no truth (apex, index, phase); make one: amiwarp simulate")
+            raise AmiwarpError(
+                f"{recording.name}: has no ground truth (apex, index, phase); create a recording with: amiwarp simulate"
+            )
         if camera is None or encoder is None or recording.prism is None:
-            raise AmiwarpError(f"{recording.name}: lacks its camera, encoder or prism; make one: amiwarp simulate")
+            raise AmiwarpError(
+                f"{recording.name}: lacks camera, encoder or prism; create a recording with: amiwarp simulate"
+            )
         events = recording.events.slice(0, MOST_EVENTS)
         if not len(events) or events.x.dtype != np.uint16:
-            raise AmiwarpError(f"{recording.name}: has no events from a sensor (uint16); give one not yet compensated")
+            raise AmiwarpError(
+                f"{recording.name}: has no sensor events (uint16); give a recording that is not compensated"
+            )
         held = Recording(
             MemoryEvents(events, *recording.events.size), camera, encoder, recording.prism, truth, {}, recording.name
         )
@@ -60,7 +71,7 @@ class Known:
         return cls(held, events, camera, encoder.with_clock_offset(truth.parameters.get("clock_offset_us", 0.0)), model)
 
     def calibration(self) -> Calibration:
-        """What a calibration without any error would find."""
+        """Return the calibration with the true parameters."""
         tilt_x, tilt_y = self.model.tilt
         tilts = {"tilt_x": tilt_x, "tilt_y": tilt_y} if tilt_x or tilt_y else {}
         prism = self.model.prism
@@ -73,9 +84,10 @@ class Known:
 
 
 def exact_places(model: ExactModel, xy: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places of events without the prism [px], in float64; ``xy`` (n, 2) [px], ``theta`` (n,) [rad]; NaN where none.
+    """Return the compensated positions of events [px], in float64; NaN if there are none.
 
-    The closed form of ``docs/optics.md``. A lens with distortion is followed in float32, within 3e-4 px.
+    ``xy`` (n, 2) [px] are the recorded positions, ``theta`` (n,) [rad] the prism angles. The closed form is that of
+    ``docs/explanation/optics.md``. Lens distortion is computed in float32, within 3e-4 px.
     """
     prism, camera = model.prism, model.camera
     axis = axis_rotation(*model.tilt)
@@ -96,6 +108,7 @@ def exact_places(model: ExactModel, xy: NDArray[np.float64], theta: NDArray[np.f
 
 
 def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit bearings of pixels."""
     if camera.distortion is not None:
         return camera.pixels_to_rays(xy)
     ray = np.column_stack([(xy - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(xy))])
@@ -103,6 +116,7 @@ def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _pixels(camera: Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pixels of bearings."""
     if camera.distortion is not None:
         return camera.rays_to_pixels(rays)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -111,12 +125,14 @@ def _pixels(camera: Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def raw_places(events: Events) -> NDArray[np.float64]:
-    """Where events were seen [px], shape (n, 2)."""
+    """Return the recorded positions of events [px], shape ``(n, 2)``."""
     return np.stack([events.x, events.y], axis=1).astype(np.float64)
 
 
-def exact_image(known: Known) -> NDArray[np.float64]:
-    """Image of all events voted bilinearly at their exact places, in float64 [events], shape (height, width)."""
+def exact_image(known: KnownRecording) -> NDArray[np.float64]:
+    """Return the image of all events with bilinear votes at their exact positions, in float64 [events], shape
+    ``(height, width)``.
+    """
     width, height = known.camera.width, known.camera.height
     image = np.zeros((height + 1) * (width + 1) + 1)
     for start in range(0, len(known.events), PIECE):
@@ -136,8 +152,10 @@ def exact_image(known: Known) -> NDArray[np.float64]:
 
 
 def rms(distance: NDArray[np.float64]) -> float:
-    """Root mean square length of rows (n, 2) [px]; rows that are not finite are left out."""
+    """Return the root mean square length [px] of rows ``(n, 2)``; rows that are not finite are left out."""
     finite = distance[np.isfinite(distance).all(axis=1)]
     if not len(finite):
-        raise AmiwarpError("no event has a place in both models; is the recording's truth its own?")
+        raise AmiwarpError(
+            "no event has a finite position in both models; check that the ground truth belongs to the recording"
+        )
     return float(np.sqrt(np.mean(np.sum(finite**2, axis=1))))

@@ -1,4 +1,4 @@
-"""The choice of prism and speed for a camera, before either is bought."""
+"""Choice of the prism and its speed for a camera, before either is bought."""
 
 from amiwarp.studies.design.choice import Choice, Design, Limits, Timing, design
 from amiwarp.studies.design.orbit import Orbit

@@ -1,4 +1,4 @@
-"""Which prism, and how fast: events, blur, model and window for apex × speed, and the choice."""
+"""Events, blur, refraction model and window for every apex angle and speed, and the recommended choice."""
 
 from __future__ import annotations
 
@@ -21,43 +21,46 @@ if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
 
 ACROSS = math.sqrt(2.0 / 3.0)
-"""Share of an error along the orbit that lies across the edges that fire: √⟨cos²⟩, weighted by their rate, |cos|."""
+"""Share of an error along the orbit that acts across edges.
+
+It is √⟨cos²⟩, weighted by |cos|, the rate at which the edges of each direction fire.
+"""
 LEAST_SWING = 1.0
-"""An edge that moves by less than this across itself finds pixels on neither side that see it pass [px]."""
+"""Smallest useful swing [px]. An edge that moves less across itself may not cross any pixel."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What is wrong with times and angles, as standard deviations."""
+    """Errors of times and angles, as standard deviations."""
 
     clock_us: float = 60.0
-    """Of an event's time against the encoder's [us]: 58 is a readout in scans of 200 us."""
+    """Error of an event's time against the encoder's [us]; 58 is a readout in scans of 200 us."""
     encoder: float = math.radians(0.1)
-    """Of the encoder's angle [rad]."""
+    """Error of the encoder's angle [rad]."""
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.clock_us <= 1e6 and 0.0 <= self.encoder <= math.pi):
             raise AmiwarpError(f"clock error {self.clock_us} us or encoder error {math.degrees(self.encoder):.6g} deg "
-                               "is negative or too large to compensate anything; give standard deviations")  # fmt: skip
+                               "is out of range; give standard deviations of 0 to 1e6 us and 0 to 180 deg")  # fmt: skip
 
     def blur(self, radius: float, rpm: float) -> tuple[float, float]:
-        """What clock and encoder each add across an edge [px], for an orbit of ``radius`` [px]."""
+        """Return the blur across an edge [px] that clock and encoder each add, for an orbit of ``radius`` [px]."""
         speed = 2.0 * math.pi * rpm / 60.0
         return ACROSS * radius * speed * self.clock_us * 1e-6, ACROSS * radius * self.encoder
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a choice must keep."""
+    """Requirements on a choice."""
 
     tolerance_px: float = 0.5
-    """Compensation error: standard deviation across an edge [px]."""
+    """Largest compensation error: standard deviation across an edge [px]."""
     window_ms: float = 33.4
-    """Time in which every edge direction must have been seen [ms]; the default is a frame of a 30 Hz camera."""
+    """Time in which every edge direction must fire [ms]; the default is one frame of a 30 Hz camera."""
     bandwidth: float | None = None
-    """What the sensor and its cable can carry [events/s]; None for any."""
+    """Event rate that sensor and cable can transfer [events/s]; None for no limit."""
     budget_px: float | None = None
-    """What the model of the prism may be wrong by [px rms]; None for :data:`SHARE` of the blur."""
+    """Largest error of the refraction model [px rms]; None for :data:`SHARE` of the blur."""
 
     def __post_init__(self) -> None:
         for name in ("tolerance_px", "window_ms", "bandwidth", "budget_px"):
@@ -68,61 +71,73 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One apex at one speed."""
+    """One apex angle at one speed."""
 
     orbit: Orbit
+    """Effect of the prism on the image."""
     rpm: float
+    """Speed [turns/min]."""
     events_per_s: float
+    """Event rate [events/s]."""
     clock_px: float
-    """Blur across an edge from the clock's error [px]."""
+    """Blur across an edge from the clock error [px]."""
     encoder_px: float
-    """Likewise from the encoder's."""
+    """Blur across an edge from the encoder error [px]."""
     model: str
-    """The first rung of the ladder whose error is within the budget."""
+    """Smallest refraction model whose error is within the budget."""
     budget_px: float
-    """What a model may be wrong by [px]."""
+    """Largest allowed error of the refraction model [px]."""
     misses: tuple[str, ...]
-    """Which limits it does not keep: of :data:`LIMITS`."""
+    """Names of the violated limits, out of :data:`LIMITS`."""
 
     LIMITS: ClassVar[tuple[str, ...]] = ("edges", "window", "blur", "bandwidth")
+    """Names of all limits."""
 
     @property
     def blur_px(self) -> float:
-        """What compensation leaves across an edge without the model's own error [px]."""
+        """Blur across an edge that compensation leaves, without the model's error [px]."""
         return math.sqrt(QUANTISATION_PX**2 + self.clock_px**2 + self.encoder_px**2)
 
     @property
     def error_px(self) -> float:
-        """Likewise with the model's error, of whose square half lies across an edge [px]."""
+        """Standard deviation across an edge, model error included; half of the square of that error counts [px]."""
         return math.hypot(self.blur_px, self.orbit.errors[self.model] / math.sqrt(2.0))
 
     @property
     def window_ms(self) -> float:
-        """A quarter turn [ms]: the shortest window that sees every edge direction."""
+        """Time of a quarter turn [ms]: the shortest window in which every edge direction fires."""
         return 15e3 / self.rpm
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """All choices of a grid, and which to take; ``dataclasses.replace`` puts other limits in at no cost."""
+    """All choices of a grid, and the recommended one.
+
+    ``dataclasses.replace`` changes the limits without new simulations.
+    """
 
     camera: Camera
+    """Camera."""
     glass: Prism
-    """Index and flat side of all prisms."""
+    """Refractive index and flat side of all prisms."""
     orbits: tuple[Orbit, ...]
-    """One an apex, which rises."""
+    """One orbit per apex angle, in rising order."""
     rpms: tuple[float, ...]
-    """Rising [turns/min]."""
+    """Speeds in rising order [turns/min]."""
     volume: Volume
+    """Measured event volume."""
     timing: Timing
+    """Errors of times and angles."""
     limits: Limits
+    """Requirements."""
 
     @cached_property
     def choices(self) -> tuple[Choice, ...]:
-        """Every apex × every speed; apexes rise first, speeds within each."""
+        """All combinations of apex angle and speed; the speed varies fastest."""
         return tuple(self._choice(orbit, rpm) for orbit in self.orbits for rpm in self.rpms)
 
     def _choice(self, orbit: Orbit, rpm: float) -> Choice:
+        """Return the choice of an orbit and a speed."""
         limits, blurs = self.limits, self.timing.blur(orbit.radius, rpm)
         budget = limits.budget_px or SHARE * math.hypot(QUANTISATION_PX, *blurs)
         model = next(name for name in MODELS if orbit.errors[name] <= budget)
@@ -137,17 +152,18 @@ class Design:
 
     @cached_property
     def chosen(self) -> Choice | None:
-        """The choice of fewest events that keeps all limits, of equal ones that of the smaller error, or None."""
+        """Choice with the fewest events that keeps all limits; ties go to the smaller error. None if there is none."""
         return min((c for c in self.choices if not c.misses), key=lambda c: (c.events_per_s, c.error_px), default=None)
 
     def at(self, apex: float, rpm: float) -> Choice:
-        """The choice of this apex [rad] and speed."""
+        """Return the choice of this apex angle [rad] and speed [turns/min]."""
         return next(c for c in self.choices if c.orbit.apex == apex and c.rpm == rpm)
 
     def range_at(self, rpm: float) -> tuple[float, float]:
-        """Smallest and largest apex [rad] whose swing and blur keep the limits at this speed, the model being exact.
+        """Return the smallest and largest apex angle [rad] whose swing and blur keep the limits at this speed.
 
-        Radii are taken as proportional to the apex. The first may be above the second: then none does.
+        The model is taken as exact, and radii as proportional to the apex. If the first is above the second, no apex
+        keeps the limits.
         """
         orbit = min(self.orbits, key=lambda o: abs(math.log(o.swing / LEAST_SWING)))
         room = self.limits.tolerance_px**2 - QUANTISATION_PX**2
@@ -170,20 +186,21 @@ def design(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> Design:
-    """Compute every apex [rad] × speed [turns/min] for a camera before a scene; ``glass``: index and flat side.
+    """Evaluate every apex angle [rad] and speed [turns/min] for a camera in front of a scene.
 
-    Raises :class:`AmiwarpError` for empty lists, and for what no prism or camera can be.
+    ``glass`` gives refractive index and flat side. Raises :class:`AmiwarpError` for empty lists, and for a prism or
+    camera that is impossible.
     """
     apexes, rpms = sorted(set(apexes)), sorted(set(rpms))
     if not (apexes and rpms and apexes[0] > 0.0 and 0.0 < rpms[0] <= rpms[-1] < math.inf):
         raise AmiwarpError(f"apexes {apexes} rad or speeds {rpms} rpm: give at least one of each, all above 0")
     timing, limits, sensor = timing or Timing(), limits or Limits(), sensor or SensorModel()
-    tell = progress or silent
+    report = progress or silent
     orbits = []
     for k, apex in enumerate(apexes):
-        tell("fitting models", 0.5 * k / len(apexes))
+        report("fitting models", 0.5 * k / len(apexes))
         orbits.append(orbit_of(camera, replace(glass, apex=apex), device))
     template = Simulation(filled(scene, camera, replace(glass, apex=apexes[-1])), camera, glass, 1.0, sensor=sensor,
                           seed=seed, device=device)  # fmt: skip
-    volume = measure(template, apexes, rpms, part(tell, 0.5, 1.0))
+    volume = measure(template, apexes, rpms, part(report, 0.5, 1.0))
     return Design(camera, glass, tuple(orbits), tuple(rpms), volume, timing, limits)

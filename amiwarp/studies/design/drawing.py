@@ -1,4 +1,4 @@
-"""The chart: error and event volume over the apex, and every choice with what it keeps and misses."""
+"""Chart of a design: error and event volume over the apex angle, and a table of all choices."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.imaging.palette import BLUE, GREEN, ORANGE, VERMILION
 from amiwarp.plotting import figures
 from amiwarp.studies.design.choice import LEAST_SWING
 from amiwarp.studies.design.recommendation import degrees, headline
@@ -17,33 +18,36 @@ if TYPE_CHECKING:
     from amiwarp.studies.design.choice import Choice, Design
 
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 12.0, 3.9, 0.85, 1.15, 2.1
-"""Of the figure, height of a panel, margins, and what is between panels, names of lines included [inch]."""
+"""Figure width, panel height, left and right margins, and gap between panels with the line names in it [inch]."""
 TITLE, AXIS, HEAD, CELL, NOTE = 0.85, 0.7, 0.95, 0.55, 0.8
-"""Heights above and below a panel, of the table's head, of its rows, and of the note [inch]."""
+"""Heights above and below a panel, of the table head, of a table row, and of the note [inch]."""
 EDGE, TABLE, FIRST = 0.3, 11.4, 1.05
-"""Margin of words and table, width of the table and of its first column [inch]."""
+"""Margin of text and table, width of the table, and width of its first column [inch]."""
 LETTERS, SMALL, TINY = 12.0, 10.5, 9.5
-"""[point]."""
-COLOURS = {"circle": "#e69f00", "radial": "#009e73", "ellipse": "#0072b2"}
-"""Okabe and Ito's, as in the other charts; the exact model has no error to draw."""
+"""Font sizes [point]."""
+COLOURS = {"circle": ORANGE, "radial": GREEN, "ellipse": BLUE}
+"""Colour of each model, as in the other charts; the exact model has no error to draw."""
 MARKS = {"circle": "o", "radial": "s", "ellipse": "^"}
-SHORT, GOOD, BAD, CHOSEN = "#e3e3e3", "#d3e8f4", "#f3f3f3", "#d55e00"
-"""Apexes that are too small, cells that keep and miss limits, the frame of the choice."""
+"""Marker of each model."""
+SHORT, GOOD, BAD, CHOSEN = "#e3e3e3", "#d3e8f4", "#f3f3f3", VERMILION
+"""Colours: apex angles that are too small, cells that keep and that violate limits, and frame of the recommended
+choice.
+"""
 HIGHEST = 0.77
-"""Where in a panel the largest value lies; words stand above."""
+"""Height of the largest value in a panel, as a share of the panel; text stands above it."""
 LOWEST_ERROR = 1e-3
-"""Errors below are not drawn [px]."""
+"""Smallest error that is drawn [px]."""
 
 
 def draw(path: Path, design: Design) -> None:
-    """Writes ``path`` with the endings .png and .svg, each whole or not at all."""
+    """Write the chart as ``path`` with the endings .png and .svg; each write is atomic."""
     figure = chart(design)
     figures.save(figure, path.with_suffix(".png"))
     figures.save_svg(figure, path.with_suffix(".svg"))
 
 
 def chart(design: Design) -> Any:
-    """The figure, for Matplotlib."""
+    """Return the chart as a Matplotlib figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -67,23 +71,25 @@ def chart(design: Design) -> Any:
 
 
 def _words(figure: Any, design: Design, height: float) -> None:
+    """Write headline and note."""
     camera, volume = design.camera, design.volume
     fov = 2.0 * math.degrees(math.atan(camera.width / 2.0 / camera.fx))
     figure.text(EDGE / WIDTH, (height - 0.3) / height, f"{camera.width}×{camera.height}, field of view {fov:.0f}°: "
                 f"{headline(design)}", fontsize=LETTERS + 1.5, fontweight="bold", va="baseline")  # fmt: skip
     limits, timing = design.limits, design.timing
     note = (
-        f"Limits: error {limits.tolerance_px:g} px, window {limits.window_ms:g} ms, every edge moved by "
+        f"Limits: error {limits.tolerance_px:g} px, window {limits.window_ms:g} ms, edges displaced by "
         f"{LEAST_SWING:g} px in a quarter turn. Clock ± {timing.clock_us:g} µs, encoder "
         f"± {math.degrees(timing.encoder):.3g}°, index {design.glass.index:g}.\n"
-        "Models: distance of the best fit from the exact model, which has no error here, rms over image and turn.\n"
+        "Models: rms distance of the best fit from the exact model over image and turn; the exact model has no error.\n"
         f"Events: simulated (rings) on {100 * volume.simulated / volume.pixels:.0f} % of the pixels, "
-        f"± {100 * volume.uncertainty:.1g} %, threshold {volume.contrast:g}; between the rings by their law."
+        f"± {100 * volume.uncertainty:.1g} %, threshold {volume.contrast:g}; interpolated between the rings."
     )
     figure.text(EDGE / WIDTH, 0.1 / height, note, fontsize=TINY, color="#404040", va="bottom", linespacing=1.35)
 
 
 def _errors(ax: Any, design: Design) -> None:
+    """Draw the panel of errors over the apex angle."""
     rpm = design.chosen.rpm if design.chosen else design.rpms[len(design.rpms) // 2]
     apex = _degrees(design)
     names = []
@@ -100,10 +106,10 @@ def _errors(ax: Any, design: Design) -> None:
     ax.axhline(design.limits.tolerance_px, color=CHOSEN, linestyle=(0, (6, 3)), linewidth=1.5)
     names.append((design.limits.tolerance_px, "tolerance", CHOSEN))
     names += [
-        (float(blur[-1]), "blur that is\nthere anyway", "black"),
-        (choices[-1].budget_px, "model's budget", "black"),
+        (float(blur[-1]), "blur without\nmodel error", "black"),
+        (choices[-1].budget_px, "model budget", "black"),
     ]
-    ax.set_title(f"What is left after compensation, at {rpm:g} rpm", fontsize=LETTERS, loc="left", pad=8.0)
+    ax.set_title(f"Error after compensation, at {rpm:g} rpm", fontsize=LETTERS, loc="left", pad=8.0)
     ax.set_ylabel("error [px]", fontsize=LETTERS)
     values = [v for v, _, _ in names] + [o.errors[m] for o in design.orbits for m in COLOURS]
     _axes(ax, design, (0.7 * max(min(values), LOWEST_ERROR), max(values)))
@@ -111,12 +117,13 @@ def _errors(ax: Any, design: Design) -> None:
 
 
 def _volume(ax: Any, design: Design) -> None:
+    """Draw the panel of event volumes over the apex angle."""
     from matplotlib import colormaps
 
     apex, rpms, low = _degrees(design), design.rpms, math.inf
     names: list[tuple[float, str, Any]] = []
     for k, rpm in enumerate(rpms):
-        # cividis: dark to light also in grey; its light end is too faint on white
+        # cividis also reads from dark to light in grey; its light end is too faint on white
         colour = colormaps["cividis"](0.72 * k / max(len(rpms) - 1, 1))
         y = np.array([design.at(orbit.apex, rpm).events_per_s for orbit in design.orbits]) / 1e6
         ax.plot(apex, y, "-", marker=".", color=colour, linewidth=1.8, markersize=8.0)
@@ -142,6 +149,7 @@ def _volume(ax: Any, design: Design) -> None:
 
 
 def _axes(ax: Any, design: Design, values: tuple[float, float]) -> None:
+    """Set up scales, ticks and shaded ranges of a panel."""
     apex = _degrees(design)
     limits = values[0], values[0] * (values[1] / values[0]) ** (1.0 / HIGHEST)
     spare = 1.18 if len(apex) > 1 else 1.6
@@ -166,7 +174,7 @@ def _axes(ax: Any, design: Design, values: tuple[float, float]) -> None:
 
 
 def _numbers(limits: tuple[float, float]) -> list[float]:
-    """What stands at a logarithmic axis: 1, 2 and 5 of each decade, or 1 alone where there are many."""
+    """Return the tick values of a logarithmic axis: 1, 2 and 5 of each decade, or only 1 if there are many decades."""
     low, high = limits
     digits = (1.0, 2.0, 5.0) if high / low < 100.0 else (1.0,)
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
@@ -174,7 +182,7 @@ def _numbers(limits: tuple[float, float]) -> list[float]:
 
 
 def _name(ax: Any, names: Sequence[tuple[float, str, Any]]) -> None:
-    """Says at the right end of each line what it is, moved apart where they are close."""
+    """Write the name of each line at its right end; names close to each other are moved apart."""
     low, high = (math.log(v) for v in ax.get_ylim())
     inside = sorted((n for n in names if low <= math.log(n[0]) <= high), key=lambda n: n[0])
     at = np.array([(math.log(value) - low) / (high - low) for value, _, _ in inside])
@@ -196,14 +204,14 @@ def _name(ax: Any, names: Sequence[tuple[float, str, Any]]) -> None:
 
 
 def _table(ax: Any, design: Design) -> None:
-    """A cell for every choice; its axes are in inches, downwards from the top left corner."""
+    """Draw a cell for every choice; the axes are in inches, downwards from the top left corner."""
     orbits, rpms = design.orbits, design.rpms
     ax.set(xlim=(0.0, TABLE), ylim=(-HEAD - CELL * len(rpms), 0.0))
     ax.axis("off")
     wide = (TABLE - FIRST) / len(orbits)
-    heads = [f"apex {degrees(o.apex)}, orbit {o.radius:.1f} px\nmoves edges {o.swing:.2f} px" for o in orbits]
+    heads = [f"apex {degrees(o.apex)}, orbit {o.radius:.1f} px\ndisplaces edges {o.swing:.2f} px" for o in orbits]
     size = _fitting(TINY, wide, heads)
-    title = "Every choice: events, error left, and the smallest model that is good enough; or what it misses"
+    title = "Every choice: events, remaining error, and smallest sufficient model or violated limits"
     ax.text(0.0, -0.2, title, fontsize=LETTERS, va="baseline")
     ax.text(0.0, -HEAD + 0.1, "speed,\nquarter turn", va="bottom", fontsize=size, linespacing=1.3)
     for k, text in enumerate(heads):
@@ -217,6 +225,7 @@ def _table(ax: Any, design: Design) -> None:
 
 
 def _cell(ax: Any, choice: Choice, at: tuple[float, float, float], size: float, *, chosen: bool) -> None:
+    """Draw the cell of one choice."""
     from matplotlib.patches import Rectangle
 
     x, y, wide = at
@@ -224,17 +233,18 @@ def _cell(ax: Any, choice: Choice, at: tuple[float, float, float], size: float, 
     box = Rectangle((x + 0.03, y - CELL + 0.03), wide - 0.06, CELL - 0.06, facecolor=GOOD if good else BAD,
                     edgecolor=CHOSEN if chosen else "none", linewidth=2.4)  # fmt: skip
     ax.add_patch(box)
-    said = choice.model if good else f"misses {', '.join(choice.misses)}"
-    text = f"{choice.events_per_s / 1e6:.3g} Mev/s, {choice.error_px:.2f} px\n{said}"
+    words = choice.model if good else f"violates {', '.join(choice.misses)}"
+    text = f"{choice.events_per_s / 1e6:.3g} Mev/s, {choice.error_px:.2f} px\n{words}"
     size = _fitting(size, wide, [text])
     ax.text(x + wide / 2.0, y - CELL / 2.0, text, ha="center", va="center", fontsize=size, linespacing=1.3,
             color="black" if good else "#6a6a6a", fontweight="bold" if chosen else "normal")  # fmt: skip
 
 
 def _fitting(size: float, wide: float, texts: Sequence[str]) -> float:
-    """Size of letters [point], at most ``size``, that lets all lines into ``wide`` [inch]."""
+    """Return the largest font size [point], at most ``size``, at which all lines fit into ``wide`` [inch]."""
     return min(size, 72.0 * (wide - 0.2) / 0.56 / max(len(line) for text in texts for line in text.split("\n")))
 
 
 def _degrees(design: Design) -> list[float]:
+    """Return the apex angles [deg]."""
     return [math.degrees(orbit.apex) for orbit in design.orbits]

@@ -1,4 +1,4 @@
-"""What a prism does to the image of a camera: the radii of the orbits, and what each model of them costs."""
+"""Effect of a prism on a camera's image: radii of the orbits, and error of each refraction model."""
 
 from __future__ import annotations
 
@@ -16,40 +16,49 @@ if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
 
 QUARTER_SWING = 1.0 - math.sqrt(0.5)
-"""Least that a quarter turn of radius 1 moves an edge across itself, over all its directions and all starts."""
+"""Smallest displacement across an edge in a quarter turn on an orbit of radius 1.
+
+The minimum is over all edge directions and all start angles.
+"""
 GRID = 12
-"""Rows of pixels at which the circles are fitted."""
+"""Rows of pixels on which the circle models are fitted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Orbit:
-    """What a prism does to the image, at any speed."""
+    """Effect of a prism on the image, independent of its speed."""
 
     apex: float
-    """[rad]."""
+    """Apex angle [rad]."""
     deflection: float
-    """Of the axial ray [rad]."""
+    """Deflection of the ray on the optical axis [rad]."""
     radius: float
-    """Of the orbits, rms over the image [px]."""
+    """Radius of the orbits [px], rms over the image."""
     smallest: float
-    """Radius of the smallest orbit of the image [px]."""
+    """Radius of the smallest orbit in the image [px]."""
     errors: dict[str, float]
-    """For each rung of the ladder its best fit's distance from the exact model, rms over image and turn [px]."""
+    """For each model, the distance of its best fit from the exact model [px rms over image and turn]."""
 
     @property
     def swing(self) -> float:
-        """Least that a quarter turn moves an edge across itself, anywhere in the image [px]."""
+        """Smallest displacement across an edge in a quarter turn, anywhere in the image [px]."""
         return QUARTER_SWING * self.smallest
 
 
 def orbit_of(camera: Camera, prism: Prism, device: str = "cpu") -> Orbit:
-    """Radii, and the errors of all models. Raises :class:`AmiwarpError` where no pixel keeps its ray for a turn."""
+    """Return the orbit of a prism: radii, and the errors of all models.
+
+    Raises :class:`AmiwarpError` if no pixel has a ray during a whole turn.
+    """
     rms, smallest = orbit_radii(camera, prism)
     return Orbit(prism.apex, prism.deflection, rms, smallest, _model_errors(ExactModel(camera, prism), device))
 
 
 def orbit_radii(camera: Camera, prism: Prism) -> tuple[float, float]:
-    """Radius of the orbits [px], rms over the image and smallest; see :func:`orbit_of` for what is raised."""
+    """Return the radius of the orbits [px], rms over the image, and the smallest radius [px].
+
+    Raises :class:`AmiwarpError` if no pixel has a ray during a whole turn.
+    """
     exact = ExactModel(camera, prism)
     x, y = np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 25)
     grid = np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
@@ -58,13 +67,13 @@ def orbit_radii(camera: Camera, prism: Prism) -> tuple[float, float]:
     radii = np.sqrt(np.mean(np.sum((moved - moved.mean(axis=1, keepdims=True)) ** 2, axis=2), axis=1))
     radii = radii[np.isfinite(radii)]
     if not len(radii):
-        raise AmiwarpError(f"apex {math.degrees(prism.apex):.6g} deg: no pixel of this camera has a ray all the turn "
-                           "long; take a smaller apex or a narrower lens")  # fmt: skip
+        raise AmiwarpError(f"apex {math.degrees(prism.apex):.6g} deg: no pixel of this camera has a ray during a "
+                           "whole turn; choose a smaller apex or a lens with a narrower view")  # fmt: skip
     return float(np.sqrt(np.mean(radii**2))), float(radii.min())
 
 
 def _model_errors(exact: ExactModel, device: str) -> dict[str, float]:
-    """Of the best fit of each rung [px rms]; circles are given the deflection that suits the image best."""
+    """Return the error of the best fit of each model [px rms]; circle models get the best deflection for the image."""
     fitted = {
         "circle": _fitted(CircleModel, exact),
         "radial": _fitted(RadialCircleModel, exact),
@@ -74,6 +83,7 @@ def _model_errors(exact: ExactModel, device: str) -> dict[str, float]:
 
 
 def _fitted(kind: type[CircleModel | RadialCircleModel], exact: ExactModel) -> CircleModel | RadialCircleModel:
+    """Return the circle model whose deflection fits the exact model best."""
     from scipy.optimize import minimize_scalar
 
     def sized(deflection: float) -> CircleModel | RadialCircleModel:

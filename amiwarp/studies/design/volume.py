@@ -1,4 +1,7 @@
-"""The law of the events: measured on small parts of the image, good for every apex, speed and size of a grid."""
+"""Event volume: a law measured on small parts of the image.
+
+It holds for every apex angle, speed and image size of a grid.
+"""
 
 from __future__ import annotations
 
@@ -23,73 +26,82 @@ if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
 
 TILE, ACROSS_TILES, DOWN_TILES = 16, 12, 9
-"""Size [px] and number of the parts of the image that are simulated."""
+"""Size [px] and number, across and down, of the tiles of the image that are simulated."""
 NODES = 4
-"""At most so many apexes are simulated; between them the yield is interpolated."""
-
-"""Called with what is being done and the share of it that is."""
+"""Largest number of apex angles that are simulated; between them the yield is interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """The measured law of the events: per turn and pixel yield · 4 r ⟨|∇L|⟩ / C, and the sensor's noise."""
+    """Measured law of the event volume.
+
+    Events per turn and pixel are yield · 4 r ⟨|∇L|⟩ / C, where r is the radius of the orbits; sensor noise is added.
+    """
 
     apexes: NDArray[np.float64]
-    """Simulated, shape (n,) [rad]."""
+    """Simulated apex angles [rad], shape ``(n,)``."""
     rpms: NDArray[np.float64]
-    """Simulated, shape (m,), one or two [turns/min]."""
+    """Simulated speeds, one or two [turns/min], shape ``(m,)``."""
     yields: NDArray[np.float64]
-    """Events found over events expected, shape (n, m)."""
+    """Simulated events relative to expected events, shape ``(n, m)``."""
     uncertainty: float
     """Relative standard error of the yields, from the scatter of the tiles."""
     texture: float
     """⟨|∇L|⟩: mean gradient of log intensity over the image [1/px]."""
     contrast: float
-    """C: what log intensity changes by between two events."""
+    """C: contrast threshold, the change of log intensity between two events."""
     pixels: int
+    """Number of pixels of the image."""
     noise_hz: float
-    """Noise of a pixel [events/s]."""
+    """Noise rate of a pixel [events/s]."""
     simulated: int
-    """Pixels that were simulated."""
+    """Number of simulated pixels."""
 
     def events_per_s(self, orbit: Orbit, rpm: float) -> float:
-        """Events of the whole image in a second."""
+        """Return the event rate of the whole image [events/s]."""
         per_turn = self._yield(orbit.apex, rpm) * 4.0 * orbit.radius * self.texture / self.contrast
         return self.pixels * (per_turn * rpm / 60.0 + self.noise_hz)
 
     def _yield(self, apex: float, rpm: float) -> float:
-        """Between simulated apexes a power law; between speeds dead time: the reciprocal is linear in the speed."""
+        """Return the yield at an apex angle and a speed.
+
+        It is a power law between simulated apexes; between speeds its reciprocal is linear, as for a dead time.
+        """
         at = [float(np.interp(math.log(apex), np.log(self.apexes), np.log(y))) for y in self.yields.T]
         return 1.0 / float(np.interp(rpm, self.rpms, np.exp(-np.array(at))))
 
 
 def filled(scene: Scene, camera: Camera, prism: Prism) -> Scene:
-    """The scene as large as fills all that the camera sees through this prism, centred; one with a size stays.
+    """Return the scene, centred and scaled to fill everything that the camera sees through this prism.
 
-    So every part of the image sees the same of it as the whole does.
+    Every part of the image then sees the same part of the scene as in the whole image. A scene with a given size stays
+    unchanged.
     """
     if scene.fov is not None:
         return scene
     whole = Simulation(scene, camera, prism, 1.0)
-    place_scene(whole)  # refuses what a plane cannot show
+    place_scene(whole)  # raises an error if a plane cannot fill the view
     bearings = seen_bearings(whole)
     reach = np.abs(bearings[:, :2] / bearings[:, 2:]).max(axis=0) + 4.0 / min(camera.fx, camera.fy)
     scale = float(np.max(reach / np.array(scene.frames.size)))
     return replace(scene, fov=2.0 * math.atan(scale * scene.frames.size[0]))
 
 
-def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float], tell: Progress) -> Volume:
-    """Simulate tiles of the camera over the range of apexes, at the slowest and the fastest speed.
+def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float], report: Progress) -> Volume:
+    """Measure the event volume by simulating tiles of the camera.
 
-    Each tile is a small camera that sees what its part of the image sees: one turn, after one for the pixels'
-    references to settle. The tiles' events are scaled to the image by the gradient along their orbits, which is known
-    everywhere, so it hardly matters which tiles they are. Raises :class:`AmiwarpError` for a scene without texture.
+    The apex angles span the range of ``apexes``; the speeds are the slowest and the fastest of ``rpms``. Each tile is a
+    small camera that sees the same as its part of the image. It is simulated for two turns; the first lets the
+    reference levels of the pixels settle, the second is counted. The events of the tiles are scaled to the image by the
+    gradient along their orbits, which is known everywhere, so that the choice of tiles matters little.
+
+    Raises :class:`AmiwarpError` for a scene without texture.
     """
     sensor, camera = template.sensor, template.camera
     slopes: Any = np.gradient(template.log_view())
     gradient = np.hypot(slopes[0], slopes[1])
     if not gradient.mean() > 0.0:
-        raise AmiwarpError("the scene has no texture, so no prism makes events of it; give another picture")
+        raise AmiwarpError("the scene has no texture, so it generates no events with any prism; choose another picture")
     nodes = np.geomspace(apexes[0], apexes[-1], min(NODES, len(apexes))) if len(apexes) > 1 else np.array(apexes)
     speeds = np.array(sorted({rpms[0], rpms[-1]}))
     contrast = 2.0 / (1.0 / sensor.contrast_on + 1.0 / sensor.contrast_off)
@@ -97,7 +109,7 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
     cameras = tiles(camera, template.seed)
     yields, spread = np.empty((len(nodes), len(speeds))), []
     for k, (i, j) in enumerate(np.ndindex(yields.shape)):
-        tell("simulating", k / yields.size)
+        report("simulating", k / yields.size)
         rpm = float(speeds[j])
         prism = replace(template.prism, apex=float(nodes[i]))
         case = replace(template, prism=prism, motion=PrismMotion(rpm), duration_s=120.0 / rpm)
@@ -113,9 +125,9 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
 
 
 def tiles(camera: Camera, seed: int = 0) -> list[Camera]:
-    """Small cameras that see parts of the image, pixel by pixel as it does: one somewhere in each cell of a grid.
+    """Return small cameras that see parts of the image, one at a random position in each cell of a grid.
 
-    Drawn at random within its cell, so that a texture that repeats does not fall into step with the grid.
+    The positions are random so that a repeating texture cannot align with the grid.
     """
     across, down = min(ACROSS_TILES, camera.width // TILE), min(DOWN_TILES, camera.height // TILE)
     if across < 2 or down < 2:
@@ -131,15 +143,15 @@ def tiles(camera: Camera, seed: int = 0) -> list[Camera]:
 
 
 def _per_turn(case: Simulation, tile: Camera, number: int) -> float:
-    """Events of a pixel in the second turn."""
+    """Return the number of events per pixel in the second turn."""
     half = case.duration_us // 2
     seeded = replace(case, camera=tile, seed=(case.seed + number) % (1 << 31))
-    blocks = seeded.blocks(chunk_us=case.duration_us)  # in one go: so few pixels need no more
+    blocks = seeded.blocks(chunk_us=case.duration_us)  # one chunk, because there are few pixels
     return sum(int((events.t >= half).sum()) for events, _ in blocks) / (tile.width * tile.height)
 
 
 def _texture_of(gradient: NDArray[Any], radius: float, camera: Camera, parts: Sequence[Camera]) -> NDArray[np.float64]:
-    """Mean gradient that each tile's pixels meet on their orbits [1/px], shape (tiles,)."""
+    """Return the mean gradient along the orbits of each tile's pixels [1/px], shape ``(tiles,)``."""
     from scipy.ndimage import gaussian_filter
 
     met = gaussian_filter(gradient, radius / math.sqrt(2.0))  # as wide as a ring of that radius

@@ -1,4 +1,4 @@
-"""The atlas of failures: recordings simulated along each axis that breaks calibration, and how methods fare."""
+"""Atlas of failures: recordings simulated along every axis that breaks calibration, and the results of each method."""
 
 from amiwarp.studies.stability.cells import METHODS, Cell, Method, Outcome, Result, Store, Stored, identity, run_cell
 from amiwarp.studies.stability.conditions import AXES, Axis, Condition, make, sensible

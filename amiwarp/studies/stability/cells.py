@@ -1,4 +1,4 @@
-"""One cell of the atlas: a condition, a seed, and what each method makes of that recording."""
+"""One cell of the atlas: a condition, a seed, and the result of each method on that recording."""
 
 from __future__ import annotations
 
@@ -28,53 +28,56 @@ from amiwarp.imaging.metrics import model_error
 from amiwarp.io.output import write_text
 from amiwarp.optics.models import ExactModel, predicted_error
 from amiwarp.studies.machine import machine
-from amiwarp.studies.stability.conditions import Condition, Sample, make
+from amiwarp.studies.stability.conditions import Condition, SimulatedSample, make
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
 
 LIMIT_PX = 0.1
-"""A success is nearer to the truth than this, or than"""
+"""Largest model error of a success [px rms], unless the best fit of the model to the truth has a large error."""
 BEST_FIT = 1.5
-"""times what the best fit of the same model to the truth leaves."""
+"""A success may also have this multiple of the error of the best fit of the same model to the truth."""
 FORMAT = 1
-"""Of a stored cell; part of its identity."""
+"""Format version of a stored cell; part of its identity."""
 
 
 class Outcome(enum.StrEnum):
-    """What came of a calibration."""
+    """Outcome of a calibration."""
 
     SUCCESS = "success"
     REFUSAL = "refusal"
-    """A clear error."""
+    """The method raised a clear error."""
     SILENT = "silent failure"
-    """An answer that is wrong, with nothing said; a crash counts as such."""
+    """The result is wrong and there was no error. A crash counts as a silent failure."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to calibrate; no settings: the paper's."""
+    """Calibration method. Without settings it is the paper's method."""
 
     name: str
+    """Name for people."""
     settings: Settings | None
+    """Settings of the calibration; None for the paper's method."""
 
     @property
     def model(self) -> str:
-        """The largest that an answer can be of."""
+        """Largest refraction model that the result can have."""
         if self.settings is None:
             return "circle"
         return "exact" if self.settings.model == AUTO else self.settings.model
 
     @property
     def identity(self) -> dict[str, Any]:
+        """Settings that identify the method, as JSON data."""
         return (
             {"method": "paper"}
             if self.settings is None
             else settings_to(self.settings) | {"sharpness": self.settings.sharpness.value}
         )
 
-    def run(self, sample: Sample, condition: Condition, seed: int, device: str) -> Calibration:
-        """Raises :class:`AmiwarpError` where the method refuses."""
+    def run(self, sample: SimulatedSample, condition: Condition, seed: int, device: str) -> Calibration:
+        """Calibrate a sample. Raises :class:`AmiwarpError` if the method refuses it."""
         if self.settings is None:
             return calibrate_as_paper(sample.recording, start=sample.hardware, device=device)
         known = sample.hardware if condition.start != "none" else {}
@@ -92,61 +95,74 @@ METHODS = (
     Method("J by DIRECT", replace(_SHARP, sharpness=Sharpness.PAPER_J)),
     Method("CRS + Sbplx", replace(_SHARP, global_algorithm="GN_CRS2_LM", local_algorithm="LN_SBPLX")),
 )
-"""Cost × model × algorithms, sharpness alone and with the photometric stage; the paper's always among them."""
+"""All methods: sharpness measures, models and algorithms; sharpness alone and with the photometric stage.
+
+The paper's method and the default are always run.
+"""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a method made of a recording."""
+    """Result of a method on a recording."""
 
     outcome: Outcome
+    """Success, refusal or silent failure."""
     error_px: float | None
-    """Model error against the truth; None where there was no answer."""
+    """Model error against the ground truth [px rms]; None without a result."""
     limit_px: float
+    """Largest model error of a success [px rms]."""
     seconds: float
+    """Time of the calibration [s]."""
     message: str = ""
-    """The refusal, or the answer's warnings."""
+    """Error message of a refusal, or warnings of the calibration."""
     machine: str = ""
-    """On which it was run."""
+    """Machine that ran the calibration."""
 
     def to_json(self) -> dict[str, Any]:
+        """Return the result as JSON data."""
         return {**asdict(self), "outcome": self.outcome.value}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Result:
+        """Return the result stored as JSON data."""
         return cls(**{**data, "outcome": Outcome(data["outcome"])})
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A condition and a seed."""
+    """Condition and seed."""
 
     condition: Condition
+    """Condition of the recording."""
     seed: int
+    """Seed of the recording and of the search."""
 
     @property
     def name(self) -> str:
+        """Name of the file of the cell, without its ending."""
         return f"{self.condition.key}_{self.seed}"
 
 
 @dataclass
 class Stored:
-    """What is known of a cell."""
+    """Known results of a cell."""
 
     cell: Cell
+    """Cell."""
     events: int = 0
+    """Number of events of the recording."""
     results: dict[str, Result] = field(default_factory=dict)
-    """By :func:`identity` of the method."""
+    """Results by :func:`identity` of the method."""
 
 
 def identity(method: Method) -> str:
-    """Tells methods apart by their settings, and by the version that ran them."""
+    """Return a text that identifies a method by its settings and by the package version."""
     text = json.dumps([FORMAT, __version__, method.identity], sort_keys=True, default=str)
     return f"{method.name} {hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
-    """Makes the recording and runs the methods on it."""
+    """Make the recording of a cell and run the methods on it."""
     sample = make(cell.condition, cell.seed, device)
     done = Stored(cell, len(sample.recording.events))
     where = machine(device)
@@ -155,7 +171,8 @@ def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
     return done
 
 
-def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
+def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> Result:
+    """Run one method, and compare its result with the ground truth."""
     truth = _truth(cell.condition, sample)
     limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
     began = time.perf_counter()
@@ -163,7 +180,7 @@ def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
         found = method.run(sample, cell.condition, cell.seed, device)
     except AmiwarpError as error:
         return Result(Outcome.REFUSAL, None, limit, time.perf_counter() - began, str(error))
-    except Exception as error:  # a crash says nothing that helps: no refusal
+    except Exception as error:  # a crash is no clear error, so it is no refusal
         return Result(Outcome.SILENT, None, limit, time.perf_counter() - began, f"crashed: {error!r}")
     took = time.perf_counter() - began
     error_px = _error_px(found, sample, truth)
@@ -171,8 +188,11 @@ def _judge(cell: Cell, method: Method, sample: Sample, device: str) -> Result:
     return Result(outcome, float(min(error_px, 1e3)), limit, took, "; ".join(found.warnings))
 
 
-def _error_px(found: Calibration, sample: Sample, truth: ExactModel) -> float:
-    """Over the image; of a model that was taken because it does where the events are, over these."""
+def _error_px(found: Calibration, sample: SimulatedSample, truth: ExactModel) -> float:
+    """Return the model error over the image [px rms].
+
+    If a smaller model was selected because it suffices at the events' positions, the error is that at these positions.
+    """
     if found.ladder is not None and found.model_name != "exact":
         recording = sample.recording
         assert recording.encoder is not None
@@ -184,24 +204,28 @@ def _error_px(found: Calibration, sample: Sample, truth: ExactModel) -> float:
         return math.inf
 
 
-def _truth(condition: Condition, sample: Sample) -> ExactModel:
+def _truth(condition: Condition, sample: SimulatedSample) -> ExactModel:
+    """Return the true model of a sample."""
     assert sample.recording.truth is not None
     return ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
 
 
 @cache
 def best_fit(condition: Condition, model: str) -> float:
-    """Model error of the best ``model`` of the camera that the recording names [px rms]."""
+    """Return the error of the best fit of ``model`` to the true model [px rms].
+
+    The fit uses the camera and the flat side that the recording states.
+    """
     truth = ExactModel(condition.camera, condition.prism)
-    nominal = replace(condition.prism, flat_side=condition.told_side)
-    if model != "circle" and (condition.told_camera, nominal) == (condition.camera, condition.prism):
+    nominal = replace(condition.prism, flat_side=condition.stated_side)
+    if model != "circle" and (condition.stated_camera, nominal) == (condition.camera, condition.prism):
         return 0.0
     size = size_name(model)
     start = nominal.apex if size == "apex" else nominal.deflection
 
     def error(v: np.ndarray[Any, np.dtype[np.float64]]) -> float:
         values = {size: start * abs(float(v[0])), "phase": float(v[1])}
-        fitted = build_model(model, condition.told_camera, nominal, values)
+        fitted = build_model(model, condition.stated_camera, nominal, values)
         return predicted_error(fitted, truth, grid=8).rms
 
     turned = 0.0 if nominal == condition.prism else math.pi
@@ -210,13 +234,16 @@ def best_fit(condition: Condition, model: str) -> float:
 
 
 class Store:
-    """Cells in a folder, a file each, written as they finish; what is there is not done again."""
+    """Folder of cells, one file each. A cell is written when it finishes, and is not run again."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def load(self, cell: Cell) -> Stored:
-        """What is known of ``cell``; nothing where its file is missing. Raises AmiwarpError for a damaged file."""
+        """Return the known results of ``cell``; none if its file is missing.
+
+        Raises :class:`AmiwarpError` for a damaged file.
+        """
         path = self.folder / f"{cell.name}.json"
         if not path.exists():
             return Stored(cell)
@@ -225,10 +252,10 @@ class Store:
             results = {name: Result.from_json(r) for name, r in data["results"].items()}
             return Stored(cell, data["events"], results)
         except (ValueError, KeyError, TypeError) as error:
-            raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to have it done again") from error
+            raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to run the cell again") from error
 
     def save(self, known: Stored) -> None:
-        """All that is known of a cell."""
+        """Write all known results of a cell."""
         data = {"condition": asdict(known.cell.condition), "seed": known.cell.seed, "events": known.events,
                 "results": {name: r.to_json() for name, r in sorted(known.results.items())}}  # fmt: skip
         write_text(self.folder / f"{known.cell.name}.json", json.dumps(data, indent=1) + "\n", overwrite=True)

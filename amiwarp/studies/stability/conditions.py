@@ -1,4 +1,8 @@
-"""A condition is all that determines a recording of the atlas; an axis is one field of it, harmless to hopeless."""
+"""Conditions and axes of the atlas.
+
+A condition holds everything that determines a simulated recording. An axis varies one of its fields from harmless to
+hopeless.
+"""
 
 from __future__ import annotations
 
@@ -18,110 +22,134 @@ from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, Still
-from amiwarp.studies.stability.scenes import Lamp, Passing, SceneKind, draw
+from amiwarp.studies.stability.scenes import Lamp, PassingObject, SceneKind, draw
 
 TEXELS = 2.0
-"""Of the picture per pixel of the camera, in its middle."""
+"""Texels of the picture per camera pixel, in the middle of the image."""
 HARDWARE_DEG = 10.0
-"""Standard deviation of what the hardware tells of the phase."""
+"""Standard deviation of the phase that the hardware states [deg]."""
 HARDWARE_APEX = 0.05
-"""Relative standard deviation of the nominal apex."""
+"""Relative standard deviation of the nominal apex angle."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A simulated recording; the defaults are harmless. Two equal ones with equal seeds give the same recording."""
+    """Settings of a simulated recording. The defaults are harmless.
+
+    Equal conditions and equal seeds give equal recordings.
+    """
 
     scene: str = SceneKind.TEXTURE.value
+    """Name of a :class:`SceneKind`."""
     width: int = 320
+    """Width of the image [px]."""
     height: int = 240
+    """Height of the image [px]."""
     fov_deg: float = 60.0
+    """Horizontal field of view [deg]."""
     apex_deg: float = 1.0
+    """Apex angle [deg]."""
     rpm: float = 720.0
+    """Speed of the prism [turns/min]."""
     turns: float = 4.0
+    """Length of the recording [turns]."""
     contrast: float = 0.25
+    """Contrast threshold [log intensity]."""
     window_events: int = 0
-    """Events in the sensor's readout window: a rectangle about the middle, as large as gives so many; 0: all of it."""
+    """Number of events in the sensor's readout window; 0 for the whole sensor.
+
+    The window is a rectangle about the middle, just large enough for that number.
+    """
     lost: float = 0.0
-    """Share of the events that never leave the sensor, at random."""
+    """Share of the events that are lost in the sensor, at random."""
     noise: float = 0.0
     """Share of background noise among all events."""
     hot: float = 0.0
-    """Share of hot pixels, of 500 events a second each."""
+    """Share of hot pixels, each with 500 events/s."""
     mismatch: float = 0.03
+    """Relative standard deviation of the contrast thresholds."""
     latency_us: float = 100.0
+    """Latency of the sensor [us]."""
     refractory_us: float = 100.0
+    """Refractory period [us]."""
     readout_us: float = 0.0
-    """Interval of scans to whose ends all time stamps are moved."""
+    """Interval of readout scans [us]; time stamps are moved to the end of their scan. 0 for none."""
     counts_per_turn: int = 8192
+    """Encoder counts per turn."""
     jitter_deg: float = 0.0
-    """Standard deviation of an encoder sample's angle."""
+    """Standard deviation of the angle of an encoder sample [deg]."""
     clock_offset_us: float = 0.0
+    """Offset of the encoder's clock [us]."""
     dropouts_hz: float = 0.0
+    """Rate of encoder drop-outs [1/s]."""
     slip_deg: float = 0.0
-    """By which the encoder loses its angle each second, in two steps a turn."""
+    """Angle that the encoder loses per second [deg], in two steps per turn."""
     backwards: bool = False
-    """Whether the encoder counts the wrong way."""
+    """Whether the encoder counts in the wrong direction."""
     ripple: float = 0.0
-    """Relative amplitude of the speed's ripple, three times a turn; the encoder sees it."""
+    """Relative amplitude of the speed ripple, three periods per turn; the encoder measures it."""
     flat_side_wrong: bool = False
+    """Whether the recording states the wrong flat side."""
     focal_error: float = 0.0
-    """Relative error of the focal length that the recording names."""
+    """Relative error of the focal length that the recording states."""
     distortion: float = 0.0
-    """k1 of the camera, of which the recording does not tell."""
+    """k1 of the camera's distortion, which the recording does not state."""
     start: str = "none"
-    """What is told of the phase beforehand: none, right or wrong (by 90 degrees)."""
+    """Phase that is given to the calibration: none, right, or wrong (by 90 degrees)."""
     lamp: float = 0.0
     """Share of the picture that flickers at 100 Hz."""
     passing: float = 0.0
-    """Share of the picture that a passing object hides, at half a picture's width a second."""
+    """Share of the picture that a passing object hides; its speed is half the picture's width per second."""
     camera_deg_s: float = 0.0
-    """Speed at which the camera turns, about a tilted axis."""
+    """Speed of the camera rotation [deg/s], about a tilted axis."""
     cancelled: float = 0.0
-    """Share of the prism's motion in the image that the camera's own takes back."""
+    """Share of the prism's motion in the image that a rotation of the camera cancels."""
 
     @property
     def key(self) -> str:
-        """Tells conditions apart by their settings."""
+        """Hash of the settings, which identifies the condition."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def camera(self) -> Camera:
-        """The true one."""
+        """True camera."""
         camera = Camera.from_fov(self.width, self.height, math.radians(self.fov_deg))
         return replace(camera, distortion=RadialTangential(k1=self.distortion)) if self.distortion else camera
 
     @property
-    def told_camera(self) -> Camera:
-        """The one that the recording names."""
+    def stated_camera(self) -> Camera:
+        """Camera that the recording states."""
         scale = 1.0 + self.focal_error
         return replace(self.camera, fx=self.camera.fx * scale, fy=self.camera.fy * scale, distortion=None)
 
     @property
-    def told_side(self) -> FlatSide:
-        """Where the flat face looks, as the recording has it."""
+    def stated_side(self) -> FlatSide:
+        """Flat side that the recording states."""
         return FlatSide.CAMERA if self.flat_side_wrong else FlatSide.SCENE
 
     @property
     def prism(self) -> Prism:
+        """True prism."""
         return Prism(math.radians(self.apex_deg))
 
     @property
     def duration_s(self) -> float:
+        """Length of the recording [s]."""
         return self.turns * 60.0 / self.rpm
 
 
 @dataclass(frozen=True)
-class Sample:
-    """A recording of the atlas, and what its hardware is thought to be."""
+class SimulatedSample:
+    """Recording of the atlas, and the parameters that its hardware states."""
 
     recording: Recording
+    """Recording with ground truth."""
     hardware: dict[str, float]
-    """Phase [rad] as the hardware tells it: roughly."""
+    """Approximate phase that the hardware states [rad]."""
 
 
-def make(condition: Condition, seed: int, device: str = "cpu") -> Sample:
-    """The recording of a condition."""
+def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSample:
+    """Simulate the recording of a condition."""
     rng = np.random.default_rng([seed, int(condition.key, 16) & 0x7FFFFFFF])
     simulation = _simulation(condition, seed, rng, device)
     recording = simulation.run()
@@ -135,20 +163,21 @@ def make(condition: Condition, seed: int, device: str = "cpu") -> Sample:
     if condition.readout_us:
         events = scanned(events, condition.readout_us)
     apex = condition.prism.apex * (1.0 + HARDWARE_APEX * rng.standard_normal())
-    nominal = Prism(apex, flat_side=condition.told_side)
+    nominal = Prism(apex, flat_side=condition.stated_side)
     assert recording.encoder is not None
-    told = replace(
+    stated = replace(
         recording,
         events=MemoryEvents(events, condition.width, condition.height),
-        camera=condition.told_camera,
-        encoder=faulty(recording.encoder, condition, rng),
+        camera=condition.stated_camera,
+        encoder=distorted_encoder(recording.encoder, condition, rng),
         prism=nominal,
     )
-    told_phase = simulation.motion.phase + math.radians(HARDWARE_DEG) * rng.standard_normal()
-    return Sample(told, {"phase": told_phase + (math.pi / 2 if condition.start == "wrong" else 0.0)})
+    stated_phase = simulation.motion.phase + math.radians(HARDWARE_DEG) * rng.standard_normal()
+    return SimulatedSample(stated, {"phase": stated_phase + (math.pi / 2 if condition.start == "wrong" else 0.0)})
 
 
 def _simulation(c: Condition, seed: int, rng: np.random.Generator, device: str) -> Simulation:
+    """Return the simulation of a condition, without noise."""
     phase = rng.uniform(-math.pi, math.pi)
     sensor = SensorModel(
         contrast_on=c.contrast, contrast_off=c.contrast, mismatch=c.mismatch, latency_us=c.latency_us,
@@ -165,6 +194,7 @@ def _simulation(c: Condition, seed: int, rng: np.random.Generator, device: str) 
 
 
 def _scene(c: Condition, seed: int) -> Scene:
+    """Return the scene of a condition."""
     wedge = 2.2 * c.prism.deflection
     half = min(math.radians(c.fov_deg) / 2.0 + wedge, 1.35)
     focal = TEXELS * c.camera.fx
@@ -177,11 +207,12 @@ def _scene(c: Condition, seed: int) -> Scene:
     if c.lamp:
         return Scene(Lamp(light, c.lamp, duration), fov)
     if c.passing:
-        return Scene(Passing(light, c.passing, 0.5, duration, seed), fov)
+        return Scene(PassingObject(light, c.passing, 0.5, duration, seed), fov)
     return Scene(Still(light), fov)
 
 
 def _prism_motion(c: Condition, phase: float) -> PrismMotion:
+    """Return the motion of the prism."""
     if not c.ripple:
         return PrismMotion(c.rpm, phase)
     hz = 3.0 * c.rpm / 60.0
@@ -191,6 +222,7 @@ def _prism_motion(c: Condition, phase: float) -> PrismMotion:
 
 
 def _camera_motion(c: Condition, motion: PrismMotion, rng: np.random.Generator) -> CameraMotion:
+    """Return the motion of the camera."""
     if c.cancelled:
         return _cancelling(c, motion)
     axis = rng.standard_normal(3)
@@ -198,10 +230,10 @@ def _camera_motion(c: Condition, motion: PrismMotion, rng: np.random.Generator) 
 
 
 def _cancelling(c: Condition, motion: PrismMotion) -> CameraMotion:
-    """Turns the camera so that the image moves against what the prism does to it.
+    """Return the rotation of the camera that moves the image against the prism's motion.
 
-    The prism moves what a pixel sees by δ (cos φ, sin φ) on the image plane, and turning about y by a moves it by
-    +a along x, about x by -a along y.
+    The prism displaces the view of a pixel by δ (cos φ, sin φ) on the image plane. A rotation about y by a displaces it
+    by +a along x, and a rotation about x by -a along y.
     """
     t = np.arange(0.0, c.duration_s + 2e-3, 1e-3)
     angle = motion.phase + motion.angle(t * 1e6)
@@ -212,13 +244,16 @@ def _cancelling(c: Condition, motion: PrismMotion) -> CameraMotion:
 
 
 def _noisy(c: Condition, simulation: Simulation, clean: int) -> SensorModel:
-    """As much noise as makes the share: its rate follows from a run without."""
+    """Return the sensor with the noise rate that gives the share; ``clean`` is the number of events without noise."""
     hz = clean * c.noise / (1.0 - c.noise) / (c.width * c.height * c.duration_s)
     return replace(simulation.sensor, shot_noise_hz=hz)
 
 
 def windowed(events: Events, width: int, height: int, count: int) -> Events:
-    """The ``count`` events, about, that lie in the smallest rectangle of the image's shape about its middle."""
+    """Return about ``count`` events in a readout window.
+
+    It is the smallest rectangle about the middle that holds them, with the aspect ratio of the image.
+    """
     away = np.maximum(np.abs(events.x / (width - 1.0) - 0.5), np.abs(events.y / (height - 1.0) - 0.5))
     if len(away) <= count:
         return events
@@ -226,14 +261,14 @@ def windowed(events: Events, width: int, height: int, count: int) -> Events:
 
 
 def scanned(events: Events, interval_us: float) -> Events:
-    """Events read out in scans: each bears the time of the next scan's end, rows in order."""
+    """Return events as read out in scans: time stamps are those of the end of the scan, rows in order."""
     t = (np.ceil(events.t / interval_us) * interval_us).astype(np.int64)
     order = np.lexsort((events.x, events.y, t))
     return Events(events.x[order], events.y[order], t[order], events.p[order])
 
 
-def faulty(encoder: Encoder, c: Condition, rng: np.random.Generator) -> Encoder:
-    """What the calibration is told of the encoder."""
+def distorted_encoder(encoder: Encoder, c: Condition, rng: np.random.Generator) -> Encoder:
+    """Return the encoder with the errors of the condition."""
     angle = encoder.angle + math.radians(c.jitter_deg) * rng.standard_normal(len(encoder.angle))
     if c.slip_deg:
         half_turns = np.floor(angle / math.pi)
@@ -245,21 +280,26 @@ def faulty(encoder: Encoder, c: Condition, rng: np.random.Generator) -> Encoder:
 
 @dataclass(frozen=True)
 class Axis:
-    """What breaks calibration, from harmless to hopeless."""
+    """Axis of the atlas: values of one field, from harmless to hopeless."""
 
     name: str
+    """Name for people."""
     field: str
-    """Of :class:`Condition`."""
+    """Field of :class:`Condition`."""
     values: tuple[Any, ...]
+    """Values of the field."""
     unit: str = ""
+    """Unit of the values, for people."""
     also: tuple[tuple[str, Any], ...] = ()
-    """Fields that differ from the default all along the axis."""
+    """Other fields that differ from the default along the whole axis."""
 
     def conditions(self) -> list[Condition]:
+        """Return the condition of each value."""
         return [replace(Condition(), **dict(self.also), **{self.field: value}) for value in self.values]
 
 
 def _scene_values(*kinds: SceneKind) -> tuple[str, ...]:
+    """Return the names of kinds of scenes."""
     return tuple(kind.value for kind in kinds)
 
 
@@ -295,24 +335,29 @@ AXES = (
     Axis("passing object", "passing", (0.0, 0.02, 0.1, 0.3, 0.6), "of the picture"),
     Axis("motion cancelled", "cancelled", (0.0, 0.3, 0.6, 0.9, 1.0), "of the prism's"),
 )
+"""All axes of the atlas."""
 
 
-_MOST: dict[str, float] = {
+_LARGEST: dict[str, float] = {
     "noise": 0.5, "camera_deg_s": 30.0, "jitter_deg": 0.5,
     "contrast": 0.6, "lost": 0.1, "hot": 0.001, "mismatch": 0.1, "latency_us": 1000.0, "refractory_us": 1000.0,
     "readout_us": 500.0, "clock_offset_us": 1000.0, "dropouts_hz": 10.0, "slip_deg": 0.0, "backwards": 0.0,
     "ripple": 0.2, "focal_error": 0.01, "lamp": 0.05, "passing": 0.02, "cancelled": 0.0, "flat_side_wrong": 0.0,
 }  # fmt: skip
-_LEAST: dict[str, float] = {"turns": 0.5, "counts_per_turn": 64, "distortion": -0.03, "apex_deg": 0.5}
-"""An apex of 0.5 degrees makes an orbit of 1.2 px here; that of 0.25 degrees lies within a pixel."""
+"""Largest values of the sensible region."""
+_SMALLEST: dict[str, float] = {"turns": 0.5, "counts_per_turn": 64, "distortion": -0.03, "apex_deg": 0.5}
+"""Smallest values of the sensible region. An apex of 0.5 degrees gives an orbit of 1.2 px; at 0.25 degrees the orbit
+lies within a pixel.
+"""
 FEWEST_EVENTS = 20_000
+"""Smallest number of events of the sensible region."""
 
 
 def sensible(c: Condition, events: int) -> bool:
-    """Whether a sensible user would expect to be served: what the aims speak of, and a working rig."""
+    """Return whether a condition belongs to the sensible region: a working rig and a scene that the aims cover."""
     return (
         events >= FEWEST_EVENTS
         and c.scene in _scene_values(SceneKind.TEXTURE, SceneKind.EDGES)
-        and all(getattr(c, name) <= most for name, most in _MOST.items())
-        and all(getattr(c, name) >= least for name, least in _LEAST.items())
+        and all(getattr(c, name) <= most for name, most in _LARGEST.items())
+        and all(getattr(c, name) >= least for name, least in _SMALLEST.items())
     )

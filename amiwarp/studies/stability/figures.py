@@ -1,4 +1,4 @@
-"""Pictures of an atlas: a page per axis, all of them as one PDF, and an overview of every axis on one sheet."""
+"""Figures of an atlas: a page per axis, all pages as one PDF, and an overview of every axis on one sheet."""
 
 from __future__ import annotations
 
@@ -11,31 +11,36 @@ from typing import Any
 
 import numpy as np
 
+from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
 from amiwarp.io.output import NewFile
 from amiwarp.plotting.figures import save
 from amiwarp.studies.stability.cells import LIMIT_PX, Outcome
 from amiwarp.studies.stability.conditions import Axis
-from amiwarp.studies.stability.report import DEFAULT, PAPER, Atlas, Spot, title_of, words_of
+from amiwarp.studies.stability.points import AxisPoint, axis_label, value_label
+from amiwarp.studies.stability.report import DEFAULT, PAPER, Atlas
 
-COLOURS = {Outcome.SUCCESS: "#56b4e9", Outcome.REFUSAL: "#d0d0d0", Outcome.SILENT: "#e6702e"}
-"""Near Okabe and Ito's, and a grey: told apart by the colour-blind, light enough for black letters."""
-MARKS = {DEFAULT: ("o", "#000000", -0.17), PAPER: ("D", "#cc79a7", 0.17)}
-"""Of the errors: mark, colour, and place about the middle of a column."""
+COLOURS = {Outcome.SUCCESS: SKY_BLUE, Outcome.REFUSAL: "#d0d0d0", Outcome.SILENT: "#e6702e"}
+"""Colour of each outcome: distinguishable with colour vision deficiency, and light enough for black text."""
+MARKS = {DEFAULT: ("o", BLACK, -0.17), PAPER: ("D", PINK, 0.17)}
+"""Marker, colour and horizontal offset of the errors of each method."""
 LEAST_PX = 1e-4
-"""Smaller errors are drawn as this."""
+"""Smaller errors are drawn at this value [px]."""
 OVERVIEW = (DEFAULT, PAPER, "sharpness")
+"""Methods of the overview."""
 WIDTH, LEFT, RIGHT, TOP = 11.0, 1.45, 0.25, 1.05
-"""Of a page, and its margins [inch]."""
+"""Width of a page, and its margins left, right and top [inch]."""
 ROW, ERRORS, BETWEEN, BOTTOM = 0.52, 2.7, 0.32, 0.85
-"""Heights of a method's row, of the errors below, of what is between them, and of the margin below [inch]."""
+"""Heights of a method's row, of the error panel, of the gap between them, and of the bottom margin [inch]."""
 SHEET, COLUMNS, STRIP, HEAD, HEADLINE = 12.4, 2, 0.23, 0.58, 0.66
-"""The overview: width, columns, heights of a method's strip, of an axis' heading and of the sheet's [inch]."""
+"""Overview: width, number of columns, heights of a method's strip, of an axis heading and of the sheet's heading
+[inch].
+"""
 LARGE, NORMAL, SMALL = 14.0, 11.0, 9.0
-"""[point]; bold figures of less than 9 are drawn badly."""
+"""Font sizes [point]; bold digits below 9 are illegible."""
 
 
 def draw(atlas: Atlas, folder: Path) -> dict[str, Path]:
-    """Writes overview.png, a PNG for each axis and atlas.pdf into ``folder``; each whole or not at all."""
+    """Write overview.png, a PNG for each axis and atlas.pdf into ``folder``; each write is atomic."""
     pages = [_page(atlas, axis) for axis in atlas.axes]
     sheet = _overview(atlas)
     files = {"overview": folder / "overview.png", "pages": folder / "atlas.pdf"}
@@ -48,6 +53,7 @@ def draw(atlas: Atlas, folder: Path) -> dict[str, Path]:
 
 
 def _save_pdf(figures: Sequence[Any], path: Path) -> None:
+    """Write figures as the pages of a PDF."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     buffer = io.BytesIO()
@@ -59,6 +65,7 @@ def _save_pdf(figures: Sequence[Any], path: Path) -> None:
 
 
 def _figure(width: float, height: float) -> Any:
+    """Return an empty figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -68,7 +75,7 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _page(atlas: Atlas, axis: Axis) -> Any:
-    """Outcomes of every method above, errors of the default and the paper's below, by the same columns."""
+    """Draw the page of an axis: outcomes of every method above, errors of the default and the paper's method below."""
     spots = atlas.of(axis)
     values = _values(axis, spots)
     rows = ROW * len(atlas.methods)
@@ -86,15 +93,15 @@ def _page(atlas: Atlas, axis: Axis) -> Any:
     _grid(heat, len(values), atlas.methods, NORMAL)
     heat.tick_params(axis="x", labelbottom=False)
     _errors(errors, spots, values)
-    errors.set_xticks(range(len(values)), [_broken(words_of(axis, v)) for v in values], fontsize=NORMAL)
-    errors.set_xlabel(title_of(axis), fontsize=NORMAL)
-    figure.text(LEFT / WIDTH, 1.0 - 0.3 / height, title_of(axis), fontsize=LARGE, va="center")
+    errors.set_xticks(range(len(values)), [_broken(value_label(axis, v)) for v in values], fontsize=NORMAL)
+    errors.set_xlabel(axis_label(axis), fontsize=NORMAL)
+    figure.text(LEFT / WIDTH, 1.0 - 0.3 / height, axis_label(axis), fontsize=LARGE, va="center")
     _legend(figure, WIDTH, height, 0.72)
     return figure
 
 
 def _overview(atlas: Atlas) -> Any:
-    """Each axis a block of strips, one a method; blocks run down the columns of the sheet."""
+    """Draw the overview: each axis is a block with a strip per method; blocks run down the columns of the sheet."""
     methods = [m for m in OVERVIEW if m in atlas.methods] or atlas.methods[:1]
     block = HEAD + STRIP * len(methods)
     deep = -(-len(atlas.axes) // COLUMNS)
@@ -108,19 +115,21 @@ def _overview(atlas: Atlas) -> Any:
         strips = STRIP * len(methods)
         ax = figure.add_axes((x / SHEET, 1.0 - (top + strips) / height, wide / SHEET, strips / height))
         _strips(ax, axis, atlas.of(axis), methods)
-        figure.text(x / SHEET, 1.0 - (top - 0.32) / height, title_of(axis), fontsize=NORMAL, fontweight="bold",
+        figure.text(x / SHEET, 1.0 - (top - 0.32) / height, axis_label(axis), fontsize=NORMAL, fontweight="bold",
                     va="center")  # fmt: skip
     figure.text(left / SHEET, 1.0 - 0.22 / height, _headline(atlas), fontsize=LARGE, va="center")
-    _legend(figure, SHEET, height, 0.52, left=left, words="numbers: per cent of successes")
+    _legend(figure, SHEET, height, 0.52, left=left, text="numbers: successes [%]")
     return figure
 
 
 def _headline(atlas: Atlas) -> str:
+    """Return the title of the overview."""
     most = max(len(s.results) for s in atlas.spots)
     return f"Where calibration works: {atlas.cells:,} simulated recordings, up to {most} for each value"
 
 
-def _strips(ax: Any, axis: Axis, spots: dict[tuple[str, Any], Spot], methods: Sequence[str]) -> None:
+def _strips(ax: Any, axis: Axis, spots: dict[tuple[str, Any], AxisPoint], methods: Sequence[str]) -> None:
+    """Draw the block of one axis."""
     values = _values(axis, spots)
     _shares(ax, spots, values, methods)
     for (method, value), spot in spots.items():
@@ -130,19 +139,20 @@ def _strips(ax: Any, axis: Axis, spots: dict[tuple[str, Any], Spot], methods: Se
     _grid(ax, len(values), methods, SMALL)
     ax.xaxis.tick_top()
     ax.tick_params(axis="x", length=0, pad=1.0)
-    names = [words_of(axis, v) for v in values]
+    names = [value_label(axis, v) for v in values]
     room = 72.0 * ax.get_position().width * SHEET / len(names)
     size = min(SMALL, *(room / (0.6 * len(name)) for name in names))
     ax.set_xticks(range(len(values)), names, fontsize=size)
 
 
-def _values(axis: Axis, spots: dict[tuple[str, Any], Spot]) -> list[Any]:
+def _values(axis: Axis, spots: dict[tuple[str, Any], AxisPoint]) -> list[Any]:
+    """Return the values of an axis that have results."""
     there = [value for _, value in spots]
     return [v for v in axis.values if v in there]
 
 
-def _shares(ax: Any, spots: dict[tuple[str, Any], Spot], values: Sequence[Any], methods: Sequence[str]) -> None:
-    """The cells of the heat map: as wide parts as there are shares."""
+def _shares(ax: Any, spots: dict[tuple[str, Any], AxisPoint], values: Sequence[Any], methods: Sequence[str]) -> None:
+    """Draw the cells of the heat map; each cell is divided by the shares of the outcomes."""
     from matplotlib.collections import PolyCollection
 
     parts: dict[str, list[list[tuple[float, float]]]] = {colour: [] for colour in COLOURS.values()}
@@ -156,17 +166,19 @@ def _shares(ax: Any, spots: dict[tuple[str, Any], Spot], values: Sequence[Any], 
         ax.add_collection(PolyCollection(part, facecolors=colour, linewidths=0))
 
 
-def _share(spot: Spot) -> str:
+def _share(spot: AxisPoint) -> str:
+    """Return the share of successes in per cent, as text."""
     return f"{100 * spot.rate(Outcome.SUCCESS).share:.0f}"
 
 
-def _count(spot: Spot) -> str:
-    """Of how many, and the median time."""
+def _count(spot: AxisPoint) -> str:
+    """Return number of successes, total, and median time, as text."""
     success = spot.rate(Outcome.SUCCESS)
     return f"{success.count}/{success.total}, {spot.seconds:.2g} s"
 
 
 def _grid(ax: Any, columns: int, methods: Sequence[str], size: float) -> None:
+    """Draw the grid lines and method names of a heat map."""
     ax.set(xlim=(-0.5, columns - 0.5), ylim=(len(methods) - 0.5, -0.5))
     ax.set_yticks(range(len(methods)), methods, fontsize=size)
     ax.tick_params(axis="both", length=0)
@@ -176,8 +188,8 @@ def _grid(ax: Any, columns: int, methods: Sequence[str], size: float) -> None:
         side.set_visible(False)
 
 
-def _errors(ax: Any, spots: dict[tuple[str, Any], Spot], values: Sequence[Any]) -> None:
-    """All errors as marks beside each other, their median a line, and what counts as a success dashed."""
+def _errors(ax: Any, spots: dict[tuple[str, Any], AxisPoint], values: Sequence[Any]) -> None:
+    """Draw all errors as markers, their median as a line, and the limit of a success as a dashed line."""
     ax.set_yscale("log")
     shown = [e for (method, _), spot in spots.items() if method in MARKS for e in spot.errors]
     low, high = max(min(shown, default=LIMIT_PX), LEAST_PX), max(shown, default=LIMIT_PX)
@@ -193,7 +205,7 @@ def _errors(ax: Any, spots: dict[tuple[str, Any], Spot], values: Sequence[Any]) 
             ax.hlines(np.median(errors), x - 0.15, x + 0.15, color=colour, linewidth=2.0)
             if spot.limit_px > LIMIT_PX:
                 ax.hlines(spot.limit_px, x - 0.16, x + 0.16, color=colour, linewidth=1.2, linestyle=(0, (2, 1.5)))
-    ax.axhline(LIMIT_PX, color="#0072b2", linewidth=1.2, linestyle="--", zorder=1)
+    ax.axhline(LIMIT_PX, color=BLUE, linewidth=1.2, linestyle="--", zorder=1)
     ax.set_ylabel("model error [px rms]", fontsize=NORMAL)
     ax.grid(True, axis="y", color="#e4e4e4")
     ax.set_axisbelow(True)
@@ -205,32 +217,34 @@ def _errors(ax: Any, spots: dict[tuple[str, Any], Spot], values: Sequence[Any]) 
 
 
 def _key(ax: Any) -> None:
+    """Draw the legend of the errors."""
     from matplotlib.lines import Line2D
 
     handles = [
         Line2D([], [], marker=mark, color=colour, markersize=5, linewidth=2.0, label=f"{name}, median")
         for name, (mark, colour, _) in MARKS.items()
     ]
-    handles.append(Line2D([], [], color="#0072b2", linestyle="--", linewidth=1.2, label=f"{LIMIT_PX} px"))
-    handles.append(Line2D([], [], color="#000000", linestyle=(0, (2, 1.5)), linewidth=1.2,
-                          label="success up to here, where its model cannot do better"))  # fmt: skip
+    handles.append(Line2D([], [], color=BLUE, linestyle="--", linewidth=1.2, label=f"{LIMIT_PX} px"))
+    handles.append(Line2D([], [], color=BLACK, linestyle=(0, (2, 1.5)), linewidth=1.2,
+                          label="limit of a success if the model itself has a larger error"))  # fmt: skip
     ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False, fontsize=SMALL,
               borderpad=0.0, borderaxespad=0.1, columnspacing=1.5)  # fmt: skip
 
 
-def _legend(figure: Any, width: float, height: float, down: float, *, left: float = LEFT, words: str = "") -> None:
+def _legend(figure: Any, width: float, height: float, down: float, *, left: float = LEFT, text: str = "") -> None:
+    """Draw the legend of the outcomes."""
     from matplotlib.patches import Patch
 
     handles = [Patch(color=colour, label=outcome.value) for outcome, colour in COLOURS.items()]
-    text = words or "share of successes; of how many, median time of a calibration"
-    handles.append(Patch(color="none", label=text))
+    label = text or "share of successes; number of successes and recordings, median time of a calibration"
+    handles.append(Patch(color="none", label=label))
     figure.legend(handles=handles, loc="center left", ncols=4, frameon=False, fontsize=NORMAL, borderpad=0.0,
                   borderaxespad=0.0, bbox_to_anchor=(left / width, 1.0 - down / height), columnspacing=1.5,
                   handletextpad=0.5)  # fmt: skip
 
 
 def _broken(text: str) -> str:
-    """In two lines where it is long."""
+    """Return a long text in two lines."""
     words = text.split()
     half = (len(words) + 1) // 2
     return "\n".join([" ".join(words[:half]), " ".join(words[half:])]) if len(text) > 12 else text

@@ -1,4 +1,6 @@
-"""Runs cells through any executor, a Dask cluster's or a pool of processes, and keeps each as it finishes."""
+"""Run of the cells through any executor, such as a Dask cluster or a process pool; each cell is stored when it
+finishes.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,11 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
 QUICK_METHODS = ("default", "paper", "sharpness")
+"""Methods of a quick run."""
 
 
 def quick_axes() -> tuple[Axis, ...]:
-    """Of each axis the ends and what lies between them, three values at most."""
+    """Return each axis with at most three values: its ends and its middle."""
     return tuple(
         replace(a, values=tuple(dict.fromkeys(a.values[i] for i in (0, len(a.values) // 2, -1))))
         for a in AXES
@@ -28,7 +31,7 @@ def quick_axes() -> tuple[Axis, ...]:
 
 
 def conditions(axes: Sequence[Axis]) -> list[Condition]:
-    """Every condition of the axes once: their harmless ends are one and the same."""
+    """Return every condition of the axes once; all axes share the harmless condition."""
     return list(dict.fromkeys(c for axis in axes for c in axis.conditions()))
 
 
@@ -44,10 +47,11 @@ def run(
     progress: Progress | None = None,
     until: Callable[[], bool] | None = None,
 ) -> list[Stored]:
-    """All cells of the axes; those in the folder are taken from there, those that miss a method run that method.
+    """Run all cells of the axes, and return their results.
 
-    Seeds are ``first`` and those after it. They go round: a run that is cut short has every condition with fewer
-    seeds. After ``until`` says so no further cell is begun. Raises :class:`AmiwarpError` for damaged files.
+    Cells in the folder are reused; if a cell lacks a method, only that method is run. Seeds begin at ``first``. The
+    seed is the outer loop: an interrupted run covers every condition, with fewer seeds. No new cell starts after
+    ``until`` returns True. Raises :class:`AmiwarpError` for damaged files.
     """
     store = Store(folder)
     cells = [Cell(c, seed) for seed in range(first, first + seeds) for c in conditions(axes)]
@@ -74,9 +78,10 @@ def run(
 
 
 def _missing(stored: Stored, methods: Sequence[Method]) -> tuple[Method, ...]:
+    """Return the methods without a result."""
     return tuple(m for m in methods if identity(m) not in stored.results)
 
 
 def chosen(names: Sequence[str] = ()) -> tuple[Method, ...]:
-    """Methods by name, the default and the paper's always among them."""
+    """Return methods by name; the default and the paper's method are always included."""
     return tuple(m for m in METHODS if not names or m.name in (*names, "default", "paper"))

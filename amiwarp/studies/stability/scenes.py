@@ -1,4 +1,4 @@
-"""Scenes of the atlas, drawn from a seed: what calibration can meet, from a dense texture to a blank wall."""
+"""Scenes of the atlas, drawn from a seed: from a dense texture to a blank wall."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ if TYPE_CHECKING:
 DARK, BRIGHT = 0.2, 1.0
 """Range of the scenes' luminance."""
 LAMP_HZ = 100.0
+"""Frequency of the flickering lamp [Hz]."""
 FRAME_US = 1000
-"""Between two pictures of a scene that changes."""
+"""Interval between two pictures of a changing scene [us]."""
 
 
 class SceneKind(enum.StrEnum):
-    """What the camera looks at."""
+    """Kind of scene."""
 
     TEXTURE = "dense texture"
     EDGES = "sparse edges"
@@ -31,7 +32,7 @@ class SceneKind(enum.StrEnum):
 
 
 def draw(kind: SceneKind, width: int, height: int, *, period: float, seed: int) -> NDArray[np.float32]:
-    """Linear luminance, shape (height, width); ``period``: of the repeating texture [pixels of the picture]."""
+    """Return linear luminance, shape ``(height, width)``; ``period`` is that of the repeating texture [texels]."""
     rng = np.random.default_rng([seed, 0x5CE7E])
     if kind is SceneKind.TEXTURE:
         return leaves(rng, width, height)
@@ -51,14 +52,14 @@ def draw(kind: SceneKind, width: int, height: int, *, period: float, seed: int) 
 
 
 def leaves(rng: np.random.Generator, width: int, height: int, count: int = 4000) -> NDArray[np.float32]:
-    """Discs that hide each other, sizes by a power law: statistics of natural pictures.
+    """Return discs that occlude each other, with sizes by a power law: the statistics of natural images.
 
     Lee, Mumford, Huang, "Occlusion models for natural images", IJCV 2001.
     """
     largest, smallest = height / 4.0, 3.0
     out = np.full((height, width), 0.5)
     u = rng.uniform(size=count)
-    radii = 1.0 / np.sqrt(u * (smallest**-2 - largest**-2) + largest**-2)  # density r^-3
+    radii = 1.0 / np.sqrt(u * (smallest**-2 - largest**-2) + largest**-2)  # density proportional to r^-3
     middles = rng.uniform(0.0, 1.0, (count, 2)) * (height, width)
     for radius, (y, x), value in zip(radii, middles, rng.uniform(size=count), strict=True):
         _disc(out, y, x, radius, value)
@@ -66,6 +67,7 @@ def leaves(rng: np.random.Generator, width: int, height: int, count: int = 4000)
 
 
 def _disc(out: NDArray[np.float64], y: float, x: float, radius: float, value: float) -> None:
+    """Draw a disc."""
     top, left = max(0, int(y - radius)), max(0, int(x - radius))
     part = out[top : int(y + radius) + 2, left : int(x + radius) + 2]
     rows, cols = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
@@ -73,7 +75,7 @@ def _disc(out: NDArray[np.float64], y: float, x: float, radius: float, value: fl
 
 
 def polygons(rng: np.random.Generator, width: int, height: int, count: int = 8) -> NDArray[np.float32]:
-    """A few triangles on an even ground."""
+    """Return a few triangles on a uniform background."""
     out = np.full((height, width), 0.5)
     rows, cols = np.mgrid[:height, :width]
     for value in rng.choice([0.1, 0.9], count):
@@ -87,42 +89,51 @@ def polygons(rng: np.random.Generator, width: int, height: int, count: int = 8) 
 
 
 def _triangle(angle: float) -> NDArray[np.float64]:
+    """Return the corners of a unit triangle."""
     at = angle + np.arange(3) * (2.0 * np.pi / 3)
     return np.stack([np.cos(at), np.sin(at)], axis=1)
 
 
 def _levels(share: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the luminance of shares of the range, 0 .. 1, on a logarithmic scale."""
     return (DARK * (BRIGHT / DARK) ** np.clip(share, 0.0, 1.0)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Changing:
-    """A still that something is done to, picture by picture."""
+class _ChangingStill:
+    """Still picture that changes over time."""
 
     light: NDArray[np.float32]
+    """Linear luminance of the still, shape ``(height, width)``."""
 
     @property
     def size(self) -> tuple[int, int]:
+        """Width and height [texels]."""
         return self.light.shape[1], self.light.shape[0]
 
     @property
     def interval_us(self) -> float:
+        """Interval between two pictures [us]."""
         return float(FRAME_US)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lamp(_Changing):
-    """A still of which a square flickers: its luminance falls by ``depth`` and rises again, ``LAMP_HZ`` times a second.
+class Lamp(_ChangingStill):
+    """Still with a flickering square.
 
-    Satisfies :class:`amiwarp.simulation.simulator.Frames`.
+    The square's luminance falls by ``depth`` and rises again :data:`LAMP_HZ` times per second. Satisfies
+    :class:`amiwarp.simulation.simulator.Frames`.
     """
 
     share: float
-    """Of the picture's area that the lamp lights."""
+    """Share of the picture's area that the lamp lights."""
     duration_us: int
+    """Length [us]."""
     depth: float = 0.7
+    """Relative fall of the luminance."""
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield time [us] and picture."""
         height, width = self.light.shape
         half = 0.5 * math.sqrt(self.share)
         rows = slice(round((0.5 - half) * height), round((0.5 + half) * height))
@@ -134,17 +145,20 @@ class Lamp(_Changing):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Passing(_Changing):
-    """A still in front of which a textured disc passes. Satisfies :class:`amiwarp.simulation.simulator.Frames`."""
+class PassingObject(_ChangingStill):
+    """Still in front of which a textured disc passes. Satisfies :class:`amiwarp.simulation.simulator.Frames`."""
 
     share: float
-    """Of the picture's area that the disc hides."""
+    """Share of the picture's area that the disc hides."""
     widths_per_s: float
-    """Its speed, in widths of the picture."""
+    """Speed of the disc [picture widths/s]."""
     duration_us: int
+    """Length [us]."""
     seed: int
+    """Seed of the disc's texture."""
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield time [us] and picture."""
         height, width = self.light.shape
         radius = math.sqrt(self.share * width * height / math.pi)
         side = 2 * math.ceil(radius) + 1

@@ -1,4 +1,4 @@
-"""What a page may send to its server: known calls, each argument of its kind and size. All else is dropped unread."""
+"""Filter for messages from a page: known calls whose arguments have the expected type and size. Drops all others."""
 
 from __future__ import annotations
 
@@ -11,33 +11,39 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 
 MOST_BYTES = 64 * 1024
-"""Of a message. The page's own have up to some hundred; it cuts none into parts."""
+"""Largest size of a message. The page's own messages have a few hundred bytes, and it never splits them into parts."""
 HEADER_BYTES = 12
-"""In front of each part: its message's number, where it begins and how long the message is, 32 bit each."""
+"""Header of each part: message number, start of the part and length of the message, 32 bits each."""
 MOST_PX, MOST_SIDE = 16_000_000, 8192
-"""Of the picture of the clouds."""
+"""Largest number of pixels and largest side [px] of the picture of the clouds."""
 LARGEST = 1e12
-"""Numbers are smaller: in ms that is 30 years."""
+"""Largest accepted number; in ms it is 30 years."""
 
 Check = Callable[[Any], bool]
+"""Function that returns whether a value is allowed."""
 
 
 def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
+    """Return a check for numbers from ``low`` to ``high``; it rejects NaN and booleans."""
+
     def check(value: Any) -> bool:
-        return type(value) in (int, float) and low <= value <= high  # NaN is in no range, True is no number
+        return type(value) in (int, float) and low <= value <= high  # comparisons with NaN are false
 
     return check
 
 
 def text(most: int) -> Check:
+    """Return a check for strings of at most ``most`` characters."""
     return lambda value: isinstance(value, str) and len(value) <= most
 
 
 def one_of(*known: Any) -> Check:
+    """Return a check for the ``known`` values, types included."""
     return lambda value: any(type(value) is type(each) and value == each for each in known)
 
 
 def list_of(*checks: Check) -> Check:
+    """Return a check for lists with one item for each of ``checks``."""
     return lambda value: (
         isinstance(value, list)
         and len(value) == len(checks)
@@ -46,6 +52,7 @@ def list_of(*checks: Check) -> Check:
 
 
 def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
+    """Return a check for dictionaries with all ``required`` keys and no keys besides these and ``optional``."""
     known = {**required, **(optional or {})}
 
     def check(value: Any) -> bool:
@@ -71,10 +78,11 @@ _mouse = {
 _wheel = one_of(*(f"{when}{what}" for when in ("Start", "", "End") for what in ("MouseWheel", "Pinch")))
 
 
-class Gate:
-    """Knows the calls of one page; ``settable``: what of its state the page may set, and to which values."""
+class MessageFilter:
+    """Filter for the messages of one page."""
 
     def __init__(self, server: Any, settable: Mapping[str, Check]) -> None:
+        """``settable`` maps each state variable that the page may set to the check of its values."""
         self._server, self._warned = server, False
         view = self._is_view
         change = self._change(settable)
@@ -99,10 +107,10 @@ class Gate:
         }
 
     def passes(self, message: bytes) -> bool:
-        """Return whether the message is one of the page's; the first that is not is logged."""
+        """Return whether the message is allowed. Log the first message that is not."""
         try:
             allowed = self._is_call(_unpacked(message))
-        except Exception:  # whatever a decoder makes of junk
+        except Exception:  # invalid bytes make the decoder raise errors of many types
             allowed = False
         if not allowed and not self._warned:
             self._warned = True
@@ -118,7 +126,7 @@ class Gate:
         return isinstance(value, str) and value == self._server.state.viewId
 
     def _is_trigger(self, args: list[Any]) -> bool:
-        """Return whether the page has registered the call with as many plain arguments."""
+        """Return whether the trigger exists and takes these arguments, which must be strings, numbers or flags."""
         plain = (text(200), number(), flag)
         if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
             return False
@@ -136,10 +144,10 @@ class Gate:
 
 
 def _unpacked(message: bytes) -> Any:
-    """Decode a message that came in one part."""
-    begin, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
-    if (begin, length) != (0, len(message) - HEADER_BYTES):
-        raise ValueError("a part of a message")
+    """Decode a message in one part. Raises :class:`ValueError` for a message in several parts."""
+    start, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
+    if (start, length) != (0, len(message) - HEADER_BYTES):
+        raise ValueError("only a part of a message: expected the complete message")
     return msgpack.unpackb(message[HEADER_BYTES:])
 
 
@@ -149,7 +157,8 @@ def _is_size(view: Check) -> Check:
 
 
 def finite(given: str) -> float:
-    """Return the number that was typed, within ±:data:`LARGEST`; raises ValueError for what is none."""
+    """Return the typed number, clipped to ±:data:`LARGEST`. Raises :class:`ValueError` for other text."""
+
     value = float(given or 0.0)
     if math.isnan(value):
         raise ValueError(given)

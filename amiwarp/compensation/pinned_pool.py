@@ -1,0 +1,51 @@
+"""Reuse of page-locked host memory for results of a GPU.
+
+A GPU writes to page-locked memory at full speed, but allocating one such array takes a millisecond, and a batch needs
+five, while it is compensated in 1.1 to 1.4 ms (``docs/explanation/performance.md``, Streams). So arrays are reused once
+the caller has released them. If the caller keeps more than :data:`POOL_SIZE` of a type, ordinary memory is handed out.
+"""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any, TypeAlias
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+POOL_SIZE = 16
+"""Largest number of pooled arrays of a type."""
+PooledArray: TypeAlias = tuple[Any, NDArray[Any]]
+"""A Warp array, and the NumPy array over its beginning that is handed out."""
+
+
+class PinnedPool:
+    """Pool of page-locked host arrays. An array is reused once its view, and all views of that, are gone."""
+
+    def __init__(self, size: int, *, pinned: bool = True) -> None:
+        """``size``: largest number of values per array. ``pinned``: page-lock the memory; requires CUDA."""
+        self._size, self._pinned = size, pinned
+        self._free: dict[Any, list[Any]] = {np.int64: [], np.float32: [], np.uint8: []}
+        self._allocated = dict.fromkeys(self._free, 0)
+
+    def fill(self, counts: dict[Any, int]) -> None:
+        """Allocate arrays now; ``counts``: number of arrays for each type."""
+        for dtype, count in counts.items():
+            self._free[dtype] += [self._allocate(dtype) for _ in range(count)]
+
+    def _allocate(self, dtype: Any) -> Any:
+        self._allocated[dtype] += 1
+        return wp.empty(self._size, dtype=wp.dtype_from_numpy(dtype), device="cpu", pinned=self._pinned)
+
+    def __call__(self, n: int, dtype: Any) -> PooledArray:
+        """Return an array of ``n`` uninitialised values."""
+        free = self._free[dtype]
+        if not free and self._allocated[dtype] >= POOL_SIZE:
+            view = np.empty(n, dtype)
+            return wp.array(view, dtype=wp.dtype_from_numpy(dtype), device="cpu", copy=False), view
+        array = free.pop() if free else self._allocate(dtype)
+        # Not a slice: NumPy makes a slice of a slice refer to the base, and the pool would miss that it is in use.
+        view = np.frombuffer(memoryview(array.numpy()), dtype, n)
+        weakref.finalize(view, free.append, array).atexit = False
+        return array, view

@@ -1,0 +1,113 @@
+"""Conversion and checks of event arrays: types, time limits, frame and order."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.validation import array as as_numbers
+
+if TYPE_CHECKING:
+    from amiwarp.events.events import Events
+
+TIME_LIMIT = 2**62
+"""Limit of the magnitude of times of events, encoder samples and index pulses [us]: 146,000 years.
+
+The difference and the sum of any two times then fit int64.
+"""
+
+SENSOR_DTYPE = np.dtype(np.uint16)
+"""Type of pixel coordinates from a sensor. Compensated events have float32 coordinates."""
+
+
+def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Return coordinates [px] as uint16 if they are integers, as float32 if they are floating."""
+    array = as_numbers(values, f"events' {name}")
+    if not array.size:
+        return array.astype(array.dtype if array.dtype in (np.uint16, np.float32) else np.uint16)
+    if array.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            short = array.astype(np.float32, copy=False)
+        if np.isinf(short).any():
+            raise AmiwarpError(f"events' {name} holds a coordinate that float32 cannot hold; drop that event")
+        return short
+    if array.dtype == np.uint16:
+        return array
+    if array.size and not (array.min() >= 0 and array.max() < LARGEST_SIZE):
+        given = f"events' {name} spans {array.min()} .. {array.max()}"
+        raise AmiwarpError(f"{given}; expected pixels in 0 .. {LARGEST_SIZE - 1}")
+    return array.astype(np.uint16)
+
+
+def as_polarity(values: ArrayLike) -> NDArray[np.uint8]:
+    """Return polarities as uint8: 1 if positive or true, else 0."""
+    array = as_numbers(values, "events' p", "iufb")
+    if array.dtype.kind == "f" and np.isnan(array).any():
+        raise AmiwarpError("events' p holds NaN; expected 1 for ON, 0 or -1 for OFF")
+    return (array > 0).astype(np.uint8)
+
+
+def as_times(values: ArrayLike) -> NDArray[np.int64]:
+    """Return times of any numeric type as int64 [us], rounded.
+
+    Raises :class:`AmiwarpError` for a time that is not finite or beyond :data:`TIME_LIMIT`.
+    """
+    array = as_numbers(values, "times")
+    if array.size and not (array.min() > -TIME_LIMIT and array.max() < TIME_LIMIT):
+        given = f"times span {array.min()} .. {array.max()} us: not finite or beyond int64"
+        raise AmiwarpError(f"{given}; expected microseconds within {TIME_LIMIT} us of 0")
+    return np.asarray(np.rint(array) if array.dtype.kind == "f" else array, np.int64)
+
+
+def check_sensor(events: Events) -> None:
+    """Raise :class:`AmiwarpError` for compensated events, whose coordinates are not uint16."""
+    if events.x.dtype != SENSOR_DTYPE:
+        raise AmiwarpError(
+            f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
+        )
+
+
+def check_events(
+    events: Events,
+    width: int,
+    height: int,
+    *,
+    where: str,
+    first_index: int = 0,
+    allow_nan: bool = False,
+    after_t: int | None = None,
+) -> None:
+    """Check one block of events: frame, order, time limits and polarities.
+
+    Sensor coordinates (uint16) must lie in the frame. Compensated coordinates (float32) may lie outside it, but must be
+    finite. With ``allow_nan``, NaN is allowed too: it marks a compensated event without a position. ``after_t`` is the
+    time of the last event before the block [us]. Raises :class:`AmiwarpError`, which gives ``where`` and the index of
+    the first bad event, counted from ``first_index``.
+    """
+    if not len(events):
+        return
+
+    def fail(bad: NDArray[np.bool_], what: str) -> None:
+        index = int(np.argmax(bad))
+        x, y, t = events.x[index], events.y[index], events.t[index]
+        raise AmiwarpError(f"{where}: event {first_index + index} (x={x}, y={y}, t={t} us) {what}")
+
+    if events.x.dtype == np.uint16:
+        if int(events.x.max()) >= width or int(events.y.max()) >= height:
+            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; check the size")
+    elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
+        fail(np.isinf(events.x) | np.isinf(events.y), "has an infinite coordinate; drop it")
+    elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
+        fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
+    if bool((events.t[1:] < events.t[:-1]).any()):
+        fail(np.concatenate([[False], events.t[1:] < events.t[:-1]]), "is earlier than the one before; sort by time")
+    if after_t is not None and events.t[0] < after_t:
+        fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
+    if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # the times are sorted here
+        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; it is damaged")
+    if int(events.p.max()) > 1:
+        fail(events.p > 1, "has a polarity that is neither 0 nor 1")

@@ -1,0 +1,17 @@
+"""Colours of all figures, point clouds and images, distinguishable with all common kinds of colour vision deficiency.
+
+Most are the colours of Okabe and Ito, "Color Universal Design", 2008.
+"""
+
+BLACK = "#000000"
+BLUE = "#0072b2"
+GREEN = "#009e73"
+ORANGE = "#e69f00"
+PINK = "#cc79a7"
+SKY_BLUE = "#56b4e9"
+VERMILION = "#d55e00"
+
+OFF_COLOUR, ON_COLOUR = BLUE, VERMILION
+"""Polarities on a light ground."""
+OFF_ON_BLACK, ON_ON_BLACK = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)
+"""Polarities on a black ground, where the darker pair would be hard to see."""

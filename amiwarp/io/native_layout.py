@@ -1,0 +1,108 @@
+"""Layout of native HDF5 recordings: header, datasets, chunks and the millisecond index.
+
+The format is described in ``docs/reference/recording-format.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import MetadataValue
+from amiwarp.io.attributes import camera_attributes, prism_attributes
+from amiwarp.io.chunks import CHUNK
+from amiwarp.optics.camera import Camera, check_size
+
+if TYPE_CHECKING:
+    from amiwarp.optics.prism import NominalPrism
+
+FORMAT = "amiwarp-recording"
+"""Value of the attribute ``format`` of native recordings."""
+
+FORMAT_VERSION = 1
+"""Newest version of the format that is read, and the version that is written."""
+
+Columns: TypeAlias = dict[str, NDArray[Any]]
+"""Arrays of a block of events, by the names of their datasets in the file."""
+
+MAX_MS = 100_000_000
+"""Longest recording [ms], 28 h. Beyond it a timestamp must be damaged, and the millisecond index would be huge."""
+
+
+def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
+    """Raise :class:`AmiwarpError` for an impossible sensor size, or one that differs from the camera's."""
+    check_size(width, height, path)
+    if camera is not None and (camera.width, camera.height) != (width, height):
+        given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
+        raise AmiwarpError(f"{path}: {given}; give both one size")
+
+
+def check_lengths(columns: Columns, count: int) -> None:
+    """Raise :class:`AmiwarpError` for a column that does not have one element per event."""
+    for name, column in columns.items():
+        if column.shape != (count,):
+            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
+
+
+def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) -> Iterator[NDArray[np.int64]]:
+    """Yield entries of ms_to_idx from ``first_ms`` on, for events at ``t`` [us] that follow ``before`` others."""
+    last_ms = (int(t[-1]) - t_offset) // 1000
+    if last_ms > MAX_MS:
+        span = f"{t_offset} .. {int(t[-1])} us"
+        raise AmiwarpError(f"events span {span}, beyond {MAX_MS // 3_600_000} h; a timestamp is damaged")
+    for first in range(first_ms, last_ms + 1, 1 << 20):
+        ms = np.arange(first, min(first + (1 << 20), last_ms + 1), dtype=np.int64)
+        yield np.searchsorted(t, ms * 1000 + t_offset) + before
+
+
+def chunks_of(columns: Columns) -> Iterator[NDArray[Any]]:
+    """Yield all chunks of the first column, then those of the next."""
+    for column in columns.values():
+        for at in range(0, column.size, CHUNK):
+            yield column[at : at + CHUNK]
+
+
+def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
+    """Describe columns and their types for messages."""
+    return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
+
+
+def make_dataset(file: Any, name: str, dtype: Any) -> Any:
+    """Create an empty dataset of the native layout."""
+    import hdf5plugin
+
+    # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.
+    return file.create_dataset(
+        name,
+        shape=(0,),
+        maxshape=(None,),
+        chunks=(CHUNK,),
+        dtype=dtype,
+        fletcher32=True,
+        compression=hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
+    )
+
+
+def write_header(
+    file: Any,
+    size: tuple[int, int],
+    camera: Camera | None,
+    prism: NominalPrism | None,
+    metadata: Mapping[str, MetadataValue],
+) -> None:
+    """Write what is known before the first event: format, size, camera, prism and metadata."""
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = FORMAT_VERSION
+    file.attrs["width"], file.attrs["height"] = size
+    if camera is not None:
+        file.create_group("camera").attrs.update(camera_attributes(camera))
+    if prism is not None:
+        file.create_group("prism").attrs.update(prism_attributes(prism))
+    group = file.create_group("metadata")
+    for name, item in metadata.items():
+        group.attrs[name] = item

@@ -1,0 +1,65 @@
+"""Ordering of events across packets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from amiwarp.events.events import Events
+
+
+class EventSorter:
+    """Sorts events by time across packets. Each event is returned once.
+
+    Packets in order pass at once and unchanged. After an event that is earlier than those of a previous packet, events
+    are held back for as long as that event was late, by at most ``most_us`` [us] of event time and ``most_events``
+    events. This ends after :data:`CALM_US` without disorder. An event that is later still gets the time of the last
+    event returned, and is counted in :attr:`late`.
+    """
+
+    CALM_US = 1_000_000
+    """Event time without disorder after which events pass at once again [us]."""
+
+    def __init__(self, *, most_us: int = 10_000, most_events: int = 1 << 18) -> None:
+        self._most_us, self._most_events = most_us, most_events
+        self._hold_us = 0
+        self._last_out_us = self._newest_us = -(1 << 62)
+        self._disorder_us = 0
+        self._held: Events | None = None
+        self.late = 0
+        """Number of events whose time was raised."""
+
+    def put(self, events: Events) -> Events:
+        """Add a packet's events; return the events that are ready, in order."""
+        t = events.t
+        if not len(events):
+            return events
+        if not self._hold_us and t[0] >= self._last_out_us and not (t[1:] < t[:-1]).any():
+            self._last_out_us = self._newest_us = int(t[-1])
+            return events
+        lateness = self._newest_us - int(t.min())
+        self._newest_us = max(self._newest_us, int(t.max()))
+        if lateness > 0:
+            self._hold_us, self._disorder_us = max(self._hold_us, min(lateness, self._most_us)), self._newest_us
+        elif self._newest_us - self._disorder_us > self.CALM_US:
+            self._hold_us = 0
+        return self._release(events, self._newest_us - self._hold_us)
+
+    def flush(self) -> Events:
+        """Return all events that are still held."""
+        return self._release(Events.empty(), self._newest_us)
+
+    def _release(self, events: Events, until: int) -> Events:
+        """Return the events up to a time, and hold the others."""
+        joined = events if self._held is None else Events.concatenate([self._held, events])
+        joined = joined[np.argsort(joined.t, kind="stable")]
+        late = int(np.searchsorted(joined.t, self._last_out_us))
+        if late:
+            self.late += late
+            t = joined.t.copy()
+            t[:late] = self._last_out_us
+            joined = Events(joined.x, joined.y, t, joined.p)
+        count = max(int(np.searchsorted(joined.t, until, "right")), len(joined) - self._most_events)
+        out, held = joined[:count], joined[count:]
+        self._held = held if len(held) else None
+        self._last_out_us = int(out.t[-1]) if len(out) else self._last_out_us
+        return out

@@ -1,0 +1,115 @@
+"""Status of a live session, and the figures in it that are measured between two reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import SharpnessMeter
+from amiwarp.imaging.warped_image import CanvasShape
+
+if TYPE_CHECKING:
+    from amiwarp.compensation.streams import Compensated, Compensator
+    from amiwarp.live.link.clocks import ClockMap
+
+IMAGE_US = 33_333
+"""Window of the image whose sharpness is reported [us]."""
+
+
+@dataclass(slots=True)
+class SessionStatus:
+    """Progress of a session. Counts are totals; shares, rates and latencies refer to the time since the last report."""
+
+    seconds: float = 0.0
+    """Duration of the session [s]."""
+    events: int = 0
+    """Number of events received."""
+    done: int = 0
+    """Number of events compensated."""
+    outside: int = 0
+    """Number of events displaced out of the image."""
+    guessed: int = 0
+    """Number of events with an extrapolated angle."""
+    unknown: int = 0
+    """Number of events without any angle."""
+    dropped: int = 0
+    """Number of events dropped by the queue, see :class:`Policy`."""
+    late: int = 0
+    """Number of events that were out of order and got a later time."""
+    waiting: int = 0
+    """Number of events in the queue, or waiting for the encoder."""
+    rate_mev_s: float = 0.0
+    """Event rate [million events/s]."""
+    covered: float = 1.0
+    """Share of events whose angle was interpolated between encoder samples."""
+    latency_ms: tuple[float, float] = (0.0, 0.0)
+    """Time from a packet's arrival to its output, median and 99th percentile [ms]."""
+    sharpness: float | None = None
+    """Sharpness of the latest image, over :data:`IMAGE_US`."""
+    rpm: float | None = None
+    """Speed of the prism [turns/min]."""
+    clock: ClockMap | None = None
+    """Map from the controller's clock to the camera's, with a link."""
+    coverage: float | None = None
+    """Share of the scene's edges that the last window showed, with adaptive speed."""
+    phase_away: float | None = None
+    """Latest estimate of the phase relative to the calibrated one [rad]."""
+
+
+class IntervalFigures:
+    """Rate, latency and coverage by the encoder since the last report."""
+
+    def __init__(self, began_us: int) -> None:
+        self._reported = (began_us, 0, 0, 0)  # time [us]; events received, compensated, without a measured angle
+        self._latencies: list[int] = []
+
+    def add(self, packet: Compensated, now_us: int, status: SessionStatus) -> None:
+        """Count a compensated packet."""
+        flags = packet.flags
+        status.done += len(flags)
+        if flags.any():
+            status.outside += int(np.count_nonzero(flags & OUTSIDE))
+            status.guessed += int(np.count_nonzero(flags & EXTRAPOLATED))
+            status.unknown += int(np.count_nonzero(flags & NO_ANGLE))
+        self._latencies.append(now_us - packet.arrived_us)
+
+    def report(self, now_us: int, status: SessionStatus) -> None:
+        """Enter the figures of the interval into the status, and begin the next interval."""
+        then_us, events, done, unsure_then = self._reported
+        unsure = status.guessed + status.unknown
+        status.rate_mev_s = (status.events - events) / max(now_us - then_us, 1)
+        status.covered = 1.0 - (unsure - unsure_then) / (status.done - done) if status.done > done else 1.0
+        self._reported = (now_us, status.events, status.done, unsure)
+        if self._latencies:
+            median, slow = np.percentile(self._latencies, [50, 99]) * 1e-3
+            status.latency_ms = float(median), float(slow)
+            self._latencies.clear()
+
+
+class WindowSharpness:
+    """Sharpness of the compensated image of one window per report."""
+
+    def __init__(self, compensator: Compensator, size: tuple[int, int], device: str) -> None:
+        self._compensator = compensator
+        self._meter = SharpnessMeter(CanvasShape(*size), Sharpness.VARIANCE, smoothing=1.0, device=device)
+        self._start_us: int | None = None
+        self._wanted = True
+
+    def update(self, t: int) -> float | None:
+        """Return the sharpness once the window is complete, for compensated events up to ``t`` [us]."""
+        if self._start_us is None:
+            self._compensator.image()  # discards the events before the window
+            self._start_us = t
+        elif self._wanted and t - self._start_us >= IMAGE_US:
+            self._meter.image.write(self._compensator.image()[None])
+            sharpness, self._start_us, self._wanted = self._meter.measure(), t, False
+            return sharpness
+        return None
+
+    def restart(self) -> None:
+        """Begin a new window."""
+        self._start_us, self._wanted = None, True

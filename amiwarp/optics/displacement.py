@@ -1,0 +1,121 @@
+"""Displacement of points by a model, for NumPy arrays and for Warp arrays on any device."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+import numpy as np
+import warp as wp
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import optics as kernels
+from amiwarp.kernels.launch import launch
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.device_camera import camera_params
+from amiwarp.validation import array
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Points = TypeVar("Points")
+"""A NumPy array of shape (n, 2), or a Warp array of vec2 of shape (n,). Results are of the same kind."""
+
+
+class HasParams(Protocol):
+    """A model with a camera and kernel parameters."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+    def params(self, device: Any) -> Any: ...
+
+
+class PointDisplacement:
+    """Base class of the models: applies their device functions to arrays of points."""
+
+    def compensate_points(self: HasParams, xy: Points, theta: Points) -> Points:
+        """Return the pixel that the same scene ray would hit without the prism.
+
+        Parameters
+        ----------
+        xy : numpy.ndarray or warp.array
+            Observed pixels [px], shape (n, 2), or a Warp array of vec2 of shape (n,).
+        theta : numpy.ndarray or warp.array
+            Prism angle of the encoder [rad], shape (n,). A float32 Warp array on the same device if ``xy`` is one.
+
+        Returns
+        -------
+        numpy.ndarray or warp.array
+            Compensated pixels [px], of the same shape as ``xy``. A row is NaN if it has no ray: total internal
+            reflection, or a ray behind the image plane.
+
+        Raises
+        ------
+        AmiwarpError
+            If the arrays have other shapes, types or devices.
+        """
+        return _run("compensate_points", self, xy, theta)
+
+    def deflect_points(self: HasParams, xy: Points, theta: Points) -> Points:
+        """Return the observed pixel of a scene ray, given its pixel without the prism.
+
+        Inverse of :meth:`compensate_points`.
+
+        Parameters
+        ----------
+        xy : numpy.ndarray or warp.array
+            Pixels without the prism [px], shape (n, 2), or a Warp array of vec2 of shape (n,).
+        theta : numpy.ndarray or warp.array
+            Prism angle of the encoder [rad], shape (n,). A float32 Warp array on the same device if ``xy`` is one.
+
+        Returns
+        -------
+        numpy.ndarray or warp.array
+            Observed pixels [px], of the same shape as ``xy``. A row is NaN if it has no ray.
+
+        Raises
+        ------
+        AmiwarpError
+            If the arrays have other shapes, types or devices.
+        """
+        return _run("deflect_points", self, xy, theta)
+
+
+def _run(kernel_name: str, model: HasParams, xy: Any, theta: Any) -> Any:
+    kernel = getattr(kernels, kernel_name)
+    if isinstance(xy, wp.array):
+        if not isinstance(theta, wp.array) or theta.device != xy.device or theta.dtype is not wp.float32:
+            raise AmiwarpError(f"xy is a Warp array on {xy.device}; give theta as a float32 Warp array there too")
+        if xy.dtype is not wp.vec2 or xy.ndim != 1 or xy.shape != theta.shape:
+            raise AmiwarpError(f"xy has type {xy.dtype}, shape {xy.shape}, theta {theta.shape}; give vec2, both (n,)")
+        out = wp.empty_like(xy)
+        launch(kernel, len(xy), [model.params(xy.device), model_camera(model, xy.device), xy, theta], [out],
+               device=xy.device)  # fmt: skip
+        return out
+    xy, theta = array(xy, "xy"), array(theta, "theta")
+    if xy.ndim != 2 or xy.shape[1] != 2 or theta.shape != xy.shape[:1]:
+        raise AmiwarpError(f"xy has shape {xy.shape} and theta {theta.shape}; give (n, 2) and (n,)")
+    wrapped = wrap_angle(theta).astype(np.float32)
+    result = _run(
+        kernel_name,
+        model,
+        wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu"),
+        wp.array(wrapped, dtype=float, device="cpu"),
+    )
+    return result.numpy().astype(xy.dtype if np.issubdtype(xy.dtype, np.floating) else np.float32, copy=False)
+
+
+def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Wrap an angle [rad] to [-pi, pi) in float64. Call it before rounding to float32."""
+    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def model_camera(model: HasParams, device: Any) -> Any:
+    """Return the parameters of the model's camera on ``device``, cached per camera."""
+    return camera_params(model.camera, str(device))
+
+
+def set_phase(params: Any, phase: float) -> None:
+    """Set the phase of a model's parameters [rad], with its cosine and sine."""
+    params.phase, params.phase_cos, params.phase_sin = phase, math.cos(phase), math.sin(phase)

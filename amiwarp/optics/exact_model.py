@@ -1,0 +1,114 @@
+"""Exact model: refraction at both faces of the prism."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from amiwarp.kernels.optics import ExactParams
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.displacement import PointDisplacement, set_phase
+from amiwarp.optics.prism import FlatSide, Prism, check_phase, check_tilt
+from amiwarp.validation import instance
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""Rotation of a prism axis without tilt: the identity matrix, row by row."""
+
+
+@dataclass(frozen=True)
+class ExactModel(PointDisplacement):
+    """Exact model: refracts each ray at both faces of the prism, in closed form.
+
+    Raises
+    ------
+    AmiwarpError
+        If a field has an unusable value.
+
+    Notes
+    -----
+    The formulas are in ``docs/explanation/optics.md``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> model = amiwarp.ExactModel(camera, amiwarp.Prism(apex=0.03), phase=0.1)
+    >>> observed = model.deflect_points(np.array([[100.0, 200.0]]), np.array([0.5]))
+    >>> model.compensate_points(observed, np.array([0.5])).round(2)
+    array([[100., 200.]])
+    """
+
+    FREE: ClassVar[tuple[str, ...]] = ("apex", "phase", "index", "tilt_x", "tilt_y")
+    """Parameters that a calibration can find."""
+    camera: Camera
+    """The camera."""
+    prism: Prism
+    """The prism."""
+    phase: float = 0.0
+    """Phase θ_b, added to the encoder's angle [rad]."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """Rotation of the prism's rotation axis about the camera's x, then about its y [rad]."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        instance(self.prism, Prism, "prism")
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        object.__setattr__(self, "tilt", check_tilt(self.tilt))
+
+    @classmethod
+    def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> ExactModel:
+        """Create the model of a prism whose axis is not tilted.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+        prism : Prism
+            The prism.
+        phase : float, default 0.0
+            Added to the encoder's angle [rad].
+
+        Returns
+        -------
+        ExactModel
+            The model.
+        """
+        return cls(camera, prism, phase)
+
+    def params(self, device: Any) -> Any:
+        """Return the parameters for kernels.
+
+        Parameters
+        ----------
+        device : str or warp.Device
+            The device that runs the kernels.
+
+        Returns
+        -------
+        amiwarp.kernels.optics.ExactParams
+            Apex angle, index, phase and tilt as a Warp struct.
+        """
+        p = ExactParams()
+        p.sin_apex = math.sin(self.prism.apex)
+        p.cos_apex = math.cos(self.prism.apex)
+        p.index2 = self.prism.index**2
+        set_phase(p, self.phase)
+        p.flat_to_scene = int(self.prism.flat_side is FlatSide.SCENE)
+        p.tilted = int(any(self.tilt))
+        p.axis = wp.mat33(*(axis_rotation(*self.tilt).ravel().tolist() if p.tilted else UPRIGHT))
+        return p
+
+
+def axis_rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
+    """Return the rotation matrix (3, 3) of a tilted axis: about x by ``tilt_x``, then about y by ``tilt_y`` [rad]."""
+    cx, sx, cy, sy = math.cos(tilt_x), math.sin(tilt_x), math.cos(tilt_y), math.sin(tilt_y)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+    return about_y @ about_x

@@ -1,0 +1,61 @@
+"""Distance between two models over the image and one turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.optics.models import Model
+
+
+@dataclass(frozen=True, slots=True)
+class ModelError:
+    """Distance between two models over the image and one turn of the prism."""
+
+    rms: float
+    """Root mean square distance [px]."""
+    worst: float
+    """Largest distance [px]."""
+    lag: float
+    """Constant angle that was subtracted from the first model's theta before the comparison [rad]; 0 by default."""
+
+
+def predicted_error(model: Model, exact: Model, *, remove_lag: bool = False, grid: int = 24) -> ModelError:
+    """Return the distance of ``model`` from ``exact``, on ``grid`` rows of the image (square cells) and 36 angles.
+
+    With ``remove_lag``, the constant angle that minimises the distance is subtracted first. Points that are invalid in
+    either model are left out. Raises :class:`AmiwarpError` if no point is valid in both.
+    """
+    from scipy.optimize import minimize_scalar
+
+    camera = exact.camera
+    columns = max(2, round(grid * camera.width / camera.height))
+    x = np.round(np.linspace(0, camera.width - 1, columns))
+    y = np.round(np.linspace(0, camera.height - 1, max(2, grid)))
+    theta = np.arange(36) * (2.0 * np.pi / 36)
+    mesh = np.stack([m.ravel() for m in np.meshgrid(x, y, theta, indexing="ij")], axis=1)
+    target = exact.compensate_points(mesh[:, :2], mesh[:, 2])
+
+    def distance(lag: float) -> NDArray[np.float64]:
+        d = np.linalg.norm(model.compensate_points(mesh[:, :2], mesh[:, 2] - lag) - target, axis=1)
+        return cast("NDArray[np.float64]", d[np.isfinite(d)])
+
+    def rms(lag: float) -> float:
+        return float(np.sqrt(np.mean(distance(lag) ** 2)))
+
+    if not len(distance(0.0)):
+        raise AmiwarpError("the two models have no valid point in common; compare models of the same camera and prism")
+    lag = 0.0
+    if remove_lag:
+        start = min(np.arange(-12, 12) * (np.pi / 12), key=rms)
+        bounds = (start - 0.3, start + 0.3)
+        lag = float(minimize_scalar(rms, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
+        lag = lag if rms(lag) < rms(0.0) else 0.0
+    return ModelError(rms(lag), float(distance(lag).max()), lag)

@@ -1,0 +1,67 @@
+"""Properties of one time window: the map that it needs, its busiest part, the ratio of the thresholds."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.brightness.solver import Tiles
+from amiwarp.events.encoder import TURN
+from amiwarp.optics.camera_rotation import CameraRotation, border
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.events.events import EventSource
+    from amiwarp.optics.models import Model
+
+LARGEST_MARGIN = 0.5
+"""Largest margin of the map around the image, relative to the image's width."""
+
+
+def map_tile(model: Model, camera_rotation: CameraRotation, length_us: int) -> tuple[int, int, Tiles]:
+    """Return the margin before the image (columns, rows), and the map: all that pixels see during the window.
+
+    ``camera_rotation`` is that about the window's middle.
+    """
+    camera = model.camera
+    margin = np.max(np.abs(border_displacements(model)), axis=0) + camera_rotation.reach(camera, length_us * 0.5e-6)
+    limit = LARGEST_MARGIN * camera.width
+    left, top = (math.ceil(min(float(m), limit)) + 2 for m in margin)
+    origin = np.array([[-left, -top]], np.float32)
+    return left, top, Tiles(origin, camera.height + 2 * top, camera.width + 2 * left, 1.0)
+
+
+def border_displacements(model: Model) -> NDArray[np.float64]:
+    """Return the displacements of the image's border by the prism over one turn [px], shape (n, 2)."""
+    xy = border(model.camera)
+    theta = np.arange(24) * (TURN / 24)
+    at = np.repeat(xy, 24, axis=0)
+    moved = model.compensate_points(at.astype(np.float32), np.tile(theta, len(xy)))
+    away = np.asarray(moved, np.float64) - at
+    return away[np.isfinite(away).all(axis=1)]
+
+
+def busiest_square(count: NDArray[np.int32], side: int) -> tuple[int, int]:
+    """Return first column and row of the square of ``side`` px with the most events; ``count``: events per pixel."""
+    rows = np.add.reduceat(count, np.arange(0, count.shape[0], side), axis=0)
+    cells = np.add.reduceat(rows, np.arange(0, count.shape[1], side), axis=1)
+    row, column = np.unravel_index(int(cells.argmax()), cells.shape)
+    return int(column) * side, int(row) * side
+
+
+def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: int, length_us: int) -> float:
+    """Return OFF threshold over ON threshold, minus 1, from event counts over whole turns near the window.
+
+    After a whole turn, a pixel is back at its brightness. So ONs times their threshold equal OFFs times theirs.
+    """
+    first, last = source.t_first, source.t_last
+    if turn_us is None or last - first < turn_us:
+        return 0.0
+    length = max(1, math.floor(length_us / turn_us)) * turn_us
+    start = min(max(start_us, first), last - length)
+    p = source.between(round(start), round(start + length)).p
+    on = int(p.sum())
+    return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0

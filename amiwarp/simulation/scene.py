@@ -1,0 +1,111 @@
+"""The scene in front of a simulated camera: pictures, which may change with time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.simulation.pictures import linear_luminance, read_picture
+from amiwarp.validation import real
+
+
+class Frames(Protocol):
+    """Pictures with times, read one after the other."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of each picture [px]."""
+
+    @property
+    def interval_us(self) -> float | None:
+        """Typical time between pictures [us]; None for a still picture."""
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield times and pictures.
+
+        Yields
+        ------
+        tuple
+            Time [us], increasing, the first no later than 0; and linear luminance, float32, shape ``(height, width)``.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Still:
+    """A single picture that never changes."""
+
+    light: NDArray[np.float32]
+    """Linear luminance, shape (height, width)."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.light.shape[1], self.light.shape[0]
+
+    @property
+    def interval_us(self) -> None:
+        """None: there is only one picture."""
+        return None
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield the picture at time 0."""
+        yield 0, self.light
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Scene in front of the camera: pictures on a plane at infinity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> amiwarp.Scene.from_picture(np.ones((48, 64), np.float32)).frames.size
+    (64, 48)
+    """
+
+    frames: Frames
+    """The pictures."""
+    fov: float | None = None
+    """Horizontal field of view of a picture [rad]. Beyond its edges it is mirrored. None fills everything ever seen."""
+    blur: float = 0.5
+    """Standard deviation of the optical blur, including the pixel's aperture [sensor px]."""
+
+    def __post_init__(self) -> None:
+        if self.fov is not None:
+            below = math.nextafter(math.pi, 0.0)
+            hint = " rad, 0 .. 180 deg; is it given in degrees?"
+            object.__setattr__(self, "fov", real(self.fov, "scene fov", 1e-9, below, hint))
+        object.__setattr__(self, "blur", real(self.blur, "scene blur", 0.0, 20.0, " px"))
+
+    @classmethod
+    def from_picture(cls, picture: str | Path | NDArray[Any], *, fov: float | None = None, blur: float = 0.5) -> Scene:
+        """Make a still scene from a picture.
+
+        Parameters
+        ----------
+        picture : str, Path or ndarray
+            Picture file, or pixel values of shape ``(height, width)`` or ``(height, width, 3)``. uint8 and uint16
+            values are sRGB-encoded; floating values are linear, with white at 1.
+        fov : float, optional
+            Horizontal field of view of the picture [rad]; by default it fills everything ever seen.
+        blur : float, optional
+            Standard deviation of the optical blur [sensor px].
+
+        Returns
+        -------
+        Scene
+            The scene.
+
+        Raises
+        ------
+        AmiwarpError
+            If the picture cannot be read, or has another shape or type.
+        """
+        light = read_picture(picture) if isinstance(picture, str | Path) else linear_luminance(picture)
+        return cls(Still(light), fov, blur)

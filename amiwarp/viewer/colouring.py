@@ -1,0 +1,85 @@
+"""Colours of the points, and the quantities that they show."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
+from amiwarp.viewer.choices import Axis, Colour
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.viewer.inspector import DisplayedWindow
+    from amiwarp.viewer.scene import Look
+
+NEAR_PX = 3.0
+"""Size of the neighbourhood whose centre is compared with an event: two standard deviations [px]."""
+
+
+def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
+    """Return the prism angle of each point [deg], or its time since the window's start [ms], shape ``(n,)``."""
+    if axis is Axis.ANGLE:
+        return np.asarray(np.degrees(shown.theta), np.float64)
+    return np.asarray((shown.events.t - shown.span.start_us) * 1e-3, np.float64)
+
+
+def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np.uint8]:
+    """Return red, green and blue of each point (0 to 255), shape ``(n, 3)``."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_rgb
+
+    if look.overlaid and not after:
+        return np.full((len(shown.events), 3), 128, np.uint8)
+    if look.colour is Colour.POLARITY:
+        two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
+        return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
+    value, name = _measure(shown, look.colour, after=after)
+    table = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
+    if name == "twilight":  # its ends are white and its middle is black: keep both apart from the background
+        table = 1.0 - 0.8 * (1.0 - table) if look.dark else 0.8 * table
+    table = (255.0 * table).astype(np.uint8)
+    return np.asarray(table[np.clip(np.nan_to_num(value) * 255.0, 0, 255).astype(np.uint8)])
+
+
+def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> tuple[NDArray[np.float64], str]:
+    """Return the displayed quantity of each point, scaled to 0 … 1, and the name of its colour map.
+
+    The colour maps are perceptually uniform; that of the angle is cyclic.
+    """
+    if colour is Colour.ANGLE:
+        return shown.theta / math.tau, "twilight"
+    if colour is Colour.TIME:
+        return (shown.events.t - shown.span.start_us) / shown.span.length_us, "viridis"
+    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
+    if colour is Colour.DENSITY:
+        top = max(float(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0, 1.0)
+        return np.sqrt(at_pixels(image, xy) / top), "cividis"
+    return residual(image, xy) / 2.0, "cividis"
+
+
+def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the image's value at each point, 0 outside the image, shape ``(n,)``."""
+    x, y = (np.nan_to_num(xy[:, k], nan=-9.0) for k in (0, 1))
+    column, row = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
+    inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
+    out = np.zeros(len(xy))
+    out[inside] = image[row[inside], column[inside]]
+    return out
+
+
+def residual(image: NDArray[np.float32], xy: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the distance of each point from the centre of the events near it [px], shape ``(n,)``.
+
+    The centre is a mean with Gaussian weights of standard deviation ``NEAR_PX / 2``.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
+    weight = np.maximum(gaussian_filter(image, NEAR_PX / 2.0), 1e-6)
+    centre = [gaussian_filter(image * m, NEAR_PX / 2.0) / weight for m in (columns, rows)]
+    distance = [at_pixels(m, xy) - xy[:, k] for k, m in enumerate(centre)]
+    return np.asarray(np.nan_to_num(np.hypot(*distance)), np.float64)
