@@ -175,7 +175,7 @@ class MapRing:
         return np.array(times, np.float64), np.array(slots, np.int32)
 
     def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return matrices (n, 3, 3) from the camera's frame to the pictures' at times [us]; None for a resting camera."""
+        """Return matrices (n, 3, 3) from the camera's frame to the pictures' at times [us]; None if the camera rests."""
         return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
 
     def _slot(self) -> int:
