@@ -1,0 +1,333 @@
+"""Worlds: rays, truth and events, compared with an independent float64 implementation."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import Prism
+from amiwarp.simulation.engine import Engine
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.frame_truth import TruthRenderer
+from amiwarp.simulation.worlds.renderer import pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Mesh, Sky, Sun, World
+from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
+from amiwarp.simulation.worlds.world_scene import WorldScene
+from tests import reference
+
+CAMERA = Camera.from_fov(64, 48, math.radians(60.0))
+CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+CUBE_FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]]
+)  # fmt: skip
+
+
+def box(centre: Any, size: Any, turn: float = 0.0) -> Mesh:
+    vertices = (CUBE * size) @ Rotation.from_euler("xyz", (turn, 0.5 * turn, 2.0 * turn)).as_matrix().T + centre
+    return Mesh(vertices, CUBE_FACES, uv=CUBE[:, :2] + 0.5)
+
+
+def smooth_texture(seed: int) -> NDArray[np.float32]:
+    image = gaussian_filter(np.random.default_rng(seed).normal(size=(64, 64)), 3.0, mode="wrap")
+    return np.asarray((image - image.min()) / np.ptp(image) * 0.9 + 0.1, np.float32)
+
+
+def random_world(seed: int, *, moving: int = 3) -> World:
+    """Boxes before a wall, of which the first few move."""
+    rng = np.random.default_rng(seed)
+    bodies = []
+    for k in range(12):
+        mesh = box(rng.uniform(-2.0, 2.0, 3), rng.uniform(0.3, 1.0, 3), rng.uniform(0.0, 3.0))
+        path = None
+        if k < moving:
+            turn = [Rotation.identity().as_quat(), Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_quat()]
+            path = Trajectory([0.0, 1.0], [np.zeros(3), rng.normal(0.0, 1.0, 3)], turn)
+        bodies.append(Body(f"box {k}", mesh, Material(0.8, smooth_texture(k)), path, category="box"))
+    bodies.append(Body("wall", box((0.0, 4.0, 0.0), (12.0, 0.1, 12.0)), Material(0.6, smooth_texture(99))))
+    return World(f"random {seed}", tuple(bodies), sun=Sun((1.0, -1.0, 2.0)), lamps=(Lamp((0.0, -3.0, 3.0)),))
+
+
+def view_from(position: Any = (0.0, -6.0, 0.5)) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return looking_at(position, (0.0, 0.0, 0.0)).as_matrix(), np.asarray(position, np.float64)
+
+
+def triangles_at(world: World, t: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Corners of all triangles in the world's frame, shape (n, 3, 3), and their instance numbers."""
+    corners, number = [], []
+    for body in world.bodies:
+        vertices = np.asarray(body.mesh.vertices)
+        if body.trajectory is not None:
+            (turn,), (place,) = body.trajectory.poses([t])
+            vertices = vertices @ turn.T + place
+        corners.append(vertices[np.asarray(body.mesh.faces)])
+        label = body.instance or body.name
+        number.append(np.full(len(corners[-1]), world.instances.index(label) + 1))
+    return np.concatenate(corners), np.concatenate(number)
+
+
+def cast(
+    world: World, t: float, origin: NDArray[np.float64], rays: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Distances, instance numbers and normals of the nearest triangles: Cramer's rule for every pair, in float64."""
+    corners, number = triangles_at(world, t)
+    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(u, v)
+    best, which = np.full(len(rays), np.inf), np.full(len(rays), -1)
+    for k in range(len(a)):
+        facing = rays @ normal[k]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (a[k] - origin) @ normal[k] / facing
+            place = origin + distance[:, None] * rays - a[k]
+            area = normal[k] @ normal[k]
+            s, r = np.cross(place, v[k]) @ normal[k] / area, np.cross(u[k], place) @ normal[k] / area
+        met = (distance > 0.0) & (distance < best) & (s >= 0.0) & (r >= 0.0) & (s + r <= 1.0)
+        best[met], which[met] = distance[met], k
+    away = normal[which] / np.linalg.norm(normal[which], axis=1, keepdims=True)
+    away *= -np.sign(np.einsum("ij,ij->i", away, rays))[:, None]
+    return best, np.where(which < 0, 0, number[which]), away
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("t", [0.0, 0.6])
+def test_rays_meet_what_the_oracle_says(seed: int, t: float, device: str) -> None:
+    world = random_world(seed)
+    rotation, position = view_from()
+    on_device = DeviceWorld(world, device)
+    on_device.set_instants(np.array([t]))
+    rays = pixel_rays(CAMERA)
+    seen = surfaces_at(on_device, rays, rotation, position)
+    distance, instance, normal = cast(world, t, position, rays @ rotation.T)
+    same = seen.instance == instance
+    assert same.mean() > 0.999  # a ray along an edge may go either way
+    hit = same & (instance > 0)
+    assert hit.mean() > 0.9
+    np.testing.assert_allclose(seen.depth[hit], (distance * rays[:, 2])[hit], rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(seen.normal[hit], normal[hit], rtol=0.0, atol=1e-4)
+    assert np.isinf(seen.depth[instance == 0]).all()
+
+
+def test_rays_meet_what_trimesh_says() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    world = random_world(7)
+    rotation, position = view_from()
+    rays = pixel_rays(CAMERA)[::7]
+    seen = surfaces_at(DeviceWorld(world, "cpu"), rays, rotation, position)
+    corners, _ = triangles_at(world, 0.0)
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    places, which, _ = mesh.ray.intersects_location(
+        np.tile(position, (len(rays), 1)), rays @ rotation.T, multiple_hits=False
+    )
+    depth = np.full(len(rays), np.inf)
+    depth[which] = ((places - position) @ rotation)[:, 2]
+    close = np.isclose(depth, seen.depth, rtol=0.0, atol=1e-4) | (np.isinf(depth) & np.isinf(seen.depth))
+    assert close.mean() > 0.999
+
+
+def moving_camera() -> Trajectory:
+    ends = [(0.0, -6.0, 0.5), (0.3, -5.9, 0.6), (0.5, -5.7, 0.6)]
+    turns = [looking_at(end, (0.1 * k, 0.0, 0.05 * k)).as_quat() for k, end in enumerate(ends)]
+    return Trajectory([0.0, 0.5, 1.0], ends, turns)
+
+
+def project(points: NDArray[np.float64], t: float, path: Trajectory) -> NDArray[np.float64]:
+    (turn,), (place,) = path.poses([t])
+    local = (points - place) @ turn
+    return np.stack(
+        [CAMERA.fx * local[:, 0] / local[:, 2] + CAMERA.cx, CAMERA.fy * local[:, 1] / local[:, 2] + CAMERA.cy], 1
+    )
+
+
+def carried(
+    world: World, points: NDArray[np.float64], instance: NDArray[np.int64], t: float, later: float
+) -> NDArray[np.float64]:
+    """Points on bodies at ``t`` [s], where they are at ``later``."""
+    out = points.copy()
+    for k, body in enumerate(world.bodies):
+        on = instance == k + 1
+        if body.trajectory is not None:
+            (r0, r1), (p0, p1) = body.trajectory.poses([t, later])
+            out[on] = (points[on] - p0) @ r0 @ r1.T + p1
+    return out
+
+
+def test_flow_is_what_finite_differences_say() -> None:
+    world, path, t, h = random_world(3), moving_camera(), 0.4, 1e-4
+    motion = Simulation(WorldScene(world, path), CAMERA, Prism(math.radians(1.0)), 1.0)
+    truth = TruthRenderer(motion).at(round(t * 1e6))
+    (turn,), (place,) = path.poses([t])
+    rays = pixel_rays(CAMERA)
+    distance, instance, _ = cast(world, t, place, rays @ turn.T)
+    hit = (instance > 0) & (truth.instance.ravel() == instance)
+    points = place + np.where(hit, distance, 1.0)[:, None] * (rays @ turn.T)
+    ends = [project(carried(world, points, instance, t, at), at, path) for at in (t - h, t + h)]
+    flow = (ends[1] - ends[0]) / (2.0 * h)
+    assert np.abs(flow[hit]).max() > 10.0
+    np.testing.assert_allclose(truth.flow.reshape(-1, 2)[hit], flow[hit], rtol=2e-3, atol=0.05)
+
+
+def test_flow_through_the_prism_is_what_finite_differences_say() -> None:
+    world, path, t, h = random_world(3), moving_camera(), 0.4, 1e-4
+    simulation = Simulation(WorldScene(world, path), CAMERA, Prism(math.radians(1.0)), 1.0)
+    truth = TruthRenderer(simulation).at(round(t * 1e6))
+    theta = [float(simulation.motion.angle([1e6 * at])[0]) for at in (t - h, t, t + h)]
+    pixels = np.stack(np.meshgrid(np.arange(64), np.arange(48)), axis=-1).reshape(-1, 2).astype(np.float64)
+
+    def moved(xy: NDArray[np.float64], angle: float, *, to_scene: bool) -> NDArray[np.float64]:
+        return reference.move(CAMERA, simulation.prism, xy, np.full(len(xy), angle), to_scene=to_scene)
+
+    (turn,), (place,) = path.poses([t])
+    rays = CAMERA.pixels_to_rays(moved(pixels, theta[1], to_scene=True))
+    distance, instance, _ = cast(world, t, place, rays @ turn.T)
+    hit = instance > 0
+    points = place + np.where(hit, distance, 1.0)[:, None] * (rays @ turn.T)
+    ends = [
+        moved(project(carried(world, points, instance, t, at), at, path)[hit], angle, to_scene=False)
+        for at, angle in ((t - h, theta[0]), (t + h, theta[2]))
+    ]
+    flow = (ends[1] - ends[0]) / (2.0 * h)
+    error = np.abs(truth.flow_with_prism.reshape(-1, 2)[hit] - flow)
+    assert np.quantile(error, 0.99) < 0.5  # [px/s] of about 60
+    assert np.linalg.norm(flow, axis=1).mean() > 30.0
+
+
+def counts(simulation: Simulation) -> tuple[NDArray[np.float64], Engine, list[Any]]:
+    """Events of each pixel, and the blocks."""
+    engine = Engine(simulation)
+    image = np.zeros((simulation.camera.height, simulation.camera.width))
+    blocks = list(engine.run())
+    for block in blocks:
+        np.add.at(image, (block.arrays.y.numpy(), block.arrays.x.numpy()), 1.0)
+    return image, engine, blocks
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_maps_and_rays_see_alike(moves: bool) -> None:
+    world = random_world(1, moving=2 if moves else 0)
+    path = moving_camera() if moves else Trajectory.still((0.0, -6.0, 0.5), look_at=(0.0, 0.0, 0.0))
+    images = [
+        counts(Simulation(WorldScene(world, path, seeing=seeing, samples=16), CAMERA, Prism(math.radians(2.0)), 0.1,
+                          sensor=SensorModel.ideal()))[0]
+        for seeing in ("maps", "rays")
+    ]  # fmt: skip
+    assert images[0].sum() > 2000
+    assert images[0].sum() == pytest.approx(images[1].sum(), rel=0.1)
+    smooth = [gaussian_filter(image, 1.0).ravel() for image in images]
+    assert np.corrcoef(*smooth)[0, 1] > 0.97
+
+
+def test_a_still_world_costs_one_map() -> None:
+    path = Trajectory.still((0.0, -6.0, 0.5), look_at=(0.0, 0.0, 0.0))
+    _, engine, _ = counts(
+        Simulation(WorldScene(random_world(1, moving=0), path, seeing="maps"), CAMERA, Prism(0.02), 0.3)
+    )
+    assert engine._maps is not None
+    assert engine._maps.rendered == 1  # type: ignore[union-attr]
+
+
+def test_a_plane_far_away_is_the_picture_at_infinity() -> None:
+    texture, distance = smooth_texture(5), 1000.0
+    half = distance * math.tan(math.radians(40.0))
+    corners = np.array(
+        [[-half, distance, -half], [half, distance, -half], [half, distance, half], [-half, distance, half]]
+    )
+    mesh = Mesh(corners, [[0, 1, 2], [0, 2, 3]], uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
+    world = World("plane", (Body("plane", mesh, Material(1.0, texture)),), ambient=1.0)
+    facing = Trajectory.still((0.0, 0.0, 0.0), look_at=(0.0, 1.0, 0.0))
+    same = {"prism": Prism(math.radians(2.0)), "duration_s": 0.1, "sensor": SensorModel.ideal(0.1)}
+    # the planar maps are blurred by their texels and their look-up too
+    blur = math.sqrt(0.5**2 + 0.25 / 1.75**2)
+    seen, _, _ = counts(Simulation(WorldScene(world, facing, seeing="maps", blur=blur), CAMERA, **same))
+    planar, _, _ = counts(Simulation(Scene.from_picture(texture, fov=math.radians(80.0), blur=0.5), CAMERA, **same))
+    assert planar.sum() > 3000
+    assert seen.sum() == pytest.approx(planar.sum(), rel=0.05)
+    assert np.corrcoef(gaussian_filter(seen, 1.0).ravel(), gaussian_filter(planar, 1.0).ravel())[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("seeing", ["maps", "rays"])
+def test_points_of_events_project_to_their_places_without_the_prism(seeing: str) -> None:
+    world, path = random_world(2), moving_camera()
+    simulation = Simulation(WorldScene(world, path, seeing=seeing), CAMERA, Prism(math.radians(1.0)), 0.1)
+    _, _, blocks = counts(simulation)
+    far = []
+    for block in blocks:
+        places = block.seen.place.astype(np.float64)
+        bare = block.arrays.points.numpy()
+        some = np.flatnonzero(np.isfinite(places[:, 0]))[::17]
+        for k in some:
+            # at the time of its crossing, which the stamp follows by the latency
+            t = float(block.arrays.t.numpy()[k]) * 1e-6 - 1e-4
+            far.append(np.linalg.norm(project(places[k : k + 1], t, path)[0] - bare[k]))
+        assert set(np.unique(block.seen.instance)) <= set(range(len(world.instances) + 1))
+    assert len(far) > 60
+    assert np.quantile(far, 0.95) < 0.05  # [px]; the latency of single events differs from its mean
+
+
+def test_shadow_and_sky() -> None:
+    floor = Body("floor", box((0.0, 0.0, -1.0), (20.0, 20.0, 0.1)), Material(0.5))
+    block = Body("block", box((0.0, 0.0, 0.5), (1.0, 1.0, 0.2)), Material(0.9))
+    world = World("shadow", (floor, block), ambient=0.2, sun=Sun((0.0, 0.0, 1.0), 0.8), sky=Sky(0.7))
+    path = Trajectory.still((0.0, -6.0, 1.0), look_at=(0.0, 0.0, 0.0))
+    truth = TruthRenderer(Simulation(WorldScene(world, path, samples=1), CAMERA, Prism(0.0), 0.1)).at(0)
+    on_floor = truth.instance == 1
+    lit, dark = 0.5 * (0.2 + 0.8), 0.5 * 0.2
+    values = truth.intensity[on_floor]
+    assert np.isclose(values, lit, atol=1e-4).any()
+    assert np.isclose(values, dark, atol=1e-4).any()
+    assert (np.isclose(values, lit, atol=1e-4) | np.isclose(values, dark, atol=1e-4)).all()
+    np.testing.assert_allclose(truth.intensity[truth.instance == 0], 0.7, atol=1e-4)
+
+
+def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
+    wall = Body("wall", box((0.0, 4.0, 0.0), (12.0, 0.1, 12.0)), Material(0.5))
+    world = World("lamp", (wall,), ambient=0.05, lamps=(Lamp((0.0, 0.0, 0.0), 8.0, 100.0, 0.8),))
+    path = Trajectory.still((0.0, 0.0, 0.0), look_at=(0.0, 4.0, 0.0))
+    _, engine, blocks = counts(
+        Simulation(WorldScene(world, path, seeing="maps"), CAMERA, Prism(0.0), 0.1, sensor=SensorModel.ideal())
+    )
+    on = np.concatenate([block.arrays.t.numpy()[block.arrays.p.numpy() == 1] for block in blocks])
+    phase = np.exp(2j * np.pi * 100.0 * on * 1e-6).mean()
+    assert abs(phase) > 0.6  # ON events come while the light rises
+    assert engine._step <= 1e6 / 1600
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)), "at least one triangle"),
+        (lambda: Mesh(np.zeros((3, 3)), [[0, 1, 3]]), "outside of 0 .. 2"),
+        (lambda: Material(texture=np.zeros(3)), r"shape \(3,\)"),
+        (lambda: World("none", ()), "no bodies"),
+        (lambda: Trajectory([0.0, 1e-3], [[0, 0, 0], [9, 0, 0]], [[0, 0, 0, 1]] * 2), "it jumps"),
+        (lambda: Trajectory([0.0, 0.0], np.zeros((2, 3)), [[0, 0, 0, 1]] * 2), "do not rise"),
+        (lambda: Trajectory([0.0], [[0, 0, 0]], [[0, 0, 0, 2]]), "unit quaternions"),
+        (lambda: Sun((0.0, 0.0, 0.0)), "length 0"),
+    ],
+)
+def test_bad_worlds_are_refused(make: Any, says: str) -> None:
+    with pytest.raises(AmiwarpError, match=says):
+        make()
+
+
+def test_a_camera_inside_a_body_sees_its_inside() -> None:
+    world = World("inside", (Body("box", box((0.0, 0.0, 0.0), (2.0, 2.0, 2.0)), Material(0.5)),))
+    path = Trajectory.still((0.0, 0.0, 0.0), look_at=(0.0, 1.0, 0.0))
+    truth = TruthRenderer(Simulation(WorldScene(world, path), CAMERA, Prism(0.02), 0.1)).at(0)
+    assert (truth.instance == 1).all()
+    np.testing.assert_allclose(truth.depth, 1.0, atol=1e-4)
+
+
+def test_an_empty_view_gives_noise_only() -> None:
+    world = World("behind", (Body("box", box((0.0, -9.0, 0.0), (1.0, 1.0, 1.0)), Material(0.5)),))
+    path = Trajectory.still((0.0, 0.0, 0.0), look_at=(0.0, 1.0, 0.0))
+    image, _, _ = counts(Simulation(WorldScene(world, path), CAMERA, Prism(0.02), 0.1, sensor=SensorModel.ideal()))
+    assert image.sum() == 0.0
