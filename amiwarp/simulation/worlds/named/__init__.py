@@ -1,0 +1,1 @@
+"""Named worlds: scenes made by a program, which need no files."""
