@@ -7,14 +7,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from amiwarp.simulation.worlds.named import ball, desk, room
+from amiwarp.simulation.worlds.named import ball, corridor, desk, person, room, street
 from amiwarp.simulation.worlds.named.motion import TRAJECTORIES, Viewpoint, camera_trajectory
 from amiwarp.simulation.worlds.scene import World
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import one_of, real, whole
 
 
-MODULES = {"room": room, "desk": desk, "ball": ball}
+MODULES = {"room": room, "desk": desk, "corridor": corridor, "street": street, "ball": ball, "person": person}
 WORLDS = tuple(MODULES)
 """Names of the worlds."""
 

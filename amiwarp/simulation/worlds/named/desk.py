@@ -8,7 +8,7 @@ from amiwarp.simulation.worlds.named import parts, shapes, textures
 from amiwarp.simulation.worlds.named.motion import Viewpoint
 from amiwarp.simulation.worlds.scene import Body, Lamp, World
 
-VIEW = Viewpoint((0.05, -0.62, 0.52), (0.0, 0.12, 0.08))
+VIEW = Viewpoint((0.05, -0.62, 0.52), (0.0, 0.16, 0.1))
 """The camera is where the head of a person is who sits at the desk; the desk's top is z = 0."""
 
 
@@ -115,8 +115,8 @@ def _gauges(rng: np.random.Generator) -> list[Body]:
     ticks[:36, ::8], ticks[:50, :2] = 0.05, 0.05
     card = shapes.moved(shapes.panel((-0.06, -0.06, 0.003), (0.12, 0, 0), (0, 0.12, 0)), (-0.2, -0.18, 0), turn_deg=-20)
     return [
-        *parts.grating_strip("grating", (-0.95, 0.74, 0.3), (1.0, 0, 0), count=8, side=0.15, cycles=8.0),
-        *parts.picture("star", (0.62, 0.75, 0.42), (1.0, 0, 0), textures.star(), 0.3, 0.3),
+        *parts.grating_strip("grating", (-0.62, 0.74, 0.012), (1.0, 0, 0), count=8, side=0.12, cycles=6.0),
+        *parts.picture("star", (0.55, 0.75, 0.42), (1.0, 0, 0), textures.star(), 0.28, 0.28),
         parts.solid("cube", cube, textures.checkerboard(4, size=128), "cube"),
         parts.solid("ruler", ruler, textures.clipped(ticks), "ruler"),
         parts.solid("card", card, textures.checkerboard(8), "card"),

@@ -80,8 +80,10 @@ def cylinder(radius: float, height: float, *, sides: int = 20, tile_m: float | N
 def ellipsoid(radii: ArrayLike, *, sides: int = 24, rings: int = 12, tile_m: float | None = None) -> Mesh:
     """Return an ellipsoid about the origin."""
     polar = np.linspace(-np.pi / 2.0, np.pi / 2.0, rings + 1)
-    ball = lathe(np.column_stack([np.cos(polar).clip(0.0), np.sin(polar)]), sides=sides, tile_m=tile_m)
-    return Mesh(np.asarray(ball.vertices) * np.asarray(radii), ball.faces, ball.uv)
+    scale = np.asarray(radii, np.float64)
+    line = np.column_stack([np.cos(polar).clip(0.0), np.sin(polar)]) * scale.max()
+    ball = lathe(line, sides=sides, tile_m=tile_m)
+    return Mesh(np.asarray(ball.vertices) * scale / scale.max(), ball.faces, ball.uv)
 
 
 def capsule(radius: float, length: float, *, sides: int = 20, rings: int = 6, tile_m: float | None = None) -> Mesh:
@@ -130,3 +132,13 @@ def legs(size: Sequence[float], height: float, radius: float) -> Mesh:
     x, y = size[0] / 2.0 - 2.0 * radius, size[1] / 2.0 - 2.0 * radius
     leg = cylinder(radius, height, sides=12, tile_m=0.3)
     return merged(moved(leg, (a * x, b * y, 0.0)) for a in (-1, 1) for b in (-1, 1))
+
+
+def tapered(mesh: Mesh, share: float) -> Mesh:
+    """Return a mesh whose horizontal size shrinks from its foot upwards, to ``share`` at its top."""
+    points = np.array(mesh.vertices, np.float64)
+    low, high = points[:, 2].min(), points[:, 2].max()
+    middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2.0
+    factor = 1.0 - (1.0 - share) * (points[:, 2:] - low) / (high - low)
+    points[:, :2] = middle + factor * (points[:, :2] - middle)
+    return Mesh(points, mesh.faces, mesh.uv)
