@@ -14,7 +14,7 @@ BLOCKS = ((-62.0, -26.0), (-18.0, 20.0), (28.0, 62.0))
 """Where the blocks begin and end along the street [m]; crossings lie between them."""
 ROWS = ((PAVEMENT, 10.0, (2, 5)), (30.0, 12.0, (4, 8)))
 """Rows of houses on each side: distance of their fronts and their depth [m], and the range of their storeys."""
-VIEW = Viewpoint((-15.0, -1.3, 1.7), (10.0, 0.9, 3.1), walk_m=(8.0, 0.0, 0.0), walk_speed=1.4)
+VIEW = Viewpoint((-15.0, 0.5, 1.7), (10.0, -0.2, 3.1), walk_m=(8.0, 0.0, 0.0), walk_speed=1.4)
 """The camera walks along the road."""
 
 
@@ -22,12 +22,12 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
     """Return the town; nothing in it moves."""
     bodies = [*_ground(rng), *_blocks(rng), *houses.town_hall(rng, 76.0), *_cars(rng), *_trees(rng), *_posts(rng)]
     sky = Sky(1.0, textures.sky(rng))
-    return World("street", tuple(bodies), ambient=0.38, sun=Sun((-0.5, -0.62, 0.8), 0.62), sky=sky)
+    return World("street", tuple(bodies), ambient=0.38, sun=Sun((-0.8, -0.3, 0.62), 0.7), sky=sky)
 
 
 def _ground(rng: np.random.Generator) -> list[Body]:
     """Asphalt, pavements around the blocks, and the markings of the road."""
-    asphalt = textures.plaster(rng, 0.14, 0.5)
+    asphalt = textures.plaster(rng, 0.2, 0.5)
     slabs = [
         shapes.standing_box((end - start + 4.0, 56.0, 0.14), ((start + end) / 2.0, side * (ROAD + 28.0), 0.0), tile_m=3.0)
         for start, end in BLOCKS

@@ -168,10 +168,9 @@ def book_spines(rng: np.random.Generator, *, books: int = 16, size: int = 512) -
     return weathered(rng, values, 0.12)
 
 
-def sky(rng: np.random.Generator, *, height: int = 256) -> Texture:
-    """Return luminances in all directions, as ``Sky.panorama``: brighter towards the horizon, with clouds; dark below."""
+def sky(rng: np.random.Generator, *, height: int = 512) -> Texture:
+    """Return luminances in all directions, as ``Sky.panorama``: clouds, brighter towards the horizon; dark below it."""
     elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
-    clouds = np.clip(0.5 + 0.5 * fractal(rng, height, 2 * height, slope=1.6), 0.0, 1.0)
-    clear = 0.45 + 0.3 * np.exp(-np.abs(elevation) / 0.35)
-    light = clear + 0.35 * clouds * np.clip(elevation / 0.15, 0.0, 1.0)
+    clouds = np.clip(0.4 + 0.6 * fractal(rng, height, 2 * height, slope=1.35), 0.0, 1.0)
+    light = 0.32 + 0.2 * np.exp(-np.abs(elevation) / 0.35) + 0.45 * clouds
     return np.where(elevation > 0.0, light, 0.25).astype(np.float32)

@@ -1,0 +1,188 @@
+"""Meshes from files: glTF and GLB, OBJ with MTL, PLY, STL, read by trimesh, their colours turned into luminance."""
+
+from __future__ import annotations
+
+import io
+import urllib.parse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name, note_input
+from amiwarp.regular_file import check_regular
+from amiwarp.simulation.pictures import LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, linear_luminance, srgb_to_linear
+from amiwarp.simulation.worlds.scene import Material, Mesh
+from amiwarp.validation import one_of, real
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+FORMATS = ("glb", "gltf", "obj", "ply", "stl")
+"""Suffixes of the files that are read."""
+Y_UP = ("glb", "gltf")
+"""Formats whose files have y up by their specification."""
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".gif", ".tga", ".dds", ".ktx2", ".exr")
+"""Suffixes by which a file that a mesh file names is taken for a texture."""
+TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns y up into z up."""
+DEFAULT_REFLECTANCE = 0.5
+"""Reflectance of meshes without colours."""
+
+
+class LoadedMesh(NamedTuple):
+    """One part of a mesh file."""
+
+    mesh: Mesh
+    """Its triangles, z up [m]."""
+    material: Material
+    """Its reflectance and texture."""
+    name: str
+    """Its name in the file."""
+
+
+def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) -> list[LoadedMesh]:
+    """Read the meshes of a glTF, GLB, OBJ, PLY or STL file.
+
+    Needs trimesh, as ``pip install amiwarp[worlds]`` installs it.
+
+    Parameters
+    ----------
+    path : str or Path
+        The mesh file. OBJ and glTF files may name others: materials, textures and buffers.
+    up : str, optional
+        Axis of the file that points up, ``"y"`` or ``"z"``; None for y in glTF and GLB files and z in others.
+    scale : float
+        Metres per unit of the file.
+
+    Returns
+    -------
+    list of LoadedMesh
+        Mesh, material and name of each part, in the frame of the file with z up.
+
+    Raises
+    ------
+    AmiwarpError
+        If there is no such file, its format is unknown, it holds no faces, or a file that it names is missing.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}")
+    up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
+    turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
+    check_regular(path)
+    note_input(path)
+    scene = _open(path, kind)
+    parts = []
+    with errors_name(path, lambda: "cannot be read as a mesh"):
+        for node in scene.graph.nodes_geometry:
+            placed, geometry = scene.graph[node]
+            part = scene.geometry[geometry]
+            if len(getattr(part, "faces", ())):
+                parts.append(_part(part, turn @ placed[:3, :3], turn @ placed[:3, 3], str(node), kind))
+    if not parts:
+        raise AmiwarpError(f"{path}: holds no faces; give a file with triangles, not points or lines alone")
+    return parts
+
+
+def _open(path: Path, kind: str) -> Any:
+    """The file as a scene of trimesh."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise AmiwarpError(f"{path}: mesh files need trimesh; install it by: pip install 'amiwarp[worlds]'") from error
+    files = _named_files(path)
+    with errors_name(path, lambda: "cannot be read as a mesh"), path.open("rb") as file:
+        try:
+            scene = trimesh.load(file, file_type=kind, resolver=files, force="scene", process=False)
+        except Exception:
+            if files.missing is None:
+                raise
+        if files.missing is not None:
+            raise AmiwarpError(f"{path}: names the file {files.missing}; put it next to the mesh file")
+    return scene
+
+
+def _named_files(path: Path) -> Any:
+    """A resolver of the files that a mesh file names, which keeps the errors that trimesh passes over in silence."""
+    from trimesh.resolvers import FilePathResolver
+
+    class NamedFiles(FilePathResolver):  # type: ignore[misc]
+        missing: str | None = None
+
+        def get(self, name: str) -> bytes:
+            file = path.parent / name.replace("\\", "/")
+            file = file if file.exists() else path.parent / urllib.parse.unquote(name)
+            try:
+                check_regular(file)
+                data = file.read_bytes()
+                if file.suffix.lower() in PICTURES:
+                    _check_picture(data)
+            except Exception as error:
+                what = "is missing" if isinstance(error, AmiwarpError) else f"cannot be read ({error})"
+                self.missing = self.missing or f"{name!r}, which {what}"
+                raise
+            note_input(file)
+            return data
+
+    return NamedFiles(str(path))
+
+
+def _check_picture(data: bytes) -> None:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=PICTURE_FORMATS) as image:
+        image.verify()
+
+
+def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64], name: str, kind: str) -> LoadedMesh:
+    """One geometry at one place of the file's scene."""
+    vertices = np.asarray(part.vertices, np.float64) @ matrix.T + offset
+    faces = np.asarray(part.faces)
+    visual: Any = part.visual
+    if visual.kind == "texture":
+        return LoadedMesh(*_textured(visual, vertices, faces, kind), name)
+    if visual.kind == "face":  # each face has its own colour: it needs its own corners
+        light = np.repeat(_reflectance(visual.face_colors, kind), 3)
+        return LoadedMesh(Mesh(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3), None, light), Material(1.0), name)
+    if visual.kind == "vertex":
+        return LoadedMesh(Mesh(vertices, faces, None, _reflectance(visual.vertex_colors, kind)), Material(1.0), name)
+    return LoadedMesh(Mesh(vertices, faces), Material(DEFAULT_REFLECTANCE), name)
+
+
+def _textured(
+    visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], kind: str
+) -> tuple[Mesh, Material]:
+    """Mesh and material of a geometry with a material, which may have a picture."""
+    material = visual.material
+    pbr = hasattr(material, "baseColorFactor")
+    picture = material.baseColorTexture if pbr else material.image
+    colour = material.baseColorFactor if pbr else material.diffuse
+    factor = 1.0 if pbr and colour is None else float(_reflectance(np.atleast_2d(colour), kind)[0])
+    shade = visual.vertex_attributes.get("color")
+    light = None if shade is None else _reflectance(shade, kind)
+    if picture is None or visual.uv is None:
+        return Mesh(vertices, faces, None, light), Material(factor)
+    if not pbr:
+        factor = 1.0  # an OBJ's picture takes the place of its diffuse colour
+    return Mesh(vertices, faces, np.asarray(visual.uv)[:, :2], light), Material(factor, _luminance(picture))
+
+
+def _luminance(picture: Any) -> NDArray[np.float32]:
+    """Linear luminance of a Pillow picture, of at least two pixels each way."""
+    if picture.width * picture.height > MOST_PIXELS:
+        raise AmiwarpError(f"a texture of {picture.width}x{picture.height} is over {MOST_PIXELS} pixels; make it smaller")
+    pixels = np.asarray(picture.convert("RGB"))
+    pixels = np.repeat(pixels, 2, axis=0) if len(pixels) < 2 else pixels
+    return linear_luminance(np.repeat(pixels, 2, axis=1) if pixels.shape[1] < 2 else pixels, name="texture")
+
+
+def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
+    """Luminance of colours, whole numbers or 0 to 1, which are linear in glTF files and sRGB in others."""
+    given = np.asarray(colours)
+    values = given[:, :3].astype(np.float64) / (np.iinfo(given.dtype).max if given.dtype.kind in "iu" else 1.0)
+    linear = values if kind in Y_UP else srgb_to_linear(values)
+    return np.asarray(np.clip(linear @ np.array(LUMINANCE), 0.0, 1.0), np.float64)
