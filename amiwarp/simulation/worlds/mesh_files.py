@@ -78,7 +78,7 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     scene = _open(path, kind)
     parts = []
     with errors_name(path, lambda: "cannot be read as a mesh"):
-        for node in scene.graph.nodes_geometry:
+        for node in sorted(scene.graph.nodes_geometry):
             placed, geometry = scene.graph[node]
             part = scene.geometry[geometry]
             if len(getattr(part, "faces", ())):
@@ -110,7 +110,7 @@ def _named_files(path: Path) -> Any:
     """A resolver of the files that a mesh file names, which keeps the errors that trimesh passes over in silence."""
     from trimesh.resolvers import FilePathResolver
 
-    class NamedFiles(FilePathResolver):  # type: ignore[misc]
+    class NamedFiles(FilePathResolver):
         missing: str | None = None
 
         def get(self, name: str) -> bytes:
@@ -147,15 +147,15 @@ def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64
         return LoadedMesh(*_textured(visual, vertices, faces, kind), name)
     if visual.kind == "face":  # each face has its own colour: it needs its own corners
         light = np.repeat(_reflectance(visual.face_colors, kind), 3)
-        return LoadedMesh(Mesh(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3), None, light), Material(1.0), name)
+        return LoadedMesh(
+            Mesh(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3), None, light), Material(1.0), name
+        )
     if visual.kind == "vertex":
         return LoadedMesh(Mesh(vertices, faces, None, _reflectance(visual.vertex_colors, kind)), Material(1.0), name)
     return LoadedMesh(Mesh(vertices, faces), Material(DEFAULT_REFLECTANCE), name)
 
 
-def _textured(
-    visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], kind: str
-) -> tuple[Mesh, Material]:
+def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], kind: str) -> tuple[Mesh, Material]:
     """Mesh and material of a geometry with a material, which may have a picture."""
     material = visual.material
     pbr = hasattr(material, "baseColorFactor")
@@ -174,7 +174,9 @@ def _textured(
 def _luminance(picture: Any) -> NDArray[np.float32]:
     """Linear luminance of a Pillow picture, of at least two pixels each way."""
     if picture.width * picture.height > MOST_PIXELS:
-        raise AmiwarpError(f"a texture of {picture.width}x{picture.height} is over {MOST_PIXELS} pixels; make it smaller")
+        raise AmiwarpError(
+            f"a texture of {picture.width}x{picture.height} is over {MOST_PIXELS} pixels; make it smaller"
+        )
     pixels = np.asarray(picture.convert("RGB"))
     pixels = np.repeat(pixels, 2, axis=0) if len(pixels) < 2 else pixels
     return linear_luminance(np.repeat(pixels, 2, axis=1) if pixels.shape[1] < 2 else pixels, name="texture")

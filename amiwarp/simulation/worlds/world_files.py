@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name, note_input
@@ -17,9 +15,9 @@ from amiwarp.io.json_files import MOST_BYTES, build, fields_of, read_json
 from amiwarp.regular_file import check_regular
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.worlds.mesh_files import LoadedMesh, load_mesh
-from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Mesh, Sky, Sun, World
+from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Sky, Sun, World
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.validation import one_of, real, shown, vector
+from amiwarp.validation import one_of, real, shown
 
 FORMAT, VERSION = "amiwarp-world", 1
 """Name and version that a world file begins with."""
@@ -154,8 +152,7 @@ class _Reader:
         if "sky" in given:
             options["sky"] = _at("sky", lambda: self._sky(given["sky"]))
         options["lamps"] = [
-            _at(where, lambda entry=entry, where=where: build(Lamp, entry, where))
-            for where, entry in _entries(given.get("lamps", []), "lamps")
+            _at(where, partial(build, Lamp, entry, where)) for where, entry in _entries(given.get("lamps", []), "lamps")
         ]
         bodies: list[Body] = []
         for where, entry in _entries(given["bodies"], "bodies"):
@@ -165,7 +162,9 @@ class _Reader:
         options["joints"] = {key: self._trajectory(value, f"joints.{key}") for key, value in joints.items()}
         camera = None
         if "camera" in given:
-            camera = self._trajectory(fields_of(given["camera"], "camera", "trajectory")["trajectory"], "camera.trajectory")
+            camera = self._trajectory(
+                fields_of(given["camera"], "camera", "trajectory")["trajectory"], "camera.trajectory"
+            )
         return World(bodies=tuple(bodies), **options), camera
 
     def _sky(self, data: Any) -> Sky:
@@ -198,7 +197,7 @@ class _Reader:
             Body(
                 name=name,
                 mesh=part.mesh,
-                material=_at(f"{where}.material", lambda part=part: _material(part, material, texture, where)),
+                material=_at(f"{where}.material", partial(_material, part, material, texture, where)),
                 trajectory=trajectory,
                 category=entry.category,
                 instance=entry.instance or entry.name,
@@ -210,7 +209,9 @@ class _Reader:
         if "trajectory" in given:
             for name in ("position", "rotation"):
                 if name in given:
-                    raise AmiwarpError(f"field {where}.{name} goes with no trajectory; put the pose into the trajectory")
+                    raise AmiwarpError(
+                        f"field {where}.{name} goes with no trajectory; put the pose into the trajectory"
+                    )
             return self._trajectory(given["trajectory"], f"{where}.trajectory")
         if entry.position is None and entry.rotation is None:
             return None
@@ -222,7 +223,9 @@ class _Reader:
         if isinstance(data, str):
             note_input(self._folder / data)
             return _at(where, lambda: Trajectory.from_file(self._folder / data))
-        poses = [build(PoseEntry, entry, place) for place, entry in _entries(data, where, "the name of a file or a list")]
+        poses = [
+            build(PoseEntry, entry, place) for place, entry in _entries(data, where, "the name of a file or a list")
+        ]
         if not poses:
             raise AmiwarpError(f"field {where} is empty; give at least one pose")
         turns = [_rotation(pose, f"{where}[{k}]") for k, pose in enumerate(poses)]

@@ -1,9 +1,9 @@
-"""The named worlds: scenes that are made by a program and need no files."""
+"""The named worlds, by name."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,20 +13,77 @@ from amiwarp.simulation.worlds.scene import World
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import one_of, real, whole
 
+LONGEST_S = 3600.0
+"""Longest recording of a named world [s]."""
 
-MODULES = {"room": room, "desk": desk, "corridor": corridor, "street": street, "ball": ball, "person": person}
-WORLDS = tuple(MODULES)
+
+@dataclass(frozen=True)
+class NamedWorld:
+    """How a named world is made, and where its camera stands."""
+
+    build: Callable[[np.random.Generator, float], World]
+    """Returns the world for a random generator and the length of the recording [s]."""
+    view: Viewpoint
+    """Where the camera stands."""
+
+
+NAMED = {
+    "room": NamedWorld(room.build, room.VIEW),
+    "desk": NamedWorld(desk.build, desk.VIEW),
+    "corridor": NamedWorld(corridor.build, corridor.VIEW),
+    "street": NamedWorld(street.build, street.VIEW),
+    "ball": NamedWorld(ball.build, ball.VIEW),
+    "person": NamedWorld(person.build, person.VIEW),
+}
+"""All named worlds."""
+WORLDS = tuple(NAMED)
 """Names of the worlds."""
 
 
 def named_world(
     name: str, trajectory: str = "handheld", *, seed: int = 0, duration_s: float = 1.0
 ) -> tuple[World, Trajectory]:
+    """Make one of the named worlds, and a way of the camera through it.
+
+    Parameters
+    ----------
+    name : str
+        ``room`` (furniture, pictures, gratings in all directions), ``desk``, ``corridor``, ``street`` (a small town),
+        ``ball`` (a ball thrown across the room) or ``person`` (a walking figure, whose joints are ``World.joints``).
+    trajectory : str
+        How the camera moves: ``still``, ``handheld`` (it sways by about 1.5 cm and 1.5 deg, below 3 Hz; it walks in
+        the corridor and the street) or ``fast`` (ten times the speed).
+    seed : int
+        Seed of textures, shapes and camera motion. Equal seeds give equal worlds, whatever the trajectory.
+    duration_s : float
+        Length of the recording [s]; bodies and camera rest after it.
+
+    Returns
+    -------
+    world : World
+        Bodies, light and sky; 2,000 to 100,000 triangles.
+    trajectory : Trajectory
+        The camera's pose over time. The camera passes through no body.
+
+    Raises
+    ------
+    AmiwarpError
+        If there is no such world or trajectory, or the seed or the duration is out of range.
+
+    Examples
+    --------
+    >>> world, trajectory = amiwarp.named_world("person", "still", seed=1, duration_s=0.1)
+    >>> [body.name for body in world.moving][:3]
+    ['pelvis', 'torso', 'neck']
+    >>> rotation, position = trajectory.poses([0.0])
+    >>> position.tolist()
+    [[0.3, -3.4, 1.35]]
+    """
     one_of(name, WORLDS, "world")
     one_of(trajectory, TRAJECTORIES, "trajectory")
     seed = whole(seed, "seed", 0, 2**63 - 1)
-    duration_s = real(duration_s, "duration_s", 1e-3, 3600.0, " s")
-    module = MODULES[name]
-    world = module.build(np.random.default_rng([seed, WORLDS.index(name)]), duration_s)
-    way = camera_trajectory(module.VIEW, trajectory, duration_s, np.random.default_rng([seed, 100]))
+    duration_s = real(duration_s, "duration_s", 1e-3, LONGEST_S, " s")
+    made = NAMED[name]
+    world = made.build(np.random.default_rng([seed, WORLDS.index(name)]), duration_s)
+    way = camera_trajectory(made.view, trajectory, duration_s, np.random.default_rng([seed, len(WORLDS)]))
     return world, way

@@ -16,10 +16,11 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
     """Return the desk; nothing on it moves."""
     top = shapes.box((1.7, 0.9, 0.03), (0.0, 0.12, -0.015), tile_m=0.6)
     wall = shapes.panel((-2.0, 0.75, -0.8), (4.0, 0.0, 0.0), (0.0, 0.0, 2.6), tile_m=1.2)
+    floor = shapes.panel((-2.0, -1.5, -0.76), (4.0, 0, 0), (0, 2.3, 0), tile_m=1.5)
     bodies = [
         parts.solid("desk", top, textures.wood(rng, mean=0.4, boards=8, size=768), "desk"),
         parts.solid("wall", wall, textures.plaster(rng, 0.5, 0.4), "wall"),
-        parts.solid("floor", shapes.panel((-2.0, -1.5, -0.76), (4.0, 0, 0), (0, 2.3, 0), tile_m=1.5), textures.tiles(rng), "floor"),
+        parts.solid("floor", floor, textures.tiles(rng), "floor"),
         *_screen(rng), *_keyboard(rng), *_papers(rng), *_books(rng), *_small(rng), *_gauges(rng),
     ]  # fmt: skip
     lamps = (Lamp((-0.6, 0.1, 0.75), 0.45, shadows=True), Lamp((1.0, -1.2, 1.4), 0.9))
@@ -57,7 +58,9 @@ def _keyboard(rng: np.random.Generator) -> list[Body]:
     base = shapes.standing_box((0.44, 0.13, 0.016), tile_m=0.2)
     return [
         parts.solid("keyboard", shapes.moved(base, place), textures.plaster(rng, 0.5, 0.3, size=256), "keyboard"),
-        parts.solid("keys", shapes.moved(shapes.merged(keys), place), textures.clipped(face), "keyboard", instance="keyboard"),
+        parts.solid(
+            "keys", shapes.moved(shapes.merged(keys), place), textures.clipped(face), "keyboard", instance="keyboard"
+        ),
     ]
 
 
@@ -77,9 +80,18 @@ def _books(rng: np.random.Generator) -> list[Body]:
         thick = float(rng.uniform(0.018, 0.04))
         book = shapes.standing_box((0.2, 0.15, thick))
         place = (-0.52, 0.22, z)
-        bodies.append(parts.solid(f"book {k + 1}", shapes.moved(book, place, turn_deg=float(rng.uniform(-15, 15))), textures.poster(rng, size=192), "book"))
+        bodies.append(
+            parts.solid(
+                f"book {k + 1}",
+                shapes.moved(book, place, turn_deg=float(rng.uniform(-15, 15))),
+                textures.poster(rng, size=192),
+                "book",
+            )
+        )
         z += thick
-    row = [shapes.standing_box((0.03, 0.16, float(rng.uniform(0.2, 0.26))), (0.42 + 0.033 * k, 0.48, 0)) for k in range(9)]
+    row = [
+        shapes.standing_box((0.03, 0.16, float(rng.uniform(0.2, 0.26))), (0.42 + 0.033 * k, 0.48, 0)) for k in range(9)
+    ]
     bodies.append(parts.solid("row of books", shapes.merged(row), textures.book_spines(rng, books=4, size=256), "book"))
     return bodies
 
@@ -88,14 +100,22 @@ def _small(rng: np.random.Generator) -> list[Body]:
     """A mug with pens, a bowl, a ball, a ruler and a lamp."""
     mug = [(0.0, 0.0), (0.035, 0.0), (0.041, 0.02), (0.041, 0.1), (0.036, 0.1), (0.035, 0.02), (0.0, 0.015)]
     bowl = [(0.0, 0.0), (0.04, 0.0), (0.085, 0.05), (0.08, 0.05), (0.035, 0.01), (0.0, 0.008)]
-    pens = [shapes.moved(shapes.cylinder(0.004, 0.16, sides=12, tile_m=0.03), (0.24 + 0.012 * k, 0.3, 0.02), turn_deg=9.0 * (k - 1.5), axis=(0.5, 1, 0))
-            for k in range(4)]  # fmt: skip
-    lying = [shapes.moved(shapes.cylinder(0.0045, 0.14, sides=12, tile_m=0.03), (0.2, y, 0.005), turn_deg=90, axis=(0.3, 1, 0)) for y in (-0.13, -0.1)]
+    pen = shapes.cylinder(0.004, 0.16, sides=12, tile_m=0.03)
+    pens = [
+        shapes.moved(pen, (0.24 + 0.012 * k, 0.3, 0.02), turn_deg=9.0 * (k - 1.5), axis=(0.5, 1, 0)) for k in range(4)
+    ]
+    lying = [
+        shapes.moved(
+            shapes.cylinder(0.0045, 0.14, sides=12, tile_m=0.03), (0.2, y, 0.005), turn_deg=90, axis=(0.3, 1, 0)
+        )
+        for y in (-0.13, -0.1)
+    ]
     ball = shapes.moved(shapes.ellipsoid((0.035,) * 3, sides=28, rings=16), (0.26, 0.13, 0.035))
+    shade = shapes.lathe([(0.09, 0.0), (0.07, 0.08), (0.03, 0.12)], sides=32, tile_m=0.15)
     lamp = shapes.merged([
         shapes.moved(shapes.cylinder(0.07, 0.015, sides=32, tile_m=0.2), (-0.72, 0.38, 0)),
         shapes.moved(shapes.cylinder(0.009, 0.4, sides=16, tile_m=0.1), (-0.72, 0.38, 0)),
-        shapes.moved(shapes.lathe([(0.09, 0.0), (0.07, 0.08), (0.03, 0.12)], sides=32, tile_m=0.15), (-0.69, 0.36, 0.4), turn_deg=-20, axis=(1, 1, 0)),
+        shapes.moved(shade, (-0.69, 0.36, 0.4), turn_deg=-20, axis=(1, 1, 0)),
     ])  # fmt: skip
     return [
         parts.vessel("mug", mug, (0.26, 0.3, 0.0), textures.plaid(rng), tile_m=0.12),

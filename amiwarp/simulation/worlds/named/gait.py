@@ -26,7 +26,10 @@ HIP, SHOULDER, SPINE = 0.1, 0.2, 0.5
 ANKLE = 0.075
 """Height of the ankle above the sole [m]."""
 SIDES = ("left", "right")
-JOINTS = ("head", *(f"{side} {joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in SIDES))
+JOINTS = (
+    "head",
+    *(f"{side} {joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in SIDES),
+)
 """Names of the joints."""
 
 Places = tuple[Any, NDArray[np.float64]]
@@ -85,7 +88,7 @@ def _legs(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
     out = {"pelvis": root}
     for side, y, shift in (("left", HIP, 0.0), ("right", -HIP, np.pi)):
         p = phase + shift
-        hip, knee = -0.41 * np.sin(p) - 0.06, 0.12 + 0.42 * (1.0 + np.cos(p)) * (1.0 + 0.15 * np.cos(p - 0.6))
+        hip, knee = -0.41 * np.sin(p) - 0.04, 0.08 + 1.05 * ((1.0 + np.cos(p + 0.35)) / 2.0) ** 2
         thigh = _child(root, (0, y, 0), _about((0, 1, 0), hip))
         shin = _child(thigh, (0, 0, -THIGH), _about((0, 1, 0), knee))
         ankle = _child(shin, (0, 0, -SHIN), _about((0, 1, 0), -0.75 * (hip + knee)))
@@ -106,6 +109,10 @@ def _upper(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
         upper = _child(trunk, (0, y, SPINE), tilt * _about((0, 1, 0), -0.45 * np.sin(p) + 0.08))
         fore = _child(upper, (0, 0, -UPPER_ARM), _about((0, 1, 0), -0.35 - 0.25 * (1.0 + np.sin(p))))
         hand = _child(fore, (0, 0, -FOREARM), _about((0, 1, 0), -0.1 + 0 * p))
-        for names, place in ((("shoulder", "upper arm"), upper), (("elbow", "forearm"), fore), (("wrist", "hand"), hand)):
+        for names, place in (
+            (("shoulder", "upper arm"), upper),
+            (("elbow", "forearm"), fore),
+            (("wrist", "hand"), hand),
+        ):
             out |= {f"{side} {name}": place for name in names}
     return out

@@ -21,7 +21,7 @@ SPACING = 2.1
 def house(
     rng: np.random.Generator, name: str, place: tuple[float, float], width: float, depth: float, storeys: int
 ) -> list[Body]:
-    """Return a house; ``place`` is the middle of its front (x, y) [m], and the house lies behind it, away from y = 0."""
+    """Return a house behind its front, seen from y = 0; ``place`` is the middle of the front (x, y) [m]."""
     away = 1.0 if place[1] > 0 else -1.0
     height = STOREY * storeys + 0.4
     middle = (place[0], place[1] + away * depth / 2.0, 0.1)
@@ -31,11 +31,16 @@ def house(
         roof = shapes.ramp((width, depth + 0.8, float(rng.uniform(2.0, 3.6))), roof_foot, tile_m=3.0)
     else:
         roof = shapes.standing_box((width, depth, 0.5), roof_foot, tile_m=3.0)
-    chimney = shapes.standing_box((0.6, 0.6, 4.4), (middle[0] + width * float(rng.uniform(-0.3, 0.3)), middle[1], 0.1 + height), tile_m=2.0)
+    chimney = shapes.standing_box(
+        (0.6, 0.6, 4.4), (middle[0] + width * float(rng.uniform(-0.3, 0.3)), middle[1], 0.1 + height), tile_m=2.0
+    )
     trim = shapes.merged(_trim(place[0], place[1], away, width, storeys))
     surfaces = {
         "": (walls, front(rng, width, storeys)),
-        " roof": (shapes.merged([roof, chimney]), textures.bricks(rng, mean=float(rng.uniform(0.12, 0.3)), joint=0.06, size=256)),
+        " roof": (
+            shapes.merged([roof, chimney]),
+            textures.bricks(rng, mean=float(rng.uniform(0.12, 0.3)), joint=0.06, size=256),
+        ),
         " trim": (trim, textures.plaster(rng, 0.6, 0.3, size=128)),
     }
     return [parts.solid(name + part, mesh, skin, "house", instance=name) for part, (mesh, skin) in surfaces.items()]
@@ -56,10 +61,16 @@ def _trim(x: float, y: float, away: float, width: float, storeys: int) -> list[M
             centre = x - width / 2.0 + at
             if storey:
                 meshes.append(shapes.box((WINDOW[0] + 0.3, 0.3, 0.1), (centre, y, base + 0.85), tile_m=0.8))
-            meshes.append(shapes.box((WINDOW[0] + 0.3, 0.2, 0.18), (centre, y, base + 0.95 + WINDOW[1] + 0.05), tile_m=0.8))
+            meshes.append(
+                shapes.box((WINDOW[0] + 0.3, 0.2, 0.18), (centre, y, base + 0.95 + WINDOW[1] + 0.05), tile_m=0.8)
+            )
         meshes.append(shapes.box((width, 0.24, 0.14), (x, y, base + STOREY - 0.05), tile_m=0.8))
     meshes.append(shapes.box((width, 0.6, 0.25), (x, y, 0.1 + STOREY * storeys + 0.3), tile_m=0.8))
-    meshes.append(shapes.standing_box((1.6, 0.7, 0.18), (x - width / 2.0 + window_columns(width)[0], y - away * 0.3, 0.1), tile_m=0.8))
+    meshes.append(
+        shapes.standing_box(
+            (1.6, 0.7, 0.18), (x - width / 2.0 + window_columns(width)[0], y - away * 0.3, 0.1), tile_m=0.8
+        )
+    )
     return meshes
 
 
@@ -117,7 +128,11 @@ def town_hall(rng: np.random.Generator, x: float) -> list[Body]:
     hall = shapes.standing_box((12.0, wide, high), (x + 6.0, 0.0, 0.0))
     tower = shapes.standing_box((5.0, 5.0, 24.0), (x, 0.0, 0.0))
     spire = shapes.moved(shapes.lathe([(3.9, 0.0), (0.4, 7.0), (0.0, 11.0)], sides=16, tile_m=2.0), (x, 0.0, 24.0))
-    shafts = [shapes.moved(shapes.cylinder(0.45, 9.0, sides=20, tile_m=1.5), (x - 1.2, y, 0.0)) for y in np.linspace(-12, 12, 9) if abs(y) > 2.0]
+    shafts = [
+        shapes.moved(shapes.cylinder(0.45, 9.0, sides=20, tile_m=1.5), (x - 1.2, y, 0.0))
+        for y in np.linspace(-12, 12, 9)
+        if abs(y) > 2.0
+    ]
     clock = shapes.panel((x - 2.52, 1.6, 18.0), (0.0, -3.2, 0.0), (0.0, 0.0, 3.2))
     roof = shapes.moved(shapes.ramp((wide, 13.0, 5.0), tile_m=3.0), (x + 6.0, 0.0, high), turn_deg=90.0)
     surfaces = {
@@ -128,4 +143,7 @@ def town_hall(rng: np.random.Generator, x: float) -> list[Body]:
         " clock": (clock, textures.star(12)),
         " roof": (roof, textures.bricks(rng, mean=0.2, joint=0.06, size=256)),
     }
-    return [parts.solid(f"town hall{part}", mesh, skin, "house", instance="town hall") for part, (mesh, skin) in surfaces.items()]
+    return [
+        parts.solid(f"town hall{part}", mesh, skin, "house", instance="town hall")
+        for part, (mesh, skin) in surfaces.items()
+    ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -37,16 +38,18 @@ def hall(size: Sequence[float], walls: Sequence[Texture], floor: Texture, ceilin
     for k, (name, (corner, along)) in enumerate(sides.items()):
         mesh = shapes.panel(corner, along, (0, 0, z), tile_m=2.0)
         bodies.append(solid(f"{name} wall", mesh, walls[k % len(walls)], "wall"))
-    skirting = shapes.merged(
-        shapes.box((2 * x, 0.02, 0.1) if along[0] else (0.02, 2 * y, 0.1), np.array(corner) + np.array(along) / 2.0 + (0, 0, 0.05),
-                   tile_m=1.0)
-        for corner, along in sides.values()
-    )  # fmt: skip
+    boards = []
+    for corner, along in sides.values():
+        size = (2 * x, 0.02, 0.1) if along[0] else (0.02, 2 * y, 0.1)
+        boards.append(shapes.standing_box(size, np.array(corner) + np.array(along) / 2.0, tile_m=1.0))
+    skirting = shapes.merged(boards)
     bodies.append(solid("skirting", skirting, textures.clipped(0.8 * np.ones((2, 2))), "wall"))
     return bodies
 
 
-def picture(name: str, centre: Sequence[float], right: Sequence[float], texture: Texture, width: float, height: float) -> list[Body]:
+def picture(
+    name: str, centre: Sequence[float], right: Sequence[float], texture: Texture, width: float, height: float
+) -> list[Body]:
     """Return a picture on a wall, of ``width`` x ``height`` [m], and its frame; ``right`` is along the wall."""
     r = np.asarray(right, np.float64)
     out = np.cross(r, (0.0, 0.0, 1.0))
@@ -55,7 +58,7 @@ def picture(name: str, centre: Sequence[float], right: Sequence[float], texture:
     bars = []
     for side in (-1.0, 1.0):
         bars.append(_bar(r, out, (0.03, 0.03, height + 0.06), middle + side * (width / 2.0 + 0.015) * r))
-        bars.append(_bar(r, out, (width, 0.03, 0.03), middle + (0, 0, side * (height / 2.0 + 0.015))))
+        bars.append(_bar(r, out, (width, 0.03, 0.03), middle + np.array((0, 0, side * (height / 2.0 + 0.015)))))
     frame = textures.clipped(0.12 * np.ones((2, 2)))
     return [
         solid(name, shapes.panel(corner, r * width, (0, 0, height)), texture, "picture"),
@@ -63,14 +66,16 @@ def picture(name: str, centre: Sequence[float], right: Sequence[float], texture:
     ]
 
 
-def _bar(right: np.ndarray, out: np.ndarray, size: Sequence[float], centre: np.ndarray) -> Mesh:
+def _bar(right: Any, out: Any, size: Sequence[float], centre: Any) -> Mesh:
     """A box whose x lies along ``right`` and y along ``out``."""
     mesh = shapes.box(size)
     axes = np.stack([right, out, np.array((0.0, 0.0, 1.0))])
     return Mesh(np.asarray(mesh.vertices) @ axes + centre + 0.015 * out, mesh.faces, mesh.uv)
 
 
-def table(name: str, size: Sequence[float], position: Sequence[float], texture: Texture, *, turn_deg: float = 0.0) -> Body:
+def table(
+    name: str, size: Sequence[float], position: Sequence[float], texture: Texture, *, turn_deg: float = 0.0
+) -> Body:
     """Return a table of ``size`` (x, y, height) [m]."""
     top = shapes.standing_box((size[0], size[1], 0.04), (0, 0, size[2] - 0.04), tile_m=0.8)
     apron = shapes.standing_box((size[0] - 0.1, size[1] - 0.1, 0.08), (0, 0, size[2] - 0.12), tile_m=0.8)
@@ -87,7 +92,14 @@ def chair(name: str, position: Sequence[float], texture: Texture, *, turn_deg: f
     return solid(name, shapes.moved(mesh, position, turn_deg=turn_deg), texture, "chair")
 
 
-def vessel(name: str, profile: Sequence[tuple[float, float]], position: Sequence[float], texture: Texture, *, tile_m: float = 0.25) -> Body:
+def vessel(
+    name: str,
+    profile: Sequence[tuple[float, float]],
+    position: Sequence[float],
+    texture: Texture,
+    *,
+    tile_m: float = 0.25,
+) -> Body:
     """Return a turned vessel, its profile rounded by a spline through the given points."""
     from scipy.interpolate import PchipInterpolator
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from amiwarp.simulation.worlds.named import parts, shapes, textures
 from amiwarp.simulation.worlds.named.motion import Viewpoint
-from amiwarp.simulation.worlds.scene import Body, Lamp, World
+from amiwarp.simulation.worlds.scene import Body, Lamp, Mesh, World
 
 SIZE = (5.2, 4.4, 2.6)
 """Length, width and height [m]."""
@@ -55,13 +55,15 @@ def _shelves(rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
-def _books(rng: np.random.Generator, middle: tuple[float, float, float], width: float) -> shapes.Mesh:
+def _books(rng: np.random.Generator, middle: tuple[float, float, float], width: float) -> Mesh:
     """A row of books along y; each shows another part of the texture."""
     books, at = [], -width / 2.0 + 0.03
     while at < width / 2.0 - 0.1:
         thick, tall, deep = rng.uniform(0.02, 0.06), rng.uniform(0.2, 0.33), rng.uniform(0.18, 0.24)
-        book = shapes.standing_box((deep, thick, tall), (middle[0], middle[1] + at + thick / 2.0, middle[2]), tile_m=0.4)
-        books.append(shapes.Mesh(book.vertices, book.faces, np.asarray(book.uv) + rng.uniform(0.0, 1.0, 2)))
+        book = shapes.standing_box(
+            (deep, thick, tall), (middle[0], middle[1] + at + thick / 2.0, middle[2]), tile_m=0.4
+        )
+        books.append(Mesh(book.vertices, book.faces, np.asarray(book.uv) + rng.uniform(0.0, 1.0, 2)))
         at += thick + (0.002 if rng.uniform() < 0.9 else 0.08)
     return shapes.merged(books)
 
@@ -80,9 +82,17 @@ def _table(rng: np.random.Generator) -> list[Body]:
         parts.vessel("cup", cup, (x - 0.2, y - 0.2, z), textures.plaid(rng), tile_m=0.1),
         parts.solid("stack", shapes.merged(stack), textures.poster(rng), "book"),
         parts.solid("globe", globe, textures.weathered(rng, textures.checkerboard(16), 0.3), "globe"),
-        parts.solid("globe foot", shapes.moved(shapes.cylinder(0.08, 0.05, tile_m=0.2), (x + 0.35, y - 0.05, z)), textures.wood(rng, size=128), "globe", instance="globe"),
+        parts.solid(
+            "globe foot",
+            shapes.moved(shapes.cylinder(0.08, 0.05, tile_m=0.2), (x + 0.35, y - 0.05, z)),
+            textures.wood(rng, size=128),
+            "globe",
+            instance="globe",
+        ),
         parts.chair("chair", (x - 0.75, y - 0.1, 0), textures.wood(rng, mean=0.2, boards=4, size=256), turn_deg=10.0),
-        parts.chair("second chair", (x + 0.1, y - 0.75, 0), textures.wood(rng, mean=0.55, boards=4, size=256), turn_deg=80.0),
+        parts.chair(
+            "second chair", (x + 0.1, y - 0.75, 0), textures.wood(rng, mean=0.55, boards=4, size=256), turn_deg=80.0
+        ),
     ]
 
 
@@ -95,8 +105,10 @@ def _sofa(rng: np.random.Generator) -> list[Body]:
         *(shapes.standing_box((0.18, 0.8, 0.5), (x + side * 0.86, y, 0.1), tile_m=0.5) for side in (-1, 1)),
         *(shapes.standing_box((0.74, 0.6, 0.12), (x + side * 0.38, y - 0.08, 0.35), tile_m=0.5) for side in (-1, 1)),
     ]
-    cushions = [shapes.moved(shapes.ellipsoid((0.22, 0.09, 0.2), tile_m=0.5), (x + at, y + 0.12, 0.66), turn_deg=25 * at, axis=(1, 0, 1))
-                for at in (-0.55, 0.5)]  # fmt: skip
+    cushion = shapes.ellipsoid((0.22, 0.09, 0.2), tile_m=0.5)
+    cushions = [
+        shapes.moved(cushion, (x + at, y + 0.12, 0.66), turn_deg=25 * at, axis=(1, 0, 1)) for at in (-0.55, 0.5)
+    ]
     return [
         parts.solid("sofa", shapes.merged(frame), textures.plaid(rng, stripes=14), "sofa"),
         parts.solid("cushions", shapes.merged(cushions), textures.checkerboard(6, size=128), "cushion"),
@@ -108,14 +120,32 @@ def _small(rng: np.random.Generator) -> list[Body]:
     shade = shapes.moved(shapes.lathe([(0.22, 0.0), (0.13, 0.3)], sides=32, tile_m=0.3), (0.95, 1.85, 1.45))
     stand = shapes.merged([shapes.cylinder(0.14, 0.03), shapes.cylinder(0.014, 1.55, sides=12)])
     pot = [(0.0, 0.0), (0.12, 0.0), (0.17, 0.3), (0.15, 0.3), (0.14, 0.25), (0.0, 0.25)]
-    leaves = [shapes.moved(shapes.moved(shapes.ellipsoid((0.3, 0.05, 0.012), sides=16, rings=8, tile_m=0.2), (0.3, 0, 0)),
-                           (0, 0, 0), turn_deg=-float(rng.uniform(30, 80)), axis=(0, 1, 0)) for _ in range(14)]  # fmt: skip
-    crown = [shapes.moved(leaf, (2.25, -0.15, 0.28), turn_deg=float(26 * k)) for k, leaf in enumerate(leaves)]
+    leaf = shapes.moved(shapes.ellipsoid((0.3, 0.05, 0.012), sides=16, rings=8, tile_m=0.2), (0.3, 0, 0))
+    steep = [shapes.moved(leaf, (0, 0, 0), turn_deg=-float(angle), axis=(0, 1, 0)) for angle in rng.uniform(30, 80, 14)]
+    crown = [shapes.moved(one, (2.25, -0.15, 0.28), turn_deg=26.0 * k) for k, one in enumerate(steep)]
     return [
-        parts.solid("rug", shapes.standing_box((1.9, 1.3, 0.012), (-0.45, 0.2, 0)), textures.plaid(rng, size=512, stripes=24), "rug"),
+        parts.solid(
+            "rug",
+            shapes.standing_box((1.9, 1.3, 0.012), (-0.45, 0.2, 0)),
+            textures.plaid(rng, size=512, stripes=24),
+            "rug",
+        ),
         parts.solid("lamp shade", shade, textures.plaid(rng), "lamp", instance="lamp", emission=0.15),
-        parts.solid("lamp stand", shapes.moved(stand, (0.95, 1.85, 0)), textures.plaster(rng, 0.1, size=64), "lamp", instance="lamp"),
+        parts.solid(
+            "lamp stand",
+            shapes.moved(stand, (0.95, 1.85, 0)),
+            textures.plaster(rng, 0.1, size=64),
+            "lamp",
+            instance="lamp",
+        ),
         parts.vessel("pot", pot, (2.25, -0.15, 0), textures.bricks(rng), tile_m=0.4),
-        parts.solid("leaves", shapes.merged(crown), textures.plaster(rng, 0.25, 0.5, size=128), "plant", instance="pot"),
-        parts.solid("toy box", shapes.moved(shapes.standing_box((0.4, 0.3, 0.3)), (-1.5, 0.2, 0), turn_deg=-30), textures.checkerboard(6), "box"),
+        parts.solid(
+            "leaves", shapes.merged(crown), textures.plaster(rng, 0.25, 0.5, size=128), "plant", instance="pot"
+        ),
+        parts.solid(
+            "toy box",
+            shapes.moved(shapes.standing_box((0.4, 0.3, 0.3)), (-1.5, 0.2, 0), turn_deg=-30),
+            textures.checkerboard(6),
+            "box",
+        ),
     ]

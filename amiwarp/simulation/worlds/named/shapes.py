@@ -44,7 +44,7 @@ def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float |
 
 def standing_box(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | None = None) -> Mesh:
     """Return a :func:`box` by the centre of its lower side."""
-    return box(size, np.asarray(foot, np.float64) + (0.0, 0.0, np.asarray(size)[2] / 2.0), tile_m=tile_m)
+    return box(size, np.asarray(foot, np.float64) + np.asarray(size) * (0.0, 0.0, 0.5), tile_m=tile_m)
 
 
 def lathe(profile: ArrayLike, *, sides: int = 24, tile_m: float | None = None) -> Mesh:
@@ -89,7 +89,9 @@ def ellipsoid(radii: ArrayLike, *, sides: int = 24, rings: int = 12, tile_m: flo
 def capsule(radius: float, length: float, *, sides: int = 20, rings: int = 6, tile_m: float | None = None) -> Mesh:
     """Return a cylinder with round ends from the origin down to z = ``-length`` [m]."""
     low, high = np.linspace(-np.pi / 2.0, 0.0, rings), np.linspace(0.0, np.pi / 2.0, rings)
-    ends = [np.column_stack([radius * np.cos(a).clip(0.0), radius * np.sin(a) + z]) for a, z in ((low, -length), (high, 0))]
+    ends = [
+        np.column_stack([radius * np.cos(a).clip(0.0), radius * np.sin(a) + z]) for a, z in ((low, -length), (high, 0))
+    ]
     return lathe(np.concatenate(ends), sides=sides, tile_m=tile_m)
 
 

@@ -29,7 +29,9 @@ def _ground(rng: np.random.Generator) -> list[Body]:
     """Asphalt, pavements around the blocks, and the markings of the road."""
     asphalt = textures.plaster(rng, 0.2, 0.5)
     slabs = [
-        shapes.standing_box((end - start + 4.0, 56.0, 0.14), ((start + end) / 2.0, side * (ROAD + 28.0), 0.0), tile_m=3.0)
+        shapes.standing_box(
+            (end - start + 4.0, 56.0, 0.14), ((start + end) / 2.0, side * (ROAD + 28.0), 0.0), tile_m=3.0
+        )
         for start, end in BLOCKS
         for side in (-1, 1)
     ]
@@ -86,11 +88,19 @@ def _car(rng: np.random.Generator, name: str, place: tuple[float, float]) -> lis
     glass[:, :6] = glass[:, 60:66] = glass[:, -6:] = glass[:6] = shade
     glass[14:34, 20:40] = 0.35
     wheel = shapes.lathe([(0.0, -0.1), (0.18, -0.1), (0.31, -0.08), (0.31, 0.08), (0.18, 0.1), (0.0, 0.1)], sides=24)
-    wheels = [shapes.moved(wheel, (x, y, 0.31), turn_deg=90, axis=(1, 0, 0)) for x in (-1.3, 1.3) for y in (-0.75, 0.75)]
+    wheels = [
+        shapes.moved(wheel, (x, y, 0.31), turn_deg=90, axis=(1, 0, 0)) for x in (-1.3, 1.3) for y in (-0.75, 0.75)
+    ]
     rim = textures.clipped(np.repeat([[0.04], [0.04], [0.5], [0.04], [0.04], [0.5]], 16, axis=1))
-    body = shapes.merged([shapes.standing_box((4.2, 1.7, 0.55), (0, 0, 0.28)), shapes.standing_box((4.35, 1.6, 0.2), (0, 0, 0.3))])
+    body = shapes.merged(
+        [shapes.standing_box((4.2, 1.7, 0.55), (0, 0, 0.28)), shapes.standing_box((4.35, 1.6, 0.2), (0, 0, 0.3))]
+    )
     top = shapes.tapered(shapes.standing_box(cabin, (0.35 if van else -0.25, 0, 0.82)), 0.88 if van else 0.68)
-    meshes = {"": (body, textures.weathered(rng, paint, 0.15)), " cabin": (top, textures.weathered(rng, glass, 0.2)), " wheels": (shapes.merged(wheels), rim)}
+    meshes = {
+        "": (body, textures.weathered(rng, paint, 0.15)),
+        " cabin": (top, textures.weathered(rng, glass, 0.2)),
+        " wheels": (shapes.merged(wheels), rim),
+    }
     turn = 0.0 if place[1] < 0 else 180.0
     return [
         parts.solid(name + part, shapes.moved(mesh, at, turn_deg=turn), texture, "car", instance=name)
@@ -102,16 +112,26 @@ def _trees(rng: np.random.Generator) -> list[Body]:
     """Trees along the pavements: a trunk and a crown of several balls."""
     bark, leaves = textures.plaster(rng, 0.15, 0.6, size=128), textures.plaster(rng, 0.22, 0.7, size=256)
     bodies = []
-    spots = [(x + rng.uniform(-1.0, 1.0), side * (ROAD + 0.9)) for start, end in BLOCKS for x in np.arange(start + 5.0, end, 11.0) for side in (-1, 1)]
+    spots = [
+        (x + rng.uniform(-1.0, 1.0), side * (ROAD + 0.9))
+        for start, end in BLOCKS
+        for x in np.arange(start + 5.0, end, 11.0)
+        for side in (-1, 1)
+    ]
     for k, (x, y) in enumerate(spots):
         trunk = shapes.lathe([(0.17, 0.0), (0.12, 0.6), (0.09, 3.0)], sides=12, tile_m=0.6)
         balls = [
-            shapes.moved(shapes.ellipsoid(rng.uniform(0.6, 1.05, 3), sides=14, rings=9, tile_m=1.0), (*rng.uniform(-0.7, 0.7, 2), rng.uniform(2.7, 4.2)))
+            shapes.moved(
+                shapes.ellipsoid(rng.uniform(0.6, 1.05, 3), sides=14, rings=9, tile_m=1.0),
+                (*rng.uniform(-0.7, 0.7, 2), rng.uniform(2.7, 4.2)),
+            )
             for _ in range(6)
         ]
         name = f"tree {k}"
         bodies.append(parts.solid(f"{name} trunk", shapes.moved(trunk, (x, y, 0.1)), bark, "tree", instance=name))
-        bodies.append(parts.solid(f"{name} crown", shapes.moved(shapes.merged(balls), (x, y, 0.1)), leaves, "tree", instance=name))
+        bodies.append(
+            parts.solid(f"{name} crown", shapes.moved(shapes.merged(balls), (x, y, 0.1)), leaves, "tree", instance=name)
+        )
     return bodies
 
 
@@ -123,10 +143,15 @@ def _posts(rng: np.random.Generator) -> list[Body]:
     for k, x in enumerate(xs):
         side = 1.0 if k % 2 else -1.0
         y = side * (ROAD + 0.5)
-        post = [shapes.lathe([(0.12, 0.0), (0.12, 0.8), (0.06, 0.9), (0.045, 5.2)], sides=16, tile_m=0.5),
-                shapes.box((0.06, 1.2, 0.06), (0, -side * 0.6, 5.2), tile_m=0.5),
-                shapes.moved(shapes.ellipsoid((0.16, 0.3, 0.1), sides=16, tile_m=0.5), (0, -side * 1.2, 5.15))]  # fmt: skip
-        bodies.append(parts.solid(f"street lamp {k}", shapes.moved(shapes.merged(post), (x, y, 0.1)), iron, "street lamp"))
+        head = shapes.ellipsoid((0.16, 0.3, 0.1), sides=16, tile_m=0.5)
+        post = [
+            shapes.lathe([(0.12, 0.0), (0.12, 0.8), (0.06, 0.9), (0.045, 5.2)], sides=16, tile_m=0.5),
+            shapes.box((0.06, 1.2, 0.06), (0, -side * 0.6, 5.2), tile_m=0.5),
+            shapes.moved(head, (0, -side * 1.2, 5.15)),
+        ]
+        bodies.append(
+            parts.solid(f"street lamp {k}", shapes.moved(shapes.merged(post), (x, y, 0.1)), iron, "street lamp")
+        )
         face = (textures.grating(22.5 * k, 6.0), textures.star(16), textures.checkerboard(4))[k % 3]
         plate = shapes.box((0.03, 0.6, 0.6), (x + 4.0, -y, 2.5))
         pole = shapes.moved(shapes.cylinder(0.03, 2.3, sides=10, tile_m=0.4), (x + 4.03, -y, 0.1))

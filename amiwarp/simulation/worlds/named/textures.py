@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,12 @@ from numpy.typing import NDArray
 
 DARKEST, BRIGHTEST = 0.03, 0.95
 """Range of the reflectances: soot and white paint. Its log contrast is 3.5."""
-WORDS = (
+TEXT = (
     "each pixel reports changes of log intensity by itself and at once so a camera that rests sees only what moves a "
     "prism before the lens turns and moves the whole picture on a circle then every edge fires whatever its direction "
     "and the known angle takes the motion out again"
-).split()
-"""Words of the printed texts."""
+)
+"""Words of the printed texts, drawn at random."""
 
 Texture = NDArray[np.float32]
 
@@ -50,7 +51,9 @@ def checkerboard(squares: int, *, size: int = 256, dark: float = 0.05, bright: f
     return clipped(np.where((k[:, None] + k) % 2, dark, bright))
 
 
-def grating(angle_deg: float, cycles: float = 12.0, *, size: int = 256, dark: float = 0.05, bright: float = 0.9) -> Texture:
+def grating(
+    angle_deg: float, cycles: float = 12.0, *, size: int = 256, dark: float = 0.05, bright: float = 0.9
+) -> Texture:
     """Return stripes whose light changes towards ``angle_deg``, counter-clockwise from the right, in a white frame."""
     v, u = np.mgrid[size:0:-1, 0:size] / size
     phase = np.cos(np.radians(angle_deg)) * u + np.sin(np.radians(angle_deg)) * v
@@ -69,17 +72,19 @@ def star(spokes: int = 24, *, size: int = 384, dark: float = 0.05, bright: float
     return clipped(np.where(radius < 0.47, dark + (bright - dark) * (wave + 1.0) / 2.0, bright))
 
 
-def text_page(rng: np.random.Generator, *, width: int = 384, height: int = 512, letter: int = 18, ink: float = 0.05) -> Texture:
+def text_page(
+    rng: np.random.Generator, *, width: int = 384, height: int = 512, letter: int = 18, ink: float = 0.05
+) -> Texture:
     """Return a printed page: a heading and lines of words."""
     from PIL import Image, ImageDraw, ImageFont
 
     page = Image.new("F", (width, height), 0.88)
-    draw, margin = ImageDraw.Draw(page), width // 14
+    words, draw, margin = TEXT.split(), ImageDraw.Draw(page), width // 14
     y, size = margin, 2 * letter
     while y < height - margin - letter:
         font = ImageFont.load_default(size)
-        line = str(rng.choice(WORDS))
-        while draw.textlength(longer := f"{line} {rng.choice(WORDS)}", font=font) < width - 2 * margin:
+        line = str(rng.choice(words))
+        while draw.textlength(longer := f"{line} {rng.choice(words)}", font=font) < width - 2 * margin:
             line = longer
         if rng.uniform() < 0.93 or size > letter:
             draw.text((margin, y), line, fill=ink, font=font)
@@ -107,7 +112,9 @@ def poster(rng: np.random.Generator, *, size: int = 384) -> Texture:
     return weathered(rng, np.asarray(page), 0.1)
 
 
-def _cells(rng: np.random.Generator, rows: int, size: int, *, columns: int, joint: int, shift: bool) -> NDArray[np.float64]:
+def _cells(
+    rng: np.random.Generator, rows: int, size: int, *, columns: int, joint: int, shift: bool
+) -> NDArray[np.float64]:
     """Random shades of rectangular cells in rows, NaN in the joints between them; odd rows shifted by half a cell."""
     y, x = np.mgrid[0:size, 0:size]
     row = y * rows // size
@@ -123,7 +130,9 @@ def bricks(rng: np.random.Generator, *, mean: float = 0.25, joint: float = 0.55,
     return weathered(rng, np.where(np.isnan(shade), joint, mean * np.exp(0.3 * np.nan_to_num(shade))), 0.25)
 
 
-def tiles(rng: np.random.Generator, *, mean: float = 0.5, joint: float = 0.12, count: int = 8, size: int = 512) -> Texture:
+def tiles(
+    rng: np.random.Generator, *, mean: float = 0.5, joint: float = 0.12, count: int = 8, size: int = 512
+) -> Texture:
     """Return ``count`` square tiles each way, veined."""
     shade = _cells(rng, count, size, columns=count, joint=4, shift=False)
     return weathered(rng, np.where(np.isnan(shade), joint, mean * np.exp(0.25 * np.nan_to_num(shade))), 0.25)
@@ -144,6 +153,7 @@ def wood(rng: np.random.Generator, *, mean: float = 0.3, boards: int = 8, size: 
 
 def plaid(rng: np.random.Generator, *, size: int = 256, stripes: int = 10) -> Texture:
     """Return woven stripes both ways."""
+
     def bands() -> NDArray[np.float64]:
         return np.repeat(rng.uniform(0.25, 1.0, stripes), -(-size // stripes))[:size]
 
@@ -154,7 +164,7 @@ def book_spines(rng: np.random.Generator, *, books: int = 16, size: int = 512) -
     """Return the backs of books next to each other, with bands and titles."""
     values = np.empty((size, size))
     edges = np.linspace(0, size, books + 1).astype(int)
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         shade = float(np.exp(rng.uniform(np.log(0.05), np.log(0.85))))
         values[:, a:b] = shade
         mark = 0.85 if shade < 0.3 else 0.05
