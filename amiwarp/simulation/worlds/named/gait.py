@@ -84,11 +84,15 @@ def _child(parent: Places, offset: tuple[float, float, float], turn: Any) -> Pla
 
 
 def _legs(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
-    """Hips swing forward and back; a knee bends while its leg swings forward; the foot stays nearly level."""
+    """Hips swing forward and back; a knee bends while its leg swings forward; the foot stays nearly level.
+
+    The curves are fitted so that the foot on the floor slides least; their ranges are those of human walking.
+    """
     out = {"pelvis": root}
     for side, y, shift in (("left", HIP, 0.0), ("right", -HIP, np.pi)):
         p = phase + shift
-        hip, knee = -0.41 * np.sin(p) - 0.04, 0.08 + 1.05 * ((1.0 + np.cos(p + 0.35)) / 2.0) ** 2
+        hip = -0.297 * (np.sin(p) - 0.065 * np.sin(3.0 * p)) - 0.192
+        knee = 0.05 + 1.15 * ((1.0 + np.cos(p + 0.22)) / 2.0) ** 4
         thigh = _child(root, (0, y, 0), _about((0, 1, 0), hip))
         shin = _child(thigh, (0, 0, -THIGH), _about((0, 1, 0), knee))
         ankle = _child(shin, (0, 0, -SHIN), _about((0, 1, 0), -0.75 * (hip + knee)))

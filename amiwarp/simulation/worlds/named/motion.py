@@ -17,10 +17,10 @@ SHAKE_M = 0.015
 """Amplitude of the hand's sway [m]."""
 SHAKE_DEG = 1.5
 """Amplitude of the hand's turns [deg]."""
-SWAY_HZ = (0.15, 1.1)
+SWAY_HZ = (0.15, 0.55)
 """Frequencies of the hand's slow sway [1/s]."""
 TREMOR_HZ = (1.5, 2.8)
-"""Frequencies of its tremor [1/s], whose amplitude is a tenth."""
+"""Frequencies of its tremor [1/s], each of an amplitude of 0.03."""
 FAST_RATE, FAST_REACH = 4.0, 2.5
 """Factors of frequency and amplitude of a fast trajectory: ten times the speed."""
 
@@ -59,7 +59,7 @@ def shake(t: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float6
     low, high = SWAY_HZ
     frequency = np.concatenate([low + (high - low) * (np.arange(4)[:, None] + rng.uniform(size=(4, 3))) / 4.0,
                                 rng.uniform(*TREMOR_HZ, (2, 3))])  # fmt: skip
-    amplitude = np.concatenate([0.5 * np.sqrt(low / frequency[:4]) + 0.1, np.full((2, 3), 0.05)])
+    amplitude = np.concatenate([0.5 * np.sqrt(low / frequency[:4]) + 0.1, np.full((2, 3), 0.03)])
     phase = rng.uniform(0.0, 2.0 * np.pi, (6, 3))
     waves = amplitude * np.sin(2.0 * np.pi * frequency * t[:, None, None] + phase)
     return np.asarray(waves.sum(axis=1))

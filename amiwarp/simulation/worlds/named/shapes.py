@@ -106,7 +106,7 @@ def ramp(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | 
     ends = []
     for side in (1.0, -1.0):
         corners = np.array([(side * x, -side * y, 0), (side * x, side * y, 0), (side * x, 0, z)])
-        ends.append(Mesh(corners, [[0, 1, 2]], corners[:, 1:] / scale))
+        ends.append(Mesh(corners, [[0, 1, 2]], corners[:, 1:] * (side, 1.0) / scale))
     return moved(merged([*slopes, *ends]), foot)
 
 
