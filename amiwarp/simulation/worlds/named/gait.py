@@ -17,7 +17,7 @@ STRIDES_HZ = 0.92
 """Strides (two steps) per second."""
 CIRCLE_M = 1.6
 """Radius of the circle that the figure walks on [m]; its middle is at y = 0.8 m."""
-RATE_HZ = 120.0
+RATE_HZ = 200.0
 """Poses per second."""
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.44, 0.42, 0.29, 0.26
 """Lengths of the limbs [m]."""
