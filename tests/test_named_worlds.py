@@ -60,7 +60,7 @@ def test_solids_have_their_volume_and_face_outwards(mesh: Mesh, expected: float)
 
 
 @pytest.mark.parametrize(
-    "mesh", [shapes.panel((0, 0, 0), (0, 2, 0), (1, 0, 0)), shapes.box((1, 2, 3)), shapes.ramp((3, 2, 1))]
+    "mesh", [shapes.panel((0, 0, 0), (0, 2, 0), (1, 0, 0)), shapes.box((1, 2, 3)), shapes.gable_roof((3, 2, 1))]
 )
 def test_textures_are_not_mirrored(mesh: Mesh) -> None:
     """Seen from outside, each triangle turns on the texture as it does in space."""

@@ -136,13 +136,16 @@ MISTAKES: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     ),
     "texture without coordinates": (
         changed(body__material={"texture": "wood.png"}),
-        r"bodies\[1\].material.texture needs texture coordinates",
+        r"bodies\[1\].material.texture needs texture coordinates, but",
     ),
     "reflectance": (
         changed(first__material={"reflectance": 2.0}),
         r"field bodies\[0\].material: material reflectance = 2.0",
     ),
-    "pose and trajectory": (changed(body__position=[0, 0, 0]), r"field bodies\[1\].position goes with no trajectory"),
+    "pose and trajectory": (
+        changed(body__position=[0, 0, 0]),
+        r"field bodies\[1\].position cannot be combined with a trajectory",
+    ),
     "trajectory missing": (
         changed(body__trajectory="no.csv"),
         r"field bodies\[1\].trajectory: .*no\.csv: no such file",
@@ -306,9 +309,9 @@ def test_meshes_that_cannot_be_read(tmp_path: Path, name: str, content: bytes | 
 @pytest.mark.parametrize(
     ("material", "message"),
     [
-        (None, "names the file 'quad.mtl', which is missing; put it next to the mesh file"),
-        ("newmtl paint\nmap_Kd no.png\n", "names the file 'no.png', which is missing"),
-        ("newmtl paint\nmap_Kd bad.png\n", "names the file 'bad.png', which cannot be read"),
+        (None, "refers to the file 'quad.mtl', which is missing; put a valid file next to the mesh file"),
+        ("newmtl paint\nmap_Kd no.png\n", "refers to the file 'no.png', which is missing"),
+        ("newmtl paint\nmap_Kd bad.png\n", "refers to the file 'bad.png', which cannot be read"),
     ],
 )
 def test_files_that_a_mesh_names(tmp_path: Path, material: str | None, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Meshes from files: glTF and GLB, OBJ with MTL, PLY, STL, read by trimesh, their colours turned into luminance."""
+"""Mesh files (glTF, GLB, OBJ with MTL, PLY, STL), read by trimesh. Colours become luminance."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
-"""Suffixes of the files that are read."""
+"""Supported file suffixes."""
 Y_UP = ("glb", "gltf")
-"""Formats whose files have y up by their specification."""
+"""Formats whose specification says that y points up."""
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".gif", ".tga", ".dds", ".ktx2", ".exr")
-"""Suffixes by which a file that a mesh file names is taken for a texture."""
+"""Suffixes of textures."""
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Turns y up into z up."""
+"""Rotation from y up to z up."""
 DEFAULT_REFLECTANCE = 0.5
 """Reflectance of meshes without colours."""
 
@@ -36,22 +36,22 @@ class LoadedMesh(NamedTuple):
     """One part of a mesh file."""
 
     mesh: Mesh
-    """Its triangles, z up [m]."""
+    """Triangles, z up [m]."""
     material: Material
-    """Its reflectance and texture."""
+    """Reflectance and texture."""
     name: str
-    """Its name in the file."""
+    """Name in the file."""
 
 
 def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) -> list[LoadedMesh]:
     """Read the meshes of a glTF, GLB, OBJ, PLY or STL file.
 
-    Needs trimesh, as ``pip install amiwarp[worlds]`` installs it.
+    Needs trimesh: ``pip install "amiwarp[worlds]"``.
 
     Parameters
     ----------
     path : str or Path
-        The mesh file. OBJ and glTF files may name others: materials, textures and buffers.
+        Mesh file. OBJ and glTF files may refer to other files: materials, textures and buffers.
     up : str, optional
         Axis of the file that points up, ``"y"`` or ``"z"``; None for y in glTF and GLB files and z in others.
     scale : float
@@ -60,12 +60,12 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     Returns
     -------
     list of LoadedMesh
-        Mesh, material and name of each part, in the frame of the file with z up.
+        Mesh, material and name of each part. The meshes are in the frame of the file, with z up.
 
     Raises
     ------
     AmiwarpError
-        If there is no such file, its format is unknown, it holds no faces, or a file that it names is missing.
+        If the file does not exist, has an unknown format or no faces, or refers to a file that is missing.
     """
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
@@ -89,7 +89,7 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
 
 
 def _open(path: Path, kind: str) -> Any:
-    """The file as a scene of trimesh."""
+    """Return the file as a trimesh scene."""
     try:
         import trimesh
     except ImportError as error:
@@ -102,12 +102,12 @@ def _open(path: Path, kind: str) -> Any:
             if files.missing is None:
                 raise
         if files.missing is not None:
-            raise AmiwarpError(f"{path}: names the file {files.missing}; put it next to the mesh file")
+            raise AmiwarpError(f"{path}: refers to the file {files.missing}; put a valid file next to the mesh file")
     return scene
 
 
 def _named_files(path: Path) -> Any:
-    """A resolver of the files that a mesh file names, which keeps the errors that trimesh passes over in silence."""
+    """Return a resolver of referenced files that records the first failure, because trimesh ignores failures."""
     from trimesh.resolvers import FilePathResolver
 
     class NamedFiles(FilePathResolver):
@@ -132,6 +132,7 @@ def _named_files(path: Path) -> Any:
 
 
 def _check_picture(data: bytes) -> None:
+    """Raise an exception if the bytes are no picture in a supported format."""
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=PICTURE_FORMATS) as image:
@@ -139,7 +140,7 @@ def _check_picture(data: bytes) -> None:
 
 
 def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64], name: str, kind: str) -> LoadedMesh:
-    """One geometry at one place of the file's scene."""
+    """Return one geometry at one node of the scene."""
     vertices = np.asarray(part.vertices, np.float64) @ matrix.T + offset
     faces = np.asarray(part.faces)
     visual: Any = part.visual
@@ -156,7 +157,7 @@ def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64
 
 
 def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], kind: str) -> tuple[Mesh, Material]:
-    """Mesh and material of a geometry with a material, which may have a picture."""
+    """Return mesh and material of a geometry that has a material, with or without a texture."""
     material = visual.material
     pbr = hasattr(material, "baseColorFactor")
     picture = material.baseColorTexture if pbr else material.image
@@ -172,7 +173,7 @@ def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], k
 
 
 def _luminance(picture: Any) -> NDArray[np.float32]:
-    """Linear luminance of a Pillow picture, of at least two pixels each way."""
+    """Return the linear luminance of a Pillow picture; single rows and columns are doubled."""
     if picture.width * picture.height > MOST_PIXELS:
         raise AmiwarpError(
             f"a texture of {picture.width}x{picture.height} is over {MOST_PIXELS} pixels; make it smaller"
@@ -183,7 +184,7 @@ def _luminance(picture: Any) -> NDArray[np.float32]:
 
 
 def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
-    """Luminance of colours, whole numbers or 0 to 1, which are linear in glTF files and sRGB in others."""
+    """Return the luminance of colours (integers, or floats from 0 to 1): linear in glTF files, sRGB in others."""
     given = np.asarray(colours)
     values = given[:, :3].astype(np.float64) / (np.iinfo(given.dtype).max if given.dtype.kind in "iu" else 1.0)
     linear = values if kind in Y_UP else srgb_to_linear(values)

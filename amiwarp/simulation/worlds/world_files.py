@@ -20,7 +20,7 @@ from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
 from amiwarp.validation import one_of, real, shown
 
 FORMAT, VERSION = "amiwarp-world", 1
-"""Name and version that a world file begins with."""
+"""Values of the fields ``format`` and ``version``."""
 
 Made = TypeVar("Made")
 Vector = tuple[float, float, float]
@@ -29,7 +29,7 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class BodyEntry:
-    """One entry of ``bodies``; ``material`` and ``trajectory`` are read apart."""
+    """Fields of an entry of ``bodies``, except ``material`` and ``trajectory``."""
 
     name: str
     mesh: str
@@ -43,7 +43,7 @@ class BodyEntry:
 
 @dataclass(frozen=True)
 class MaterialEntry:
-    """What a world file says about a material; the rest is the mesh file's."""
+    """Fields of ``material``. None keeps the value of the mesh file."""
 
     reflectance: float | None = None
     texture: str | None = None
@@ -52,7 +52,7 @@ class MaterialEntry:
 
 @dataclass(frozen=True)
 class SkyEntry:
-    """What a world file says about the sky."""
+    """Fields of ``sky``."""
 
     luminance: float | None = None
     panorama: str | None = None
@@ -60,7 +60,7 @@ class SkyEntry:
 
 @dataclass(frozen=True)
 class PoseEntry:
-    """One key pose of a trajectory: ``rotation`` or ``look_at``, or neither."""
+    """Fields of a key pose. At most one of ``rotation`` and ``look_at`` is given."""
 
     t: float
     position: Vector
@@ -69,28 +69,27 @@ class PoseEntry:
 
 
 def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
-    """Read a world, and the camera's way through it, from a TOML or JSON file.
+    """Read a world and its camera trajectory from a TOML or JSON file.
 
-    Files that it names are sought from its own folder on. Mesh files need trimesh, as ``pip install amiwarp[worlds]``
-    installs it.
+    File names in it are relative to its folder. Mesh files need trimesh: ``pip install "amiwarp[worlds]"``.
 
     Parameters
     ----------
     path : str or Path
-        The world file; its suffix is ``.toml`` or ``.json``.
+        World file with the suffix ``.toml`` or ``.json``.
 
     Returns
     -------
     world : World
         Bodies, light and sky.
     trajectory : Trajectory or None
-        The camera's trajectory; None if the file has none.
+        Camera trajectory; None if the file has none.
 
     Raises
     ------
     AmiwarpError
-        If the file, or one that it names, cannot be read, or a field is missing, unknown or has a wrong value. The
-        message names the file and the field.
+        If the file or a file named in it cannot be read, or if a field is missing, unknown or has an invalid value.
+        The message names the file and the field.
 
     Examples
     --------
@@ -121,7 +120,7 @@ def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The file's fields."""
+    """Return the fields of the file."""
     kind = path.suffix.lower()
     if kind == ".json":
         data = read_json(path, "a world")
@@ -138,7 +137,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 class _Reader:
-    """Reads the parts of a world file; ``folder`` is where the files that it names are sought from."""
+    """Builds a world from the fields of a world file. File names in it are relative to ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -178,7 +177,7 @@ class _Reader:
         return read_picture(self._folder / name)
 
     def _bodies(self, data: Any, where: str) -> list[Body]:
-        """The bodies of one entry: one for each part of its mesh file."""
+        """Return the bodies of one entry: one for each part of its mesh file."""
         known = (*BodyEntry.__dataclass_fields__, "material", "trajectory")
         given = fields_of(data, where, "name", "mesh", optional=tuple(k for k in known if k not in ("name", "mesh")))
         plain = {key: value for key, value in given.items() if key not in ("material", "trajectory")}
@@ -210,7 +209,7 @@ class _Reader:
             for name in ("position", "rotation"):
                 if name in given:
                     raise AmiwarpError(
-                        f"field {where}.{name} goes with no trajectory; put the pose into the trajectory"
+                        f"field {where}.{name} cannot be combined with a trajectory; put the pose into the trajectory"
                     )
             return self._trajectory(given["trajectory"], f"{where}.trajectory")
         if entry.position is None and entry.rotation is None:
@@ -219,7 +218,7 @@ class _Reader:
         return _at(where, lambda: Trajectory.still(position, rotation=rotation))
 
     def _trajectory(self, data: Any, where: str) -> Trajectory:
-        """A trajectory from the name of a CSV or TUM file, or from a list of key poses."""
+        """Return a trajectory from the name of a CSV or TUM file, or from a list of key poses."""
         if isinstance(data, str):
             note_input(self._folder / data)
             return _at(where, lambda: Trajectory.from_file(self._folder / data))
@@ -233,7 +232,7 @@ class _Reader:
 
 
 def _at(where: str, make: Callable[[], Made]) -> Made:
-    """The result of ``make``; an error of it names the field."""
+    """Return the result of ``make``, and add the field to the message of an :class:`AmiwarpError`."""
     try:
         return make()
     except AmiwarpError as error:
@@ -248,14 +247,14 @@ def _text(value: Any, where: str) -> str:
 
 
 def _entries(value: Any, where: str, expected: str = "a list") -> list[tuple[str, Any]]:
-    """The entries of a list, each with its place for messages."""
+    """Return the entries of a list, each with its field name for messages."""
     if not isinstance(value, list):
         raise AmiwarpError(f"field {where} is {shown(value)}; expected {expected}")
     return [(f"{where}[{k}]", entry) for k, entry in enumerate(value)]
 
 
 def _rotation(pose: PoseEntry, where: str) -> Any:
-    """The quaternion of a key pose."""
+    """Return the quaternion of a key pose."""
     if pose.look_at is None:
         return pose.rotation or (0.0, 0.0, 0.0, 1.0)
     if pose.rotation is not None:
@@ -264,17 +263,19 @@ def _rotation(pose: PoseEntry, where: str) -> Any:
 
 
 def _part_names(name: str, parts: list[LoadedMesh]) -> list[str]:
-    """Names of bodies: the entry's, followed by the part's if there are several."""
+    """Return the names of the bodies of an entry: ``name``, or ``name/part`` if the mesh file has several parts."""
     if len(parts) == 1:
         return [name]
     return [f"{name}/{part.name}" for part in parts]
 
 
 def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) -> Material:
-    """The part's own material with what the world file says instead."""
+    """Return the material of the mesh file, with the fields of the world file in its place."""
     own = part.material
     if texture is not None and part.mesh.uv is None:
-        raise AmiwarpError(f"field {where}.material.texture needs texture coordinates, which the mesh has not")
+        raise AmiwarpError(
+            f"field {where}.material.texture needs texture coordinates, but the mesh has none; add them to the mesh file"
+        )
     reflectance = own.reflectance if texture is None else 1.0
     return Material(
         reflectance if entry.reflectance is None else entry.reflectance,

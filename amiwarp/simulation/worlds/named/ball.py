@@ -1,4 +1,4 @@
-"""A ball thrown across the room, that bounces off its floor and walls."""
+"""The world ``ball``: a ball that is thrown across the room and bounces off the floor and the ends of its path."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from amiwarp.simulation.worlds.scene import World
 from amiwarp.simulation.worlds.trajectory import Trajectory
 
 VIEW = room.VIEW
-"""The camera of the room."""
+"""Camera pose: that of the world ``room``."""
 RADIUS = 0.12
-"""Of the ball [m]."""
+"""Radius of the ball [m]."""
 GRAVITY = 9.81
-"""Acceleration of falling [m/s²]."""
+"""Acceleration of free fall [m/s²]."""
 START = (-1.25, 1.0)
-"""Distance along its way and height when it is thrown [m]."""
+"""Start of the throw: distance along the path from its middle, and height [m]."""
 THROWN = (2.6, 3.9)
-"""Velocity along its way and upwards when it is thrown [m/s]."""
+"""Initial velocity: along the path, and upwards [m/s]."""
 LENGTH = 1.55
-"""The way reaches so far both ways from its middle [m]."""
-MIDDLE, WAY = (-0.15, -0.15), (math.sqrt(0.5), -math.sqrt(0.5))
-"""Middle of the way on the floor [m], and its direction."""
+"""Half the length of the path on the floor [m]; the ball bounces at both ends."""
+MIDDLE, DIRECTION = (-0.15, -0.15), (math.sqrt(0.5), -math.sqrt(0.5))
+"""Middle of the path on the floor (x, y) [m], and its direction (unit vector)."""
 BOUNCE = 0.8
-"""Share of the speed that a bounce leaves."""
+"""Fraction of the speed that remains after a bounce."""
 STEP_S = 0.002
-"""Time between two poses [s]."""
+"""Longest time between two poses [s]."""
 SPIN = 5.0
-"""Angular velocity about an upright axis and about the way [rad/s]."""
+"""Angular velocity about the path [rad/s]; about the vertical axis it is 0.6 of that."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
-    """Return the room with the ball."""
+    """Return the room and the ball."""
     ball = parts.solid(
         "ball",
         shapes.ellipsoid((RADIUS,) * 3, sides=40, rings=20),
@@ -46,17 +46,17 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def thrown(duration_s: float) -> Trajectory:
-    """Return the poses of the ball."""
+    """Return the trajectory of the ball."""
     from scipy.spatial.transform import Rotation
 
     t, along, height = flight(duration_s)
-    position = np.column_stack([MIDDLE[0] + along * WAY[0], MIDDLE[1] + along * WAY[1], height])
-    turn = np.outer(t, (SPIN * WAY[0], SPIN * WAY[1], 0.6 * SPIN))
+    position = np.column_stack([MIDDLE[0] + along * DIRECTION[0], MIDDLE[1] + along * DIRECTION[1], height])
+    turn = np.outer(t, (SPIN * DIRECTION[0], SPIN * DIRECTION[1], 0.6 * SPIN))
     return Trajectory(t, position, Rotation.from_rotvec(turn).as_quat())
 
 
 def flight(duration_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return times [s], distances along the way and heights [m]: parabolas between bounces."""
+    """Return times [s], distances along the path [m] and heights [m]: parabolas between bounces."""
     t = np.linspace(0.0, duration_s, max(4, math.ceil(duration_s / STEP_S) + 1))
     step = float(t[1])
     s, z = START

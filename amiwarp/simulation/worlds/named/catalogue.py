@@ -19,12 +19,12 @@ LONGEST_S = 3600.0
 
 @dataclass(frozen=True)
 class NamedWorld:
-    """How a named world is made, and where its camera stands."""
+    """Builder and camera position of a named world."""
 
     build: Callable[[np.random.Generator, float], World]
-    """Returns the world for a random generator and the length of the recording [s]."""
+    """Function that returns the world for a random generator and a duration [s]."""
     view: Viewpoint
-    """Where the camera stands."""
+    """Position and viewing direction of the camera."""
 
 
 NAMED = {
@@ -35,7 +35,7 @@ NAMED = {
     "ball": NamedWorld(ball.build, ball.VIEW),
     "person": NamedWorld(person.build, person.VIEW),
 }
-"""All named worlds."""
+"""Named worlds by name."""
 WORLDS = tuple(NAMED)
 """Names of the worlds."""
 
@@ -43,7 +43,9 @@ WORLDS = tuple(NAMED)
 def named_world(
     name: str, trajectory: str = "handheld", *, seed: int = 0, duration_s: float = 1.0
 ) -> tuple[World, Trajectory]:
-    """Make one of the named worlds, and a way of the camera through it.
+    """Return a built-in world and a camera trajectory through it.
+
+    The worlds are generated from a seed and need no files.
 
     Parameters
     ----------
@@ -51,19 +53,19 @@ def named_world(
         ``room`` (furniture, pictures, gratings in all directions), ``desk``, ``corridor``, ``street`` (a small town),
         ``ball`` (a ball thrown across the room) or ``person`` (a walking figure, whose joints are ``World.joints``).
     trajectory : str
-        How the camera moves: ``still``, ``handheld`` (it sways by about 1.5 cm and 1.5 deg, below 3 Hz; it walks in
-        the corridor and the street) or ``fast`` (ten times the speed).
+        Camera motion: ``still``, ``handheld`` (smooth random motion below 3 Hz, about 1.5 cm and 1.5 deg in amplitude;
+        in the corridor and the street the camera also walks forward) or ``fast`` (about ten times the speed).
     seed : int
-        Seed of textures, shapes and camera motion. Equal seeds give equal worlds, whatever the trajectory.
+        Seed of textures, shapes and camera motion. A seed gives the same world with every trajectory.
     duration_s : float
-        Length of the recording [s]; bodies and camera rest after it.
+        Length of the trajectories [s]. After it nothing moves.
 
     Returns
     -------
     world : World
         Bodies, light and sky; 2,000 to 100,000 triangles.
     trajectory : Trajectory
-        The camera's pose over time. The camera passes through no body.
+        Camera poses. The camera never passes through a body.
 
     Raises
     ------
@@ -85,5 +87,5 @@ def named_world(
     duration_s = real(duration_s, "duration_s", 1e-3, LONGEST_S, " s")
     made = NAMED[name]
     world = made.build(np.random.default_rng([seed, WORLDS.index(name)]), duration_s)
-    way = camera_trajectory(made.view, trajectory, duration_s, np.random.default_rng([seed, len(WORLDS)]))
-    return world, way
+    camera = camera_trajectory(made.view, trajectory, duration_s, np.random.default_rng([seed, len(WORLDS)]))
+    return world, camera

@@ -1,4 +1,4 @@
-"""A long corridor: doors, notices, pillars, pipes and lights that repeat into the distance."""
+"""The world ``corridor``: doors, notices, pillars, pipes and lights that repeat into the distance."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from amiwarp.simulation.worlds.scene import Body, Lamp, World
 SIZE = (36.0, 2.6, 2.7)
 """Length, width and height [m]; the corridor lies along x."""
 BAY = 4.0
-"""Length of a part that repeats [m]."""
+"""Length of a section [m]."""
 BAYS = tuple(float(x) for x in np.arange(-14.0, 15.0, BAY))
-"""Middles of these parts along x [m]."""
+"""Centres of the sections along x [m]."""
 VIEW = Viewpoint((-6.0, -0.1, 1.55), (4.0, 0.15, 1.3), walk_m=(7.0, 0.0, 0.0))
-"""The camera walks along the corridor's middle."""
+"""Camera pose: in the middle of the corridor, along which the camera walks."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
@@ -41,7 +41,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def _bay(rng: np.random.Generator, k: int, x: float) -> list[Body]:
-    """A light, two pillars and pictures of one part."""
+    """Return the light, pillars and pictures of one section."""
     y, z = SIZE[1] / 2.0, SIZE[2]
     light = shapes.box((1.2, 0.3, 0.05), (x, 0.0, z - 0.026))
     north, south = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)
@@ -58,13 +58,13 @@ def _bay(rng: np.random.Generator, k: int, x: float) -> list[Body]:
         *parts.picture(f"picture {k}", (x + 1.1, y, 1.5), north, art, 0.7, 0.8),
         *parts.picture(f"notice {k}", (x + 0.6, -y, 1.5), south, textures.text_page(rng), 0.5, 0.68),
     ]
-    if k % 2 == 0:  # the other parts have a door there
+    if k % 2 == 0:  # other sections have a door there
         bodies += parts.grating_strip(f"grating {k}", (x + 0.1, -y, 1.35), south, count=6, side=0.28, cycles=5.0)
     return bodies
 
 
 def _door(leaf: textures.Texture, k: int, x: float) -> list[Body]:
-    """A door with frame and handle; the doors alternate between the sides."""
+    """Return a door with frame and handle. Doors alternate between the two sides."""
     side = 1.0 if k % 2 == 0 else -1.0
     at, y = x - 0.75 if side > 0 else x - 1.3, side * SIZE[1] / 2.0
     bars = [shapes.standing_box((0.09, 0.12, 2.15), (at + a * 0.52, y, 0.0), tile_m=0.7) for a in (-1, 1)]
@@ -85,7 +85,7 @@ def _door(leaf: textures.Texture, k: int, x: float) -> list[Body]:
 
 
 def _pipes(rng: np.random.Generator) -> list[Body]:
-    """Pipes under the ceiling, with joints, and a handrail."""
+    """Return pipes with joints under the ceiling, and handrails."""
     bodies = []
     for k, (y, z, radius) in enumerate(((1.1, 2.5, 0.06), (0.94, 2.56, 0.04), (-1.12, 2.45, 0.08))):
         pipe = [shapes.cylinder(radius, SIZE[0], sides=16, tile_m=0.4)]
@@ -103,7 +103,7 @@ def _pipes(rng: np.random.Generator) -> list[Body]:
 
 
 def _things(rng: np.random.Generator) -> list[Body]:
-    """Benches, bins, boxes and fire extinguishers along the walls."""
+    """Return benches, bins, boxes and fire extinguishers along the walls."""
     bodies = []
     bin_profile = [(0.0, 0.0), (0.14, 0.0), (0.18, 0.5), (0.17, 0.5), (0.13, 0.03), (0.0, 0.03)]
     bottle = [(0.0, 0.0), (0.08, 0.0), (0.08, 0.38), (0.05, 0.45), (0.02, 0.48), (0.02, 0.54), (0.0, 0.54)]

@@ -1,4 +1,4 @@
-"""A desk seen from the chair: a screen, a keyboard, printed pages, books, pens and a mug."""
+"""The world ``desk``, seen from the chair: a screen, a keyboard, printed pages, books, pens and a mug."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from amiwarp.simulation.worlds.named.motion import Viewpoint
 from amiwarp.simulation.worlds.scene import Body, Lamp, World
 
 VIEW = Viewpoint((0.05, -0.62, 0.52), (0.0, 0.16, 0.1))
-"""The camera is where the head of a person is who sits at the desk; the desk's top is z = 0."""
+"""Camera pose: at the head of a person who sits at the desk. The top of the desk is z = 0."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
@@ -28,7 +28,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def _screen(rng: np.random.Generator) -> list[Body]:
-    """A screen on a foot, that shows a page of text."""
+    """Return a screen on a stand. It shows a page of text."""
     frame = shapes.merged([
         shapes.box((0.56, 0.03, 0.34), (0.0, 0.5, 0.31), tile_m=0.3),
         shapes.standing_box((0.05, 0.03, 0.16), (0.0, 0.52, 0.0), tile_m=0.3),
@@ -43,7 +43,7 @@ def _screen(rng: np.random.Generator) -> list[Body]:
 
 
 def _keyboard(rng: np.random.Generator) -> list[Body]:
-    """A keyboard of separate keys."""
+    """Return a keyboard with separate keys."""
     keys = []
     for row in range(5):
         at = -0.2
@@ -74,7 +74,7 @@ def _papers(rng: np.random.Generator) -> list[Body]:
 
 
 def _books(rng: np.random.Generator) -> list[Body]:
-    """A stack that lies, and a row that stands."""
+    """Return a stack of books and a row of upright books."""
     bodies, z = [], 0.0
     for k in range(4):
         thick = float(rng.uniform(0.018, 0.04))
@@ -97,7 +97,7 @@ def _books(rng: np.random.Generator) -> list[Body]:
 
 
 def _small(rng: np.random.Generator) -> list[Body]:
-    """A mug with pens, a bowl, a ball, a ruler and a lamp."""
+    """Return a mug with pens, a bowl, a ball and a lamp."""
     mug = [(0.0, 0.0), (0.035, 0.0), (0.041, 0.02), (0.041, 0.1), (0.036, 0.1), (0.035, 0.02), (0.0, 0.015)]
     bowl = [(0.0, 0.0), (0.04, 0.0), (0.085, 0.05), (0.08, 0.05), (0.035, 0.01), (0.0, 0.008)]
     pen = shapes.cylinder(0.004, 0.16, sides=12, tile_m=0.03)
@@ -128,7 +128,7 @@ def _small(rng: np.random.Generator) -> list[Body]:
 
 
 def _gauges(rng: np.random.Generator) -> list[Body]:
-    """Cards with gratings, a star and a checkerboard, and a cube."""
+    """Return gratings, a Siemens star, a checkerboard card, a cube and a ruler."""
     cube = shapes.moved(shapes.standing_box((0.07, 0.07, 0.07)), (-0.36, 0.33, 0.0), turn_deg=30)
     ruler = shapes.moved(shapes.standing_box((0.3, 0.025, 0.003), tile_m=0.025), (0.02, -0.15, 0.0), turn_deg=4)
     ticks = np.full((64, 64), 0.75)

@@ -1,4 +1,4 @@
-"""Walking: the joints of a figure, each turned against the one before it, over the phase of the stride."""
+"""Gait of the walking figure: a hierarchy of joints whose angles depend on the phase of the stride."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from amiwarp.simulation.worlds.scene import Mesh
 from amiwarp.simulation.worlds.trajectory import Trajectory
 
 SPEED = 1.25
-"""Speed of walking [m/s]."""
+"""Walking speed [m/s]."""
 STRIDES_HZ = 0.92
 """Strides (two steps) per second."""
 CIRCLE_M = 1.6
-"""Radius of the circle that the figure walks on [m]; its middle is at y = 0.8 m."""
+"""Radius of the circular path [m]. Its centre is at x = 0, y = 0.8 m."""
 RATE_HZ = 200.0
 """Poses per second."""
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.44, 0.42, 0.29, 0.26
@@ -62,7 +62,7 @@ def walk(duration_s: float) -> dict[str, Trajectory]:
     """Return the trajectories of all joints and limbs by name."""
     t = np.linspace(0.0, duration_s, max(4, round(duration_s * RATE_HZ) + 1))
     phase = 2.0 * np.pi * STRIDES_HZ * t
-    path = SPEED * t / CIRCLE_M - np.pi / 2.0 - 0.45  # angle on the circle; it starts left of the camera's view
+    path = SPEED * t / CIRCLE_M - np.pi / 2.0 - 0.45  # angle on the circle, from the left of the camera's view
     heading = _about((0, 0, 1), path + np.pi / 2.0)
     ground = np.column_stack([CIRCLE_M * np.cos(path), 0.8 + CIRCLE_M * np.sin(path), np.zeros(len(t))])
     root = (heading * _about((0, 0, 1), 0.08 * np.sin(phase)), ground)
@@ -78,15 +78,16 @@ def _about(axis: tuple[int, int, int], angle: NDArray[np.float64]) -> Any:
 
 
 def _child(parent: Places, offset: tuple[float, float, float], turn: Any) -> Places:
-    """A joint at ``offset`` in its parent's frame, turned against it."""
+    """Return the pose of a joint at ``offset`` in its parent's frame, rotated by ``turn`` relative to it."""
     rotation, position = parent
     return rotation * turn, position + rotation.apply(offset)
 
 
 def _legs(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
-    """Hips swing forward and back; a knee bends while its leg swings forward; the foot stays nearly level.
+    """Return the poses of pelvis, hips, knees and ankles, and of the limbs below them.
 
-    The curves are fitted so that the foot on the floor slides least; their ranges are those of human walking.
+    The knee bends while its leg swings forward, and the foot stays nearly level. The coefficients minimise the sliding
+    of the standing foot. The angles stay within the range of human walking.
     """
     out = {"pelvis": root}
     for side, y, shift in (("left", HIP, 0.0), ("right", -HIP, np.pi)):
@@ -102,7 +103,7 @@ def _legs(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
 
 
 def _upper(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
-    """The trunk leans forward a little and turns against the hips; each arm swings with the leg of the other side."""
+    """Return the poses of trunk, neck, head and arms. Each arm swings with the leg of the other side."""
     trunk = _child(root, (0, 0, 0.06), _about((0, 0, 1), -0.2 * np.sin(phase)) * _about((0, 1, 0), 0.05 + 0 * phase))
     neck = _child(trunk, (0, 0, SPINE + 0.08), _about((0, 0, 1), 0.12 * np.sin(phase)))
     head = _child(neck, (0.015, 0, 0.2), _about((0, 1, 0), -0.05 + 0.02 * np.sin(2.0 * phase)))

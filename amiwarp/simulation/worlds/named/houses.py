@@ -11,24 +11,24 @@ from amiwarp.simulation.worlds.scene import Body, Mesh
 STOREY = 3.1
 """Height of a storey [m]."""
 TEXELS = 24
-"""Texels per metre of a front."""
+"""Texels per metre of a façade."""
 WINDOW = (1.1, 1.6)
 """Width and height of a window [m]."""
 SPACING = 2.1
-"""Least distance between the middles of two windows [m]."""
+"""Least distance between the centres of two windows [m]."""
 
 
 def house(
     rng: np.random.Generator, name: str, place: tuple[float, float], width: float, depth: float, storeys: int
 ) -> list[Body]:
-    """Return a house behind its front, seen from y = 0; ``place`` is the middle of the front (x, y) [m]."""
+    """Return a house whose front faces y = 0; ``place`` is the middle of the front (x, y) [m]."""
     away = 1.0 if place[1] > 0 else -1.0
     height = STOREY * storeys + 0.4
     middle = (place[0], place[1] + away * depth / 2.0, 0.1)
     walls = shapes.standing_box((width, depth, height), middle)
     roof_foot = (middle[0], middle[1], 0.1 + height)
     if rng.uniform() < 0.6:
-        roof = shapes.ramp((width, depth + 0.8, float(rng.uniform(2.0, 3.6))), roof_foot, tile_m=3.0)
+        roof = shapes.gable_roof((width, depth + 0.8, float(rng.uniform(2.0, 3.6))), roof_foot, tile_m=3.0)
     else:
         roof = shapes.standing_box((width, depth, 0.5), roof_foot, tile_m=3.0)
     chimney = shapes.standing_box(
@@ -47,13 +47,13 @@ def house(
 
 
 def window_columns(width: float) -> NDArray[np.float64]:
-    """Return the distances of the windows' middles from the left end of a front [m]."""
+    """Return the distances of the window centres from the left end of a façade [m]."""
     count = max(2, int(width / SPACING))
     return (np.arange(count) + 0.5) * width / count
 
 
 def _trim(x: float, y: float, away: float, width: float, storeys: int) -> list[Mesh]:
-    """Sills and lintels of the windows, cornices, and a step before the door."""
+    """Return window sills, lintels, cornices and the doorstep."""
     meshes = []
     for storey in range(storeys):
         base = 0.1 + STOREY * storey
@@ -75,7 +75,7 @@ def _trim(x: float, y: float, away: float, width: float, storeys: int) -> list[M
 
 
 def front(rng: np.random.Generator, width: float, storeys: int) -> textures.Texture:
-    """Return the front of a house: a wall with windows in each storey, and a door under the first window."""
+    """Return the texture of a façade: windows in each storey, and a door at the left of the ground floor."""
     rows, columns = round((STOREY * storeys + 0.4) * TEXELS), round(width * TEXELS)
     wall = float(rng.uniform(0.2, 0.7))
     if rng.uniform() < 0.5:
@@ -96,7 +96,7 @@ def front(rng: np.random.Generator, width: float, storeys: int) -> textures.Text
 
 
 def _window(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left: int) -> None:
-    """Draw a frame, dark panes with a gleam, and sometimes curtains or a lit room."""
+    """Draw a window: frame, dark panes with a reflection, and sometimes curtains or a lit room."""
     wide, high = round(WINDOW[0] * TEXELS), round(WINDOW[1] * TEXELS)
     pane = values[foot - high : foot, left : left + wide]
     glass = float(rng.choice([0.04, 0.06, 0.1, 0.55], p=[0.35, 0.3, 0.2, 0.15]))
@@ -112,6 +112,7 @@ def _window(rng: np.random.Generator, values: NDArray[np.float64], foot: int, le
 
 
 def _door(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left: int) -> None:
+    """Draw a door with four panels."""
     wide, high = round(WINDOW[0] * TEXELS), round(2.4 * TEXELS)
     leaf = values[foot - high : foot, left : left + wide]
     shade = float(rng.uniform(0.05, 0.5))
@@ -123,7 +124,7 @@ def _door(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left
 
 
 def town_hall(rng: np.random.Generator, x: float) -> list[Body]:
-    """Return a hall that closes the street at ``x`` [m], with a tower, a clock and a spire."""
+    """Return a town hall with tower, clock and spire across the end of the street at ``x`` [m]."""
     wide, high = 26.0, 13.0
     hall = shapes.standing_box((12.0, wide, high), (x + 6.0, 0.0, 0.0))
     tower = shapes.standing_box((5.0, 5.0, 24.0), (x, 0.0, 0.0))
@@ -134,7 +135,7 @@ def town_hall(rng: np.random.Generator, x: float) -> list[Body]:
         if abs(y) > 2.0
     ]
     clock = shapes.panel((x - 2.52, 1.6, 18.0), (0.0, -3.2, 0.0), (0.0, 0.0, 3.2))
-    roof = shapes.moved(shapes.ramp((wide, 13.0, 5.0), tile_m=3.0), (x + 6.0, 0.0, high), turn_deg=90.0)
+    roof = shapes.moved(shapes.gable_roof((wide, 13.0, 5.0), tile_m=3.0), (x + 6.0, 0.0, high), turn_deg=90.0)
     surfaces = {
         "": (hall, front(rng, wide, 4)),
         " tower": (tower, front(rng, 6.0, 7)),

@@ -1,4 +1,4 @@
-"""How the cameras of the named worlds move: at rest, in a hand, and fast."""
+"""Camera trajectories of the named worlds: still, handheld and fast."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
 TRAJECTORIES = ("still", "handheld", "fast")
 """Kinds of camera trajectories."""
 RATE_HZ = 100.0
-"""Poses per second of the trajectories."""
+"""Poses per second."""
 SHAKE_M = 0.015
-"""Amplitude of the hand's sway [m]."""
+"""Approximate amplitude of the handheld translation [m]."""
 SHAKE_DEG = 1.5
-"""Amplitude of the hand's turns [deg]."""
+"""Approximate amplitude of the handheld rotation [deg]."""
 SWAY_HZ = (0.15, 0.55)
-"""Frequencies of the hand's slow sway [1/s]."""
+"""Frequency range of the slow sway [Hz]."""
 TREMOR_HZ = (1.5, 2.8)
-"""Frequencies of its tremor [1/s], each of an amplitude of 0.03."""
+"""Frequency range of the tremor [Hz]; its relative amplitude is 0.03 per sine."""
 FAST_RATE, FAST_REACH = 4.0, 2.5
-"""Factors of frequency and amplitude of a fast trajectory: ten times the speed."""
+"""Factors of frequency and amplitude for fast trajectories; together ten times the speed."""
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where a camera stands, and how far it walks."""
+    """Mean pose of a camera, and the distance that it walks."""
 
     position: tuple[float, float, float]
-    """Middle of its positions [m]."""
+    """Mean position [m]."""
     target: tuple[float, float, float]
-    """Point that it looks at [m]."""
+    """Point that the camera looks at [m]."""
     walk_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Half of the way that a moving camera goes to and fro along [m]."""
+    """Vector from the mean position to the end of the path that a moving camera walks to and fro [m]."""
     walk_speed: float = 1.2
-    """Largest speed on this way [m/s], ten times as much for fast trajectories."""
+    """Largest walking speed [m/s]; fast trajectories have ten times as much."""
 
 
 def camera_trajectory(view: Viewpoint, kind: str, duration_s: float, rng: np.random.Generator) -> Trajectory:
-    """Return the poses of a camera for a kind of trajectory."""
+    """Return the camera trajectory of a kind, one of :data:`TRAJECTORIES`."""
     from scipy.spatial.transform import Rotation
 
     base = looking_at(view.position, view.target)
@@ -55,7 +55,7 @@ def camera_trajectory(view: Viewpoint, kind: str, duration_s: float, rng: np.ran
 
 
 def shake(t: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return a smooth random motion of three axes, about 1 in amplitude: four sines of sway and two of tremor each."""
+    """Return smooth random motion along three axes, shape ``(n, 3)``, of amplitude about 1: a sum of six sines each."""
     low, high = SWAY_HZ
     frequency = np.concatenate([low + (high - low) * (np.arange(4)[:, None] + rng.uniform(size=(4, 3))) / 4.0,
                                 rng.uniform(*TREMOR_HZ, (2, 3))])  # fmt: skip
@@ -66,9 +66,9 @@ def shake(t: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float6
 
 
 def walk(view: Viewpoint, factor: float, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements to and fro along ``view.walk_m``, fastest at time 0, which is in the middle [m]."""
-    way = np.asarray(view.walk_m)
-    length = float(np.linalg.norm(way))
+    """Return displacements [m] along ``view.walk_m``, shape ``(n, 3)``: a sine, so the speed is largest at time 0."""
+    end = np.asarray(view.walk_m)
+    length = float(np.linalg.norm(end))
     if not length > 0.0:
         return np.zeros((len(t), 3))
-    return np.asarray(np.sin(factor * view.walk_speed * t / length)[:, None] * way)
+    return np.asarray(np.sin(factor * view.walk_speed * t / length)[:, None] * end)

@@ -1,4 +1,4 @@
-"""Things that several named worlds hold: walls, tables, pictures, vessels."""
+"""Bodies that several named worlds share: walls, tables, chairs, pictures, vessels."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def solid(
     name: str, mesh: Mesh, texture: Texture | None, category: str, *, instance: str | None = None,
     trajectory: Trajectory | None = None, emission: float = 0.0,
 ) -> Body:  # fmt: skip
-    """Return a body whose texture holds its reflectances."""
+    """Return a body whose texture gives its reflectance; without a texture it is 0.5."""
     material = Material(1.0 if texture is not None else 0.5, texture, emission)
     return Body(name, mesh, material, trajectory, category, instance)
 
 
 def hall(size: Sequence[float], walls: Sequence[Texture], floor: Texture, ceiling: Texture) -> list[Body]:
-    """Return floor, ceiling and four walls of a hall of ``size`` (x, y, z) [m] about the z axis, on z = 0."""
+    """Return floor, ceiling and four walls of a hall of ``size`` (x, y, z) [m], its floor at z = 0, centred on the z axis."""
     x, y, z = size[0] / 2.0, size[1] / 2.0, size[2]
     sides = {
         "north": ((-x, y, 0), (2 * x, 0, 0)),
@@ -50,7 +50,7 @@ def hall(size: Sequence[float], walls: Sequence[Texture], floor: Texture, ceilin
 def picture(
     name: str, centre: Sequence[float], right: Sequence[float], texture: Texture, width: float, height: float
 ) -> list[Body]:
-    """Return a picture on a wall, of ``width`` x ``height`` [m], and its frame; ``right`` is along the wall."""
+    """Return a picture of ``width`` x ``height`` [m] on a wall, and its frame; ``right`` is a unit vector along it."""
     r = np.asarray(right, np.float64)
     out = np.cross(r, (0.0, 0.0, 1.0))
     middle = np.asarray(centre, np.float64)
@@ -67,7 +67,7 @@ def picture(
 
 
 def _bar(right: Any, out: Any, size: Sequence[float], centre: Any) -> Mesh:
-    """A box whose x lies along ``right`` and y along ``out``."""
+    """Return a box whose x axis lies along ``right`` and whose y axis lies along ``out``."""
     mesh = shapes.box(size)
     axes = np.stack([right, out, np.array((0.0, 0.0, 1.0))])
     return Mesh(np.asarray(mesh.vertices) @ axes + centre + 0.015 * out, mesh.faces, mesh.uv)
@@ -100,7 +100,7 @@ def vessel(
     *,
     tile_m: float = 0.25,
 ) -> Body:
-    """Return a turned vessel, its profile rounded by a spline through the given points."""
+    """Return a vessel of revolution whose profile (radius, height) [m] is smoothed by a spline."""
     from scipy.interpolate import PchipInterpolator
 
     points = np.asarray(profile, np.float64)
@@ -113,7 +113,7 @@ def vessel(
 def grating_strip(
     name: str, corner: Sequence[float], right: Sequence[float], *, count: int, side: float, cycles: float
 ) -> list[Body]:
-    """Return square gratings in a row along a wall, their directions evenly spread over all; lower left ``corner``."""
+    """Return a row of square gratings along a wall, with evenly spaced directions; ``corner`` is its lower left end."""
     r = np.asarray(right, np.float64)
     out = 0.01 * np.cross(r, (0.0, 0.0, 1.0))
     bodies = []

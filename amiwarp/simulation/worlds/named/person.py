@@ -1,4 +1,4 @@
-"""A figure of capsules that walks round in a hall."""
+"""The world ``person``: a figure of capsules and ellipsoids that walks in a circle in a hall."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 SIZE = (9.0, 8.0, 3.2)
 """Length, width and height of the hall [m]."""
 VIEW = Viewpoint((0.3, -3.4, 1.35), (0.05, 0.0, 1.0))
-"""The camera stands at a wall; the figure first walks across its view from left to right."""
+"""Camera pose: near a wall. The figure first crosses the view from left to right."""
 LAMPS = (Lamp((-1.5, -1.5, 3.0), 4.5, shadows=True), Lamp((2.5, 1.5, 2.9), 3.0))
-"""Two lamps at the ceiling; the first casts shadows."""
+"""Two lamps near the ceiling; the first casts shadows."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
@@ -37,7 +37,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def _hall(rng: np.random.Generator) -> list[Body]:
-    """Pictures, columns and benches along the walls, outside of the figure's circle."""
+    """Return what stands in the hall, clear of the figure's path."""
     north, y = (1.0, 0.0, 0.0), SIZE[1] / 2.0
     columns = [
         shapes.moved(shapes.cylinder(0.18, SIZE[2], sides=32, tile_m=0.6), (x, 3.3, 0)) for x in (-3.3, -1.1, 1.1, 3.3)
@@ -66,7 +66,7 @@ def _hall(rng: np.random.Generator) -> list[Body]:
 
 
 def _figure(rng: np.random.Generator, poses: dict[str, Trajectory]) -> list[Body]:
-    """The limbs, each with the trajectory of its upper joint."""
+    """Return the limbs. Each has the trajectory of its upper joint."""
     skin = textures.plaster(rng, 0.42, 0.25, size=256)
     trousers = textures.plaster(rng, 0.16, 0.45, size=256)
     shirt, shoe = textures.plaid(rng, stripes=12), textures.plaster(rng, 0.07, 0.4, size=128)

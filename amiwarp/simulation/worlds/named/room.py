@@ -1,4 +1,4 @@
-"""A furnished room: textured walls, gratings in all directions, printed pages, a table, shelves and a sofa."""
+"""The world ``room``: textured walls, gratings in all directions, printed pages, a table, shelves and a sofa."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from amiwarp.simulation.worlds.scene import Body, Lamp, Mesh, World
 SIZE = (5.2, 4.4, 2.6)
 """Length, width and height [m]."""
 VIEW = Viewpoint((-2.1, -1.55, 1.5), (1.0, 1.0, 0.95))
-"""The camera stands in one corner and looks towards the opposite one."""
+"""Camera pose: in one corner, towards the opposite one."""
 LAMPS = (Lamp((-0.3, 0.2, 2.35), 2.0, shadows=True), Lamp((-1.9, -1.7, 2.2), 0.9))
-"""One lamp at the ceiling, and a weaker one behind the camera."""
+"""A lamp near the ceiling, which casts shadows, and a weaker one behind the camera."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
@@ -22,13 +22,14 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def furniture(rng: np.random.Generator) -> list[Body]:
-    """Return the room's bodies. A strip from (-1.8, 1.5) to (1.5, -1.8) [m] on its floor stays free."""
+    """Return the bodies of the room. The ball's path, from (-1.8, 1.5) to (1.5, -1.8) [m] on the floor, is clear."""
     walls = [textures.plaster(rng, mean, 0.45) for mean in (0.45, 0.55, 0.4, 0.5)]
     bodies = parts.hall(SIZE, walls, textures.wood(rng, mean=0.28), textures.tiles(rng, mean=0.7, joint=0.3, count=4))
     return [*bodies, *_pictures(rng), *_shelves(rng), *_table(rng), *_sofa(rng), *_small(rng)]
 
 
 def _pictures(rng: np.random.Generator) -> list[Body]:
+    """Return gratings and pictures on two walls."""
     north, east = (1.0, 0.0, 0.0), (0.0, -1.0, 0.0)
     x, y = SIZE[0] / 2.0, SIZE[1] / 2.0
     return [
@@ -42,7 +43,7 @@ def _pictures(rng: np.random.Generator) -> list[Body]:
 
 
 def _shelves(rng: np.random.Generator) -> list[Body]:
-    """A bookcase against the eastern wall."""
+    """Return a bookcase with books against the eastern wall."""
     depth, width, height = 0.32, 1.3, 2.1
     x, y = SIZE[0] / 2.0 - depth / 2.0 - 0.03, 0.95
     boards = [shapes.standing_box((depth, 0.03, height), (x, y + a * width / 2.0, 0), tile_m=0.8) for a in (-1, 1)]
@@ -56,7 +57,7 @@ def _shelves(rng: np.random.Generator) -> list[Body]:
 
 
 def _books(rng: np.random.Generator, middle: tuple[float, float, float], width: float) -> Mesh:
-    """A row of books along y; each shows another part of the texture."""
+    """Return a row of books along y. Each shows another part of the texture."""
     books, at = [], -width / 2.0 + 0.03
     while at < width / 2.0 - 0.1:
         thick, tall, deep = rng.uniform(0.02, 0.06), rng.uniform(0.2, 0.33), rng.uniform(0.18, 0.24)
@@ -69,7 +70,7 @@ def _books(rng: np.random.Generator, middle: tuple[float, float, float], width: 
 
 
 def _table(rng: np.random.Generator) -> list[Body]:
-    """A table with vessels and a stack of books, and two chairs."""
+    """Return a table with vessels, books and a globe, and two chairs."""
     x, y, z = 1.15, 0.35, 0.74
     cup = [(0.0, 0.0), (0.03, 0.0), (0.042, 0.03), (0.04, 0.09), (0.036, 0.09), (0.03, 0.02), (0.0, 0.015)]
     vase = [(0.0, 0.0), (0.06, 0.0), (0.11, 0.12), (0.05, 0.26), (0.07, 0.33), (0.06, 0.33), (0.03, 0.25)]
@@ -97,7 +98,7 @@ def _table(rng: np.random.Generator) -> list[Body]:
 
 
 def _sofa(rng: np.random.Generator) -> list[Body]:
-    """A sofa against the northern wall, with cushions."""
+    """Return a sofa with cushions against the northern wall."""
     x, y = -0.35, SIZE[1] / 2.0 - 0.45
     frame = [
         shapes.standing_box((1.7, 0.8, 0.25), (x, y, 0.1), tile_m=0.5),
@@ -116,7 +117,7 @@ def _sofa(rng: np.random.Generator) -> list[Body]:
 
 
 def _small(rng: np.random.Generator) -> list[Body]:
-    """A rug, a floor lamp, a plant and a box of toys."""
+    """Return a rug, a floor lamp, a plant and a toy box."""
     shade = shapes.moved(shapes.lathe([(0.22, 0.0), (0.13, 0.3)], sides=32, tile_m=0.3), (0.95, 1.85, 1.45))
     stand = shapes.merged([shapes.cylinder(0.14, 0.03), shapes.cylinder(0.014, 1.55, sides=12)])
     pot = [(0.0, 0.0), (0.12, 0.0), (0.17, 0.3), (0.15, 0.3), (0.14, 0.25), (0.0, 0.25)]

@@ -1,4 +1,4 @@
-"""Meshes of the named worlds, from NumPy alone: panels, boxes, surfaces of revolution, and what is made of them."""
+"""Meshes of simple shapes, made with NumPy: panels, boxes, surfaces of revolution."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOX_SIDES = (
 
 
 def panel(corner: ArrayLike, right: ArrayLike, up: ArrayLike, *, tile_m: float | None = None) -> Mesh:
-    """Return a parallelogram from its lower left corner and its sides [m]; it faces along ``right`` x ``up``.
+    """Return a parallelogram from its lower left corner and two sides [m]. Its normal is ``right`` x ``up``.
 
     ``tile_m``: width and height of the texture on it [m]; None to show the whole texture once.
     """
@@ -43,14 +43,14 @@ def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float |
 
 
 def standing_box(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | None = None) -> Mesh:
-    """Return a :func:`box` by the centre of its lower side."""
+    """Return a box of ``size`` (x, y, z) [m], given the centre of its lower side."""
     return box(size, np.asarray(foot, np.float64) + np.asarray(size) * (0.0, 0.0, 0.5), tile_m=tile_m)
 
 
 def lathe(profile: ArrayLike, *, sides: int = 24, tile_m: float | None = None) -> Mesh:
-    """Return the surface of revolution about z of a line of points (radius, height) [m], given from below upwards.
+    """Return the surface of revolution about z of a polyline (radius, height) [m], from bottom to top.
 
-    ``tile_m``: width and height of the texture [m], rounded so that it closes; None to show it once around.
+    ``tile_m``: width and height of the texture [m]. The width is rounded so that the texture closes. None: once around.
     """
     line = np.asarray(profile, np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
@@ -66,7 +66,7 @@ def lathe(profile: ArrayLike, *, sides: int = 24, tile_m: float | None = None) -
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.int32]:
-    """Triangles of a grid of points, row by row."""
+    """Return the triangles of a grid of points, numbered row by row."""
     at = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
     return np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
@@ -95,8 +95,8 @@ def capsule(radius: float, length: float, *, sides: int = 20, rings: int = 6, ti
     return lathe(np.concatenate(ends), sides=sides, tile_m=tile_m)
 
 
-def ramp(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | None = None) -> Mesh:
-    """Return a gable roof: a prism whose ridge lies along x, on a floor of ``size`` (x, y) and of height z [m]."""
+def gable_roof(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | None = None) -> Mesh:
+    """Return a gable roof of ``size`` (x, y, height) [m] with its ridge along x."""
     x, y, z = np.asarray(size, np.float64) / (2.0, 2.0, 1.0)
     slopes = [
         panel((-x, -y, 0), (2 * x, 0, 0), (0, y, z), tile_m=tile_m),
@@ -122,7 +122,7 @@ def merged(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def moved(mesh: Mesh, position: ArrayLike, *, turn_deg: float = 0.0, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Mesh:
-    """Return a mesh turned about an axis through the origin, then displaced by ``position`` [m]."""
+    """Return a mesh rotated about an axis through the origin and then translated by ``position`` [m]."""
     from scipy.spatial.transform import Rotation
 
     rotation: Any = Rotation.from_rotvec(np.radians(turn_deg) * np.asarray(axis, np.float64))
@@ -137,7 +137,7 @@ def legs(size: Sequence[float], height: float, radius: float) -> Mesh:
 
 
 def tapered(mesh: Mesh, share: float) -> Mesh:
-    """Return a mesh whose horizontal size shrinks from its foot upwards, to ``share`` at its top."""
+    """Return a mesh whose horizontal size shrinks linearly from its foot to a fraction ``share`` at its top."""
     points = np.array(mesh.vertices, np.float64)
     low, high = points[:, 2].min(), points[:, 2].max()
     middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2.0

@@ -1,4 +1,4 @@
-"""A small town: blocks of houses along a street and its crossings, pavements, parked cars, trees, and a town hall."""
+"""The world ``street``, a small town: blocks of houses, pavements, parked cars, trees, and a town hall."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from amiwarp.simulation.worlds.named.motion import Viewpoint
 from amiwarp.simulation.worlds.scene import Body, Sky, Sun, World
 
 ROAD, PAVEMENT = 3.6, 6.4
-"""Distances of the kerb and of the houses from the street's middle [m]."""
+"""Distances of the kerb and of the houses from the middle of the street [m]."""
 BLOCKS = ((-62.0, -26.0), (-18.0, 20.0), (28.0, 62.0))
-"""Where the blocks begin and end along the street [m]; crossings lie between them."""
+"""Ranges of the blocks along the street [m]. Side streets lie between them."""
 ROWS = ((PAVEMENT, 10.0, (2, 5)), (30.0, 12.0, (4, 8)))
-"""Rows of houses on each side: distance of their fronts and their depth [m], and the range of their storeys."""
+"""Rows of houses on each side: distance of the fronts [m], depth [m], and range of the number of storeys."""
 VIEW = Viewpoint((-15.0, 0.5, 1.7), (10.0, -0.2, 3.1), walk_m=(8.0, 0.0, 0.0), walk_speed=1.4)
-"""The camera walks along the road."""
+"""Camera pose: on the road, along which the camera walks."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
@@ -26,7 +26,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def _ground(rng: np.random.Generator) -> list[Body]:
-    """Asphalt, pavements around the blocks, and the markings of the road."""
+    """Return the road, the pavements of the blocks, and the road markings."""
     asphalt = textures.plaster(rng, 0.2, 0.5)
     slabs = [
         shapes.standing_box(
@@ -47,7 +47,7 @@ def _ground(rng: np.random.Generator) -> list[Body]:
 
 
 def _blocks(rng: np.random.Generator) -> list[Body]:
-    """Two rows of houses in each block on both sides, wall to wall."""
+    """Return two rows of adjoining houses for each block, on both sides."""
     bodies: list[Body] = []
     count = 0
     for start, end in BLOCKS:
@@ -63,7 +63,7 @@ def _blocks(rng: np.random.Generator) -> list[Body]:
 
 
 def _cars(rng: np.random.Generator) -> list[Body]:
-    """Cars parked along both kerbs, not at the crossings."""
+    """Return cars parked along both kerbs of the blocks."""
     bodies: list[Body] = []
     for start, end in BLOCKS:
         for side in (-1.0, 1.0):
@@ -76,7 +76,7 @@ def _cars(rng: np.random.Generator) -> list[Body]:
 
 
 def _car(rng: np.random.Generator, name: str, place: tuple[float, float]) -> list[Body]:
-    """A car of boxes: body with bonnet, cabin that narrows upwards, wheels."""
+    """Return a car: body, cabin and wheels."""
     at = (*place, 0.0)
     van = rng.uniform() < 0.2
     cabin = (3.4, 1.62, 1.0) if van else (2.3, 1.6, 0.58)
@@ -109,7 +109,7 @@ def _car(rng: np.random.Generator, name: str, place: tuple[float, float]) -> lis
 
 
 def _trees(rng: np.random.Generator) -> list[Body]:
-    """Trees along the pavements: a trunk and a crown of several balls."""
+    """Return trees along the pavements. A crown consists of six ellipsoids."""
     bark, leaves = textures.plaster(rng, 0.15, 0.6, size=128), textures.plaster(rng, 0.22, 0.7, size=256)
     bodies = []
     spots = [
@@ -136,7 +136,7 @@ def _trees(rng: np.random.Generator) -> list[Body]:
 
 
 def _posts(rng: np.random.Generator) -> list[Body]:
-    """Street lamps, and signs with gratings, stars and checkerboards."""
+    """Return street lamps, and signs with gratings, stars and checkerboards."""
     iron = textures.plaster(rng, 0.1, 0.4, size=64)
     bodies = []
     xs = [x for start, end in BLOCKS for x in np.arange(start + 1.0, end, 16.0)]

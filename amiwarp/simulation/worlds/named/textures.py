@@ -1,4 +1,4 @@
-"""Textures of the named worlds, drawn from a random generator: linear reflectances from 0.03 to 0.95."""
+"""Random textures: linear reflectances from 0.03 to 0.95."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 DARKEST, BRIGHTEST = 0.03, 0.95
-"""Range of the reflectances: soot and white paint. Its log contrast is 3.5."""
+"""Range of the reflectances; its log contrast is 3.5."""
 TEXT = (
     "each pixel reports changes of log intensity by itself and at once so a camera that rests sees only what moves a "
     "prism before the lens turns and moves the whole picture on a circle then every edge fires whatever its direction "
     "and the known angle takes the motion out again"
 )
-"""Words of the printed texts, drawn at random."""
+"""Words from which the printed pages are drawn at random."""
 
 Texture = NDArray[np.float32]
 
 
 def clipped(values: NDArray[Any]) -> Texture:
-    """Return values as reflectances that occur."""
+    """Return values clipped to the range of the reflectances."""
     return np.clip(values, DARKEST, BRIGHTEST).astype(np.float32)
 
 
 def fractal(rng: np.random.Generator, height: int, width: int, *, slope: float = 1.2) -> NDArray[np.float64]:
-    """Return noise of mean 0 and deviation 1 that repeats, its amplitude falling with frequency to the ``slope``."""
+    """Return periodic noise of mean 0 and standard deviation 1. Its amplitude spectrum is frequency ** -``slope``."""
     fy, fx = np.fft.fftfreq(height)[:, None] * height, np.fft.rfftfreq(width) * width
     radius = np.hypot(fy, fx)
     radius[0, 0] = np.inf
@@ -36,17 +36,17 @@ def fractal(rng: np.random.Generator, height: int, width: int, *, slope: float =
 
 
 def plaster(rng: np.random.Generator, mean: float = 0.5, contrast: float = 0.35, size: int = 512) -> Texture:
-    """Return fractal noise about ``mean``; ``contrast`` is the deviation of the log reflectance."""
+    """Return fractal noise about ``mean``; ``contrast`` is the standard deviation of the log reflectance."""
     return clipped(mean * np.exp(contrast * fractal(rng, size, size)))
 
 
 def weathered(rng: np.random.Generator, values: NDArray[Any], contrast: float = 0.15) -> Texture:
-    """Return reflectances with some fractal noise, so that no area is blank."""
+    """Return reflectances with added fractal noise, so that no area is blank."""
     return clipped(values * np.exp(contrast * fractal(rng, *values.shape, slope=1.0)))
 
 
 def checkerboard(squares: int, *, size: int = 256, dark: float = 0.05, bright: float = 0.9) -> Texture:
-    """Return a checkerboard of ``squares`` each way, an even number if it is to repeat."""
+    """Return a checkerboard with ``squares`` squares along each side. An even number repeats without a seam."""
     k = np.arange(size) * squares // size
     return clipped(np.where((k[:, None] + k) % 2, dark, bright))
 
@@ -54,7 +54,7 @@ def checkerboard(squares: int, *, size: int = 256, dark: float = 0.05, bright: f
 def grating(
     angle_deg: float, cycles: float = 12.0, *, size: int = 256, dark: float = 0.05, bright: float = 0.9
 ) -> Texture:
-    """Return stripes whose light changes towards ``angle_deg``, counter-clockwise from the right, in a white frame."""
+    """Return stripes in a white frame. Light varies along ``angle_deg``, counter-clockwise from the right."""
     v, u = np.mgrid[size:0:-1, 0:size] / size
     phase = np.cos(np.radians(angle_deg)) * u + np.sin(np.radians(angle_deg)) * v
     stripes = np.clip(3.0 * np.sin(2.0 * np.pi * cycles * phase), -1.0, 1.0)
@@ -115,7 +115,7 @@ def poster(rng: np.random.Generator, *, size: int = 384) -> Texture:
 def _cells(
     rng: np.random.Generator, rows: int, size: int, *, columns: int, joint: int, shift: bool
 ) -> NDArray[np.float64]:
-    """Random shades of rectangular cells in rows, NaN in the joints between them; odd rows shifted by half a cell."""
+    """Return random shades of cells in rows, NaN in the joints; ``shift`` moves odd rows by half a cell."""
     y, x = np.mgrid[0:size, 0:size]
     row = y * rows // size
     x = (x + np.where(shift & (row % 2 == 1), size // columns // 2, 0)) % size
@@ -133,13 +133,13 @@ def bricks(rng: np.random.Generator, *, mean: float = 0.25, joint: float = 0.55,
 def tiles(
     rng: np.random.Generator, *, mean: float = 0.5, joint: float = 0.12, count: int = 8, size: int = 512
 ) -> Texture:
-    """Return ``count`` square tiles each way, veined."""
+    """Return ``count`` by ``count`` square tiles."""
     shade = _cells(rng, count, size, columns=count, joint=4, shift=False)
     return weathered(rng, np.where(np.isnan(shade), joint, mean * np.exp(0.25 * np.nan_to_num(shade))), 0.25)
 
 
 def wood(rng: np.random.Generator, *, mean: float = 0.3, boards: int = 8, size: int = 512) -> Texture:
-    """Return boards that run to the right, with grain."""
+    """Return horizontal boards with grain."""
     y = np.arange(size)[:, None]
     board = y * boards // size
     fibre = fractal(rng, size, size, slope=0.9)
@@ -152,7 +152,7 @@ def wood(rng: np.random.Generator, *, mean: float = 0.3, boards: int = 8, size: 
 
 
 def plaid(rng: np.random.Generator, *, size: int = 256, stripes: int = 10) -> Texture:
-    """Return woven stripes both ways."""
+    """Return a fabric of crossed stripes."""
 
     def bands() -> NDArray[np.float64]:
         return np.repeat(rng.uniform(0.25, 1.0, stripes), -(-size // stripes))[:size]
@@ -161,7 +161,7 @@ def plaid(rng: np.random.Generator, *, size: int = 256, stripes: int = 10) -> Te
 
 
 def book_spines(rng: np.random.Generator, *, books: int = 16, size: int = 512) -> Texture:
-    """Return the backs of books next to each other, with bands and titles."""
+    """Return a row of book spines with bands and titles."""
     values = np.empty((size, size))
     edges = np.linspace(0, size, books + 1).astype(int)
     for a, b in itertools.pairwise(edges):
@@ -179,7 +179,7 @@ def book_spines(rng: np.random.Generator, *, books: int = 16, size: int = 512) -
 
 
 def sky(rng: np.random.Generator, *, height: int = 512) -> Texture:
-    """Return luminances in all directions, as ``Sky.panorama``: clouds, brighter towards the horizon; dark below it."""
+    """Return a panorama for ``Sky``: clouds, brighter towards the horizon, dark below it."""
     elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
     clouds = np.clip(0.4 + 0.6 * fractal(rng, height, 2 * height, slope=1.35), 0.0, 1.0)
     light = 0.32 + 0.2 * np.exp(-np.abs(elevation) / 0.35) + 0.45 * clouds
