@@ -274,7 +274,7 @@ def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) 
     own = part.material
     if texture is not None and part.mesh.uv is None:
         raise AmiwarpError(
-            f"field {where}.material.texture needs texture coordinates, but the mesh has none; add them to the mesh file"
+            f"field {where}.material.texture needs texture coordinates, but the mesh has none; add them"
         )
     reflectance = own.reflectance if texture is None else 1.0
     return Material(

@@ -23,7 +23,7 @@ def solid(
 
 
 def hall(size: Sequence[float], walls: Sequence[Texture], floor: Texture, ceiling: Texture) -> list[Body]:
-    """Return floor, ceiling and four walls of a hall of ``size`` (x, y, z) [m], its floor at z = 0, centred on the z axis."""
+    """Return floor, ceiling and four walls of a hall of ``size`` (x, y, z) [m], centred on the z axis."""
     x, y, z = size[0] / 2.0, size[1] / 2.0, size[2]
     sides = {
         "north": ((-x, y, 0), (2 * x, 0, 0)),
