@@ -1,0 +1,75 @@
+"""The world ``ball``: a ball that is thrown across the room and bounces off the floor and the ends of its path."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.simulation.worlds.named import parts, room, shapes, textures
+from amiwarp.simulation.worlds.scene import World
+from amiwarp.simulation.worlds.trajectory import Trajectory
+
+VIEW = room.VIEW
+"""Camera pose: that of the world ``room``."""
+RADIUS = 0.12
+"""Radius of the ball [m]."""
+GRAVITY = 9.81
+"""Acceleration of free fall [m/s²]."""
+START = (-1.25, 1.0)
+"""Start of the throw: distance along the path from its middle, and height [m]."""
+THROWN = (2.6, 3.9)
+"""Initial velocity: along the path, and upwards [m/s]."""
+LENGTH = 1.55
+"""Half the length of the path on the floor [m]; the ball bounces at both ends."""
+MIDDLE, DIRECTION = (-0.15, -0.15), (math.sqrt(0.5), -math.sqrt(0.5))
+"""Middle of the path on the floor (x, y) [m], and its direction (unit vector)."""
+BOUNCE = 0.8
+"""Fraction of the speed that remains after a bounce."""
+STEP_S = 0.002
+"""Longest time between two poses [s]."""
+SPIN = 5.0
+"""Angular velocity about the path [rad/s]; about the vertical axis it is 0.6 of that."""
+
+
+def build(rng: np.random.Generator, duration_s: float) -> World:
+    """Return the room and the ball."""
+    ball = parts.solid(
+        "ball",
+        shapes.ellipsoid((RADIUS,) * 3, sides=40, rings=20),
+        textures.weathered(rng, textures.checkerboard(12), 0.2),
+        "ball",
+        trajectory=thrown(duration_s),
+    )
+    return World("ball", (*room.furniture(rng), ball), ambient=0.3, lamps=room.LAMPS)
+
+
+def thrown(duration_s: float) -> Trajectory:
+    """Return the trajectory of the ball."""
+    from scipy.spatial.transform import Rotation
+
+    t, along, height = flight(duration_s)
+    position = np.column_stack([MIDDLE[0] + along * DIRECTION[0], MIDDLE[1] + along * DIRECTION[1], height])
+    turn = np.outer(t, (SPIN * DIRECTION[0], SPIN * DIRECTION[1], 0.6 * SPIN))
+    return Trajectory(t, position, Rotation.from_rotvec(turn).as_quat())
+
+
+def flight(duration_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return times [s], distances along the path [m] and heights [m]: parabolas between bounces."""
+    t = np.linspace(0.0, duration_s, max(4, math.ceil(duration_s / STEP_S) + 1))
+    step = float(t[1])
+    s, z = START
+    v, w = THROWN
+    path = []
+    for _ in t:
+        path.append((s, z))
+        s, z, w = s + v * step, z + w * step - 0.5 * GRAVITY * step**2, w - GRAVITY * step
+        if abs(s) > LENGTH and s * v > 0.0:
+            v = -BOUNCE * v
+        if z < RADIUS and w < 0.0:
+            z, v, w = RADIUS, 0.98 * v, -BOUNCE * w
+            if w < GRAVITY * STEP_S * 4.0:
+                v, w = 0.99 * v, 0.0
+    along, height = np.array(path).T
+    return t, along, height

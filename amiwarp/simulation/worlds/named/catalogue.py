@@ -1,0 +1,91 @@
+"""The named worlds, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from amiwarp.simulation.worlds.named import ball, corridor, desk, person, room, street
+from amiwarp.simulation.worlds.named.motion import TRAJECTORIES, Viewpoint, camera_trajectory
+from amiwarp.simulation.worlds.scene import World
+from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.validation import one_of, real, whole
+
+LONGEST_S = 3600.0
+"""Longest recording of a named world [s]."""
+
+
+@dataclass(frozen=True)
+class NamedWorld:
+    """Builder and camera position of a named world."""
+
+    build: Callable[[np.random.Generator, float], World]
+    """Function that returns the world for a random generator and a duration [s]."""
+    view: Viewpoint
+    """Position and viewing direction of the camera."""
+
+
+NAMED = {
+    "room": NamedWorld(room.build, room.VIEW),
+    "desk": NamedWorld(desk.build, desk.VIEW),
+    "corridor": NamedWorld(corridor.build, corridor.VIEW),
+    "street": NamedWorld(street.build, street.VIEW),
+    "ball": NamedWorld(ball.build, ball.VIEW),
+    "person": NamedWorld(person.build, person.VIEW),
+}
+"""Named worlds by name."""
+WORLDS = tuple(NAMED)
+"""Names of the worlds."""
+
+
+def named_world(
+    name: str, trajectory: str = "handheld", *, seed: int = 0, duration_s: float = 1.0
+) -> tuple[World, Trajectory]:
+    """Return a built-in world and a camera trajectory through it.
+
+    The worlds are generated from a seed and need no files.
+
+    Parameters
+    ----------
+    name : str
+        ``room`` (furniture, pictures, gratings in all directions), ``desk``, ``corridor``, ``street`` (a small town),
+        ``ball`` (a ball thrown across the room) or ``person`` (a walking figure, whose joints are ``World.joints``).
+    trajectory : str
+        Camera motion: ``still``, ``handheld`` (smooth random motion below 3 Hz, about 1.5 cm and 1.5 deg in amplitude;
+        in the corridor and the street the camera also walks forward) or ``fast`` (about ten times the speed).
+    seed : int
+        Seed of textures, shapes and camera motion. A seed gives the same world with every trajectory.
+    duration_s : float
+        Length of the trajectories [s]. After it nothing moves.
+
+    Returns
+    -------
+    world : World
+        Bodies, light and sky; 2,000 to 100,000 triangles.
+    trajectory : Trajectory
+        Camera poses. The camera never passes through a body.
+
+    Raises
+    ------
+    AmiwarpError
+        If there is no such world or trajectory, or the seed or the duration is out of range.
+
+    Examples
+    --------
+    >>> world, trajectory = amiwarp.named_world("person", "still", seed=1, duration_s=0.1)
+    >>> [body.name for body in world.moving][:3]
+    ['pelvis', 'torso', 'neck']
+    >>> rotation, position = trajectory.poses([0.0])
+    >>> position.tolist()
+    [[0.3, -3.4, 1.35]]
+    """
+    one_of(name, WORLDS, "world")
+    one_of(trajectory, TRAJECTORIES, "trajectory")
+    seed = whole(seed, "seed", 0, 2**63 - 1)
+    duration_s = real(duration_s, "duration_s", 1e-3, LONGEST_S, " s")
+    made = NAMED[name]
+    world = made.build(np.random.default_rng([seed, WORLDS.index(name)]), duration_s)
+    camera = camera_trajectory(made.view, trajectory, duration_s, np.random.default_rng([seed, len(WORLDS)]))
+    return world, camera

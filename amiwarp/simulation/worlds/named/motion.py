@@ -1,0 +1,74 @@
+"""Camera trajectories of the named worlds: still, handheld and fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
+
+TRAJECTORIES = ("still", "handheld", "fast")
+"""Kinds of camera trajectories."""
+RATE_HZ = 100.0
+"""Poses per second."""
+SHAKE_M = 0.015
+"""Approximate amplitude of the handheld translation [m]."""
+SHAKE_DEG = 1.5
+"""Approximate amplitude of the handheld rotation [deg]."""
+SWAY_HZ = (0.15, 0.55)
+"""Frequency range of the slow sway [Hz]."""
+TREMOR_HZ = (1.5, 2.8)
+"""Frequency range of the tremor [Hz]; its relative amplitude is 0.03 per sine."""
+FAST_RATE, FAST_REACH = 4.0, 2.5
+"""Factors of frequency and amplitude for fast trajectories; together ten times the speed."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Mean pose of a camera, and the distance that it walks."""
+
+    position: tuple[float, float, float]
+    """Mean position [m]."""
+    target: tuple[float, float, float]
+    """Point that the camera looks at [m]."""
+    walk_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Vector from the mean position to the end of the path that a moving camera walks to and fro [m]."""
+    walk_speed: float = 1.2
+    """Largest walking speed [m/s]; fast trajectories have ten times as much."""
+
+
+def camera_trajectory(view: Viewpoint, kind: str, duration_s: float, rng: np.random.Generator) -> Trajectory:
+    """Return the camera trajectory of a kind, one of :data:`TRAJECTORIES`."""
+    from scipy.spatial.transform import Rotation
+
+    base = looking_at(view.position, view.target)
+    if kind == "still":
+        return Trajectory.still(view.position, rotation=base.as_quat())
+    t = np.linspace(0.0, duration_s, max(4, round(duration_s * RATE_HZ) + 1))
+    rate, reach = (FAST_RATE, FAST_REACH) if kind == "fast" else (1.0, 1.0)
+    sway, turn = (reach * shake(rate * t, rng) for _ in range(2))
+    position = np.asarray(view.position) + SHAKE_M * sway + walk(view, rate * reach, t)
+    rotation = base * Rotation.from_rotvec(np.radians(SHAKE_DEG) * turn)
+    return Trajectory(t, position, rotation.as_quat())
+
+
+def shake(t: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return smooth random motion along three axes, shape ``(n, 3)``, of amplitude about 1: a sum of six sines each."""
+    low, high = SWAY_HZ
+    frequency = np.concatenate([low + (high - low) * (np.arange(4)[:, None] + rng.uniform(size=(4, 3))) / 4.0,
+                                rng.uniform(*TREMOR_HZ, (2, 3))])  # fmt: skip
+    amplitude = np.concatenate([0.5 * np.sqrt(low / frequency[:4]) + 0.1, np.full((2, 3), 0.03)])
+    phase = rng.uniform(0.0, 2.0 * np.pi, (6, 3))
+    waves = amplitude * np.sin(2.0 * np.pi * frequency * t[:, None, None] + phase)
+    return np.asarray(waves.sum(axis=1))
+
+
+def walk(view: Viewpoint, factor: float, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return displacements [m] along ``view.walk_m``, shape ``(n, 3)``: a sine, so the speed is largest at time 0."""
+    end = np.asarray(view.walk_m)
+    length = float(np.linalg.norm(end))
+    if not length > 0.0:
+        return np.zeros((len(t), 3))
+    return np.asarray(np.sin(factor * view.walk_speed * t / length)[:, None] * end)

@@ -1,0 +1,160 @@
+"""The world ``street``, a small town: blocks of houses, pavements, parked cars, trees, and a town hall."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from amiwarp.simulation.worlds.named import houses, parts, shapes, textures
+from amiwarp.simulation.worlds.named.motion import Viewpoint
+from amiwarp.simulation.worlds.scene import Body, Sky, Sun, World
+
+ROAD, PAVEMENT = 3.6, 6.4
+"""Distances of the kerb and of the houses from the middle of the street [m]."""
+BLOCKS = ((-62.0, -26.0), (-18.0, 20.0), (28.0, 62.0))
+"""Ranges of the blocks along the street [m]. Side streets lie between them."""
+ROWS = ((PAVEMENT, 10.0, (2, 5)), (30.0, 12.0, (4, 8)))
+"""Rows of houses on each side: distance of the fronts [m], depth [m], and range of the number of storeys."""
+VIEW = Viewpoint((-15.0, 0.5, 1.7), (10.0, -0.2, 3.1), walk_m=(8.0, 0.0, 0.0), walk_speed=1.4)
+"""Camera pose: on the road, along which the camera walks."""
+
+
+def build(rng: np.random.Generator, duration_s: float) -> World:
+    """Return the town; nothing in it moves."""
+    bodies = [*_ground(rng), *_blocks(rng), *houses.town_hall(rng, 76.0), *_cars(rng), *_trees(rng), *_posts(rng)]
+    sky = Sky(1.0, textures.sky(rng))
+    return World("street", tuple(bodies), ambient=0.38, sun=Sun((-0.8, -0.3, 0.62), 0.7), sky=sky)
+
+
+def _ground(rng: np.random.Generator) -> list[Body]:
+    """Return the road, the pavements of the blocks, and the road markings."""
+    asphalt = textures.plaster(rng, 0.2, 0.5)
+    slabs = [
+        shapes.standing_box(
+            (end - start + 4.0, 56.0, 0.14), ((start + end) / 2.0, side * (ROAD + 28.0), 0.0), tile_m=3.0
+        )
+        for start, end in BLOCKS
+        for side in (-1, 1)
+    ]
+    dashes = [shapes.box((2.0, 0.14, 0.01), (x, 0.0, 0.0)) for x in np.arange(-78.0, 66.0, 4.5)]
+    bars = [shapes.box((2.6, 0.45, 0.01), (x, y, 0.0)) for x in (-15.0, 17.0, 31.0) for y in np.arange(-3.0, 3.1, 1.0)]
+    paint = textures.weathered(rng, np.full((128, 128), 0.75), 0.3)
+    return [
+        parts.solid("road", shapes.panel((-150, -150, 0), (300, 0, 0), (0, 300, 0), tile_m=5.0), asphalt, "road"),
+        parts.solid("pavement", shapes.merged(slabs), textures.tiles(rng, mean=0.42, joint=0.15), "pavement"),
+        parts.solid("lane markings", shapes.merged(dashes), paint, "marking"),
+        parts.solid("crossings", shapes.merged(bars), paint, "marking"),
+    ]
+
+
+def _blocks(rng: np.random.Generator) -> list[Body]:
+    """Return two rows of adjoining houses for each block, on both sides."""
+    bodies: list[Body] = []
+    count = 0
+    for start, end in BLOCKS:
+        for side in (-1.0, 1.0):
+            for front, depth, storeys in ROWS:
+                x = start
+                while x < end - 6.0:
+                    width = float(min(rng.uniform(6.5, 11.0), end - x))
+                    place = (x + width / 2.0, side * front)
+                    bodies += houses.house(rng, f"house {count}", place, width, depth, int(rng.integers(*storeys)))
+                    x, count = x + width + 0.02, count + 1
+    return bodies
+
+
+def _cars(rng: np.random.Generator) -> list[Body]:
+    """Return cars parked along both kerbs of the blocks."""
+    bodies: list[Body] = []
+    for start, end in BLOCKS:
+        for side in (-1.0, 1.0):
+            x = start + 4.0
+            while x < end - 4.0:
+                if rng.uniform() < 0.65:
+                    bodies += _car(rng, f"car {len(bodies) // 3}", (x, side * (ROAD - 1.05)))
+                x += float(rng.uniform(5.6, 7.0))
+    return bodies
+
+
+def _car(rng: np.random.Generator, name: str, place: tuple[float, float]) -> list[Body]:
+    """Return a car: body, cabin and wheels."""
+    at = (*place, 0.0)
+    van = rng.uniform() < 0.2
+    cabin = (3.4, 1.62, 1.0) if van else (2.3, 1.6, 0.58)
+    shade = float(np.exp(rng.uniform(np.log(0.05), np.log(0.85))))
+    paint = np.full((96, 192), shade)
+    paint[:, 60:62] = paint[:, 120:122] = paint[70:74] = 0.3 * shade + 0.02
+    paint[20:34, 4:18] = paint[20:34, -18:-4] = 0.9
+    glass = np.full((64, 128), 0.05)
+    glass[:, :6] = glass[:, 60:66] = glass[:, -6:] = glass[:6] = shade
+    glass[14:34, 20:40] = 0.35
+    wheel = shapes.lathe([(0.0, -0.1), (0.18, -0.1), (0.31, -0.08), (0.31, 0.08), (0.18, 0.1), (0.0, 0.1)], sides=24)
+    wheels = [
+        shapes.moved(wheel, (x, y, 0.31), turn_deg=90, axis=(1, 0, 0)) for x in (-1.3, 1.3) for y in (-0.75, 0.75)
+    ]
+    rim = textures.clipped(np.repeat([[0.04], [0.04], [0.5], [0.04], [0.04], [0.5]], 16, axis=1))
+    body = shapes.merged(
+        [shapes.standing_box((4.2, 1.7, 0.55), (0, 0, 0.28)), shapes.standing_box((4.35, 1.6, 0.2), (0, 0, 0.3))]
+    )
+    top = shapes.tapered(shapes.standing_box(cabin, (0.35 if van else -0.25, 0, 0.82)), 0.88 if van else 0.68)
+    meshes = {
+        "": (body, textures.weathered(rng, paint, 0.15)),
+        " cabin": (top, textures.weathered(rng, glass, 0.2)),
+        " wheels": (shapes.merged(wheels), rim),
+    }
+    turn = 0.0 if place[1] < 0 else 180.0
+    return [
+        parts.solid(name + part, shapes.moved(mesh, at, turn_deg=turn), texture, "car", instance=name)
+        for part, (mesh, texture) in meshes.items()
+    ]
+
+
+def _trees(rng: np.random.Generator) -> list[Body]:
+    """Return trees along the pavements. A crown consists of six ellipsoids."""
+    bark, leaves = textures.plaster(rng, 0.15, 0.6, size=128), textures.plaster(rng, 0.22, 0.7, size=256)
+    bodies = []
+    spots = [
+        (x + rng.uniform(-1.0, 1.0), side * (ROAD + 0.9))
+        for start, end in BLOCKS
+        for x in np.arange(start + 5.0, end, 11.0)
+        for side in (-1, 1)
+    ]
+    for k, (x, y) in enumerate(spots):
+        trunk = shapes.lathe([(0.17, 0.0), (0.12, 0.6), (0.09, 3.0)], sides=12, tile_m=0.6)
+        balls = [
+            shapes.moved(
+                shapes.ellipsoid(rng.uniform(0.6, 1.05, 3), sides=14, rings=9, tile_m=1.0),
+                (*rng.uniform(-0.7, 0.7, 2), rng.uniform(2.7, 4.2)),
+            )
+            for _ in range(6)
+        ]
+        name = f"tree {k}"
+        bodies.append(parts.solid(f"{name} trunk", shapes.moved(trunk, (x, y, 0.1)), bark, "tree", instance=name))
+        bodies.append(
+            parts.solid(f"{name} crown", shapes.moved(shapes.merged(balls), (x, y, 0.1)), leaves, "tree", instance=name)
+        )
+    return bodies
+
+
+def _posts(rng: np.random.Generator) -> list[Body]:
+    """Return street lamps, and signs with gratings, stars and checkerboards."""
+    iron = textures.plaster(rng, 0.1, 0.4, size=64)
+    bodies = []
+    xs = [x for start, end in BLOCKS for x in np.arange(start + 1.0, end, 16.0)]
+    for k, x in enumerate(xs):
+        side = 1.0 if k % 2 else -1.0
+        y = side * (ROAD + 0.5)
+        head = shapes.ellipsoid((0.16, 0.3, 0.1), sides=16, tile_m=0.5)
+        post = [
+            shapes.lathe([(0.12, 0.0), (0.12, 0.8), (0.06, 0.9), (0.045, 5.2)], sides=16, tile_m=0.5),
+            shapes.box((0.06, 1.2, 0.06), (0, -side * 0.6, 5.2), tile_m=0.5),
+            shapes.moved(head, (0, -side * 1.2, 5.15)),
+        ]
+        bodies.append(
+            parts.solid(f"street lamp {k}", shapes.moved(shapes.merged(post), (x, y, 0.1)), iron, "street lamp")
+        )
+        face = (textures.grating(22.5 * k, 6.0), textures.star(16), textures.checkerboard(4))[k % 3]
+        plate = shapes.box((0.03, 0.6, 0.6), (x + 4.0, -y, 2.5))
+        pole = shapes.moved(shapes.cylinder(0.03, 2.3, sides=10, tile_m=0.4), (x + 4.03, -y, 0.1))
+        bodies.append(parts.solid(f"sign {k}", plate, face, "sign", instance=f"sign {k}"))
+        bodies.append(parts.solid(f"sign {k} pole", pole, iron, "sign", instance=f"sign {k}"))
+    return bodies

@@ -1,0 +1,284 @@
+"""Worlds from files: a TOML or JSON file that names meshes, materials, trajectories, light and sky."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name, note_input
+from amiwarp.io.json_files import MOST_BYTES, build, fields_of, read_json
+from amiwarp.regular_file import check_regular
+from amiwarp.simulation.pictures import read_picture
+from amiwarp.simulation.worlds.mesh_files import LoadedMesh, load_mesh
+from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Sky, Sun, World
+from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
+from amiwarp.validation import one_of, real, shown
+
+FORMAT, VERSION = "amiwarp-world", 1
+"""Values of the fields ``format`` and ``version``."""
+
+Made = TypeVar("Made")
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class BodyEntry:
+    """Fields of an entry of ``bodies``, except ``material`` and ``trajectory``."""
+
+    name: str
+    mesh: str
+    scale: float = 1.0
+    up: str | None = None
+    position: Vector | None = None
+    rotation: Quaternion | None = None
+    category: str = ""
+    instance: str | None = None
+
+
+@dataclass(frozen=True)
+class MaterialEntry:
+    """Fields of ``material``. None keeps the value of the mesh file."""
+
+    reflectance: float | None = None
+    texture: str | None = None
+    emission: float | None = None
+
+
+@dataclass(frozen=True)
+class SkyEntry:
+    """Fields of ``sky``."""
+
+    luminance: float | None = None
+    panorama: str | None = None
+
+
+@dataclass(frozen=True)
+class PoseEntry:
+    """Fields of a key pose. At most one of ``rotation`` and ``look_at`` is given."""
+
+    t: float
+    position: Vector
+    rotation: Quaternion | None = None
+    look_at: Vector | None = None
+
+
+def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
+    """Read a world and its camera trajectory from a TOML or JSON file.
+
+    File names in it are relative to its folder. Mesh files need trimesh: ``pip install "amiwarp[worlds]"``.
+
+    Parameters
+    ----------
+    path : str or Path
+        World file with the suffix ``.toml`` or ``.json``.
+
+    Returns
+    -------
+    world : World
+        Bodies, light and sky.
+    trajectory : Trajectory or None
+        Camera trajectory; None if the file has none.
+
+    Raises
+    ------
+    AmiwarpError
+        If the file or a file named in it cannot be read, or if a field is missing, unknown or has an invalid value.
+        The message names the file and the field.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> _ = (folder / "tile.obj").write_text("v 0 0 0\\nv 1 0 0\\nv 0 1 0\\nf 1 2 3\\n")
+    >>> _ = (folder / "world.toml").write_text('''
+    ... format = "amiwarp-world"
+    ... version = 1
+    ... bodies = [{name = "tile", mesh = "tile.obj"}]
+    ... camera = {trajectory = [{t = 0, position = [0, 0, 2], look_at = [0, 0, 0]}]}
+    ... ''')
+    >>> world, trajectory = amiwarp.load_world(folder / "world.toml")
+    >>> world.instances
+    ('tile',)
+    """
+    path = Path(path)
+    data = _read(path)
+    with errors_name(path, lambda: "is no world file"):
+        optional = ("name", "ambient", "sun", "lamps", "sky", "joints", "camera")
+        given = fields_of(data, "", "format", "version", "bodies", optional=optional)
+        if given["format"] != FORMAT or given["version"] != VERSION:
+            raise AmiwarpError(
+                f"fields format and version are {shown(given['format'])} and {shown(given['version'])}; "
+                f"expected {FORMAT!r} and {VERSION}"
+            )
+        return _Reader(path.parent).world(given, path.stem)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the fields of the file."""
+    kind = path.suffix.lower()
+    if kind == ".json":
+        data = read_json(path, "a world")
+    elif kind == ".toml":
+        with errors_name(path, lambda: "cannot be read as a world"):
+            check_regular(path)
+            if path.stat().st_size > MOST_BYTES:
+                raise AmiwarpError(f"is larger than {MOST_BYTES >> 20} MiB; give another file")
+            data = tomllib.loads(path.read_text(encoding="utf-8"))
+    else:
+        raise AmiwarpError(f"{path}: has the suffix {path.suffix!r}; a world file ends in .toml or .json")
+    note_input(path)
+    return data
+
+
+class _Reader:
+    """Builds a world from the fields of a world file. File names in it are relative to ``folder``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def world(self, given: dict[str, Any], name: str) -> tuple[World, Trajectory | None]:
+        options: dict[str, Any] = {"name": _text(given.get("name", name), "name")}
+        if "ambient" in given:
+            options["ambient"] = real(given["ambient"], "field ambient", 0.0)
+        if "sun" in given:
+            options["sun"] = _at("sun", lambda: build(Sun, given["sun"], "sun"))
+        if "sky" in given:
+            options["sky"] = _at("sky", lambda: self._sky(given["sky"]))
+        options["lamps"] = [
+            _at(where, partial(build, Lamp, entry, where)) for where, entry in _entries(given.get("lamps", []), "lamps")
+        ]
+        bodies: list[Body] = []
+        for where, entry in _entries(given["bodies"], "bodies"):
+            bodies += self._bodies(entry, where)
+        joints = given.get("joints", {})
+        joints = joints if isinstance(joints, dict) else fields_of(joints, "joints")
+        options["joints"] = {key: self._trajectory(value, f"joints.{key}") for key, value in joints.items()}
+        camera = None
+        if "camera" in given:
+            camera = self._trajectory(
+                fields_of(given["camera"], "camera", "trajectory")["trajectory"], "camera.trajectory"
+            )
+        return World(bodies=tuple(bodies), **options), camera
+
+    def _sky(self, data: Any) -> Sky:
+        entry = build(SkyEntry, data, "sky")
+        panorama = None if entry.panorama is None else self._picture(entry.panorama)
+        luminance = entry.luminance if entry.luminance is not None else (0.6 if panorama is None else 1.0)
+        return Sky(luminance, panorama)
+
+    def _picture(self, name: str) -> Any:
+        note_input(self._folder / name)
+        return read_picture(self._folder / name)
+
+    def _bodies(self, data: Any, where: str) -> list[Body]:
+        """Return the bodies of one entry: one for each part of its mesh file."""
+        known = (*BodyEntry.__dataclass_fields__, "material", "trajectory")
+        given = fields_of(data, where, "name", "mesh", optional=tuple(k for k in known if k not in ("name", "mesh")))
+        plain = {key: value for key, value in given.items() if key not in ("material", "trajectory")}
+        entry = build(BodyEntry, plain, where)
+        if entry.up is not None:
+            one_of(entry.up, ("y", "z"), f"field {where}.up")
+        real(entry.scale, f"field {where}.scale", 1e-9, 1e9)
+        material = build(MaterialEntry, given.get("material", {}), f"{where}.material")
+        trajectory = self._body_trajectory(given, entry, where)
+        parts = _at(f"{where}.mesh", lambda: load_mesh(self._folder / entry.mesh, up=entry.up, scale=entry.scale))
+        names = _part_names(entry.name, parts)
+        texture = None if material.texture is None else _at(
+            f"{where}.material.texture", lambda: self._picture(str(material.texture))
+        )  # fmt: skip
+        return [
+            Body(
+                name=name,
+                mesh=part.mesh,
+                material=_at(f"{where}.material", partial(_material, part, material, texture, where)),
+                trajectory=trajectory,
+                category=entry.category,
+                instance=entry.instance or entry.name,
+            )
+            for name, part in zip(names, parts, strict=True)
+        ]
+
+    def _body_trajectory(self, given: Mapping[str, Any], entry: BodyEntry, where: str) -> Trajectory | None:
+        if "trajectory" in given:
+            for name in ("position", "rotation"):
+                if name in given:
+                    raise AmiwarpError(
+                        f"field {where}.{name} cannot be combined with a trajectory; put the pose into the trajectory"
+                    )
+            return self._trajectory(given["trajectory"], f"{where}.trajectory")
+        if entry.position is None and entry.rotation is None:
+            return None
+        position, rotation = entry.position or (0.0, 0.0, 0.0), entry.rotation or (0.0, 0.0, 0.0, 1.0)
+        return _at(where, lambda: Trajectory.still(position, rotation=rotation))
+
+    def _trajectory(self, data: Any, where: str) -> Trajectory:
+        """Return a trajectory from the name of a CSV or TUM file, or from a list of key poses."""
+        if isinstance(data, str):
+            note_input(self._folder / data)
+            return _at(where, lambda: Trajectory.from_file(self._folder / data))
+        poses = [
+            build(PoseEntry, entry, place) for place, entry in _entries(data, where, "the name of a file or a list")
+        ]
+        if not poses:
+            raise AmiwarpError(f"field {where} is empty; give at least one pose")
+        turns = [_rotation(pose, f"{where}[{k}]") for k, pose in enumerate(poses)]
+        return _at(where, lambda: Trajectory([pose.t for pose in poses], [pose.position for pose in poses], turns))
+
+
+def _at(where: str, make: Callable[[], Made]) -> Made:
+    """Return the result of ``make``, and add the field to the message of an :class:`AmiwarpError`."""
+    try:
+        return make()
+    except AmiwarpError as error:
+        message = str(error)
+        raise AmiwarpError(message if f"field {where}" in message else f"field {where}: {message}") from error
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str):
+        raise AmiwarpError(f"field {where} is {shown(value)}; expected text")
+    return value
+
+
+def _entries(value: Any, where: str, expected: str = "a list") -> list[tuple[str, Any]]:
+    """Return the entries of a list, each with its field name for messages."""
+    if not isinstance(value, list):
+        raise AmiwarpError(f"field {where} is {shown(value)}; expected {expected}")
+    return [(f"{where}[{k}]", entry) for k, entry in enumerate(value)]
+
+
+def _rotation(pose: PoseEntry, where: str) -> Any:
+    """Return the quaternion of a key pose."""
+    if pose.look_at is None:
+        return pose.rotation or (0.0, 0.0, 0.0, 1.0)
+    if pose.rotation is not None:
+        raise AmiwarpError(f"field {where} has both rotation and look_at; give one of them")
+    return _at(where, lambda: looking_at(pose.position, pose.look_at or ()).as_quat())
+
+
+def _part_names(name: str, parts: list[LoadedMesh]) -> list[str]:
+    """Return the names of the bodies of an entry: ``name``, or ``name/part`` if the mesh file has several parts."""
+    if len(parts) == 1:
+        return [name]
+    return [f"{name}/{part.name}" for part in parts]
+
+
+def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) -> Material:
+    """Return the material of the mesh file, with the fields of the world file in its place."""
+    own = part.material
+    if texture is not None and part.mesh.uv is None:
+        raise AmiwarpError(
+            f"field {where}.material.texture needs texture coordinates, but the mesh has none; add them"
+        )
+    reflectance = own.reflectance if texture is None else 1.0
+    return Material(
+        reflectance if entry.reflectance is None else entry.reflectance,
+        own.texture if texture is None else texture,
+        own.emission if entry.emission is None else entry.emission,
+    )
