@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
@@ -59,7 +60,7 @@ def without_encoder(recording: Recording) -> Recording:
 def calibration_of(recording: Recording, **parameters: float) -> Calibration:
     assert recording.camera is not None
     values = {"apex": TRUE.apex, "phase": 0.2, **parameters}
-    return Calibration("exact", recording.camera, TRUE, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+    return exact_calibration(recording.camera, TRUE, values)
 
 
 class Counted:
