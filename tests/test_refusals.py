@@ -11,7 +11,7 @@ from conftest import TRUE_PRISM
 from amiwarp.calib import calibrate
 from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.photometric.acceptance import verdict
-from amiwarp.calib.prism_speed import turns_per_turn
+from amiwarp.calib.prism_speed import encoder_turns_per_period
 from amiwarp.calib.selection.trial import FARTHEST_PX, in_pixels
 from amiwarp.calib.sharpness.search import Settings
 from amiwarp.calib.single_model import prepare
@@ -84,7 +84,7 @@ def test_the_events_repeat_once_a_turn_of_a_good_encoder(recording: Recording) -
     for factor in (0.5, 0.98, 1.0, 1.024, 2.0):
         wrong = scaled(recording, factor)
         assert wrong.encoder is not None
-        assert turns_per_turn(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
+        assert encoder_turns_per_period(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
 
 
 # -- events of no use

@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from amiwarp.calib import Calibration
-from amiwarp.calib.bad_pixels import Masked
+from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.calib.parameters import build_model
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
@@ -92,7 +92,7 @@ def test_every_source_finds_a_moment(million: MemoryEvents, tmp_path: Path) -> N
     text = "\n".join(f"{t * 1e-6:.6f} {x} {y} {p}" for t, x, y, p in zip(some.t, some.x, some.y, some.p, strict=True))
     (tmp_path / "events.txt").write_text(text + "\n")
     save_recording(tmp_path / "events.h5", Recording(MemoryEvents(some, 4, 4)))
-    hidden = Masked(MemoryEvents(some, 4, 4), np.zeros((4, 4), np.bool_))
+    hidden = MaskedEventSource(MemoryEvents(some, 4, 4), np.zeros((4, 4), np.bool_))
     sources = [open_recording(tmp_path / name).events for name in ("events.txt", "events.h5")] + [hidden]
     for moment in (-5, int(some.t[0]), 3_456, int(some.t[-1]), 10_000_000):
         assert {source.find(moment) for source in sources} == {int(np.searchsorted(some.t, moment))}
