@@ -12,9 +12,9 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.checks import edge_coherence
+from amiwarp.calib.preparation import prepare
 from amiwarp.calib.prism_speed import estimate_rpm
 from amiwarp.calib.sharpness.search import PARTS
-from amiwarp.calib.single_model import prepare
 from amiwarp.calib.space_setup import make_space
 from amiwarp.calib.thinning import RUN, thin
 from amiwarp.errors import AmiwarpError

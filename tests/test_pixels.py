@@ -13,11 +13,11 @@ from amiwarp.calib import calibrate
 from amiwarp.calib.bad_pixels import (
     BadPixelSummary,
     bin_times,
-    without_pixels,
     outliers,
     strange_pixels,
     stretch,
     unrepeated_counts,
+    without_pixels,
 )
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents

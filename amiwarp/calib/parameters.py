@@ -60,6 +60,8 @@ CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera."""
 MOTION = (*RATES, *CHANGES)
 """All parameters of the camera's rotation."""
+EXACT_PARAMETERS = ("apex", "index", "tilt_x", "tilt_y")
+"""Parameters that the circle models do not have."""
 DEGENERATE_WITH_APEX = ("index", "focal_length")
 """Left to the photometric stage if it runs: nearly degenerate with the apex in sharpness."""
 
