@@ -57,7 +57,13 @@ def calibrate(
     Examples
     --------
     >>> import numpy as np
-    >>> texture = np.kron(np.random.default_rng(0).random((24, 24)), np.ones((8, 8)))
+    >>> blocks = np.random.default_rng(0).integers(0, 255, (30, 40), dtype=np.uint8)
+    >>> texture = np.kron(blocks, np.ones((8, 8), np.uint8))
+    >>> camera = amiwarp.Camera.from_fov(80, 60, 0.9)
+    >>> recording = amiwarp.simulate(texture, camera, amiwarp.Prism(apex=0.03), duration_s=0.1, seed=0)
+    >>> calibration = amiwarp.calibrate(recording, model="exact")
+    >>> round(calibration.parameters["apex"], 3)
+    0.03
     """
     settings = replace(settings or Settings(), **changes)
     settings.check()
