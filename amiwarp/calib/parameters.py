@@ -66,7 +66,7 @@ DEGENERATE_WITH_APEX = ("index", "focal_length")
 """Left to the photometric stage if it runs: nearly degenerate with the apex in sharpness."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ParameterSpace:
     """Free parameters of one model: names, bounds and start, and their conversion to and from the search vector.
 
@@ -77,9 +77,9 @@ class ParameterSpace:
     model: str
     """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
-    """The camera. A free focal length replaces its own."""
+    """Nominal camera. If the focal length is free, its value replaces that of the camera."""
     prism: Prism
-    """The nominal prism. It gives the index if that is not free, and the flat side."""
+    """Nominal prism. It gives the flat side, and the index if that is not free."""
     names: tuple[str, ...]
     """Names of the free parameters, in the order of the vector."""
     low: Mapping[str, float]

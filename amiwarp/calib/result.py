@@ -70,9 +70,9 @@ class Calibration:
     model_name: str
     """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
-    """The camera. A calibrated focal length is in ``parameters`` and replaces its own."""
+    """Nominal camera. If ``parameters`` contain a focal length, it replaces that of the camera."""
     prism: Prism
-    """The nominal prism. It gives the index if that was not free, and the flat side."""
+    """Nominal prism. It gives the flat side, and the index if that was not free."""
     parameters: Mapping[str, float]
     """Parameter values by name, in the units of ``amiwarp.calib.parameters.UNITS``."""
     uncertainty: Mapping[str, float]

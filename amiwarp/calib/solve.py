@@ -140,7 +140,9 @@ def maximise(
     check_algorithm(algorithm, names)
     began = time.perf_counter()
     nlopt.srand(seed + 1)  # 0 would seed NLopt from the clock
-    optimiser = _optimiser(algorithm, low, high, evaluations, tolerance, step, inner)
+    optimiser = _optimiser(
+        algorithm, low=low, high=high, evaluations=evaluations, tolerance=tolerance, step=step, inner=inner
+    )
     samples = _EvaluationLog(score, evaluations, optimiser.force_stop)
     optimiser.set_min_objective(samples.cost)
     try:
@@ -199,6 +201,7 @@ _ENDS = {1: "converged", 2: "score reached", 3: "tolerance of the score", 4: "to
 
 def _optimiser(
     algorithm: str,
+    *,
     low: NDArray[np.float64],
     high: NDArray[np.float64],
     evaluations: int,
@@ -222,6 +225,9 @@ def _optimiser(
         optimiser.set_initial_step(np.minimum(step, 0.45 * (high - low)))
     if "MLSL" in algorithm:
         check_algorithm(inner, LOCAL_ALGORITHMS)
-        local = _optimiser(inner, low, high, max(20, evaluations // 8), max(tolerance, 0.05), step, inner)
+        local = _optimiser(
+            inner, low=low, high=high, evaluations=max(20, evaluations // 8), tolerance=max(tolerance, 0.05),
+            step=step, inner=inner,
+        )  # fmt: skip
         optimiser.set_local_optimizer(local)
     return optimiser

@@ -97,9 +97,14 @@ def make_space(
         if not low[name] < high[name]:
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower first")
         values[name] = min(max(values[name], low[name]), high[name])
-    shifts = _pixels_per_unit(model, camera, prism, names, values, rad_per_us, duration_us)
+    shifts = _pixels_per_unit(
+        model, camera, prism, names=names, values=values, rad_per_us=rad_per_us, duration_us=duration_us
+    )
     undrifted = {n: x for n, x in values.items() if n in DRIFTS}
-    return ParameterSpace(model, camera, prism, names, low, high, values, shifts, middle_us, duration_us, undrifted)
+    return ParameterSpace(
+        model=model, camera=camera, prism=prism, names=names, low=low, high=high, start=values, pixels=shifts,
+        middle_us=middle_us, duration_us=duration_us, undrifted=undrifted,
+    )  # fmt: skip
 
 
 def _ordered_names(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
@@ -154,6 +159,7 @@ def _pixels_per_unit(
     model: str,
     camera: Camera,
     prism: Prism,
+    *,
     names: tuple[str, ...],
     values: Mapping[str, float],
     rad_per_us: float,

@@ -77,7 +77,7 @@ class PhotometricSummary:
     cost: float
     """Mean robust residual at the answer, relative to that without a brightness map."""
     cost_at_sharpness: float
-    """The same at the answer of the sharpness stage."""
+    """Cost at the answer of the sharpness stage, relative to that without a brightness map."""
     residual: float
     """Median magnitude of the residuals [ON thresholds]."""
     pairs: int

@@ -92,7 +92,7 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
     else:
         tile_of, tiles = choose_tiles(search.image(), settings.density, margin)
     collector = _PairCollector(recording, search, tile_of, settings.sensor)
-    spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in _van_der_corput(turns)]
+    spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
     if search.full_space.moving:
         spans = [(first, last + 1)]  # a rotating camera needs successive turns
     many = min(FEWEST_TURNS, len(spans))
@@ -104,10 +104,10 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
     keep = max(FEWEST_TILES, round(count * settings.pairs / max(len(pairs), 1)))
     if keep >= count:
         return pairs, tiles
-    return pairs.of_tiles(np.isin(np.arange(count), _van_der_corput(count)[:keep])), tiles
+    return pairs.of_tiles(np.isin(np.arange(count), van_der_corput(count)[:keep])), tiles
 
 
-def _van_der_corput(n: int) -> list[int]:
+def van_der_corput(n: int) -> list[int]:
     """Return 0 … n-1 in van der Corput's order: the first numbers of the list are always spread evenly."""
     bits = max(1, (n - 1).bit_length())
     order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))

@@ -140,15 +140,17 @@ class Search:
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
         self.progress = progress
         self.stages: list[StageSummary] = []
-        self.fine = self._objective(calibration_events, 1.0, settings.smoothing_px)
+        self.fine = self._objective(calibration_events, scale=1.0, smoothing=settings.smoothing_px)
 
     def _objective_by_parts(self, kind: Sharpness) -> Objective:
         """Return an objective that measures disjoint parts of the events separately."""
-        return self._objective(self.calibration_events, 1.0, max(1.0, self.settings.smoothing_px), kind, parts=PARTS)
+        smoothing = max(1.0, self.settings.smoothing_px)
+        return self._objective(self.calibration_events, scale=1.0, smoothing=smoothing, kind=kind, parts=PARTS)
 
     def _objective(
         self,
         events: CalibrationEvents,
+        *,
         scale: float,
         smoothing: float,
         kind: Sharpness | None = None,
@@ -179,7 +181,7 @@ class Search:
 
     def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
         step = max(1, len(events.events) // (self.settings.events // 3 + 1))
-        return self._objective(events.every(step), 0.5, 4.0, space=space)
+        return self._objective(events.every(step), scale=0.5, smoothing=4.0, space=space)
 
     def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
         """Return the starts for the local search. The camera's rotation stays at its start."""
