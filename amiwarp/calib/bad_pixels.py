@@ -91,7 +91,7 @@ def stretch(source: EventSource, encoder: Encoder) -> Events:
     first, whole = source.t_first, source.t_last + 1 - source.t_first
     turn = 60e6 / max(abs(encoder.rpm), 1e-6)
     turns = min(max(MOST_EVENTS * whole / (len(source) * turn), LEAST_TURNS), MOST_TURNS)
-    # two turns may exceed MOST_EVENTS, but at a very low speed they must not load a whole file
+    # two turns may hold more than MOST_EVENTS, but turns of a very slow prism must not load a whole file
     most = min(whole, 4.0 * MOST_EVENTS * whole / len(source))
     length = math.ceil(min((math.floor(turns) + 0.05) * turn, most))
     start = first + (whole - length) // 2

@@ -43,7 +43,7 @@ def candidate_names(recording: Recording, exact: Calibration) -> tuple[str, ...]
 
 
 def judge_parameters(trial: Trial) -> tuple[FreedParameter, ...]:
-    """Decide for each group of the trial's parameters whether to free it, and rate a calibrated rpm."""
+    """Decide for each group of the trial's parameters whether to free it, and whether a free rpm is determined."""
     found = [_judge(trial, group) for group, members in GROUPS.items() if set(members) <= set(trial.space.names)]
     if "rpm" in trial.exact.uncertainty:
         angle = trial.exact.uncertainty["rpm"] * (math.tau / 60e6) * trial.duration_us / math.sqrt(12.0)

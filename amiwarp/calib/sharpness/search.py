@@ -56,7 +56,7 @@ class Settings:
     """
 
     model: str = AUTO
-    """Model: ``circle``, ``radial``, ``ellipse``, ``exact``, or ``auto`` for the smallest one that keeps the budget."""
+    """Model: ``circle``, ``radial``, ``ellipse``, ``exact``, or ``auto`` for the smallest with a tolerable error."""
     budget_px: float | None = None
     """Largest tolerated model error for ``auto`` [px rms]; None: a tenth of the blur by quantisation and timing."""
     sharpness: Sharpness = Sharpness.VARIANCE
