@@ -24,6 +24,7 @@ from typing import Any
 import h5py
 import hdf5plugin
 import numpy as np
+from calibration_sample import exact_calibration
 from io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
 from PIL import Image
 
@@ -73,7 +74,7 @@ def write_csv(path: Path) -> None:
 def write_calibration(path: Path) -> None:
     camera = Camera(*SIZE, 200.0, 200.0, 150.0, 110.0, Fisheye(0.1, 0.0, 0.0, 0.0))
     values = {"apex": 0.035, "phase": 0.5, "tilt_x": 0.0, "tilt_y": 0.0, "clock_offset": 0.0}
-    Calibration("exact", camera, Prism(0.035), values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(path)
+    exact_calibration(camera, Prism(0.035), values).save(path)
 
 
 def write_camera(path: Path) -> None:

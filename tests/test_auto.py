@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection import model_choice as auto
 from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.selection.smaller_models import Places, encoder_noise, fit, rung_space
-from amiwarp.calib.selection.trial import FACTOR, make_trial
-from amiwarp.calib.sharpness.held_out import halves
-from amiwarp.calib.sharpness.search import Material
+from amiwarp.calib.selection.smaller_models import Places, candidate_space, encoder_noise, fit
+from amiwarp.calib.selection.trial import CONVERSION_FACTOR, make_trial
+from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
+from amiwarp.calib.sharpness.held_out import split_turns
 from amiwarp.calib.thinning import thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -92,8 +92,8 @@ def test_a_wide_lens_does_not(found: Calibration, wide: Recording) -> None:
     assert [r.model for r in rungs.values() if r.chosen] == ["exact"]
     exact = replace(found.exact, parameters={"apex": truth.prism.apex, "phase": truth.phase})
     for name in ("circle", "radial"):
-        space = rung_space(name, exact, (), rad_per_us=7.5e-5, duration_us=3e5)
-        assert rungs[name].predicted_px == pytest.approx(fit(space, places.moved(truth), places)[1], rel=0.05)
+        space = candidate_space(name, exact, (), rad_per_us=7.5e-5, duration_us=3e5)
+        assert rungs[name].predicted_px == pytest.approx(fit(space, places.compensated(truth), places)[1], rel=0.05)
     assert rungs["circle"].predicted_px > 10 * found.ladder.budget_px
     assert rungs["exact"].predicted_px == 0.0
 
@@ -116,15 +116,15 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     ratio = found.uncertainty["deflection"] / found.exact.uncertainty["apex"]
     apex = found.exact.parameters["apex"]
     larger = replace(found.exact, parameters={**found.exact.parameters, "apex": 1.01 * apex})
-    space = rung_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
-    deflection = fit(space, places.moved(larger.model), places)[0]["deflection"]
+    space = candidate_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
+    deflection = fit(space, places.compensated(larger.model), places)[0]["deflection"]
     assert ratio == pytest.approx((deflection - found.parameters["deflection"]) / (0.01 * apex), rel=0.02)
     # no nearer one is found by a method that shares nothing with it
-    target = places.moved(found.exact.model)
+    target = places.compensated(found.exact.model)
 
     def error(v: np.ndarray) -> float:
         model = CircleModel(found.camera, v[0] * 1e-2, v[1])
-        return float(np.sqrt(np.mean(np.sum((places.moved(model) - target) ** 2, axis=1))))
+        return float(np.sqrt(np.mean(np.sum((places.compensated(model) - target) ** 2, axis=1))))
 
     start = [found.parameters["deflection"] * 1e2, found.parameters["phase"]]
     best = minimize(error, start, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-6}).fun
@@ -134,8 +134,8 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
 def test_held_out_turns_see_the_circle_s_error_in_pixels(found: Calibration) -> None:
     assert found.ladder is not None
     circle = found.ladder.rungs[0]
-    assert circle.seen_px[0] > circle.predicted_px / FACTOR
-    assert circle.seen_px[1] < circle.predicted_px * FACTOR
+    assert circle.seen_px[0] > circle.predicted_px / CONVERSION_FACTOR
+    assert circle.seen_px[1] < circle.predicted_px * CONVERSION_FACTOR
     assert found.ladder.agreed
     assert found.warnings == ()
 
@@ -144,10 +144,10 @@ def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording, monke
     """Were the circle predicted to be without error, held-out turns would still refuse it."""
     monkeypatch.setattr(auto, "fit", lambda *given: (fit(*given)[0], 0.0))
     trial = make_trial(wide, found.exact, SHARPNESS, (), device="cpu", budget_px=None)
-    circle, exact = (j.rung for j in auto.judge_rungs(trial)[:2])
+    circle, exact = (f.candidate for f in auto.fit_models(trial)[:2])
     assert not circle.chosen
-    assert circle.seen_px[0] > trial.tells_px
-    assert circle.verdict.startswith("under the budget as predicted, but held-out turns miss")
+    assert circle.seen_px[0] > trial.rejection_px
+    assert circle.verdict.startswith("predicted under the budget, but held-out turns show an error")
     assert exact.chosen
 
 
@@ -236,7 +236,7 @@ def test_halves_are_alternate_turns() -> None:
     t = np.arange(0, 1_000_000, 100, dtype=np.int64)
     zero = np.zeros(len(t), np.uint16)
     encoder = Encoder.constant_speed(300.0, 0, 1_000_000)  # five turns
-    first, second = halves(Material(Events(zero, zero, t, zero.astype(np.uint8)), encoder, None))
+    first, second = split_turns(CalibrationEvents(Events(zero, zero, t, zero.astype(np.uint8)), encoder, None))
     assert np.array_equal(np.sort(np.concatenate([first.t, second.t])), t)
     # one at its very edge may be either's
     whole = [half.t[half.t % 200_000 > 1000] // 200_000 for half in (first, second)]

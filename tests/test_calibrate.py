@@ -12,10 +12,10 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.checks import edge_coherence
-from amiwarp.calib.parameters import make_space
+from amiwarp.calib.preparation import prepare
 from amiwarp.calib.prism_speed import estimate_rpm
 from amiwarp.calib.sharpness.search import PARTS
-from amiwarp.calib.single_model import prepare
+from amiwarp.calib.space_setup import make_space
 from amiwarp.calib.thinning import RUN, thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -281,8 +281,8 @@ def test_unknown_camera(recording: Recording) -> None:
         ({"free": ("apex", "focal")}, "focal"),
         ({"free": ("rpm", "apex")}, "encoder gives the rpm"),
         ({"start": {"rpm": 720.0}}, "encoder gives the rpm"),
-        ({"start": {"deflection": 0.01}}, "deflection, which the exact model has not"),
-        ({"bounds": {"index": (1.4, 1.6)}}, "index are given, which is not free"),
+        ({"start": {"deflection": 0.01}}, "deflection, which is no parameter of the exact model"),
+        ({"bounds": {"index": (1.4, 1.6)}}, "given for index, which is not free"),
         ({"free": ()}, "no parameter is free"),
         ({"model": "circle", "free": ("deflection", "tilt_x")}, "tilt_x"),
         ({"model": "sphere"}, "sphere"),

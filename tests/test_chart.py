@@ -385,7 +385,7 @@ def test_presets_that_are_no_files_are_named(charted: tuple[Path, dict[str, Any]
     assert "recording.h5" in fails(*words)
     words = ("calibrate", folder / "recording.h5", tmp_path / "c.json", "--preset")
     assert "missing.json" in fails(*words, tmp_path / "missing.json")
-    assert "needed here is a preset for calibration" in fails(*words, folder / "out" / "preset_compensation.json")
+    assert "give a preset for calibration" in fails(*words, folder / "out" / "preset_compensation.json")
     file = tmp_path / "p.json"
     file.write_text('{"format": "amiwarp-preset", "version": 1, "kind": "compensation", "settings": {}}')
     with pytest.raises(AmiwarpError, match="model is None"):

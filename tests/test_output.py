@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from PIL import Image
 from typer.testing import CliRunner, Result
 
@@ -57,9 +58,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with open_recording(folder / "a.h5").events.path.open("rb") as file:
         assert file.read(4) == b"\x89HDF"
     values = {"apex": math.radians(2.0), "index": 1.5168, "phase": 0.0, "tilt_x": 0.0, "tilt_y": 0.0}
-    Calibration("exact", CAMERA, Prism(math.radians(2.0)), values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(
-        folder / "cal.json"
-    )
+    exact_calibration(CAMERA, Prism(math.radians(2.0)), values).save(folder / "cal.json")
     camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     (folder / "cam.json").write_text(json.dumps(camera))
     (folder / "enc.csv").write_text("t_us,angle_deg\n-1000,0\n100000,436.3\n201000,872.6\n")

@@ -13,7 +13,8 @@ from scipy.sparse.linalg import spsolve
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.brightness.solver import BrightnessMap, Tiles
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings, _spread
+from amiwarp.calib.photometric.pair_collection import van_der_corput
+from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -239,8 +240,8 @@ def test_no_pair_is_an_error() -> None:
 
 
 def test_turns_are_spread() -> None:
-    assert sorted(_spread(24)) == list(range(24))
-    assert _spread(8)[:4] == [0, 4, 2, 6]
+    assert sorted(van_der_corput(24)) == list(range(24))
+    assert van_der_corput(8)[:4] == [0, 4, 2, 6]
 
 
 def test_a_memory_source_without_truth(recording: Recording) -> None:

@@ -11,13 +11,13 @@ from scipy import ndimage
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.bad_pixels import (
-    StrangeSummary,
+    BadPixelSummary,
     bin_times,
-    keep,
-    stands_out,
+    outliers,
     strange_pixels,
     stretch,
-    unlocked_counts,
+    unrepeated_counts,
+    without_pixels,
 )
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -72,7 +72,7 @@ def events_of(recording: Recording) -> Events:
     return recording.events.slice(0, len(recording.events))
 
 
-def strange(recording: Recording, every: int = 1) -> tuple[NDArray[np.bool_], StrangeSummary]:
+def strange(recording: Recording, every: int = 1) -> tuple[NDArray[np.bool_], BadPixelSummary]:
     assert recording.encoder is not None
     events = events_of(recording)
     return strange_pixels(events[np.arange(len(events)) // 8 % every == 0], recording.encoder, SIZE)
@@ -142,11 +142,11 @@ def test_what_repeats_counts_for_nothing_and_what_does_not_for_itself() -> None:
     x = np.concatenate([np.zeros(len(locked)), np.ones(len(random)), [2, 2]]).astype(np.uint16)
     order = np.argsort(t, kind="stable")
     events = Events(x, np.zeros_like(x), t, (t % 2).astype(np.uint8))[order]
-    found = unlocked_counts(events, events.x.astype(np.int32), encoder, (3, 1))
+    found = unrepeated_counts(events, events.x.astype(np.int32), encoder, (3, 1))
     assert found is not None
     assert found[0, 0] == pytest.approx(0.0, abs=1e-9)
     assert found[0, 1] == pytest.approx(4000.0, rel=0.5)  # 40 squares: a standard deviation of 0.22
-    assert unlocked_counts(events[events.t < 190_000], events.x.astype(np.int32), encoder, (3, 1)) is None
+    assert unrepeated_counts(events[events.t < 190_000], events.x.astype(np.int32), encoder, (3, 1)) is None
 
 
 @pytest.mark.parametrize("rpm", [600.0, -600.0])
@@ -162,11 +162,11 @@ def test_bins_of_the_angle(rpm: float) -> None:
 def test_a_fast_pixel_stands_out_a_fast_region_does_not() -> None:
     count = np.full((20, 20), 10.0)
     count[:, 10:] = 1000.0
-    assert not stands_out(count).any()
+    assert not outliers(count).any()
     count[5, 5] = 80.0
     count[0, 0] = count[5, 6] = 200.0
     count[8, 15] = 3500.0
-    assert np.argwhere(stands_out(count)).tolist() == [[0, 0], [5, 5], [5, 6], [8, 15]]
+    assert np.argwhere(outliers(count)).tolist() == [[0, 0], [5, 5], [5, 6], [8, 15]]
 
 
 # -- flicker
@@ -197,7 +197,7 @@ def test_calibration_without_them(texture: NDArray[np.uint8]) -> None:
     assert recording.camera is not None
     assert recording.truth is not None
     truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
-    cut = replace(recording, events=MemoryEvents(keep(events_of(recording), mask), *SIZE))
+    cut = replace(recording, events=MemoryEvents(without_pixels(events_of(recording), mask), *SIZE))
     settings = {"stages": ("sharpness",), "events": 100_000}
     assert model_error(calibrate(cut, **settings).model, truth).rms < 0.3
     assert model_error(calibrate(recording, **settings).model, truth).rms > 0.5
@@ -226,9 +226,9 @@ def test_a_stretch_of_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_keep() -> None:
     events = Events.from_arrays([1, 2, 3, 2], [0, 1, 1, 1], [5, 6, 7, 8], [1, 0, 1, 1])
     mask = np.zeros((2, 4), np.bool_)
-    assert keep(events, mask) is events
+    assert without_pixels(events, mask) is events
     mask[1, 2] = True
-    assert keep(events, mask).t.tolist() == [5, 7]
+    assert without_pixels(events, mask).t.tolist() == [5, 7]
 
 
 def test_nothing_to_look_at() -> None:
@@ -241,6 +241,6 @@ def test_nothing_to_look_at() -> None:
 
 
 def test_the_summary_says_what_was_left_out() -> None:
-    assert str(StrangeSummary(1, 0, (), 0.031)) == "1 hot pixel left out, 3 % of the events"
-    text = str(StrangeSummary(12, 3400, (100.2,), 0.41))
+    assert str(BadPixelSummary(1, 0, (), 0.031)) == "1 hot pixel left out, 3 % of the events"
+    text = str(BadPixelSummary(12, 3400, (100.2,), 0.41))
     assert text == "12 hot pixels and 3400 that flicker at 100 Hz left out, 41 % of the events"

@@ -8,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -81,7 +82,7 @@ def with_events(recording: Recording, events: Events) -> Recording:
 
 def calibration() -> Calibration:
     parameters = {"apex": PRISM.apex, "phase": PHASE}
-    return Calibration("exact", CAMERA, PRISM, parameters, {}, (), "variance", 1.0, 2.0, (), 0, 0.0)
+    return exact_calibration(CAMERA, PRISM, parameters)
 
 
 def test_one_turn_looks_like_the_truth(picture: Picture, truth: NDArray[np.float32]) -> None:

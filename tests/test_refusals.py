@@ -10,11 +10,11 @@ from conftest import TRUE_PRISM
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.checks import check_pulses, check_texture
-from amiwarp.calib.photometric.acceptance import verdict
-from amiwarp.calib.prism_speed import turns_per_turn
-from amiwarp.calib.selection.trial import FARTHEST_PX, in_pixels
+from amiwarp.calib.photometric.acceptance import judge_optimum
+from amiwarp.calib.preparation import prepare
+from amiwarp.calib.prism_speed import encoder_turns_per_period
+from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, in_pixels
 from amiwarp.calib.sharpness.search import Settings
-from amiwarp.calib.single_model import prepare
 from amiwarp.cli.inputs import interval, number
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TURN, Encoder
@@ -84,7 +84,7 @@ def test_the_events_repeat_once_a_turn_of_a_good_encoder(recording: Recording) -
     for factor in (0.5, 0.98, 1.0, 1.024, 2.0):
         wrong = scaled(recording, factor)
         assert wrong.encoder is not None
-        assert turns_per_turn(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
+        assert encoder_turns_per_period(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
 
 
 # -- events of no use
@@ -168,11 +168,11 @@ def test_a_motion_that_turns_all_out_of_view_is_refused() -> None:
 
 def test_words_for_numbers_that_mean_nothing() -> None:
     assert in_pixels(0.25) == "0.250 px"
-    assert in_pixels(27_431.659) == f"more than {FARTHEST_PX:g} px"
-    assert "over 1.5 px" in verdict(0.1, 0.1, 0.1, 3e5)[1]
-    assert "100 %" in verdict(1.7, 0.1, 0.1, 0.0)[1]
-    assert "explains the events better" in verdict(0.1, -0.02, 0.1, 0.0)[1]
-    assert "0.4 % of the residual more" in verdict(0.1, 0.004, 0.1, 0.0)[1]
+    assert in_pixels(27_431.659) == f"more than {LARGEST_MOTION_PX:g} px"
+    assert "over 1.5 px" in judge_optimum(0.1, rise=0.1, moved=0.1, next_step=3e5)[1]
+    assert "100 %" in judge_optimum(1.7, rise=0.1, moved=0.1, next_step=0.0)[1]
+    assert "explains the events better" in judge_optimum(0.1, rise=-0.02, moved=0.1, next_step=0.0)[1]
+    assert "0.4 % of the residual more" in judge_optimum(0.1, rise=0.004, moved=0.1, next_step=0.0)[1]
     worse = np.linspace(0.0, 1.0, 8)
     with pytest.raises(AmiwarpError, match="it is less sharp, or the same"):
         check_texture(worse, worse + 3.0, worse, "recording")

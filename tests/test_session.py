@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from rig_world import LONG_S, Counted, Wire, World, has_taken_in
 
-from amiwarp.calib.result import Calibration
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.compensation.streams import OUTSIDE, Compensated
 from amiwarp.errors import AmiwarpError
@@ -40,9 +40,7 @@ from amiwarp.optics.prism import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.4)
-KNOWN = Calibration(
-    "exact", CAMERA, PRISM, {"apex": PRISM.apex, "phase": 0.4}, {}, (), "variance", 0.0, 0.0, (), 0, 0.0
-)
+KNOWN = exact_calibration(CAMERA, PRISM, {"apex": PRISM.apex, "phase": 0.4})
 COUNTS = 65536
 SPEED_PX_US = 720 / 60e6 * math.tau * math.radians(2.0) * 0.52 * CAMERA.fx
 """By which the prism moves an event while its clock is wrong by a microsecond."""

@@ -20,6 +20,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from rig_world import LONG_S
 from typer.testing import CliRunner
 
@@ -58,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_recording(path / "recording.h5", Recording(events, CAMERA, encoder, PRISM))
     save_recording(path / "still.h5", Recording(events, CAMERA))
     values = {"apex": PRISM.apex, "phase": 0.4}
-    Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(path / "c.json")
+    exact_calibration(CAMERA, PRISM, values).save(path / "c.json")
     return path
 
 
@@ -316,7 +317,7 @@ def test_bad_input_is_one_line(
 
 def test_another_camera_is_refused(folder: Path, tmp_path: Path) -> None:
     values = {"apex": PRISM.apex, "phase": 0.4}
-    other = Calibration("exact", Camera.from_fov(32, 24, 1.0), PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+    other = exact_calibration(Camera.from_fov(32, 24, 1.0), PRISM, values)
     other.save(tmp_path / "other.json")
     done = CliRunner().invoke(
         app, ["live", str(folder / "recording.h5"), "--calibration", str(tmp_path / "other.json")]

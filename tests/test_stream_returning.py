@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from test_stream_cli import start
 from typer.testing import CliRunner
 
-from amiwarp.calib.result import Calibration
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -82,7 +82,7 @@ def sender(path: Path, *streams: bytes | Callable[[], bytes]) -> Iterator[str]:
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("known") / "c.json"
     values = {"apex": PRISM.apex, "phase": 0.4}
-    Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(path)
+    exact_calibration(CAMERA, PRISM, values).save(path)
     return path
 
 

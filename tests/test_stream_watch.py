@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.streams import Compensated, Compensator
@@ -48,7 +49,7 @@ def recording(texture: np.ndarray) -> Recording:
 def known(recording: Recording, away_deg: float) -> Calibration:
     assert recording.truth is not None
     values = {"apex": PRISM.apex, "phase": recording.truth.parameters["phase"] - math.radians(away_deg)}
-    return Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+    return exact_calibration(CAMERA, PRISM, values)
 
 
 def streamed(recording: Recording) -> EncoderStream:
