@@ -36,7 +36,7 @@ from amiwarp.optics.models import MODELS, EllipseModel
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
-from amiwarp.studies.machine import machine
+from amiwarp.studies.machine_info import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1

@@ -44,7 +44,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import CircleModel, ExactModel, Model
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
-from amiwarp.studies.machine import machine
+from amiwarp.studies.machine_info import machine
 
 PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))
 MODELS: dict[str, Model] = {

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import amiwarp
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.calib.parameters import build_model
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.presets import simplified
 from amiwarp.calib.sharpness.search import STAGES, Settings
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
@@ -27,7 +27,7 @@ from amiwarp.imaging.export import IweFiles, to_picture
 from amiwarp.imaging.sharpness_costs import SharpnessMeter, sharpness
 from amiwarp.imaging.warped_image import CanvasShape, iwe
 from amiwarp.io.formats import Format, open_recording
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, CircleModel, ExactModel, RadialCircleModel

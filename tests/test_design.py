@@ -28,9 +28,9 @@ from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 from amiwarp.studies.design import Design, Limits, Timing, design
 from amiwarp.studies.design.choice import ACROSS, LEAST_SWING, QUANTISATION_PX
 from amiwarp.studies.design.drawing import chart
-from amiwarp.studies.design.orbit import QUARTER_SWING, orbit_of
+from amiwarp.studies.design.event_volume import TILE, filled, measure, tiles
+from amiwarp.studies.design.orbit_size import QUARTER_SWING, orbit_of
 from amiwarp.studies.design.recommendation import headline, reasons
-from amiwarp.studies.design.volume import TILE, filled, measure, tiles
 
 GLASS = Prism(0.0)
 SMALL = Camera.from_fov(64, 48, math.radians(10.0))

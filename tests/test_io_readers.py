@@ -10,7 +10,8 @@ from io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sam
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, EventSource, MemoryEvents
-from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording, scan
+from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording
+from amiwarp.io import file_scan as scan
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import Prism

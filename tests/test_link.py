@@ -18,16 +18,17 @@ from typer.testing import CliRunner
 
 from amiwarp.cli import motor as command
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link import following, updates
+from amiwarp.live.link import follower as following
 from amiwarp.live.link import link as link_module
+from amiwarp.live.link import updates
 from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.emulated_rotors import Motor
 from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault
-from amiwarp.live.link.following import Follower
+from amiwarp.live.link.follower import Follower
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.port import open_port, usb_id
 from amiwarp.live.link.protocol import Answer, ControllerStatus, FrameDecoder, Index, Message, Ping, Samples, encode
-from amiwarp.live.link.rotors import Motor
-from amiwarp.live.link.terminal import PseudoTerminal
+from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 from amiwarp.live.link.updates import LinkUpdate
 
 S = 1_000_000

@@ -27,9 +27,10 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.export import IweFiles
-from amiwarp.io import RecordingWriter, convert, open_recording, output, save_recording
+from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
+from amiwarp.io import atomic_output as output
+from amiwarp.io.atomic_output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.io.output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -405,7 +406,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path, dead_pid:
 
 def test_sigkill_leaves_nothing_after_the_next_run(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; from amiwarp.io.output import NewFile\n"
+        "import os, signal, sys; from pathlib import Path; from amiwarp.io.atomic_output import NewFile\n"
         "new = NewFile(Path(sys.argv[1])); new.part.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", script, tmp_path / "a.txt"], env=environment(), check=False)

@@ -15,8 +15,8 @@ from io_samples import SIZE, make_events, write_text
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import Format, open_recording, read_encoder_csv
+from amiwarp.io.regular_file import check_regular
 from amiwarp.io.text import read_calib
-from amiwarp.regular_file import check_regular
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.translator import open_pictures
 
@@ -124,7 +124,7 @@ def test_npz_of_other_compressions(tmp_path):
 
 def test_an_archive_that_unpacks_to_much_takes_little_memory(tmp_path, monkeypatch):
     """Four arrays of 64 MiB in a quarter of a megabyte."""
-    monkeypatch.setattr("amiwarp.io.scan.KEEP_EVENTS", 0)
+    monkeypatch.setattr("amiwarp.io.file_scan.KEEP_EVENTS", 0)
     path = npz(tmp_path / "a.npz", f"({1 << 23},)", bytes(1 << 26))
     assert path.stat().st_size < 1 << 20
     tracemalloc.start()

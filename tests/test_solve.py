@@ -6,7 +6,7 @@ import weakref
 import numpy as np
 import pytest
 
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.errors import AmiwarpError
 
 LOW, HIGH = np.array([-10.0, -10.0]), np.array([10.0, 10.0])

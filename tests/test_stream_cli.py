@@ -63,7 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.DRAIN_S = 120.0; "
+PATIENT = "import amiwarp.live.stream.socket_sinks as sockets; sockets.DRAIN_S = 120.0; "
 """Code placed before a command that serves packets: at the end it waits longer for slow receivers."""
 
 
@@ -255,9 +255,9 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
 
 def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The motor starts from rest. Random events exceed the allowed event rate, so the speed is reduced."""
+    from amiwarp.live.link.emulated_rotors import Motor
     from amiwarp.live.link.emulator import Controller
-    from amiwarp.live.link.rotors import Motor
-    from amiwarp.live.link.terminal import PseudoTerminal
+    from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 
     motor = Motor()
     monkeypatch.setattr("amiwarp.live.link.link.ANSWER_S", LONG_S)

@@ -25,11 +25,11 @@ from amiwarp.events.recording import Recording
 from amiwarp.io import save_recording
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.live.stream.forward import Forward
-from amiwarp.live.stream.opening import open_source
+from amiwarp.live.stream.forwarding import Forward
 from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
+from amiwarp.live.stream.source_opening import open_source
 from amiwarp.live.stream.sources import FileSource
 from amiwarp.live.stream.speed_control import WINDOW_US, SpeedKeeper
 from amiwarp.optics.camera import Camera

@@ -17,16 +17,16 @@ import warp as wp
 from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.brightness.residuals import CHUNKS, Residuals
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import descent as cg
+from amiwarp.kernels import conjugate_gradients as cg
+from amiwarp.kernels import map_positions as places
 from amiwarp.kernels import photometric as kernels
-from amiwarp.kernels import places
-from amiwarp.kernels.descent import dot, gather, gather_diagonal
+from amiwarp.kernels.conjugate_gradients import dot, gather, gather_diagonal
 from amiwarp.kernels.launch import launch, slice_count
+from amiwarp.kernels.map_prior import EXTRA, Prior, link
 from amiwarp.kernels.pairs import keep_nodes
 from amiwarp.kernels.photometric import BLOCK, Geometry, add_diagonal, subtract, weigh
-from amiwarp.kernels.prior import EXTRA, Prior, link
-from amiwarp.kernels.replay import BLOCK_DIM, Program
-from amiwarp.kernels.slopes import slope_between
+from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
+from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.models import model_camera
@@ -75,7 +75,7 @@ class Tiles:
 class BrightnessMap:
     """Brightness map for a set of pairs, and its solver; owns its buffers. A solve starts from the last map.
 
-    Repeated launches are recorded once (:class:`amiwarp.kernels.replay.Program`). Nothing is read back in between.
+    Repeated launches are recorded once (:class:`amiwarp.kernels.recorded_launches.Program`). Nothing is read back in between.
     """
 
     def __init__(

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.nlopt_solver import best_of
 from amiwarp.calib.preparation import prepare
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.sharpness.search import STAGES, Settings
-from amiwarp.calib.solve import best_of
 from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from amiwarp.calib.nlopt_solver import SearchStage
     from amiwarp.calib.sharpness.search import Search
-    from amiwarp.calib.solve import SearchStage
     from amiwarp.events.recording import Recording
     from amiwarp.progress import Progress
 

@@ -14,9 +14,9 @@ from amiwarp.calib import Settings
 from amiwarp.calib.parameters import EXACT_PARAMETERS, size_name
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name
+from amiwarp.io.atomic_output import write_text
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
-from amiwarp.io.output import write_text
 from amiwarp.optics.models import MODELS
 from amiwarp.validation import one_of, shown
 

@@ -17,9 +17,9 @@ from amiwarp.calib.summaries import FreedParameter, ModelCandidate, ModelChoice,
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.io.files import errors_name
+from amiwarp.io.atomic_output import write_text
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
-from amiwarp.io.output import write_text
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from amiwarp.calib.nlopt_solver import SearchStage
     from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.calib.solve import SearchStage
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.live.stream.clocking import clock_offset
+from amiwarp.live.stream.camera_clock import clock_offset
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 

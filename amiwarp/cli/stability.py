@@ -19,8 +19,8 @@ from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import make_folder, own_folder
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.io.atomic_output import make_folder, own_folder
+from amiwarp.kernels.cpu_threads import cpu_threads
 
 if TYPE_CHECKING:
     from amiwarp.studies.stability import Atlas, Axis, Method, Stored
@@ -186,7 +186,7 @@ def _prepare(device: str, local: bool) -> None:
 
 
 def _about(cells: Sequence[Stored]) -> dict[str, Any]:
-    from amiwarp.studies.machine import versions
+    from amiwarp.studies.machine_info import versions
 
     machines = sorted({r.machine for c in cells for r in c.results.values() if r.machine})
     return {"date": time.strftime("%Y-%m-%d"), "machine": ", ".join(machines), "versions": versions(())}

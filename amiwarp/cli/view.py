@@ -19,7 +19,7 @@ from amiwarp.cli.streams import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.hosts import warning
+from amiwarp.viewer.host_names import warning
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -104,8 +104,8 @@ class StreamOptions:
         if not self.live:
             yield None
             return
-        from amiwarp.live.stream.opening import open_source
         from amiwarp.live.stream.recent_events import RecentEvents, followed
+        from amiwarp.live.stream.source_opening import open_source
 
         with SourceOptions(port=self.controller).link() as link:
             stream = open_source(source)

@@ -20,9 +20,10 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, check_events
 from amiwarp.events.recording import MetadataValue, Recording
+from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.copying import copy_events
-from amiwarp.io.files import errors_name
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
     Columns,
     check_frame,
@@ -33,7 +34,6 @@ from amiwarp.io.native_layout import (
     ms_entries,
     write_header,
 )
-from amiwarp.io.output import NewFile
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.kernels.cpu_threads import cpu_threads
 
 SMALLEST_SLICE = 1 << 15  # threads; launching a smaller slice takes longer than running it
 

@@ -11,9 +11,9 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
 from amiwarp.kernels.encoder import THETA_U16_RAD
-from amiwarp.kernels.native import load_uint32
-from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams, displace
+from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, displace
 from amiwarp.kernels.shared_memory import add_to_word, get_word, set_word, wait_for_block, window
+from amiwarp.kernels.vector_code import load_uint32
 from amiwarp.kernels.votes import Canvas, dither_offset
 
 # Fast math is on: these sums need not equal those of a CPU bit for bit.

@@ -16,8 +16,8 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
 from amiwarp.kernels.encoder import EncoderParams, theta_u32_at
-from amiwarp.kernels.native import add_word, load_float, load_uint8, load_uint16, store_int, store_word
-from amiwarp.kernels.optics import MODEL_STRUCTS, displace
+from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
+from amiwarp.kernels.vector_code import add_word, load_float, load_uint8, load_uint16, store_int, store_word
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import optics as kernels
+from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.device_camera import camera_params

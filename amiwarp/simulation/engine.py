@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.events.events import Events
 from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import launch as launching
-from amiwarp.kernels import sight
+from amiwarp.kernels import prism_view as sight
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
 from amiwarp.simulation.scenery import MapRing, place_scene, step_us

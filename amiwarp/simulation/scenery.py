@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import sight
+from amiwarp.kernels import prism_view as sight
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel

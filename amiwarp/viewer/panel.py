@@ -32,8 +32,8 @@ from amiwarp.viewer.inspector import Selection
 from amiwarp.viewer.jobs import CalibrationJob, Playback
 from amiwarp.viewer.layout import KEYS, NAMES, UNITS, build
 from amiwarp.viewer.message_filter import finite
+from amiwarp.viewer.page_values import event_text, initial_state, jpeg, percent_of_range, polyline, source_state
 from amiwarp.viewer.scene import ORBIT_COLOUR, Look, Scene
-from amiwarp.viewer.values import event_text, initial_state, jpeg, percent_of_range, polyline, source_state
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import DisplayedWindow, Inspector

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from amiwarp.calib.nlopt_solver import best_of
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.solve import best_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.calib.nlopt_solver import SearchStage
     from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.calib.solve import SearchStage
 
     Vector = NDArray[np.float64]
 

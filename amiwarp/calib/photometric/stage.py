@@ -16,14 +16,14 @@ import numpy as np
 
 from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
+from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION
 from amiwarp.calib.photometric.acceptance import LARGEST_MOVE_PX, judge_optimum
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined, iterate
 from amiwarp.calib.photometric.minimum_check import cost_around_optimum
 from amiwarp.calib.photometric.pair_collection import check_pairs, collect_pairs
-from amiwarp.calib.solve import LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
-from amiwarp.calib.stage_share import stage_share
+from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.summaries import PhotometricSummary, StageSummary
 from amiwarp.validation import real, whole
 

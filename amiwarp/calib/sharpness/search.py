@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib import checks
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION, UNITS, check_names
 from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.sharpness.curvature import finite_differences
 from amiwarp.calib.sharpness.objective import Objective
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
-from amiwarp.calib.stage_share import stage_share
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.models import MODELS

@@ -16,7 +16,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.session import Session
 
 if TYPE_CHECKING:

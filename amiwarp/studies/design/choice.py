@@ -14,8 +14,8 @@ from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
-from amiwarp.studies.design.orbit import Orbit, orbit_of
-from amiwarp.studies.design.volume import Volume, filled, measure
+from amiwarp.studies.design.event_volume import Volume, filled, measure
+from amiwarp.studies.design.orbit_size import Orbit, orbit_of
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera

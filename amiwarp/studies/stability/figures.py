@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
-from amiwarp.io.output import NewFile
+from amiwarp.io.atomic_output import NewFile
 from amiwarp.plotting.figures import save
 from amiwarp.studies.stability.cells import LIMIT_PX, Outcome
 from amiwarp.studies.stability.conditions import Axis

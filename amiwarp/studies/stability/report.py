@@ -13,7 +13,7 @@ from typing import Any
 from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import write_text
+from amiwarp.io.atomic_output import write_text
 from amiwarp.studies.stability.cells import Cell, Method, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.conditions import Axis, Condition, sensible
 from amiwarp.studies.stability.points import AxisPoint, Rate, axis_label, percent, value_label

@@ -5,9 +5,9 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
-from amiwarp.kernels.native import load_float, load_int, load_uint16, store_float, store_int
-from amiwarp.kernels.optics import MODEL_STRUCTS, compensate, displace
 from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs
+from amiwarp.kernels.refraction import MODEL_STRUCTS, compensate, displace
+from amiwarp.kernels.vector_code import load_float, load_int, load_uint16, store_float, store_int
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,7 +7,7 @@ and the results are bit-identical on every run.
 
 import warp as wp
 
-from amiwarp.kernels.prior import Prior, prior_diagonal, prior_product
+from amiwarp.kernels.map_prior import Prior, prior_diagonal, prior_product
 
 wp.set_module_options({"enable_backward": False})
 
