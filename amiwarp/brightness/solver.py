@@ -75,7 +75,8 @@ class Tiles:
 class BrightnessMap:
     """Brightness map for a set of pairs, and its solver; owns its buffers. A solve starts from the last map.
 
-    Repeated launches are recorded once (:class:`amiwarp.kernels.recorded_launches.Program`). Nothing is read back in between.
+    Repeated launches are recorded once (:class:`amiwarp.kernels.recorded_launches.Program`). Nothing is read back in
+    between.
     """
 
     def __init__(
