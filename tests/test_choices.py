@@ -36,7 +36,7 @@ from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, tones
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.scene import Look
+from amiwarp.viewer.cloud_scene import Look
 
 CAMERA = Camera.from_fov(8, 6, 1.0)
 EVENTS = Events.from_arrays([1, 2, 1, 2], [1, 2, 1, 2], [0, 10, 20, 30], [0, 1, 0, 1])
@@ -164,7 +164,7 @@ def test_simplified_names_its_models() -> None:
 
 
 def test_views_are_taken_by_name(tmp_path: Path) -> None:
-    from amiwarp.viewer.scene import CAMERA_DIRECTIONS
+    from amiwarp.viewer.cloud_scene import CAMERA_DIRECTIONS
 
     assert set(CAMERA_DIRECTIONS) == {view.value for view in View}  # a name finds its stand as the member does
 

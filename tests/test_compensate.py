@@ -24,7 +24,7 @@ from amiwarp.imaging.sharpness_costs import sharpness
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.chunks import CHUNK
-from amiwarp.kernels.encoder import EncoderParams, theta_u32_at
+from amiwarp.kernels.encoder_angle import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye, RadialTangential

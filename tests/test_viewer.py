@@ -27,9 +27,9 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.colouring import colours_of, residual
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection
-from amiwarp.viewer.scene import Look, Scene
 from amiwarp.viewer.timeline import event_rate, read_span
 
 TRUE = Prism(math.radians(1.0))

@@ -65,7 +65,7 @@ class ScreenshotOptions:
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
         from amiwarp.viewer.app import save_screenshot
-        from amiwarp.viewer.scene import Look
+        from amiwarp.viewer.cloud_scene import Look
 
         if path.suffix.lower() != ".png":
             raise AmiwarpError(f"{path}: pictures are written as .png; give a name that ends in .png")
@@ -217,7 +217,7 @@ def run(
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
     from amiwarp.viewer.app import export_folder
-    from amiwarp.viewer.scene import check_display
+    from amiwarp.viewer.cloud_scene import check_display
 
     device = choose_device(common.device)
     check_display()

@@ -20,7 +20,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_encoder import encoder_pieces
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.kernels.compensation import Columns
-from amiwarp.kernels.encoder import EncoderParams
+from amiwarp.kernels.encoder_angle import EncoderParams
 from amiwarp.kernels.launch import Recorded, beside, launch
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, PinholeParams
-from amiwarp.kernels.encoder import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
+from amiwarp.kernels.encoder_angle import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
 from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
 from amiwarp.kernels.vector_code import (
     load_float,

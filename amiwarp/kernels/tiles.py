@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
-from amiwarp.kernels.encoder import THETA_U16_RAD
+from amiwarp.kernels.encoder_angle import THETA_U16_RAD
 from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, displace
 from amiwarp.kernels.shared_memory import add_to_word, get_word, set_word, wait_for_block, window
 from amiwarp.kernels.vector_code import load_uint32

@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
-from amiwarp.kernels.encoder import EncoderParams, theta_u32_at
+from amiwarp.kernels.encoder_angle import EncoderParams, theta_u32_at
 from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
 from amiwarp.kernels.vector_code import add_word, load_float, load_uint8, load_uint16, store_int, store_word
 

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import check_output
 from amiwarp.viewer.choices import View
+from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.page_values import SETTABLE
 from amiwarp.viewer.panel import Panel
-from amiwarp.viewer.scene import Look, Scene
 from amiwarp.viewer.serve import serve
 
 if TYPE_CHECKING:
