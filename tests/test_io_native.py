@@ -312,7 +312,7 @@ def test_blosc_parameters_that_would_crash_are_noticed(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         for name, kind in (("x", "u2"), ("y", "u2"), ("t", "u4"), ("p", "u1")):
-            # The last filter option declares bytes per chunk: fewer than 64 elements need.
+            # Filter option 3 is the number of bytes per chunk. The damaged chunk below declares more.
             file.create_dataset(f"events/{name}", data=np.zeros(64, kind), chunks=(64,), compression=32001)
             assert file[f"events/{name}"].id.get_create_plist().get_filter(0)[2][3] == 64 * np.dtype(kind).itemsize
     raw = bytearray(path.read_bytes())

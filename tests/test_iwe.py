@@ -148,7 +148,7 @@ def test_events_are_voted_as_their_points_are(name: str, vote: Vote, device: str
 @pytest.mark.parametrize("vote", list(Vote))
 @pytest.mark.parametrize("points", [500, 64 * 48])
 def test_cpu_and_cuda_agree_bit_for_bit(name: str, vote: Vote, points: int) -> None:
-    """On CUDA by the fast vote, whose words overflow with 500 points, and by the exact vote for the remaining events."""
+    """On CUDA by the fast vote, whose words overflow with 500 points, and by the exact vote for the rest."""
     camera = Camera.from_fov(64, 48, math.radians(60))
     model = MODELS[name].from_prism(camera, Prism(math.radians(2)), 0.4)
     n = FIRST_BATCH + 100_000

@@ -140,7 +140,7 @@ def test_phase_adds_to_the_angle_and_whole_turns_do_not_count() -> None:
 
 
 def test_tilt_about_x_moves_the_axis_of_rotation_up() -> None:
-    """The prism's z axis is rotated about x by a, then about y by b. Its mean image moves by second order only."""
+    """A tilt of 1 degree changes compensated positions by 0.05 to 1 px rms."""
     cam, wedge = camera(), prism(2.0)
     straight, tilted = ExactModel(cam, wedge), ExactModel(cam, wedge, tilt=(math.radians(1.0), 0.0))
     assert 0.05 < predicted_error(tilted, straight).rms < 1.0

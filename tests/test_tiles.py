@@ -60,7 +60,7 @@ def test_tiles_vote_as_one_pass_does(vote: Vote, scale: float, apex_deg: float) 
     found, expected = both(canvas, models)
     for a, b in zip(found, expected, strict=True):
         assert a.sum(dtype=np.float64) == pytest.approx(b.sum(dtype=np.float64), abs=50)
-        # the GPU's fast division may move a nearest vote to the next pixel, and half of the events are equal
+        # the GPU's fast division may move a nearest vote to the next pixel; half of the events share a pixel
         moved = np.abs(a - b).sum()
         assert moved < (400_000 if vote is Vote.NEAREST else 3000)
         if vote is Vote.BILINEAR:
