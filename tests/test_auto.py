@@ -1,4 +1,4 @@
-"""The smallest model that a scene needs, and the parameters that a recording tells; on simulated recordings."""
+"""Automatic choice of the model and of the free parameters, on simulated recordings."""
 
 import json
 import math
@@ -60,7 +60,7 @@ def found(wide: Recording) -> Calibration:
 
 @pytest.fixture(scope="module")
 def as_circle(wide: Recording) -> Calibration:
-    """By a budget that a circle keeps."""
+    """Calibrated with a budget that a circle keeps."""
     return calibrate_auto(wide, Settings(events=120_000), budget_px=5.0)
 
 
@@ -119,7 +119,7 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     space = candidate_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
     deflection = fit(space, places.compensated(larger.model), places)[0]["deflection"]
     assert ratio == pytest.approx((deflection - found.parameters["deflection"]) / (0.01 * apex), rel=0.02)
-    # no nearer one is found by a method that shares nothing with it
+    # an independent method finds no closer circle
     target = places.compensated(found.exact.model)
 
     def error(v: np.ndarray) -> float:
@@ -141,7 +141,7 @@ def test_held_out_turns_see_the_circle_s_error_in_pixels(found: Calibration) -> 
 
 
 def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Were the circle predicted to be without error, held-out turns would still refuse it."""
+    """Even if the predicted error of the circle is zero, the check on held-out turns rejects it."""
     monkeypatch.setattr(auto, "fit", lambda *given: (fit(*given)[0], 0.0))
     trial = make_trial(wide, found.exact, SHARPNESS, (), device="cpu", budget_px=None)
     circle, exact = (f.candidate for f in auto.fit_models(trial)[:2])
@@ -166,7 +166,7 @@ def test_the_file_keeps_the_ladder(as_circle: Calibration, tmp_path: Path) -> No
     found.save(tmp_path / "c.json")
     assert Calibration.load(tmp_path / "c.json") == found
     data = json.loads((tmp_path / "c.json").read_text())
-    del data["ladder"]  # as a file of before it
+    del data["ladder"]  # as in an older file
     (tmp_path / "old.json").write_text(json.dumps(data))
     old = Calibration.load(tmp_path / "old.json")
     assert old == replace(found, ladder=None)
@@ -205,7 +205,7 @@ def test_a_clock_offset_is_freed_where_the_speed_changes(texture: np.ndarray) ->
     c = calibrate_auto(recording, SHARPNESS)
     assert c.ladder is not None
     assert [p.name for p in c.ladder.parameters if p.freed] == ["clock_offset"]
-    assert c.parameters["clock_offset"] == pytest.approx(3000.0, abs=400.0)  # us; the sensor is late too
+    assert c.parameters["clock_offset"] == pytest.approx(3000.0, abs=400.0)  # us; the sensor's latency adds to it
     assert "clock_offset" in c.uncertainty
     assert c.model_name == "exact"
 
@@ -238,7 +238,7 @@ def test_halves_are_alternate_turns() -> None:
     encoder = Encoder.constant_speed(300.0, 0, 1_000_000)  # five turns
     first, second = split_turns(CalibrationEvents(Events(zero, zero, t, zero.astype(np.uint8)), encoder, None))
     assert np.array_equal(np.sort(np.concatenate([first.t, second.t])), t)
-    # one at its very edge may be either's
+    # an event at the border of two turns may belong to either
     whole = [half.t[half.t % 200_000 > 1000] // 200_000 for half in (first, second)]
     assert [set(turns.tolist()) for turns in whole] == [{0, 2, 4}, {1, 3}]
 

@@ -1,4 +1,4 @@
-"""The encoder: angle at a time, unwrapping, index pulses, gaps and coverage; and its logs as text."""
+"""The encoder: angle at a time, unwrapping, index pulses, gaps, coverage, and logs in text files."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def test_index_pulses_make_the_angle_absolute_and_show_slip():
     count = TURN / 4096
     np.testing.assert_allclose(wrapped(encoder.angle_at(pulses)), 0.0, rtol=0, atol=1.5 * count)
     assert np.abs(encoder.slip()).max() < 1.5 * count
-    # From the ninth turn on the counter misses a quarter of a turn: a minority of pulses disagree.
+    # From the ninth turn on a quarter turn of counts is lost, so a minority of the pulses disagree.
     lost = np.where(t > 300_000, 1024, 0)
     slipped = Encoder.from_counts(t, np.round(turns * 4096) - lost, counts_per_turn=4096, index_t_us=pulses)
     np.testing.assert_allclose(slipped.slip()[pulses < 300_000], 0.0, rtol=0, atol=1.5 * count)
@@ -219,7 +219,7 @@ def test_csv_of_angles_counts_and_index(tmp_path):
     )
     encoder = read_encoder_csv(path, counts_per_turn=2000)
     assert encoder.rpm == pytest.approx(3000.0, abs=0.1)
-    # 13 ms lead to the first pulse, and each pulse counts once however long it is high.
+    # The first pulse comes after 13 ms. A pulse counts once, however long it is high.
     assert encoder.index_t is not None
     assert encoder.index_t.tolist() == [13_000, 33_000, 53_000, 73_000, 93_000]
     np.testing.assert_allclose(encoder.slip(), 0.0, rtol=0, atol=1e-9)

@@ -1,4 +1,4 @@
-"""What a recording cannot tell is refused with the reason: encoders of a wrong scale, and events of no use."""
+"""Recordings that cannot be calibrated are refused with the reason: wrong encoder scales and useless events."""
 
 import math
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def scaled(recording: Recording, factor: float) -> Recording:
 
 @pytest.mark.parametrize("factor", [0.98, 1.024])
 def test_a_wrong_scale_is_found_in_the_events(recording: Recording, factor: float) -> None:
-    """It was taken for a camera that turns slowly, or confirmed."""
+    """Not mistaken for a slowly rotating camera, and not confirmed."""
     with pytest.raises(AmiwarpError, match=r"a still camera explains the events.*counts_per_turn") as caught:
         calibrate(scaled(recording, factor), model="exact")
     assert float(str(caught.value).rpartition(" times ")[2]) == pytest.approx(factor, abs=0.002)
@@ -87,7 +87,7 @@ def test_the_events_repeat_once_a_turn_of_a_good_encoder(recording: Recording) -
         assert encoder_turns_per_period(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
 
 
-# -- events of no use
+# -- useless events
 
 
 def events(x: object, y: object, t: object, p: object) -> Events:
@@ -102,7 +102,7 @@ def scattered(n: int, width: int = WIDTH, height: int = HEIGHT, length_us: int =
 
 
 def flicker() -> Events:
-    """A still scene whose every eighth pixel fires at each of 40 flashes, ON and OFF in turn."""
+    """Every eighth pixel fires at each of 40 flashes, alternately ON and OFF; the scene is still."""
     at = np.arange(WIDTH * HEIGHT // 8) * 8
     flashes = np.repeat(np.arange(40), len(at))
     return events(np.tile(at % WIDTH, 40), np.tile(at // WIDTH, 40), flashes * 12_500, flashes % 2)

@@ -1,4 +1,4 @@
-"""Counters that wrap at their width, and angles that wrap at whole turns: found or refused, never silently wrong."""
+"""Counters that wrap at their width, and angles that wrap at whole turns: unwrapped or refused, never wrong."""
 
 import pickle
 from pathlib import Path
@@ -29,7 +29,7 @@ def steady(rpm, counts_per_turn, *, n=3000, start=0):
 @pytest.mark.parametrize("rpm", [720.0, -720.0])
 @pytest.mark.parametrize("given_bits", [True, False])
 def test_a_counter_that_wraps_is_unwrapped(bits, signed, rpm, given_bits):
-    """At 1000 counts a turn no power of two is a whole number of turns: each wrap that is missed turns the prism."""
+    """At 1000 counts per turn no power of two is a whole number of turns, so a missed wrap gives a wrong angle."""
     t, count = steady(rpm, 1000, start=(2 ** (bits - 1) if signed else 0) + (5000 if rpm < 0 else -5000))
     shown = wrapped(count, bits, signed=signed)
     assert np.ptp(shown) > 0.9 * 2**bits
@@ -39,7 +39,7 @@ def test_a_counter_that_wraps_is_unwrapped(bits, signed, rpm, given_bits):
 
 @st.composite
 def rotations(draw):
-    """Times [us], the true running count, and counts per turn: steady, swinging or speeding up, either way."""
+    """Times [us], true counts and counts per turn of a steady, swinging or accelerating rotation, either way."""
     seed = draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
     n = draw(st.sampled_from([2, 3, 5, 12, 100, 400]))
@@ -67,7 +67,7 @@ def rotations(draw):
 @settings(deadline=None, max_examples=500)
 @given(rotations(), st.integers(8, 32), st.booleans(), st.integers(0, 2**32), st.booleans())
 def test_counts_are_right_or_refused(rotation, bits, signed, start, given_bits):
-    """Steps under half of the counter's period: with its width the true count, without it that or an error."""
+    """Steps are under half of the counter's period. With its width counts are right; without it right or refused."""
     t, progress, per_turn, way, kind = rotation
     count = start + way * np.round(progress * min(2**bits, per_turn)).astype(np.int64)
     assume(np.abs(np.diff(count)).max() < 0.45 * (2**bits if given_bits else min(2**bits, per_turn)))
@@ -98,7 +98,7 @@ def test_counters_that_start_anew_each_turn(rotation, start, bits):
 
 @pytest.mark.parametrize("bits", [8, 16, 24, 32])
 def test_a_steady_rotation_is_never_refused(bits):
-    """The wrap of a steady rotation tells the width: found for every width, not only for those that are given."""
+    """A wrap in a steady rotation reveals the width of the counter, for every width."""
     t, count = steady(600.0, 1000, n=800, start=2**bits - 1500)
     encoder = Encoder.from_counts(t, wrapped(count, bits), counts_per_turn=1000)
     assert encoder.rpm == pytest.approx(600.0, abs=0.2)
@@ -133,7 +133,7 @@ def test_a_gap_longer_than_a_counter_lasts_is_refused():
 
 
 def test_lost_counts_and_a_stop_are_no_wraps():
-    """A counter that runs on may lose counts, or stand for a while: its index pulses tell, it is not refused."""
+    """A counter that does not wrap may lose counts or pause. Index pulses show that, and the log is not refused."""
     t, count = steady(720.0, 1000)
     lost = count - np.where(t > 1_000_000, 250, 0)
     assert Encoder.from_counts(t, lost, counts_per_turn=1000).angle[-1] == pytest.approx(lost[-1] * TURN / 1000)
