@@ -210,7 +210,7 @@ def test_what_makes_no_sense_is_said() -> None:
     orbit = circle(4.0)
     with pytest.raises(AmiwarpError, match=r"100 rpm to start with is not in 120 \.\. 1440 rpm"):
         SpeedController(orbit, 100.0)
-    with pytest.raises(AmiwarpError, match=r"coverage from 0\.99 to 0\.9"):
+    with pytest.raises(AmiwarpError, match=r"coverage limits low = 0\.99 and high = 0\.9"):
         SpeedController(orbit, low=0.99, high=0.9)
     with pytest.raises(AmiwarpError, match="ramp_rpm_s = 0"):
         SpeedController(orbit, ramp_rpm_s=0.0)

@@ -16,7 +16,7 @@ from amiwarp.calib import Calibration, calibrate
 from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks, inside_image
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_encoder import encoder_params
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import edge_blur, truth_model
@@ -43,7 +43,7 @@ def angle_error(encoder: Encoder, t: np.ndarray, device: str) -> float:
     params = encoder_params(encoder, int(t.min()), int(t.max()), device)
     out = wp.empty(len(t), dtype=wp.uint32, device=device)
     launch(angles, len(t), [params, wp.array(t, dtype=wp.int64, device=device)], [out], device=device)
-    away = encoder.angle_at(t) / TURN - out.numpy() / 2.0**32
+    away = encoder.angle_at(t) / TWO_PI - out.numpy() / 2.0**32
     return float(np.abs(away - np.round(away)).max())
 
 
@@ -58,7 +58,7 @@ def test_angle_of_the_kernel(interval: tuple[int, int], turns_per_s: float, offs
     """Even and uneven samples, close and far apart, fractional clock offset, present-day times, unsorted events."""
     rng = np.random.default_rng(5)
     times = EPOCH + np.cumsum(rng.integers(*interval, 3000))
-    angle = (times - times[0]) * (TURN * turns_per_s * 1e-6) + np.cumsum(rng.normal(0.0, 0.01, times.size))
+    angle = (times - times[0]) * (TWO_PI * turns_per_s * 1e-6) + np.cumsum(rng.normal(0.0, 0.01, times.size))
     encoder = Encoder(times, angle, offset)
     first, last = encoder.coverage
     at_samples = np.clip(times + np.round(-offset).astype(int), first, last)

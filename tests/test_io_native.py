@@ -249,7 +249,7 @@ def test_writer_refuses_its_path(tmp_path):
         write(tmp_path, make(10))
     with pytest.raises(AmiwarpError, match="does not exist"):
         write(tmp_path / "no" / "a.h5", make(10))
-    with pytest.raises(AmiwarpError, match="outside the writer's with block"):
+    with pytest.raises(AmiwarpError, match="outside the writer's 'with' block"):
         RecordingWriter(tmp_path / "b.h5", width=1, height=1).append(make(1))
     del recording
     with pytest.raises(AmiwarpError, match=r"a\.h5: exists; .*overwrite=True"):

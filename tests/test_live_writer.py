@@ -303,7 +303,7 @@ def test_writer_refuses_its_path_and_options(tmp_path):
         LiveWriter(tmp_path / "a.h5", width=10, height=10, camera=CAMERA)
     with pytest.raises(AmiwarpError, match=r"a\.h5: making the file"), live(tmp_path / "a.h5", metadata={"n": "a\0b"}):
         pass
-    with pytest.raises(AmiwarpError, match="outside the writer's with block"):
+    with pytest.raises(AmiwarpError, match="outside the writer's 'with' block"):
         live(tmp_path / "a.h5").append(make(1))
     assert os.listdir(tmp_path) == []
     with live(tmp_path / "a.h5") as writer:

@@ -17,7 +17,7 @@ from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, in_pixels
 from amiwarp.calib.sharpness.search import Settings
 from amiwarp.cli.inputs import interval, number
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
@@ -49,8 +49,8 @@ def test_a_wrong_scale_is_found_in_the_events(recording: Recording, factor: floa
 def test_a_wrong_scale_is_found_at_the_index_pulses(recording: Recording, factor: float) -> None:
     assert recording.encoder is not None
     true = recording.encoder
-    turns = np.arange(math.ceil(true.angle[0] / TURN), math.floor(true.angle[-1] / TURN) + 1)
-    pulses = np.interp(turns * TURN, true.angle, true.t).astype(np.int64)
+    turns = np.arange(math.ceil(true.angle[0] / TWO_PI), math.floor(true.angle[-1] / TWO_PI) + 1)
+    pulses = np.interp(turns * TWO_PI, true.angle, true.t).astype(np.int64)
     assert len(pulses) >= 3
     good = replace(recording, encoder=true.with_index(pulses))
     prepare(good, Settings())

@@ -173,7 +173,7 @@ def test_files_hold_every_spot(atlas: Atlas, tmp_path: Path) -> None:
 
 
 def test_nothing_to_report_is_an_error() -> None:
-    with pytest.raises(AmiwarpError, match="no cell of these axes"):
+    with pytest.raises(AmiwarpError, match=r"no results of single runs \(cells\) for these axes"):
         aggregate(cells({"gradient": good}), AXES, METHODS[:2], {})
 
 
@@ -188,7 +188,7 @@ def test_cells_are_loaded_and_those_of_other_versions_left_out(tmp_path: Path) -
     (tmp_path / "renamed_0.json").write_text("{")
     with pytest.raises(AmiwarpError, match=r"renamed_0\.json: damaged cell"):
         load(tmp_path)
-    with pytest.raises(AmiwarpError, match="no cells of this version"):
+    with pytest.raises(AmiwarpError, match=r"no results of single runs \(cells\) of this version"):
         load(tmp_path / "empty")
 
 
@@ -256,7 +256,7 @@ def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:
     words = ("--out", tmp_path, "--device", "cpu")
     assert "unknown axis 'colour'; choose among width" in fails("--axes", "colour", *words)
     assert "unknown method 'magic'; choose among default, paper" in fails("--methods", "magic", *words)
-    assert "no cells of this version" in fails("--redraw", *words)
+    assert "no results of single runs (cells) of this version" in fails("--redraw", *words)
     (tmp_path / "file").write_text("")
     assert "cannot be made a folder" in fails("--out", tmp_path / "file" / "deeper", "--device", "cpu")
 

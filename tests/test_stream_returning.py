@@ -246,7 +246,7 @@ def test_a_view_of_less_than_a_turn_says_how_it_ended(tmp_path: Path) -> None:
     with sender(tmp_path / "s", HELLO) as address:
         source = open_source(address)
         view = followed(source, None, RecentEvents(source), print)
-        with pytest.raises(AmiwarpError, match="no whole turn before the stream ended: it broke off"):
+        with pytest.raises(AmiwarpError, match="less than one full turn before the stream ended: it broke off"):
             view.__enter__()
 
 

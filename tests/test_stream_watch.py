@@ -244,7 +244,7 @@ def test_a_stream_without_a_turn_is_told(tmp_path: Path, recording: Recording) -
     save_recording(tmp_path / "r.h5", replace(recording, encoder=still, truth=None))
     source = open_source(str(tmp_path / "r.h5"), pace=None)
     with (
-        pytest.raises(AmiwarpError, match="no whole turn"),
+        pytest.raises(AmiwarpError, match="less than one full turn"),
         followed(source, None, RecentEvents(source), lambda _: None),
     ):
         raise AssertionError("followed")

@@ -9,7 +9,7 @@ from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.unwrapping import UnwrapError
 from amiwarp.io import read_encoder_csv
 
@@ -34,7 +34,7 @@ def test_a_counter_that_wraps_is_unwrapped(bits, signed, rpm, given_bits):
     shown = wrapped(count, bits, signed=signed)
     assert np.ptp(shown) > 0.9 * 2**bits
     encoder = Encoder.from_counts(t, shown, counts_per_turn=1000, counter_bits=bits if given_bits else None)
-    np.testing.assert_allclose(encoder.angle - encoder.angle[0], (count - count[0]) * TURN / 1000, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(encoder.angle - encoder.angle[0], (count - count[0]) * TWO_PI / 1000, rtol=0, atol=1e-6)
 
 
 @st.composite
@@ -78,8 +78,8 @@ def test_counts_are_right_or_refused(rotation, bits, signed, start, given_bits):
         event(f"refused, {kind}, {'width given' if given_bits else 'width sought'}")
         return
     event(f"found, {kind}, {'width given' if given_bits else 'width sought'}")
-    true = (count - count[0]) * (TURN / per_turn)
-    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TURN / per_turn
+    true = (count - count[0]) * (TWO_PI / per_turn)
+    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TWO_PI / per_turn
 
 
 @settings(deadline=None, max_examples=300)
@@ -92,8 +92,8 @@ def test_counters_that_start_anew_each_turn(rotation, start, bits):
         encoder = Encoder.from_counts(t, count % per_turn, counts_per_turn=per_turn, counter_bits=bits)
     except UnwrapError:
         return
-    true = (count - count[0]) * (TURN / per_turn)
-    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TURN / per_turn
+    true = (count - count[0]) * (TWO_PI / per_turn)
+    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TWO_PI / per_turn
 
 
 @pytest.mark.parametrize("bits", [8, 16, 24, 32])
@@ -136,28 +136,28 @@ def test_lost_counts_and_a_stop_are_no_wraps():
     """A counter that does not wrap may lose counts or pause. Index pulses show that, and the log is not refused."""
     t, count = steady(720.0, 1000)
     lost = count - np.where(t > 1_000_000, 250, 0)
-    assert Encoder.from_counts(t, lost, counts_per_turn=1000).angle[-1] == pytest.approx(lost[-1] * TURN / 1000)
+    assert Encoder.from_counts(t, lost, counts_per_turn=1000).angle[-1] == pytest.approx(lost[-1] * TWO_PI / 1000)
     stood = np.where(t < 1_000_000, 0, count - 12_000)
-    assert Encoder.from_counts(t, stood, counts_per_turn=1000).angle[-1] == pytest.approx(stood[-1] * TURN / 1000)
+    assert Encoder.from_counts(t, stood, counts_per_turn=1000).angle[-1] == pytest.approx(stood[-1] * TWO_PI / 1000)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 9, 32])
 def test_angles_that_wrap_at_whole_turns(turns):
     t = np.arange(3000) * 1000
-    angle = TURN * 0.012 * np.arange(3000) + 0.3
-    encoder = Encoder.from_angles(t, angle % (turns * TURN))
+    angle = TWO_PI * 0.012 * np.arange(3000) + 0.3
+    encoder = Encoder.from_angles(t, angle % (turns * TWO_PI))
     np.testing.assert_allclose(encoder.angle - encoder.angle[0], angle - angle[0], rtol=0, atol=1e-6)
 
 
 def test_angles_that_wrap_elsewhere_are_refused():
     t = np.arange(3000) * 1000
-    angle = TURN * 0.012 * np.arange(3000)
+    angle = TWO_PI * 0.012 * np.arange(3000)
     with pytest.raises(AmiwarpError, match=r"-3,272.* where about 4\.32"):
         Encoder.from_angles(t, angle % np.radians(3276.7))
     with pytest.raises(AmiwarpError, match="angle wraps by about 1,00"):
         Encoder.from_angles(t, angle % np.radians(1000.0))
     with pytest.raises(AmiwarpError, match=r"where about 4\.32 was expected"):
-        Encoder.from_angles(t, np.where(t == 1_700_000, angle - 2.0, angle) % TURN)
+        Encoder.from_angles(t, np.where(t == 1_700_000, angle - 2.0, angle) % TWO_PI)
 
 
 def test_a_log_names_its_line(tmp_path: Path):

@@ -186,9 +186,10 @@ class BrightnessMap:
         return self._new_geometry(), self._new_geometry()
 
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float) -> Any:
-        """Return the slope of the residuals for a fixed map: a difference quotient of two parameter sets.
+        """Return the derivative of each pair's residual along a line in parameter space, for a fixed map.
 
-        ``plus`` and ``minus``: arguments of :meth:`place`, ``width`` apart. The positions of the pairs do not change.
+        It is the change of the residual from the parameters ``minus`` to ``plus``, divided by their distance ``width``.
+        Both are keyword arguments of :meth:`place`. The positions that :meth:`place` stored remain unchanged.
         """
         for side, at in zip(self._sides, (plus, minus), strict=True):
             self._place(at["model"], at["drift"], at["camera_rotation"], side)
@@ -350,9 +351,9 @@ class _ConjugateGradients:
     def _add_step(self, program: Any) -> None:
         of = self._map
         if of._grids is None:
-            self._add(program, cg.turn, [], [of._u, of._dots])
+            self._add(program, cg.update_search_direction, [], [of._u, of._dots])
         else:
-            self._add(program, cg.turn_to, [of._z], [of._u, of._dots])
+            self._add(program, cg.update_search_direction_with, [of._z], [of._u, of._dots])
         inputs = [*of._equations, of._u.direction]
         if of.device.is_cpu:
             blocks = of.pairs.arrays.stride // int(kernels.BLOCK)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.events.encoder import TURN
+from amiwarp.events.encoder import TWO_PI
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -232,7 +232,7 @@ def unrepeated_counts(
 
 def harmonics() -> NDArray[np.float64]:
     """Return low harmonics of the angle at the bin centres, each with mean square 1, shape (harmonics, BINS)."""
-    phase = np.outer(np.arange(1, HARMONICS + 1), (np.arange(BINS) + 0.5) * (TURN / BINS))
+    phase = np.outer(np.arange(1, HARMONICS + 1), (np.arange(BINS) + 0.5) * (TWO_PI / BINS))
     return np.concatenate([np.ones((1, BINS)), math.sqrt(2.0) * np.cos(phase), math.sqrt(2.0) * np.sin(phase)])
 
 
@@ -246,8 +246,8 @@ def bin_times(events: Events, encoder: Encoder) -> NDArray[np.int64]:
     elapsed = (encoder.t - encoder.t[0]).astype(np.float64) - encoder.clock_offset_us
     ends = np.array([int(events.t[0]) - int(encoder.t[0]), int(events.t[-1]) + 1 - int(encoder.t[0])])
     first, last = np.interp(ends, elapsed, angle)
-    bins = int((last - first) / TURN + 1e-3) * BINS
-    marks = np.interp(first + np.arange(bins + 1) * (TURN / BINS), angle, elapsed)
+    bins = int((last - first) / TWO_PI + 1e-3) * BINS
+    marks = np.interp(first + np.arange(bins + 1) * (TWO_PI / BINS), angle, elapsed)
     return np.rint(marks).astype(np.int64) + encoder.t[0]
 
 
@@ -341,7 +341,7 @@ def _patch(
         smooth = ndimage.uniform_filter(np.where(without, 0.0, counted), SMOOTHING, mode="mirror")
         return np.asarray(np.rint(smooth * SMOOTHING**2) if weights is None else smooth * SMOOTHING**2)
 
-    angle = ((events.t - events.t[0]) * (hz * TURN * 1e-6)).astype(np.float32)
+    angle = ((events.t - events.t[0]) * (hz * TWO_PI * 1e-6)).astype(np.float32)
     sign = 2.0 * events.p - 1.0
     together, count = np.hypot(around(sign * np.cos(angle)), around(sign * np.sin(angle))), around(None)
     sees = (together >= LEAST_SHARE * count) & (together >= LEAST_SIGMA * np.sqrt(count)) & (count > 0.5)

@@ -113,7 +113,10 @@ def wrong_scale(
 
 
 def check_turned(theta: NDArray[np.float64], name: str) -> None:
-    """Check how far the prism turned: size and phase are not independent in less than a quarter turn."""
+    """Check that the prism turned far enough.
+
+    In less than a quarter turn, the size and the phase of the prism's orbit cannot be determined separately.
+    """
     turned = float(np.ptp(theta))
     if turned < SMALLEST_ROTATION:
         raise AmiwarpError(

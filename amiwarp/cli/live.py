@@ -144,7 +144,10 @@ class ProcessingOptions:
 
 def run(
     source: Annotated[
-        str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")
+        str,
+        typer.Argument(
+            help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+        ),
     ],
     *,
     calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],

@@ -20,7 +20,10 @@ EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
 def run(
     source: Annotated[
-        str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")
+        str,
+        typer.Argument(
+            help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+        ),
     ],
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,

@@ -34,9 +34,9 @@ QUICK_MINUTES = 9.0
 
 def run(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for cells, figures and tables."), OUTPUT_FOLDER] = Path(
-        "amiwarp-atlas"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Folder for the results of single runs (cells), figures and tables."), OUTPUT_FOLDER
+    ] = Path("amiwarp-atlas"),
     quick: Annotated[
         bool,
         typer.Option("--quick", help="Use three values per axis, three methods and one seed: within ten minutes."),
@@ -48,7 +48,7 @@ def run(
         list[str] | None,
         typer.Option(
             help="Method to run in addition to 'default' and 'paper'. Can be repeated. "
-            "Default: all methods, with --quick three.",
+            "Default: all methods; with --quick, only 'sharpness'.",
             metavar="NAME",
         ),
     ] = None,
@@ -174,7 +174,7 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
         try:
             yield stack.enter_context(client.get_executor())
         except distributed.KilledWorker as error:
-            raise AmiwarpError(f"workers died while running a cell ({error}): out of memory, or killed; "
+            raise AmiwarpError(f"workers died during a single run (cell), out of memory or killed: {error}; "
                                "run the same command again to continue") from error  # fmt: skip
 
 

@@ -223,7 +223,7 @@ class LiveWriter:
         self.tick()
 
     def set_encoder(self, encoder: Encoder) -> None:
-        """Set the encoder that replaces all appended samples when the file is finished."""
+        """Set the encoder data that the finished file holds instead of the appended encoder samples."""
         self._encoder = encoder
 
     def tick(self) -> None:
@@ -234,9 +234,8 @@ class LiveWriter:
 
     def _check_open(self, what: str) -> None:
         if self._file is None:
-            raise AmiwarpError(
-                f"{self.path}: {what} outside the writer's with block, or after it failed; use a new writer"
-            )
+            given = f"{what}() was called outside the writer's 'with' block, or after it failed"
+            raise AmiwarpError(f"{self.path}: {given}; use a new writer")
 
     def _as_columns(self, events: Events, inside: ArrayLike | None, extrapolated: ArrayLike | None) -> Columns:
         if len(events) and events.x.dtype != self._columns["events/x"].dtype:

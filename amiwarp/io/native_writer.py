@@ -174,7 +174,7 @@ class RecordingWriter:
             If events are unsorted or outside the frame, or the arrays differ from those of the first call.
         """
         if self._file is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
+            raise AmiwarpError(f"{self.path}: append() was called outside the writer's 'with' block; call it inside")
         check_events(
             events,
             *self._size,
@@ -218,7 +218,8 @@ class RecordingWriter:
             If other events were written before, or events are unsorted or outside the frame.
         """
         if self._file is None or len(self):
-            raise AmiwarpError(f"{self.path}: fill outside the writer's with block or after other events")
+            given = "fill() was called outside the writer's 'with' block, or after append()"
+            raise AmiwarpError(f"{self.path}: {given}; call it inside the block, before other events")
         self._t_offset = t_first
         with contextlib.closing(in_order(partial(self._compute, piece) for piece in pieces)) as computed:
             for events, inside, columns, encoded in computed:

@@ -112,7 +112,7 @@ def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
 
 
 def place_scene(simulation: Simulation) -> Placement:
-    """Place the picture so that it covers everything that is ever seen.
+    """Place the picture so that it covers everything that the camera sees through the turning prism.
 
     Raises :class:`AmiwarpError` if the camera turns away from it.
     """

@@ -1,4 +1,7 @@
-"""Fit of the smaller models to the exact model at the events of a scene, and the blur that is there anyway."""
+"""Fit of the models with fewer parameters to the exact model, at the events of a scene.
+
+Also the blur that remains even with the exact model: by encoder noise, clock resolution and latency jitter.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Emulated camera for the emulated controller: serves a recording's events, with triggers at the sync pulses."""
+"""Emulated camera for the emulated controller: serves a recording's events, and a trigger for each sync pulse."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NEVER_US = 1 << 60
 
 
 class EmulatedCamera:
-    """Serves a recording's events at their recorded pace, and triggers at the controller's sync pulses.
+    """Serves a recording's events at their recorded pace, and one trigger for each of the controller's sync pulses.
 
     Camera and ``rotor`` begin once the first client connects. If reading, sending or a client is slower than the
     recording, events are sent late, but none is lost. ``now_us``: emulation time [us], shared with the controller.
