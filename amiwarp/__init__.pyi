@@ -3,6 +3,7 @@
 from ._version import __version__ as __version__
 from .brightness.event_pairs import SensorTiming as SensorTiming
 from .calib.calibration import calibrate as calibrate
+from .calib.nlopt_solver import SearchStage as SearchStage
 from .calib.parameters import ParameterSpace as ParameterSpace
 from .calib.photometric.stage import PhotometricSettings as PhotometricSettings
 from .calib.result import Calibration as Calibration
@@ -12,7 +13,6 @@ from .calib.result import ModelChoice as ModelChoice
 from .calib.result import PhotometricSummary as PhotometricSummary
 from .calib.result import StageSummary as StageSummary
 from .calib.sharpness.search import Settings as Settings
-from .calib.solve import SearchStage as SearchStage
 from .compensation.recordings import CompensationSummary as CompensationSummary
 from .compensation.recordings import compensate as compensate
 from .compensation.recordings import compensate_events as compensate_events

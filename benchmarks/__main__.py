@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.kernels.cores import cpu_threads
-from amiwarp.studies.machine import processor
+from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.studies.machine_info import processor
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case
 from benchmarks.job import Job

@@ -29,8 +29,8 @@ from scipy.spatial.transform import Rotation
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
-from amiwarp.io.output import write_text
-from amiwarp.kernels import sight
+from amiwarp.io.atomic_output import write_text
+from amiwarp.kernels import prism_view as sight
 from amiwarp.kernels.launch import launch
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
 from amiwarp.optics.camera import Camera
@@ -42,7 +42,7 @@ from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.scenery import MapRing, place_scene, step_us
 from amiwarp.simulation.simulator import Scene, Simulation
 from amiwarp.studies.demo import earth
-from amiwarp.studies.machine import machine, versions
+from amiwarp.studies.machine_info import machine, versions
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 PRISM, SMALL, PHASE = Prism(math.radians(1.8)), Prism(math.radians(0.9)), 1.0

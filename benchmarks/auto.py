@@ -27,7 +27,7 @@ import warp as wp
 
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.selection.smaller_models import Places, fit, rung_space
+from amiwarp.calib.selection.smaller_models import Places, candidate_space, fit
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
@@ -36,7 +36,7 @@ from amiwarp.optics.models import MODELS, EllipseModel
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
-from amiwarp.studies.machine import machine
+from amiwarp.studies.machine_info import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1
@@ -78,8 +78,8 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
     exact = replace(c, model_name="exact", parameters=values)
     found = {"ellipse": places.distance(EllipseModel.from_model(truth), truth), "exact": 0.0}
     for name in ("circle", "radial"):
-        space = rung_space(name, exact, (), rad_per_us=1e-4, duration_us=1e6)
-        found[name] = fit(space, places.moved(truth), places)[1]
+        space = candidate_space(name, exact, (), rad_per_us=1e-4, duration_us=1e6)
+        found[name] = fit(space, places.compensated(truth), places)[1]
     return {name: found[name] for name in MODELS}
 
 

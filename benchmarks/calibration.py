@@ -37,12 +37,12 @@ import warp as wp
 
 from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.calib.parameters import RATES
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON
 from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.preparation import prepare
 from amiwarp.calib.sharpness.search import STAGES
-from amiwarp.calib.single_model import prepare
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents

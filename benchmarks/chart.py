@@ -14,7 +14,7 @@ from pathlib import Path
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import own_folder
+from amiwarp.io.atomic_output import own_folder
 from amiwarp.studies.chart import Charts, make, simulated
 from amiwarp.studies.chart.rows import beaten_by, fronts
 from benchmarks.chart_libraries import library_tasks

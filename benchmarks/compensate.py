@@ -40,7 +40,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import in_order
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.optics.prism import Prism
@@ -280,7 +280,9 @@ def errors(
 
 
 def about(device: str) -> dict[str, Any]:
-    from amiwarp.studies.machine import processor  # imported here: imports of a row's process count towards its memory
+    from amiwarp.studies.machine_info import (
+        processor,  # imported here: imports of a row's process count towards its memory
+    )
 
     wp.init()
     found = {"python": platform.python_version()}

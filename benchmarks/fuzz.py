@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.kernels.cpu_threads import cpu_threads
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 

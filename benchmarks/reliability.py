@@ -32,7 +32,7 @@ import psutil
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.output import NewFile, remove_abandoned
+from amiwarp.io.atomic_output import NewFile, remove_abandoned
 
 LIMIT_S = 180.0
 """A command that still runs this long after a signal counts as hanging [s]."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel, apex_from_deflection
 from amiwarp.optics.prism import Prism

@@ -17,10 +17,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from amiwarp.brightness.event_pairs import off_excess
 from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib import Settings
-from amiwarp.calib.photometric.stage import Cost, gather_pairs, off_excess
-from amiwarp.calib.single_model import prepare
+from amiwarp.calib.photometric.cost import Cost
+from amiwarp.calib.photometric.pair_collection import collect_pairs
+from amiwarp.calib.preparation import prepare
 from amiwarp.imaging.export import save_png
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -42,8 +44,8 @@ def costs(offsets_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     unit = search.space.pixels["apex"]
     points = [{**search.best, "apex": APEX + x / unit, "phase": 0.0} for x in offsets_px]
     sharp = np.array([search.fine.values(values) for values in points])
-    pairs, tiles = gather_pairs(recording, search, search.settings.photometric)
-    brightness = BrightnessMap(pairs, tiles, search.material.encoder, off_excess=off_excess(pairs))
+    pairs, tiles = collect_pairs(recording, search, search.settings.photometric)
+    brightness = BrightnessMap(pairs, tiles, off_excess=off_excess(pairs))
     cost = Cost(search.space, brightness, 40)
     cost.warm_up(search.space.to_vector(points[len(points) // 2]))
     rest = np.array([-cost(search.space.to_vector(values)) for values in points])

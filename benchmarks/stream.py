@@ -44,7 +44,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import CircleModel, ExactModel, Model
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
-from amiwarp.studies.machine import machine
+from amiwarp.studies.machine_info import machine
 
 PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))
 MODELS: dict[str, Model] = {
@@ -215,7 +215,20 @@ class Hour:
 def hour(device: str, pool: Events) -> dict[str, Any]:
     source, sizes = Hour(pool), []
     values = {"apex": PRISM.apex, "phase": 0.3}
-    known = Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 0.0, 0.0, (), 0, 0.0)
+    known = Calibration(
+        model_name="exact",
+        camera=CAMERA,
+        prism=PRISM,
+        parameters=values,
+        uncertainty={},
+        free=(),
+        sharpness_name="variance",
+        sharpness_before=0.0,
+        sharpness_after=0.0,
+        stages=(),
+        events=0,
+        seconds=0.0,
+    )
 
     def note(status: SessionStatus) -> None:
         with open("/proc/self/statm") as statm:

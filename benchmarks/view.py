@@ -30,11 +30,11 @@ from amiwarp.events.recording import Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
-from amiwarp.studies.machine import machine
+from amiwarp.studies.machine_info import machine
 from amiwarp.viewer.choices import View
+from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.scene import Look, Scene
-from amiwarp.viewer.values import jpeg
+from amiwarp.viewer.page_values import jpeg
 
 SIZE, WIDTH, HEIGHT = (1048, 514), 640, 480
 """Size of the clouds' picture in a window of 1366 x 768 [px], and size of the sensor [px]."""
@@ -45,7 +45,7 @@ import sys, time
 began = time.perf_counter()
 from amiwarp.io import open_recording
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.scene import Look, Scene
+from amiwarp.viewer.cloud_scene import Look, Scene
 import pyvista, warp
 pyvista.Plotter
 imported = time.perf_counter() - began

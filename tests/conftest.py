@@ -1,4 +1,4 @@
-"""Shared fixtures: the device, and the real recordings where there are any."""
+"""Shared fixtures: devices, a headless browser, the folder of real recordings, a picture and a simulated recording."""
 
 import math
 import os
@@ -18,7 +18,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import simulate
 
-# for the benchmarks; last, so that the package that is tested is the one that was installed
+# Makes benchmarks importable. At the end of the path, so that tests use the installed package, not the checkout.
 sys.path.append(str(Path(__file__).parents[1]))
 wp.config.log_level = wp.LOG_ERROR
 wp.init()
@@ -26,7 +26,7 @@ wp.init()
 
 @pytest.fixture(params=["cpu", "cuda:0"])
 def device(request: pytest.FixtureRequest) -> str:
-    """Each device that Warp runs on; CUDA is skipped, visibly, where there is none."""
+    """Each device that Warp runs on. Without a CUDA GPU, its tests are reported as skipped."""
     if request.param.startswith("cuda") and not wp.is_cuda_available():
         pytest.skip("no CUDA device")
     return str(request.param)
@@ -34,7 +34,7 @@ def device(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A headless Chromium; its tests are skipped, visibly, where there is none."""
+    """A headless Chromium. Without Chromium, its tests are reported as skipped."""
     sync_api = pytest.importorskip("playwright.sync_api")
     chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
     if chromium is None:
@@ -48,7 +48,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """Folder of the real recordings and pictures: AMIWARP_TEST_DATA, or ../shared/data beside the checkout."""
+    """Folder of the real recordings and pictures: AMIWARP_TEST_DATA, or ../shared/data next to the checkout."""
     default = Path(__file__).parents[2] / "shared" / "data"
     folder = Path(os.environ.get("AMIWARP_TEST_DATA", default))
     if not (folder / "README.md").is_file():
@@ -58,7 +58,7 @@ def data_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def texture() -> np.ndarray:
-    """A picture with edges in every direction: overlapping discs of random brightness, seeded; 240 × 320, 8 bit."""
+    """A seeded picture with edges of every orientation: overlapping discs, shape (240, 320), 8 bit."""
     rng = np.random.default_rng(7)
     rows, columns = np.mgrid[:240, :320]
     picture = np.full((240, 320), 90, dtype=np.uint8)
@@ -75,7 +75,7 @@ TRUE_PHASE = 2.0
 
 @pytest.fixture(scope="session")
 def recording(texture: np.ndarray) -> Recording:
-    """Three turns in front of the texture, 200 × 150, noise on; the nominal apex is not the true one."""
+    """Three turns of the prism in front of the texture, 200 × 150, with noise. The nominal apex is not the true one."""
     camera = Camera.from_fov(200, 150, math.radians(50.0))
     return simulate(
         texture, camera, TRUE_PRISM, duration_s=0.25, motion=PrismMotion(720.0, phase=TRUE_PHASE),

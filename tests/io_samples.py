@@ -22,7 +22,7 @@ FAERY = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), (("p", "on"), "?")])
 
 
 def make_events(count: int = 600, seed: int = 0) -> Events:
-    """Events over the whole frame, some at one time, from 1 s on."""
+    """Random events over the whole frame, from 1 s on. Some share a time."""
     rng = np.random.default_rng(seed)
     t = 1_000_000 + np.cumsum(rng.integers(0, 30, count))
     x, y = (rng.integers(0, side, count) for side in SIZE)
@@ -113,7 +113,7 @@ def write_dsec(path: Path, events: Events) -> None:
 
 
 WRITERS: dict[str, tuple[str, str, Callable[[Path, Events], None]]] = {
-    # name: (metadata's format, ending, writer)
+    # name: (format in the metadata, file ending, writer)
     "evt2": ("evt2.0", "raw", write_evt("evt2")),
     "evt3": ("evt3.0", "raw", write_evt("evt3")),
     "dat": ("dat2", "dat", write_dat),
@@ -127,7 +127,7 @@ WRITERS: dict[str, tuple[str, str, Callable[[Path, Events], None]]] = {
 
 
 def refusal(call: Callable[..., object], *arguments: object) -> str | None:
-    """What the AmiwarpError says that a call raises, or None where it raises none."""
+    """Return the message of the AmiwarpError that a call raises, or None if it raises none."""
     try:
         call(*arguments)
     except AmiwarpError as error:
@@ -136,7 +136,7 @@ def refusal(call: Callable[..., object], *arguments: object) -> str | None:
 
 
 def write_sample(folder: Path, name: str, events: Events, *, ending: str | None = None) -> Path:
-    """Write the events in one of the formats of :data:`WRITERS`; ``ending`` gives the file another ending."""
+    """Write the events in one of the formats of :data:`WRITERS`. ``ending`` replaces the usual file ending."""
     _, usual, writer = WRITERS[name]
     path = folder / f"sample.{usual}"
     writer(path, events)

@@ -1,8 +1,8 @@
-"""Damaged files for tests and for long runs of fuzzing: small samples of every input, a mutator, and a watched check.
+"""Damaged files for tests and long fuzzing runs: small samples of every input, a mutator, and a supervised check.
 
-The rule: a damaged file is read, or refused with one :class:`AmiwarpError`; nothing else is raised, nothing crashes or
+The rule: a damaged file is read, or refused with one :class:`AmiwarpError`. Nothing else is raised, nothing crashes or
 hangs, and memory stays below :data:`MEMORY_KIB`. ``python tests/mutation_files.py COUNT [NAME ...]`` checks COUNT
-mutants of each input named, or of all.
+mutants of each named input, or of all inputs.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import Any
 import h5py
 import hdf5plugin
 import numpy as np
+from calibration_sample import exact_calibration
 from io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
 from PIL import Image
 
@@ -40,16 +41,16 @@ from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.translator import open_pictures
 
 MEMORY_KIB = 3 << 19
-"""Most memory that a check may take, 1.5 GiB [KiB]."""
+"""Largest memory that a check may take, 1.5 GiB [KiB]."""
 
 LONGEST_S = 300.0
-"""Time after which a check hangs, beyond doubt on any machine [s]. Reading itself ends after 30 s of processor time."""
+"""Time after which a check counts as hanging, on any machine [s]. Reading itself ends after 30 s of processor time."""
 
 EVENTS = make_events(300)
 
 
 def write_hdf5(filters: dict[str, Any], libver: str, path: Path) -> None:
-    """Write a file as DSEC's, with any filters, with attributes of every kind, a camera and an encoder."""
+    """Write a file in DSEC's layout with the given filters, attributes of every kind, a camera and an encoder."""
     with h5py.File(path, "w", libver=libver) as file:
         file.attrs["width"], file.attrs["height"] = SIZE
         relative = EVENTS.t - 1_000_000
@@ -73,7 +74,7 @@ def write_csv(path: Path) -> None:
 def write_calibration(path: Path) -> None:
     camera = Camera(*SIZE, 200.0, 200.0, 150.0, 110.0, Fisheye(0.1, 0.0, 0.0, 0.0))
     values = {"apex": 0.035, "phase": 0.5, "tilt_x": 0.0, "tilt_y": 0.0, "clock_offset": 0.0}
-    Calibration("exact", camera, Prism(0.035), values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(path)
+    exact_calibration(camera, Prism(0.035), values).save(path)
 
 
 def write_camera(path: Path) -> None:
@@ -103,7 +104,7 @@ def write_video(path: Path) -> None:
 
 
 def read_recording(path: Path) -> None:
-    """Read in every way there is, check what comes, and describe it as ``amiwarp info`` does."""
+    """Read a recording in every possible way, check the events, and describe it as ``amiwarp info`` does."""
     recording = open_recording(path)
     source = recording.events
     count = 0
@@ -130,7 +131,7 @@ def read_pictures(path: Path) -> None:
 
 
 Kind = tuple[str, Callable[[Path], None], Callable[[Path], object]]
-"""Ending, writer of a sample, and reader."""
+"""File ending, writer of a sample, and reader."""
 
 PLUGINS: dict[str, dict[str, Any]] = {
     "plain": {},
@@ -170,12 +171,12 @@ KINDS: dict[str, Kind] = {
     "stack_npy": (".npy", write_stack, read_pictures),
     "video_mp4": (".mp4", write_video, read_pictures),
 }  # fmt: skip
-"""Every input that is read from a file."""
+"""Every kind of input that is read from a file."""
 
 
 @cache
 def sample(name: str) -> bytes:
-    """Content of a sound file of a kind of :data:`KINDS`."""
+    """Return the content of an undamaged file of one of :data:`KINDS`."""
     ending, write, _ = KINDS[name]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"sample{ending}"
@@ -205,7 +206,7 @@ def _set(data: bytearray, at: int, length: int, rng: random.Random) -> bytearray
 
 
 def _number(data: bytearray, at: int, length: int, rng: random.Random) -> bytearray:
-    """Overwrite with a length: small, huge, negative or near a power of two."""
+    """Overwrite bytes with a number: small, huge, negative or near a power of two."""
     size = rng.choice([1, 2, 4, 8])
     value = rng.choice([0, 1, -1, 1 << rng.randrange(64), (1 << rng.randrange(64)) - 1, rng.randrange(1 << 16)])
     patch = (value % (1 << 8 * size)).to_bytes(size, rng.choice(["little", "big"]))
@@ -214,7 +215,7 @@ def _number(data: bytearray, at: int, length: int, rng: random.Random) -> bytear
 
 
 def _digits(data: bytearray, at: int, length: int, rng: random.Random) -> bytearray:
-    """Insert what means something in text."""
+    """Insert characters that have a meaning in text files."""
     return (
         data[:at]
         + rng.choice([b"9" * length, b"-", b"nan", b"1e999", b"\n", b",", b"\0", b"\xff", b"[", b"{"])
@@ -254,9 +255,9 @@ EDITS = (_flip, _flip, _set, _number, _number, _digits, _cut, _remove, _duplicat
 
 
 def check(path: Path, name: str) -> str | None:
-    """Read a file of a kind of :data:`KINDS` in this process; returns the refusal, None if it was read.
+    """Read a file of one of :data:`KINDS` in this process. Return the refusal, or None if the file was read.
 
-    Whatever else it raises is a defect, as is a refusal of several lines or without the file's name.
+    Any other exception is a defect. So is a refusal of several lines or without the file's name.
     """
     said = refusal(KINDS[name][2], path)
     if said is not None:
@@ -269,7 +270,7 @@ def check(path: Path, name: str) -> str | None:
 
 
 class Checker:
-    """Runs :func:`check` in a process that is watched, so that a crash or a hang is a finding too."""
+    """Runs :func:`check` in a supervised process, so that a crash or a hang is a finding too."""
 
     def __init__(self) -> None:
         self._start()
@@ -280,7 +281,7 @@ class Checker:
         )
 
     def check(self, path: Path, name: str) -> str | None:
-        """As :func:`check`; raises :class:`AssertionError` for a crash, a hang or a wrong exception as well."""
+        """Run :func:`check`. Raise :class:`AssertionError` for a crash, a hang or a wrong exception as well."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps([str(path), name]) + "\n")
@@ -307,7 +308,7 @@ class Checker:
 
 
 def serve() -> None:
-    """Check the files that are named on standard input."""
+    """Check the files whose names arrive on standard input."""
     replies = sys.stdout
     sys.stdout = io.StringIO()
     for line in sys.stdin:
@@ -320,7 +321,7 @@ def serve() -> None:
 
 
 def main(count: int, names: list[str]) -> None:
-    """Check ``count`` mutants of each input; mutants with findings are kept in the current folder."""
+    """Check ``count`` mutants of each input. Mutants with findings are kept in the current folder."""
     checker = Checker()
     with tempfile.TemporaryDirectory() as folder:
         for name in names or list(KINDS):

@@ -1,7 +1,7 @@
-"""Damaged and hostile bytes for both wires, made from a seed, and readers that take them to the end.
+"""Damaged and hostile bytes for the packet stream and the serial port, made from a seed, and readers for them.
 
-``mutated_stream(seed)`` belongs to the stream of packets, ``mutated_serial(seed)`` to the controller's serial port.
-Rule for each seed: :func:`read_stream` and :func:`read_serial` return, or raise :class:`AmiwarpError`; nothing else.
+``mutated_stream(seed)`` makes bytes of a packet stream, ``mutated_serial(seed)`` bytes of the controller's serial port.
+Rule for each seed: :func:`read_stream` and :func:`read_serial` return or raise :class:`AmiwarpError`, nothing else.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from amiwarp.live.link.following import Follower
+from amiwarp.live.link.follower import Follower
 from amiwarp.live.link.protocol import (
     LONGEST,
     Answer,
@@ -58,7 +58,7 @@ CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 60.0, "cx": 31.5, 
 
 
 def packed(kind: int, count: int, payload: bytes, **wrong: int) -> bytes:
-    """One packet, its header right but for ``wrong``."""
+    """Return one packet. Its header is right, except for the fields in ``wrong``."""
     fields = {"version": 1, "zero": 0, "length": len(payload), "check": zlib.crc32(payload), **wrong}
     return (
         HEADER.pack(MAGIC, fields["version"], kind, fields["zero"], count, fields["length"], fields["check"]) + payload
@@ -66,7 +66,7 @@ def packed(kind: int, count: int, payload: bytes, **wrong: int) -> bytes:
 
 
 def hello(rng: random.Random) -> bytes:
-    """A hello, in a quarter of the cases with something in it that is none."""
+    """Return a hello packet, invalid in a quarter of the cases."""
     camera = {**CAMERA, "distortion_model": "none"}
     fields = {"width": WIDTH, "height": HEIGHT, "camera": camera, "prism": {"apex": 0.03, "index": 1.5}}
     text = json.dumps(fields)
@@ -104,7 +104,7 @@ def hello(rng: random.Random) -> bytes:
 
 
 def rows(kind: int, rng: random.Random, at: int) -> bytes:
-    """A packet of columns; values are sometimes beyond what may be."""
+    """Return a packet of columns, sometimes with values beyond their limits."""
     n = rng.choice([0, 1, 3, 100])
     columns = []
     for k, dtype in enumerate(COLUMNS[kind]):
@@ -122,7 +122,7 @@ def rows(kind: int, rng: random.Random, at: int) -> bytes:
 
 
 def wild_header(rng: random.Random) -> bytes:
-    """A header whose sizes are what they should not be."""
+    """Return a header with wrong sizes."""
     payload = rng.randbytes(rng.choice([0, 8, 64]))
     name = rng.choice(["length", "check", "version", "zero"])
     value = rng.choice(WHOLE) & {"version": 0xFF, "zero": 0xFFFF}.get(name, 0xFFFFFFFF)
@@ -130,7 +130,7 @@ def wild_header(rng: random.Random) -> bytes:
 
 
 def mutated_stream(seed: int) -> bytes:
-    """A stream of packets: mostly right, then changed in its packets, its bytes, or neither."""
+    """Return a mostly valid packet stream, then changed in its packets, in its bytes, or not at all."""
     rng = random.Random(f"stream {seed}")
     parts, at = [hello(rng)], rng.choice([0, 5_000_000, 1 << 50])
     for _ in range(rng.choice([1, 5, 20])):
@@ -148,7 +148,7 @@ def mutated_stream(seed: int) -> bytes:
 
 
 def frames(rng: random.Random) -> list[bytes]:
-    """Frames of a controller, some of them with wild numbers, some lost, some from before a reset."""
+    """Return frames of a controller. Some hold extreme numbers, some are lost, some date from before a reset."""
     out, sequence, t = [], rng.randrange(1 << 16), rng.choice([0, (1 << 32) - 50_000])
     count = 0
     number = lambda: rng.choice(WHOLE)  # noqa: E731
@@ -171,7 +171,7 @@ def frames(rng: random.Random) -> list[bytes]:
 
 
 def lines(rng: random.Random) -> list[bytes]:
-    """Lines of text of a controller, with what is none among them."""
+    """Return text lines of a controller, with invalid lines among them."""
     out, t = [b"rest of a line\n"], rng.choice([0, (1 << 32) - 9000])
     for k in range(rng.choice([5, 60])):
         t += 1000
@@ -192,7 +192,7 @@ def lines(rng: random.Random) -> list[bytes]:
 
 
 def mutated_serial(seed: int) -> bytes:
-    """Bytes of a serial port: frames, lines or noise, then damaged."""
+    """Return bytes of a serial port: frames, lines or noise, then damaged."""
     rng = random.Random(f"serial {seed}")
     made: Callable[[random.Random], list[bytes]] = rng.choice([frames, frames, lines])
     parts = made(rng)
@@ -206,7 +206,7 @@ def mutated_serial(seed: int) -> bytes:
 
 
 def damaged(data: bytes, rng: random.Random) -> bytes:
-    """The bytes with up to three changes."""
+    """Return the bytes with up to three changes."""
     out = bytearray(data)
     for _ in range(rng.choice([0, 0, 1, 3])):
         if not out:
@@ -230,7 +230,7 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
 
 
 def read_stream(data: bytes) -> int:
-    """Take a stream as ``amiwarp record`` does; the number of packets. Raises :class:`AmiwarpError`."""
+    """Read a stream as ``amiwarp record`` does. Return the number of packets. Raises :class:`AmiwarpError`."""
     decoder = PacketDecoder("the stream")
     with tempfile.TemporaryFile(buffering=0) as file:
         file.write(data)
@@ -243,7 +243,7 @@ def read_stream(data: bytes) -> int:
 
 
 def read_serial(data: bytes) -> int:
-    """Take bytes of a serial port as :class:`Link` does; the number of samples."""
+    """Read bytes of a serial port as :class:`Link` does. Return the number of samples."""
     decoder, follower, count = FrameDecoder(), Follower("the port", 4096), 0
     follower.opened(0)
     for n, start in enumerate(range(0, len(data), 61)):
@@ -262,7 +262,7 @@ def read_serial(data: bytes) -> int:
 
 
 def frames_in(data: bytes, wire: str) -> int:
-    """Return about how many packets, or messages, some bytes were made of."""
+    """Return the approximate number of packets or messages in some bytes."""
     if wire == "stream":
         return max(data.count(MAGIC), 1)
     return max(data.count(b"\0"), data.count(b"\n"), 1)

@@ -1,7 +1,7 @@
 """Independent float64 NumPy oracle: OpenCV's published lens polynomials and a two-interface Snell trace.
 
-Nothing here shares a formula with the package: the prism is traced face by face with the vector form of Snell's law,
-and the lens is inverted by bisection and damped Newton steps instead of the kernels' closed form and plain steps.
+Nothing here shares a formula with the package. The prism is traced face by face with the vector form of Snell's law.
+The lens is inverted by bisection and damped Newton steps, where the kernels use a closed form and plain steps.
 Every function takes and returns float64; a point or ray that does not exist is a row of NaN.
 """
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def polynomial(radius: Array, *k: float) -> Array:
-    """r (1 + k1 r² + k2 r⁴ + …)."""
+    """Return r (1 + k1 r² + k2 r⁴ + …)."""
     factor = np.ones_like(radius)
     for i, value in enumerate(k):
         factor = factor + value * radius ** (2 * i + 2)
@@ -28,7 +28,7 @@ def polynomial(radius: Array, *k: float) -> Array:
 
 
 def monotonic_limit(*k: float, largest: float) -> float:
-    """Largest radius below which r (1 + k1 r² + …) grows, by a scan and bisection of its slope."""
+    """Return the largest radius up to which r (1 + k1 r² + …) grows, by a scan and bisection of its slope."""
 
     def slope(r: Array) -> Array:
         return np.sum([(2 * i + 1) * value * r ** (2 * i) for i, value in enumerate((1.0, *k))], axis=0)
@@ -45,7 +45,7 @@ def monotonic_limit(*k: float, largest: float) -> float:
 
 
 def invert_polynomial(value: Array, *k: float, limit: float) -> Array:
-    """Radius in [0, limit] where the polynomial takes ``value``, by bisection; NaN where it never does."""
+    """Return the radius in [0, limit] at which the polynomial equals ``value``, by bisection; NaN if there is none."""
     low, high = np.zeros_like(value), np.full_like(value, limit)
     for _ in range(56):
         middle = 0.5 * (low + high)
@@ -56,7 +56,7 @@ def invert_polynomial(value: Array, *k: float, limit: float) -> Array:
 
 @cache
 def lens_limit(camera: Camera) -> float:
-    """Largest tangent (radial-tangential) or angle [rad] (fisheye) where the lens is one-to-one."""
+    """Return the largest tangent (radial-tangential) or angle [rad] (fisheye) up to which the lens is one-to-one."""
     d = camera.distortion
     if isinstance(d, Fisheye):
         return monotonic_limit(d.k1, d.k2, d.k3, d.k4, largest=0.999 * np.pi / 2)
@@ -64,7 +64,7 @@ def lens_limit(camera: Camera) -> float:
 
 
 def distort_radial_tangential(d: RadialTangential, p: Array) -> Array:
-    """OpenCV, Camera Calibration and 3D Reconstruction: x'' and y'' from x' and y' (tangents), shape (n, 2)."""
+    """Return x'' and y'' from x' and y' (tangents), shape (n, 2). OpenCV, Camera Calibration and 3D Reconstruction."""
     x, y = p.T
     r2 = x**2 + y**2
     radial = 1.0 + d.k1 * r2 + d.k2 * r2**2 + d.k3 * r2**3
@@ -78,7 +78,7 @@ def distort_radial_tangential(d: RadialTangential, p: Array) -> Array:
 
 
 def undistort_radial_tangential(d: RadialTangential, distorted: Array, limit: float) -> Array:
-    """Inverse: the radial part by bisection, then Newton steps, each halved until it helps; shape (n, 2)."""
+    """Invert: the radial part by bisection, then Newton steps, each halved until the residual drops; shape (n, 2)."""
     radius = np.linalg.norm(distorted, axis=1)
     largest = polynomial(np.array(limit), d.k1, d.k2, d.k3)
     start = invert_polynomial(np.minimum(radius, 0.9999 * largest), d.k1, d.k2, d.k3, limit=limit)
@@ -105,7 +105,7 @@ def undistort_radial_tangential(d: RadialTangential, distorted: Array, limit: fl
 
 
 def pixels_to_rays(camera: Camera, xy: Array) -> Array:
-    """Unit bearings (n, 3) of pixels (n, 2)."""
+    """Return unit bearings (n, 3) of pixels (n, 2)."""
     d = (np.asarray(xy, dtype=np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     lens = camera.distortion
     if isinstance(lens, Fisheye):
@@ -120,7 +120,7 @@ def pixels_to_rays(camera: Camera, xy: Array) -> Array:
 
 
 def rays_to_pixels(camera: Camera, rays: Array) -> Array:
-    """Pixels (n, 2) of bearings (n, 3); NaN behind the image and past the fold of the lens."""
+    """Return pixels (n, 2) of bearings (n, 3); NaN behind the image and beyond the fold of the lens."""
     rays = np.asarray(rays, dtype=np.float64)
     ahead = rays[:, 2] > 1e-6
     lens = camera.distortion
@@ -141,7 +141,7 @@ def rays_to_pixels(camera: Camera, rays: Array) -> Array:
 
 
 def refract(ray: Array, normal: Array, ratio: float) -> Array:
-    """Snell's law in vector form: bearing (n, 3) across a face of unit normal (n, 3), ratio = n_from / n_to."""
+    """Refract a bearing (n, 3) at a face of unit normal (n, 3) by Snell's law in vector form; ratio = n_from / n_to."""
     cosine = np.sum(ray * normal, axis=1, keepdims=True)
     radicand = 1.0 - ratio**2 * (1.0 - cosine**2)
     root = np.sqrt(np.where((radicand > 0.0) & (cosine > 0.0), radicand, np.nan))
@@ -149,10 +149,10 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
 
 
 def through_prism(prism: Prism, rays: Array, phi: Array, *, to_scene: bool) -> Array:
-    """Bearing (n, 3) after both faces; ``phi`` (n,) [rad] is the azimuth of the tilt, rays point away from the camera.
+    """Trace bearings (n, 3) through both faces. ``phi`` (n,) [rad] is the azimuth of the tilt; rays leave the camera.
 
-    ``to_scene``: from the observed bearing to the scene's; else back, which by reversibility of light is the same trace
-    from the other side. NaN after total internal reflection or where the ray does not meet a face.
+    ``to_scene``: from the observed bearing to the scene's. Otherwise back, which is the same trace from the other side,
+    because light paths are reversible. NaN after total internal reflection or if the ray misses a face.
     """
     flat = np.tile([0.0, 0.0, 1.0], (len(phi), 1))
     s, c = np.sin(prism.apex), np.cos(prism.apex)
@@ -165,7 +165,7 @@ def through_prism(prism: Prism, rays: Array, phi: Array, *, to_scene: bool) -> A
 
 
 def rotation(tilt: tuple[float, float]) -> Array:
-    """Matrix (3, 3) of a rotation about x by ``tilt[0]``, then about y by ``tilt[1]`` [rad]."""
+    """Return the matrix (3, 3) of a rotation about x by ``tilt[0]``, then about y by ``tilt[1]`` [rad]."""
     cx, sx, cy, sy = np.cos(tilt[0]), np.sin(tilt[0]), np.cos(tilt[1]), np.sin(tilt[1])
     return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
 
@@ -180,7 +180,7 @@ def move(
     phase: float = 0.0,
     tilt: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
-    """Pixels (n, 2) after the prism: compensated (``to_scene``) or deflected."""
+    """Return compensated (``to_scene``) or deflected pixels (n, 2)."""
     axis = rotation(tilt)
     rays = pixels_to_rays(camera, xy) @ axis
     out = through_prism(prism, rays, np.asarray(theta, dtype=np.float64) + phase, to_scene=to_scene)
@@ -188,10 +188,10 @@ def move(
 
 
 def cross_section(angle: Array, apex: float, index: Array | float, *, tilted_first: bool) -> Array:
-    """The paper's plane formula δ = Φq − Φo + Φp − Φi: signed turn [rad] of a ray in the plane of the wedge.
+    """Return the signed deflection [rad] of a ray in the plane of the wedge: the paper's δ = Φq − Φo + Φp − Φi.
 
-    ``angle`` [rad] is the ray's, positive towards the azimuth of the tilt; every Φ is measured from the normal of its
-    own face with that sign: (Φi, Φp) before and after the first face, (Φo, Φq) before and after the second.
+    ``angle`` [rad] is the ray's, positive towards the azimuth of the tilt. Every Φ is measured from the normal of its
+    face with that sign: (Φi, Φp) before and after the first face, (Φo, Φq) before and after the second.
     """
     first, second = (apex, 0.0) if tilted_first else (0.0, apex)
     phi_i = angle - first
@@ -202,7 +202,7 @@ def cross_section(angle: Array, apex: float, index: Array | float, *, tilted_fir
 
 
 def turn(rays: Array, phi: Array, angle: Array | float) -> Array:
-    """Bearings (n, 3) turned by ``angle`` [rad] from z towards the azimuth ``phi``, a plane rotation in that basis."""
+    """Rotate bearings (n, 3) by ``angle`` [rad] from z towards the azimuth ``phi``."""
     along = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=1)
     across = np.stack([-np.sin(phi), np.cos(phi), np.zeros_like(phi)], axis=1)
     u, v, z = np.sum(rays * along, axis=1), np.sum(rays * across, axis=1), rays[:, 2]
@@ -213,7 +213,7 @@ def turn(rays: Array, phi: Array, angle: Array | float) -> Array:
 
 
 def place(name: str, camera: Camera, prism: Prism, xy: Array, theta: Array, *, phase: float) -> Array:
-    """Pixels without the prism by a model: ``exact``, ``radial`` or ``circle``; the flat face to the scene."""
+    """Return pixels compensated by the model ``exact``, ``radial`` or ``circle``; the flat face points to the scene."""
     if name == "exact":
         return move(camera, prism, xy, theta, to_scene=True, phase=phase)
     rays = pixels_to_rays(camera, xy)

@@ -1,6 +1,6 @@
-"""An emulated rig in a world of its own time, which stands still until the programs under test have caught up.
+"""An emulated rig with a simulated clock, which stands still until the programs under test have caught up.
 
-Nothing that is late on a busy machine is late by this clock: what a test finds does not depend on the machine's speed.
+Delays on a busy machine do not count on this clock, so results of tests do not depend on the machine's speed.
 """
 
 from __future__ import annotations
@@ -9,19 +9,19 @@ from collections.abc import Callable, Iterator
 
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import Answer
-from amiwarp.live.link.terminal import PseudoTerminal
+from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 from amiwarp.live.stream.emulated import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, Source
 from amiwarp.live.stream.session import Session
 
 LONG_S = 120.0
-"""Limit of every wait: only what hangs takes as long [s]."""
+"""Limit of every wait [s]. Only a hang takes so long."""
 LAG_US = 20_000
-"""By how much a session may be behind the camera before the world waits for it [us]."""
+"""Delay of a session behind the camera at which the simulated clock waits for it [us]."""
 
 
 class World:
-    """A clock [us] that begins at 0; :meth:`step` moves it on if all ``conditions`` hold."""
+    """Simulated clock [us] that begins at 0. :meth:`step` advances it if all ``conditions`` hold."""
 
     def __init__(self, *conditions: Callable[[], bool], step_us: int = 4000) -> None:
         self.conditions = list(conditions)
@@ -31,16 +31,16 @@ class World:
         return self._now
 
     def step(self) -> int:
-        """For one thread, the emulated controller's."""
+        """Advance the clock if possible and return the time. Only the emulated controller's thread calls this."""
         if all(condition() for condition in self.conditions):
             self._now += self._step_us
         return self._now
 
 
 class Wire:
-    """The bytes between a terminal and a link. A kernel under load hands them over later than it takes them.
+    """Count of the bytes between a terminal and a link, which a busy operating system delivers late.
 
-    Called, it tells whether the link has read all, and knows whether the cable is in.
+    A call returns whether the link has read all bytes and has noticed whether the cable is plugged in.
     """
 
     def __init__(self, link: Link, terminal: PseudoTerminal) -> None:
@@ -69,7 +69,7 @@ class Wire:
 
 
 class Counted:
-    """A source that counts the triggers that came."""
+    """A source that counts its triggers."""
 
     def __init__(self, source: Source) -> None:
         self._source, self.triggers = source, 0
@@ -86,7 +86,7 @@ class Counted:
 
 
 def has_taken_in(session: Session, source: Counted, camera: EmulatedCamera, link: Link) -> Callable[[], bool]:
-    """Whether the session has what the link gives, all pulses that the camera saw, and its events but the last few."""
+    """Return a check that the session has the link's samples, the camera's pulses, and all but its last few events."""
     first, last = camera._events.t_first, camera._events.t_last
 
     def ready() -> bool:

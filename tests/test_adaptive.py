@@ -1,4 +1,4 @@
-"""The speed that a stream asks for, and the edges seen that it is made from."""
+"""Adaptive prism speed: the estimate of edges seen, and the speed that follows from it."""
 
 import math
 
@@ -24,7 +24,7 @@ CAMERA, PRISM, PHASE = Camera.from_fov(200, 150, math.radians(40.0)), Prism(math
 def watched(
     light: np.ndarray, rpm: float, rates: tuple[float, float, float], windows: int = 8
 ) -> tuple[CoverageMeter, list[Coverage]]:
-    """Windows of a simulated recording; ``rates`` of the camera [rad/s]."""
+    """Measure the windows of a simulated recording. ``rates``: the camera's angular velocity [rad/s]."""
     made = Simulation(
         Scene.from_picture(light), CAMERA, PRISM, windows * WINDOW_US * 1e-6, PrismMotion(rpm, PHASE),
         CameraMotion(rates),
@@ -56,14 +56,14 @@ def test_a_faster_prism_shows_more_edges(leaves: np.ndarray) -> None:
 def test_the_cameras_own_motion_is_found_and_shows_edges_too(leaves: np.ndarray) -> None:
     _, still = watched(leaves, 120.0, (0.0, 0.0, 0.0))
     _, panning = watched(leaves, 120.0, (0.0, 1.0, 0.0))
-    px_s = -CAMERA.fx  # the image runs against the camera
+    px_s = -CAMERA.fx  # the image moves against the camera
     np.testing.assert_allclose([c.drift for c in still[1:]], 0.0, atol=0.05 * CAMERA.fx)
     np.testing.assert_allclose([c.drift for c in panning[1:]], [(px_s, 0.0)] * 7, atol=0.1 * CAMERA.fx)
     assert np.mean([1.0 - c.share for c in panning[1:]]) < 0.5 * np.mean([1.0 - c.share for c in still[1:]])
 
 
 def stripes(angle: float) -> np.ndarray:
-    """Edges whose normals are at one angle [rad]."""
+    """A picture of edges whose normals all have one angle [rad]."""
     rows, columns = np.mgrid[:240, :320]
     steps = (columns * math.cos(angle) + rows * math.sin(angle)) // 12
     return np.where(steps % 2, 0.9, 0.2).astype(np.float32)
@@ -108,12 +108,12 @@ def circle(radius: float) -> np.ndarray:
 
 
 def scene(drift: tuple[float, float] = (0.0, 0.0), texture: np.ndarray = EVEN) -> Coverage:
-    """A window's, of what the controller looks at."""
+    """The coverage of a window, with the fields that the controller uses."""
     return Coverage(1.0, np.array(drift), np.zeros(2), np.zeros(DIRECTIONS), texture)
 
 
 def follow(controller: SpeedController, scenes: list[Coverage], mev_per_rpm: float = 0.005) -> np.ndarray:
-    """Speeds of a loop with a lagging motor, one for each window."""
+    """Run the control loop with a lagging motor. Return the requested speed of each window."""
     motor, told, out = controller.rpm, controller.rpm, []
     for k, seen in enumerate(scenes):
         motor += (told - motor) * (1.0 - math.exp(-0.33))
@@ -128,14 +128,14 @@ def unseen(radius: float, rpm: float, seen: Coverage) -> float:
 
 @pytest.mark.parametrize("drift", [(0.0, 0.0), (90.0, -40.0), (0.0, 700.0)])
 def test_what_is_foretold_is_what_windows_see(drift: tuple[float, float]) -> None:
-    """At the worst of the phases; of windows that begin at any of them."""
+    """The prediction is the coverage at the worst phase of the prism. The windows begin at any phase."""
     radius, rpm, along = 4.0, 500.0, np.linspace(0.0, 1.0, 17)
     shares = []
     for phase in np.arange(0.0, 1.0, 0.125):
         turned = math.tau * (phase + along * rpm / 60e6 * WINDOW_US)
         way = radius * np.stack([np.cos(turned), np.sin(turned)], axis=1)
         way += along[:, None] * np.array(drift) * 1e-6 * WINDOW_US
-        meter = CoverageMeter(64, 48)  # that has seen nothing: its camera is still, its texture even
+        meter = CoverageMeter(64, 48)  # new, so it assumes a still camera and edges of all directions
         shares.append(meter(Events.empty(), 0, WINDOW_US, way).share)
     assert 1.0 - unseen(radius, rpm, scene(drift)) == pytest.approx(min(shares), abs=2e-3)
     assert 0.5 < min(shares) < 0.9999
@@ -149,15 +149,15 @@ def test_it_settles_where_coverage_is_right_and_stays(radius: float) -> None:
     assert 120.0 < speeds[-1] < 1440.0
     assert (speeds[150:] == speeds[-1]).all()
     ways = np.sign(np.diff(speeds))
-    assert len(set(ways[ways != 0.0])) == 1  # it never turned back
+    assert len(set(ways[ways != 0.0])) == 1  # it never reverses
 
 
 ONE = np.eye(DIRECTIONS)[0]
-"""Texture whose normals all lie near x."""
+"""Texture whose edge normals all lie near x."""
 
 
 def test_it_follows_a_scene_that_changes_without_swinging() -> None:
-    """A camera that moves across the only edges there are needs no prism."""
+    """All edges have one direction. A camera that moves across them needs no prism."""
     still, moved = scene(texture=ONE), scene((800.0, 0.0), ONE)
     controller = SpeedController(circle(4.0))
     speeds = follow(controller, [still] * 150 + [moved] * 200 + [still] * 200)
@@ -210,7 +210,7 @@ def test_what_makes_no_sense_is_said() -> None:
     orbit = circle(4.0)
     with pytest.raises(AmiwarpError, match=r"100 rpm to start with is not in 120 \.\. 1440 rpm"):
         SpeedController(orbit, 100.0)
-    with pytest.raises(AmiwarpError, match=r"coverage from 0\.99 to 0\.9"):
+    with pytest.raises(AmiwarpError, match=r"coverage limits low = 0\.99 and high = 0\.9"):
         SpeedController(orbit, low=0.99, high=0.9)
     with pytest.raises(AmiwarpError, match="ramp_rpm_s = 0"):
         SpeedController(orbit, ramp_rpm_s=0.0)

@@ -1,4 +1,4 @@
-"""The smallest model that a scene needs, and the parameters that a recording tells; on simulated recordings."""
+"""Automatic choice of the model and of the free parameters, on simulated recordings."""
 
 import json
 import math
@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection import model_choice as auto
 from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.selection.smaller_models import Places, encoder_noise, fit, rung_space
-from amiwarp.calib.selection.trial import FACTOR, make_trial
-from amiwarp.calib.sharpness.held_out import halves
-from amiwarp.calib.sharpness.search import Material
+from amiwarp.calib.selection.smaller_models import Places, candidate_space, encoder_noise, fit
+from amiwarp.calib.selection.trial import CONVERSION_FACTOR, make_trial
+from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
+from amiwarp.calib.sharpness.held_out import split_turns
 from amiwarp.calib.thinning import thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -60,7 +60,7 @@ def found(wide: Recording) -> Calibration:
 
 @pytest.fixture(scope="module")
 def as_circle(wide: Recording) -> Calibration:
-    """By a budget that a circle keeps."""
+    """Calibrated with a budget that a circle keeps."""
     return calibrate_auto(wide, Settings(events=120_000), budget_px=5.0)
 
 
@@ -92,8 +92,8 @@ def test_a_wide_lens_does_not(found: Calibration, wide: Recording) -> None:
     assert [r.model for r in rungs.values() if r.chosen] == ["exact"]
     exact = replace(found.exact, parameters={"apex": truth.prism.apex, "phase": truth.phase})
     for name in ("circle", "radial"):
-        space = rung_space(name, exact, (), rad_per_us=7.5e-5, duration_us=3e5)
-        assert rungs[name].predicted_px == pytest.approx(fit(space, places.moved(truth), places)[1], rel=0.05)
+        space = candidate_space(name, exact, (), rad_per_us=7.5e-5, duration_us=3e5)
+        assert rungs[name].predicted_px == pytest.approx(fit(space, places.compensated(truth), places)[1], rel=0.05)
     assert rungs["circle"].predicted_px > 10 * found.ladder.budget_px
     assert rungs["exact"].predicted_px == 0.0
 
@@ -116,15 +116,15 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     ratio = found.uncertainty["deflection"] / found.exact.uncertainty["apex"]
     apex = found.exact.parameters["apex"]
     larger = replace(found.exact, parameters={**found.exact.parameters, "apex": 1.01 * apex})
-    space = rung_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
-    deflection = fit(space, places.moved(larger.model), places)[0]["deflection"]
+    space = candidate_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
+    deflection = fit(space, places.compensated(larger.model), places)[0]["deflection"]
     assert ratio == pytest.approx((deflection - found.parameters["deflection"]) / (0.01 * apex), rel=0.02)
-    # no nearer one is found by a method that shares nothing with it
-    target = places.moved(found.exact.model)
+    # an independent method finds no closer circle
+    target = places.compensated(found.exact.model)
 
     def error(v: np.ndarray) -> float:
         model = CircleModel(found.camera, v[0] * 1e-2, v[1])
-        return float(np.sqrt(np.mean(np.sum((places.moved(model) - target) ** 2, axis=1))))
+        return float(np.sqrt(np.mean(np.sum((places.compensated(model) - target) ** 2, axis=1))))
 
     start = [found.parameters["deflection"] * 1e2, found.parameters["phase"]]
     best = minimize(error, start, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-6}).fun
@@ -134,20 +134,20 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
 def test_held_out_turns_see_the_circle_s_error_in_pixels(found: Calibration) -> None:
     assert found.ladder is not None
     circle = found.ladder.rungs[0]
-    assert circle.seen_px[0] > circle.predicted_px / FACTOR
-    assert circle.seen_px[1] < circle.predicted_px * FACTOR
+    assert circle.seen_px[0] > circle.predicted_px / CONVERSION_FACTOR
+    assert circle.seen_px[1] < circle.predicted_px * CONVERSION_FACTOR
     assert found.ladder.agreed
     assert found.warnings == ()
 
 
 def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Were the circle predicted to be without error, held-out turns would still refuse it."""
+    """Even if the predicted error of the circle is zero, the check on held-out turns rejects it."""
     monkeypatch.setattr(auto, "fit", lambda *given: (fit(*given)[0], 0.0))
     trial = make_trial(wide, found.exact, SHARPNESS, (), device="cpu", budget_px=None)
-    circle, exact = (j.rung for j in auto.judge_rungs(trial)[:2])
+    circle, exact = (f.candidate for f in auto.fit_models(trial)[:2])
     assert not circle.chosen
-    assert circle.seen_px[0] > trial.tells_px
-    assert circle.verdict.startswith("under the budget as predicted, but held-out turns miss")
+    assert circle.seen_px[0] > trial.rejection_px
+    assert circle.verdict.startswith("predicted under the budget, but held-out turns show an error")
     assert exact.chosen
 
 
@@ -166,7 +166,7 @@ def test_the_file_keeps_the_ladder(as_circle: Calibration, tmp_path: Path) -> No
     found.save(tmp_path / "c.json")
     assert Calibration.load(tmp_path / "c.json") == found
     data = json.loads((tmp_path / "c.json").read_text())
-    del data["ladder"]  # as a file of before it
+    del data["ladder"]  # as in an older file
     (tmp_path / "old.json").write_text(json.dumps(data))
     old = Calibration.load(tmp_path / "old.json")
     assert old == replace(found, ladder=None)
@@ -205,7 +205,7 @@ def test_a_clock_offset_is_freed_where_the_speed_changes(texture: np.ndarray) ->
     c = calibrate_auto(recording, SHARPNESS)
     assert c.ladder is not None
     assert [p.name for p in c.ladder.parameters if p.freed] == ["clock_offset"]
-    assert c.parameters["clock_offset"] == pytest.approx(3000.0, abs=400.0)  # us; the sensor is late too
+    assert c.parameters["clock_offset"] == pytest.approx(3000.0, abs=400.0)  # us; the sensor's latency adds to it
     assert "clock_offset" in c.uncertainty
     assert c.model_name == "exact"
 
@@ -236,9 +236,9 @@ def test_halves_are_alternate_turns() -> None:
     t = np.arange(0, 1_000_000, 100, dtype=np.int64)
     zero = np.zeros(len(t), np.uint16)
     encoder = Encoder.constant_speed(300.0, 0, 1_000_000)  # five turns
-    first, second = halves(Material(Events(zero, zero, t, zero.astype(np.uint8)), encoder, None))
+    first, second = split_turns(CalibrationEvents(Events(zero, zero, t, zero.astype(np.uint8)), encoder, None))
     assert np.array_equal(np.sort(np.concatenate([first.t, second.t])), t)
-    # one at its very edge may be either's
+    # an event at the border of two turns may belong to either
     whole = [half.t[half.t % 200_000 > 1000] // 200_000 for half in (first, second)]
     assert [set(turns.tolist()) for turns in whole] == [{0, 2, 4}, {1, 3}]
 

@@ -1,4 +1,4 @@
-"""The benchmark runner on small scenes: right answers pass, wrong ones are named, and the page shows the files."""
+"""The benchmark runner on small scenes: right results pass, wrong ones are named, and the page shows the files."""
 
 import dataclasses
 import importlib.util
@@ -24,7 +24,7 @@ from benchmarks.scenes import SECONDS, TURNS_PER_S, EventScene, RecordingScene, 
 EVENTS = 4_000
 RECORDED = 60_000
 LESS_SURE = {"model_px": 0.2, "decorrelation": 0.05}
-"""Bars for a recording of so few events."""
+"""Error limits for a recording of few events."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def recorded(texture: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> R
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, scene: EventScene) -> None:
-    """Every scene is the small one."""
+    """Replace every scene by the small one."""
     kind = cases.SceneKind(lambda n, device, picture: scene, {"cpu": 1, "cuda": 1})
     monkeypatch.setattr(runner, "SCENES", dict.fromkeys(cases.EVENT_SCENES, kind))
     monkeypatch.setattr(runner, "REST_S", 0.0)
@@ -53,13 +53,13 @@ def test_events_are_in_order_and_on_their_orbits(scene: EventScene) -> None:
     assert 0.99 * SECONDS < (e.t[-1] - e.t[0]) * 1e-6 <= SECONDS
     np.testing.assert_allclose(scene.theta, e.t * (2e-6 * math.pi * TURNS_PER_S), atol=1e-9)
     image = truth.images(scene, "plane circle")[Vote.NEAREST]
-    assert image.sum() == EVENTS  # nobody leaves the image
-    assert np.count_nonzero(image) < 9 * 50  # rounding to the pixel spreads an edge point, no more
+    assert image.sum() == EVENTS  # no event leaves the image
+    assert np.count_nonzero(image) < 9 * 50  # each edge point is spread only by rounding to pixels
 
 
 @pytest.mark.parametrize("model", ["circle", "radial", "ellipse", "exact", "plane circle"])
 def test_models_agree_on_where_events_belong(scene: EventScene, model: str) -> None:
-    """Every truth is near the exact one: sign and angle of the peers' formula too."""
+    """The true positions of every model are close to the exact ones, those of the other libraries' formula too."""
     xy, theta = scene.sample()
     away = truth.places(scene, model, xy, theta) - truth.places(scene, "exact", xy, theta)
     assert np.sqrt(np.mean(np.sum(away**2, axis=1))) <= cases.EXACT_PX[model]
@@ -75,7 +75,7 @@ OF_EVENTS = [
 def test_answers_are_right(scene: EventScene, case: cases.Case, device: str) -> None:
     try:
         job = case.make(scene, device, case.model, case.vote)
-    except Missing as missing:  # and it is
+    except Missing as missing:  # check that it is not installed
         library, _, said = str(missing).partition(" ")
         assert said == "is not installed"
         assert importlib.util.find_spec(library) is None
@@ -116,7 +116,7 @@ def test_recordings_are_as_long_as_was_asked(recorded: RecordingScene) -> None:
 
 @pytest.fixture
 def strewn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In place of half a second of the simulator."""
+    """Use random events instead of half a second of simulation."""
     rng, n = np.random.default_rng(0), 100_000
     x, y = rng.integers(0, [640, 480], (n, 2)).astype(np.uint16).T
     times = np.sort(rng.integers(0, compensate.REPEATED_US, n))
@@ -209,7 +209,7 @@ def test_missing_libraries_are_seen_and_files_are_read(
     assert "old" not in text
     assert text.count("| absent | nolib is not installed |") == 3
     assert "| exact model over circle, time | ≤ 1.5 × |" in text
-    assert "compared with NumPy" not in text  # which was not in the run
+    assert "compared with NumPy" not in text  # NumPy was not in the run
     assert report.page(text, [results]) == text
 
 

@@ -1,4 +1,4 @@
-"""Calibration by sharpness, without a guess, on simulated recordings; and the refusals."""
+"""Contrast maximisation without an initial guess, on simulated recordings, and its refusals."""
 
 import functools
 import math
@@ -12,10 +12,10 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.checks import edge_coherence
-from amiwarp.calib.parameters import make_space
+from amiwarp.calib.preparation import prepare
 from amiwarp.calib.prism_speed import estimate_rpm
 from amiwarp.calib.sharpness.search import PARTS
-from amiwarp.calib.single_model import prepare
+from amiwarp.calib.space_setup import make_space
 from amiwarp.calib.thinning import RUN, thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -46,7 +46,7 @@ def keep(recording: Recording, which: object) -> Recording:
 
 def test_found_without_a_guess(recording: Recording, device: str) -> None:
     c = calibrate(recording, device=device)
-    assert error_px(recording, c.model) < 0.15  # px; sharpness is biased by the sensor's hysteresis
+    assert error_px(recording, c.model) < 0.15  # px; contrast maximisation is biased by the sensor's hysteresis
     assert c.sharpness_after > 1.5 * c.sharpness_before
     assert abs(math.degrees(c.parameters["apex"] - TRUE_PRISM.apex)) < 0.08
     assert [s.name for s in c.stages][:2] == ["global", "local"]
@@ -94,7 +94,7 @@ def test_the_paper_s_cost_works_on_few_events_of_sparse_edges() -> None:
 
 
 def test_the_paper_s_cost_is_refused_where_it_fails(recording: Recording) -> None:
-    """On dense texture its minimum is far from the truth: that is said, and not believed."""
+    """On dense texture its minimum is far from the truth. The answer is refused."""
     with pytest.raises(AmiwarpError, match="no motion of a prism"):
         calibrate(recording, sharpness=Sharpness.PAPER_J, events=200_000)
 
@@ -117,7 +117,7 @@ def test_the_same_input_gives_the_same_bits(recording: Recording, device: str) -
 
 
 def test_uncertainty_matches_the_scatter_of_repeats(texture: np.ndarray) -> None:
-    """Eight noise seeds: the spread of the answers is what the covariance says, within a factor of three."""
+    """Eight noise seeds: the scatter of the answers agrees with the covariance within a factor of three."""
     camera = Camera.from_fov(120, 90, math.radians(50))
     found, said = [], []
     for seed in range(8):
@@ -153,7 +153,7 @@ def test_tilt_is_found(texture: np.ndarray) -> None:
 
 
 def test_index_can_be_free_and_is_hardly_determined(recording: Recording) -> None:
-    """At equal deflection another index moves events by hundredths of a pixel: apex and index trade."""
+    """At equal deflection, another index moves events by hundredths of a pixel only."""
     c = calibrate(recording, free=("apex", "phase", "index"), events=200_000, local_evaluations=300)
     assert c.uncertainty["index"] > 5 * calibrate(recording, events=200_000).uncertainty["apex"]
     assert error_px(recording, c.model) < 0.25
@@ -184,13 +184,13 @@ def test_phase_without_an_encoder_belongs_to_the_speed_found(
     c = calibrate(blind, events=200_000, start={} if given is None else {"rpm": given})
     c.save(tmp_path / "c.json")
     c = Calibration.load(tmp_path / "c.json")
-    # the angle of the tilt itself, against a calibration that knows the encoder
+    # the azimuth of the tilt, compared with a calibration that uses the encoder
     known = calibrate(recording, events=200_000)
     t = np.array([first, (first + last) // 2, last])
     azimuth = c.encoder_for(None, first, last).angle_at(t) + c.parameters["phase"]
     expected = recording.encoder.angle_at(t) + known.parameters["phase"]
     np.testing.assert_allclose(wrap_angle(azimuth - expected), 0.0, rtol=0, atol=math.radians(1.0))
-    # and so for part of the recording
+    # the same holds for a part of the recording
     part = c.encoder_for(None, first + 100_000, last).angle_at(t[1:]) + c.parameters["phase"]
     np.testing.assert_allclose(part, azimuth[1:], rtol=0, atol=1e-9)
 
@@ -200,7 +200,7 @@ def test_what_is_known_is_used(recording: Recording) -> None:
     c = calibrate(recording, global_algorithm=None, start=known, events=50_000)
     assert c.parameters["index"] == 1.6
     assert "index" not in c.free
-    # (n - 1) apex is what the events tell
+    # the events determine (n - 1) apex only
     assert c.parameters["apex"] * 0.6 == pytest.approx(TRUE_PRISM.apex * (TRUE_PRISM.index - 1.0), rel=0.03)
 
 
@@ -214,7 +214,7 @@ def test_thinning_is_even_and_complete(recording: Recording) -> None:
     assert PARTS > 1
 
 
-# -- refusals: each says which
+# -- refusals, each with its reason
 
 
 def test_too_few_events(recording: Recording) -> None:
@@ -281,8 +281,8 @@ def test_unknown_camera(recording: Recording) -> None:
         ({"free": ("apex", "focal")}, "focal"),
         ({"free": ("rpm", "apex")}, "encoder gives the rpm"),
         ({"start": {"rpm": 720.0}}, "encoder gives the rpm"),
-        ({"start": {"deflection": 0.01}}, "deflection, which the exact model has not"),
-        ({"bounds": {"index": (1.4, 1.6)}}, "index are given, which is not free"),
+        ({"start": {"deflection": 0.01}}, "deflection, which is no parameter of the exact model"),
+        ({"bounds": {"index": (1.4, 1.6)}}, "given for index, which is not free"),
         ({"free": ()}, "no parameter is free"),
         ({"model": "circle", "free": ("deflection", "tilt_x")}, "tilt_x"),
         ({"model": "sphere"}, "sphere"),
@@ -305,7 +305,7 @@ def test_coherence_of_edges() -> None:
 
 
 def test_a_drift_that_is_held_still_turns_the_angles(recording: Recording) -> None:
-    """Events get the angles of the start; where the parameter is held elsewhere, they must follow it there."""
+    """Angles of events are computed for the start value. If the parameter is fixed elsewhere, they change."""
     assert recording.camera is not None
     space = make_space(
         "exact", recording.camera, NOMINAL_PRISM, free=("apex", "phase", "clock_offset"), start={"clock_offset": 100.0},

@@ -1,4 +1,4 @@
-"""The calibration's JSON file: there and back, and every kind of damage."""
+"""The calibration's JSON file: saved and loaded again, and every kind of damage."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The camera: OpenCV's lens polynomials both ways, against the float64 oracle, and every way to have no ray."""
+"""The camera: OpenCV's lens polynomials and their inverses against the float64 reference, and pixels without a ray."""
 
 import math
 from pathlib import Path
@@ -15,14 +15,14 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.device_camera import camera_params, fold_radius
 from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
 
-# as the package's kernels: a GPU would else fuse multiplications and additions here alone
+# as in the package's kernels; otherwise a GPU would fuse multiplications and additions in this module only
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 DAVIS = Camera(
     240, 180, 199.092366542, 198.82882047, 132.192071378, 110.712660011,
     RadialTangential(-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0),
 )  # fmt: skip
-"""The DAVIS240C of the public shapes_rotation recording: the barrel that an event camera typically has."""
+"""The DAVIS240C of the public recording shapes_rotation, with a barrel distortion typical of event cameras."""
 
 LENSES: list[Distortion | None] = [
     None,
@@ -40,7 +40,7 @@ def camera(lens: Distortion | None, *, fov_deg: float = 60.0) -> Camera:
 
 
 def pixels(cam: Camera, *, count: int = 2000, whole: bool = False) -> np.ndarray:
-    """Random pixels of the image that float32 holds exactly, as float64 (n, 2)."""
+    """Random pixels of the image that float32 represents exactly, as float64 (n, 2)."""
     xy = np.random.default_rng(0).uniform(0.0, [cam.width - 1, cam.height - 1], (count, 2)).astype(np.float32)
     return (np.round(xy) if whole else xy).astype(np.float64)
 
@@ -56,7 +56,7 @@ def solve_each_pixel(c: CameraParams, rays: wp.array2d(dtype=wp.vec3)):
 
 
 def test_oracle_gives_the_published_polynomial() -> None:
-    """Worked by hand from OpenCV's formula: r² = 0.3125, radial factor 0.948791504."""
+    """Computed by hand from OpenCV's formula: r² = 0.3125, radial factor 0.948791504."""
     lens = RadialTangential(k1=-0.2, k2=0.1, p1=0.001, p2=-0.002, k3=0.05)
     got = reference.distort_radial_tangential(lens, np.array([[0.5, -0.25]]))
     np.testing.assert_allclose(got, [[0.472520752, -0.236260376]], rtol=0, atol=1e-9)
@@ -91,7 +91,7 @@ def test_newton_converges_everywhere_in_a_real_barrel(whole: bool) -> None:
     back = DAVIS.rays_to_pixels(DAVIS.pixels_to_rays(xy))
     assert distance(back, xy).max() < 1e-4
     angle = np.degrees(np.arccos(DAVIS.pixels_to_rays(np.array([[0.0, 0.0]]))[0, 2]))
-    assert 45.0 < angle < 50.0  # the far corner looks out this far; without the lens it would be 40.9
+    assert 45.0 < angle < 50.0  # degrees off the axis at the farthest corner; 40.9 without distortion
 
 
 def test_real_calibration_file_is_the_camera_above(data_dir: Path) -> None:
@@ -103,7 +103,7 @@ def test_real_calibration_file_is_the_camera_above(data_dir: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_inverse_agrees_with_bisection_for_wild_lenses(seed: int) -> None:
-    """Strong lenses of every sign, folds inside the image included: same rays, and none where the oracle has none."""
+    """Strong lenses of every sign, some folding inside the image: same rays and same missing rays as the reference."""
     rng = np.random.default_rng(seed)
     lenses: list[Distortion] = [
         RadialTangential(*(rng.uniform(-1, 1, 5) * [0.6, 0.5, 0.01, 0.01, 0.3])),
@@ -140,7 +140,7 @@ def test_fold_is_the_first_root_of_the_slope() -> None:
 
 @pytest.mark.parametrize("lens", [RadialTangential(k1=-0.4), Fisheye(k1=-0.3)], ids=str)
 def test_folded_distortion_is_invalid_not_wrong(device: str, lens: Distortion) -> None:
-    """A barrel without k2 turns back: past it there is no pixel for a ray and no ray for a pixel."""
+    """A barrel distortion without k2 folds back. Beyond the fold no ray has a pixel, and no pixel a ray."""
     cam = camera(lens)
     limit = reference.lens_limit(cam)
     angles = np.array([0.99, 1.01]) * (math.atan(limit) if isinstance(lens, RadialTangential) else limit)
@@ -169,7 +169,7 @@ def test_rays_behind_and_broken_rows_are_invalid_alone(device: str, lens: Distor
 
 
 def test_extreme_fisheye_reaches_the_horizon() -> None:
-    """Equidistant lens, 160 degrees across: the pinhole tangent runs to 5.7, the round trip holds."""
+    """Equidistant lens, field of view 160 degrees: the round trip holds up to a pinhole tangent of 5.7."""
     focal = 640 / math.radians(160.0)
     cam = Camera(640, 480, focal, focal, 319.5, 239.5, Fisheye())
     xy = np.stack([np.linspace(0, 639, 641), np.full(641, 239.5)], axis=1)

@@ -1,4 +1,4 @@
-"""Charts: errors against float64, fronts and budgets, files, and presets that calibrate and compensate take."""
+"""Charts: errors against float64, Pareto fronts, budgets, files, and presets for calibrate and compensate."""
 
 import csv
 import itertools
@@ -61,14 +61,14 @@ def fails(*args: str | Path) -> str:
 
 @pytest.fixture(scope="module")
 def known(recording: Recording) -> KnownRecording:
-    """The first 0.1 s of the suite's recording."""
+    """The first 0.1 s of the shared recording."""
     events = recording.events.between(0, 100_000)
     return KnownRecording.of(replace(recording, events=MemoryEvents(events, *recording.events.size)))
 
 
 @pytest.fixture(scope="module")
 def charted(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """A folder with the recording as a file and a quick chart of it, and what the command printed."""
+    """A folder with the recording's file and a quick chart of it, and the output of the command."""
     folder = tmp_path_factory.mktemp("chart")
     save_recording(folder / "recording.h5", recording)
     words = ("chart", folder / "recording.h5", "--quick", "--out", folder / "out", "--budget-px", "0.3", "--json")
@@ -198,7 +198,7 @@ def test_what_beats_a_row() -> None:
     assert [r.label for r in beaten_by(ROWS[3], ROWS)] == ["slow", "fast"] or [
         r.label for r in beaten_by(ROWS[3], ROWS)
     ] == ["fast"]
-    # 2 % faster is the machine's mood, 0.001 px the noise's
+    # 2 % of speed and 0.001 px are within the variation between runs
     assert beaten_by(ROWS[1], ROWS) == []
     assert beaten_by(ROWS[0], ROWS) == []
 
@@ -233,7 +233,7 @@ def test_what_cannot_reach_the_front_is_not_repeated() -> None:
     rows = [row("best", 1.0, 0.1), row("near", 1.3, 0.1), row("far", 1.5, 0.1), row("nearer", 9.0, 0.09), None]
     assert near_front(rows) == [True, True, False, True, False]
     assert near_front([rows[0], row("default", 5.0, 0.2, default=True)]) == [True, True]
-    # what needs a guess rules out nothing
+    # a row that needs an initial guess beats no other row
     assert near_front([replace(row("best", 1.0, 0.1), comparable=False), row("far", 1.5, 0.1)]) == [True, True]
     ran: list[str] = []
     tasks = [Task(lambda name=name: ran.append(name), 1) for name in "abc"]
@@ -256,7 +256,7 @@ def test_tasks_take_turns() -> None:
     timed = measure(tasks, 2, progress, "measuring")
     assert "".join(order) == "ababab"
     assert [len(t.times) for t in timed] == [2, 2]
-    assert [t.result for t in timed] == [3, 4]  # of the first round on the clock
+    assert [t.result for t in timed] == [3, 4]  # results of the first timed round
     assert shares == [(k + 1) / 6 for k in range(6)]
     order.clear()
     assert [len(t.times) for t in measure(tasks, 9, progress, "measuring", warm_up=False, limit_s=0.0)] == [1, 1]
@@ -281,7 +281,7 @@ def test_quick_chart_writes_everything(charted: tuple[Path, dict[str, Any]]) -> 
     for chart in ("compensation", "calibration"):
         assert np.asarray(Image.open(folder / "out" / f"{chart}.png")).shape[1] > 1000
         assert (folder / "out" / f"{chart}.svg").read_text().rstrip().endswith("</svg>")
-    # the answer is a row of that very run
+    # the chosen settings are a row of the same run
     for kind, unit in (("calibration", "ms"), ("compensation", "mev_per_s")):
         preset = json.loads((folder / "out" / f"preset_{kind}.json").read_text())
         (same,) = (r for r in whole[kind]["rows"] if r["label"] == preset["measured"]["label"])
@@ -292,7 +292,7 @@ def test_quick_chart_writes_everything(charted: tuple[Path, dict[str, Any]]) -> 
 def test_charts_are_drawn_later(
     charted: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the data alone, as where the packages that draw were missing."""
+    """Charts are drawn from the data file alone, as after a run without the drawing packages."""
     folder, data = charted
     loaded = Charts.load(folder / "out" / "chart.json")
 
@@ -336,7 +336,7 @@ def test_presets_are_taken(charted: tuple[Path, dict[str, Any]], tmp_path: Path)
     found = json.loads(result.stdout)
     assert found["events"] <= 30_000
     assert found["stages"][0]["name"] == "global"
-    assert found["stages"][0]["evaluations"] == 30  # what is given beside a preset wins
+    assert found["stages"][0]["evaluations"] == 30  # an option takes precedence over the preset
     assert "photometric" not in [stage["name"] for stage in found["stages"]]
     for model in MODELS:
         preset = tmp_path / f"{model}.json"
@@ -385,7 +385,7 @@ def test_presets_that_are_no_files_are_named(charted: tuple[Path, dict[str, Any]
     assert "recording.h5" in fails(*words)
     words = ("calibrate", folder / "recording.h5", tmp_path / "c.json", "--preset")
     assert "missing.json" in fails(*words, tmp_path / "missing.json")
-    assert "needed here is a preset for calibration" in fails(*words, folder / "out" / "preset_compensation.json")
+    assert "give a preset for calibration" in fails(*words, folder / "out" / "preset_compensation.json")
     file = tmp_path / "p.json"
     file.write_text('{"format": "amiwarp-preset", "version": 1, "kind": "compensation", "settings": {}}')
     with pytest.raises(AmiwarpError, match="model is None"):
@@ -414,7 +414,7 @@ def test_simpler_models_of_the_same_prism(known: KnownRecording) -> None:
     errors = [predicted_error(simplified(exact, m).model, known.model).rms for m in ("circle", "radial", "ellipse")]
     assert errors[0] > errors[1] > errors[2] > 0.0
     assert simplified(exact, "exact") is exact
-    # of the circle another size would be worse
+    # a circle of any other size would be worse
     circle = simplified(exact, "circle")
     for factor in (0.98, 1.02):
         values = {**circle.parameters, "deflection": factor * circle.parameters["deflection"]}
@@ -429,7 +429,7 @@ def test_simpler_models_of_the_same_prism(known: KnownRecording) -> None:
 
 
 def calibrations(known: KnownRecording, low_ms: float, high_ms: float, error_px: float) -> list[Row]:
-    """The rows of a whole chart with times and errors within these."""
+    """The calibration rows of a whole chart with times and errors within these limits."""
     rng = np.random.default_rng(0)
     out = []
     for way in calibration.settings(known, quick=False):
@@ -441,7 +441,7 @@ def calibrations(known: KnownRecording, low_ms: float, high_ms: float, error_px:
 
 
 def compensations(mev_per_s: dict[str, float], others: dict[str, float], files: float) -> list[Row]:
-    """The same, given the speed of each model and of the other libraries."""
+    """The compensation rows of a whole chart, with the given speeds of each model and of other libraries."""
     rng = np.random.default_rng(0)
     errors = {"circle": 0.21, "radial": 0.05, "ellipse": 3e-3, "exact": 2e-4}
 
@@ -479,7 +479,7 @@ DRAWN = {
     "fast calibrations": lambda known: calibrations(known, 3.0, 90.0, 0.002),
     "slow calibrations": lambda known: calibrations(known, 2000.0, 60_000.0, 0.3),
     "calibrations as fast as each other": lambda known: calibrations(known, 900.0, 1100.0, 0.01),
-    # a front of many points close together
+    # a front with many neighbouring points
     "a long front": lambda known: [
         *(row(f"{k} k events, folded to {k} angles, sharpness", 1.0 + 0.06 * k, 0.5 * 0.8**k) for k in range(14)),
         row("default", 3.0, 0.02, default=True, family="default"),
@@ -501,14 +501,14 @@ def test_letters_do_not_overlap(
     (figure,) = drawn
     figure.canvas.draw()
     texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
-    boxes = [(t.get_text(), Text.get_window_extent(t)) for t in texts]  # without the line to a point
+    boxes = [(t.get_text(), Text.get_window_extent(t)) for t in texts]  # without the line from a label to its point
     assert len(boxes) > (15 if len(rows) == 1 else 30)
     inner = [(text, box.shrunk(0.95, 0.85)) for text, box in boxes]
     clashes = [(a, b) for (a, box), (b, other) in itertools.combinations(inner, 2) if box.overlaps(other)]
     assert clashes == []
     size = figure.bbox
     assert [t for t, b in boxes if b.x0 < 0 or b.x1 > size.x1 + 1 or b.y0 < 0 or b.y1 > size.y1 + 1] == []
-    # every axis has numbers enough to be read
+    # every axis has enough numbers
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
             assert len([t for t in axis.get_major_ticks() if axis.get_view_interval()[0] <= t.get_loc()]) >= 3

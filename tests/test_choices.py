@@ -1,4 +1,4 @@
-"""Every closed set of the public API takes its enum or the exact name, and refuses the rest with the choices."""
+"""Every enum of the public API may be given as a member or its exact name; all else is refused with the choices."""
 
 import enum
 import importlib
@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import amiwarp
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.calib.parameters import build_model
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.presets import simplified
 from amiwarp.calib.sharpness.search import STAGES, Settings
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
@@ -27,7 +27,7 @@ from amiwarp.imaging.export import IweFiles, to_picture
 from amiwarp.imaging.sharpness_costs import SharpnessMeter, sharpness
 from amiwarp.imaging.warped_image import CanvasShape, iwe
 from amiwarp.io.formats import Format, open_recording
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, CircleModel, ExactModel, RadialCircleModel
@@ -36,7 +36,7 @@ from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, tones
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.scene import Look
+from amiwarp.viewer.cloud_scene import Look
 
 CAMERA = Camera.from_fov(8, 6, 1.0)
 EVENTS = Events.from_arrays([1, 2, 1, 2], [1, 2, 1, 2], [0, 10, 20, 30], [0, 1, 0, 1])
@@ -85,7 +85,7 @@ TAKES: list[tuple[str, type[enum.StrEnum], Callable[[Any], Any]]] = [
     ("Look.colour", Colour, lambda colour: Look(colour=colour).colour),
     ("Look.axis", Axis, lambda axis: Look(axis=axis).axis),
 ]
-"""Where an enum is taken; the result must be the same for the member and for its name."""
+"""Uses of each enum. The result must be the same for a member and for its name."""
 
 WRONG = ["", "Scene", "SCENE", "nothing", " scene", None, 0, True, 1.5, float("nan"), ["scene"], b"scene", np.arange(2)]
 OTHERS: list[tuple[str, tuple[str, ...], Callable[[Any], Any]]] = [
@@ -102,7 +102,7 @@ OTHERS: list[tuple[str, tuple[str, ...], Callable[[Any], Any]]] = [
 ]
 VALUES = {"apex": 0.02, "deflection": 0.01, "phase": 0.0}
 MEANS_SOMETHING_ELSE = {("Settings.global_algorithm", None), ("open_recording", None)}
-"""None has its own meaning there, and says so in the docstring."""
+"""Here None has a meaning, which the docstring states."""
 
 
 @pytest.mark.parametrize(("name", "kind", "use"), TAKES, ids=[name for name, _, _ in TAKES])
@@ -112,7 +112,7 @@ def test_enum_and_exact_name_do_the_same(
     monkeypatch.chdir(tmp_path)
     for member in kind:
         if (name, member) == ("to_picture", Layers.MERGED) or (name, member) == ("to_picture", Layers.SIGNED):
-            continue  # these take an image without polarities; the two below cover them
+            continue  # these take an image without polarities; the next two entries test them
         by_member = use(member)
         assert use(member.value) == by_member
         if isinstance(by_member, enum.Enum):
@@ -157,20 +157,20 @@ def test_stages_are_one_of_two_tuples() -> None:
 
 
 def test_simplified_names_its_models() -> None:
-    """It takes a model's name only: the check comes before the calibration is looked at."""
+    """``simplified`` checks the model's name before it uses the calibration."""
     for wrong in WRONG:
         with pytest.raises(AmiwarpError, match="circle, exact, radial, ellipse"):
             simplified(None, wrong)  # type: ignore[arg-type]
 
 
 def test_views_are_taken_by_name(tmp_path: Path) -> None:
-    from amiwarp.viewer.scene import CAMERA_DIRECTIONS
+    from amiwarp.viewer.cloud_scene import CAMERA_DIRECTIONS
 
-    assert set(CAMERA_DIRECTIONS) == {view.value for view in View}  # a name finds its stand as the member does
+    assert set(CAMERA_DIRECTIONS) == {view.value for view in View}  # names and members select the same camera position
 
 
 def test_the_wrong_side_can_no_longer_be_taken_by_its_name() -> None:
-    """The name used to be silently taken for the other side: 18 px at 60 deg and an apex of 1 deg."""
+    """A string once selected the other side without an error: 18 px at 60 deg and an apex of 1 deg."""
     by_name, by_member = Prism(0.1, flat_side="scene"), Prism(0.1, flat_side=FlatSide.SCENE)  # type: ignore[arg-type]
     assert by_name == by_member
     assert by_name.deflection == by_member.deflection != replace(by_name, flat_side=FlatSide.CAMERA).deflection
@@ -180,7 +180,7 @@ def test_the_wrong_side_can_no_longer_be_taken_by_its_name() -> None:
 
 
 def test_every_enum_of_the_package_is_of_text() -> None:
-    """So a member equals its name, sorts and prints as it, and goes into JSON as it."""
+    """As a string, a member equals its name, sorts and prints like it, and is written to JSON as it."""
     plain = []
     for info in pkgutil.walk_packages(amiwarp.__path__, "amiwarp."):
         if info.name == "amiwarp.__main__":

@@ -1,4 +1,4 @@
-"""Compensation of recordings: nothing lost, nothing reordered, places those of the model."""
+"""Compensation of recordings: no event is lost or reordered, and positions are those of the model."""
 
 import math
 import sys
@@ -16,7 +16,7 @@ from amiwarp.calib import Calibration, calibrate
 from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks, inside_image
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_encoder import encoder_params
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import edge_blur, truth_model
@@ -24,7 +24,7 @@ from amiwarp.imaging.sharpness_costs import sharpness
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.chunks import CHUNK
-from amiwarp.kernels.encoder import EncoderParams, theta_u32_at
+from amiwarp.kernels.encoder_angle import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye, RadialTangential
@@ -39,11 +39,11 @@ def angles(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, out:
 
 
 def angle_error(encoder: Encoder, t: np.ndarray, device: str) -> float:
-    """Largest distance of the kernel's angle to the encoder's own, in float64 [turn]."""
+    """Return the largest difference between the kernel's angle and the encoder's in float64 [turn]."""
     params = encoder_params(encoder, int(t.min()), int(t.max()), device)
     out = wp.empty(len(t), dtype=wp.uint32, device=device)
     launch(angles, len(t), [params, wp.array(t, dtype=wp.int64, device=device)], [out], device=device)
-    away = encoder.angle_at(t) / TURN - out.numpy() / 2.0**32
+    away = encoder.angle_at(t) / TWO_PI - out.numpy() / 2.0**32
     return float(np.abs(away - np.round(away)).max())
 
 
@@ -55,15 +55,15 @@ EPOCH = 1_700_000_000_000_000
     ("interval", "turns_per_s"), [((1000, 1001), 50.0), ((1, 2000), -12.0), ((1, 4), 300.0), ((10**7, 10**8), 100.0)]
 )
 def test_angle_of_the_kernel(interval: tuple[int, int], turns_per_s: float, offset: float, device: str) -> None:
-    """Even and uneven samples, close and far apart, with a fractional offset, at today's times; unsorted events."""
+    """Even and uneven samples, close and far apart, fractional clock offset, present-day times, unsorted events."""
     rng = np.random.default_rng(5)
     times = EPOCH + np.cumsum(rng.integers(*interval, 3000))
-    angle = (times - times[0]) * (TURN * turns_per_s * 1e-6) + np.cumsum(rng.normal(0.0, 0.01, times.size))
+    angle = (times - times[0]) * (TWO_PI * turns_per_s * 1e-6) + np.cumsum(rng.normal(0.0, 0.01, times.size))
     encoder = Encoder(times, angle, offset)
     first, last = encoder.coverage
     at_samples = np.clip(times + np.round(-offset).astype(int), first, last)
     t = np.concatenate([rng.integers(first, last + 1, 50_000), at_samples, at_samples[1:] - 1, [first, last]])
-    # Float64 itself keeps 1e7 turns, as there are here at most, to 2**-28.
+    # There are at most 1e7 turns here; float64 itself resolves these to 2**-28.
     assert angle_error(encoder, t, device) < 2.0**-26
     some = t[(t > first + (last - first) // 3) & (t < last - (last - first) // 3)]
     assert angle_error(encoder, some, device) < 2.0**-26
@@ -97,7 +97,7 @@ LENSES = (None, RadialTangential(-0.2, 0.05, 1e-4, -1e-4, 0.0), Fisheye(0.05, 0.
 @pytest.mark.parametrize("lens", LENSES, ids=["pinhole", "radial-tangential", "fisheye"])
 @pytest.mark.parametrize("name", MODELS)
 def test_places_are_the_models(name: str, lens: RadialTangential | Fisheye | None, device: str) -> None:
-    """In one pass from the file's columns: the places of compensate_points, and of a float64 trace."""
+    """One pass over the columns gives the positions of compensate_points and of a float64 trace."""
     rng = np.random.default_rng(3)
     camera = replace(Camera.from_fov(320, 240, math.radians(60.0)), distortion=lens)
     model = MODELS[name].from_prism(camera, TRUE_PRISM, 0.4)
@@ -129,7 +129,7 @@ def calibration(recording: Recording) -> Calibration:
 
 
 def test_places_agree_with_the_stored_truth(recording: Recording, device: str) -> None:
-    """The simulator's truth is the scene point at the moment of crossing; events are stamped 0.1 ms late."""
+    """The ground truth is the scene point at the threshold crossing. Time stamps are 0.1 ms late."""
     assert recording.truth is not None
     assert recording.encoder is not None
     events = recording.events.slice(0, 100_000)
@@ -185,7 +185,7 @@ def test_blocks_by_time_hold_every_event_once(recording: Recording, calibration:
 def test_files_and_memory_give_the_same(
     recording: Recording, calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:
-    """A file whose chunks threads read past HDF5, one that HDF5 reads, and events in memory, in several pieces."""
+    """A file that threads decode without HDF5, a file that HDF5 reads, and events in memory; in several pieces."""
     monkeypatch.setattr(sys.modules["amiwarp.compensation.recordings"], "PIECE", CHUNK)
     count = len(recording.events)
     raw = recording.events.slice(0, count)
@@ -257,7 +257,7 @@ def test_inside_image_at_its_border() -> None:
 
 
 def test_total_reflection_is_marked_not_spread(recording: Recording, tmp_path: Path) -> None:
-    """A prism so steep that part of the image has no ray: NaN places, marked, and an image without NaN."""
+    """With this steep prism, part of the image has no ray: NaN positions are marked, and the image has no NaN."""
     assert recording.camera is not None
     assert recording.encoder is not None
     wide = replace(recording.camera, fx=30.0, fy=30.0)

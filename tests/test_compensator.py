@@ -1,4 +1,4 @@
-"""Compensation of streams: the same as of recordings, every event once and in order, what is guessed is marked."""
+"""Compensation of streams: the same as of recordings, every event once and in order, extrapolated angles marked."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def joined(packets: list[Compensated]) -> tuple[Events, np.ndarray]:
 @pytest.mark.parametrize("name", list(MODELS))
 @pytest.mark.parametrize("distorted", [False, True])
 def test_a_stream_comes_out_as_its_recording_does(name: str, distorted: bool, device: str) -> None:
-    """Bit for bit, in packets of any size, some longer than a batch, with a clock offset."""
+    """Equal bit for bit, for packets of any size, some longer than a batch, with a clock offset."""
     camera = replace(CAMERA, distortion=RadialTangential(-0.2, 0.05, 0.001, -0.001, 0.0)) if distorted else CAMERA
     model, events = MODELS[name].from_prism(camera, Prism(math.radians(2.0)), 0.4), random_events(30_000)
     encoder = Encoder.constant_speed(720.0, -5000, 110_000).with_clock_offset(123.4)
@@ -79,13 +79,13 @@ def test_the_running_image_is_that_of_the_events_taken(device: str) -> None:
     for image, part in zip(images, (events[:21_000], events[21_000:]), strict=True):
         expected = iwe(part, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, device=device)
         assert image.sum() == pytest.approx(expected.sum(), rel=1e-3)
-        assert np.abs(image - np.squeeze(expected)).max() < 0.3  # angles of 16 bits there, of 32 here
+        assert np.abs(image - np.squeeze(expected)).max() < 0.3  # angles have 16 bits in iwe, 32 bits here
     assert compensator.image().sum() == 0.0
 
 
 @pytest.mark.parametrize("size", [700, 3000])
 def test_the_image_is_whole_however_many_batches_are_under_way(size: int, device: str) -> None:
-    """Many batches by one call: the buffers are gone round several times."""
+    """One call takes many batches, so each buffer is used several times."""
     events = random_events(100_000)
     compensator = Compensator(MODEL, streamed(), batch=4096, device=device)
     for start in range(0, 100_000, size):
@@ -98,7 +98,7 @@ def test_the_image_is_whole_however_many_batches_are_under_way(size: int, device
 
 
 def test_columns_with_gaps_are_sorted_too(device: str) -> None:
-    """Long packets whose columns are views of records."""
+    """Long packets whose columns are strided views of a structured array."""
     n = 600_000
     records = np.zeros(n, [("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("p", "u1")])
     records["t"] = np.arange(n) // 6
@@ -118,7 +118,7 @@ def test_a_packet_that_steps_back_between_two_batches_is_refused() -> None:
 
 
 def test_batches_under_way_come_with_the_next_call(device: str) -> None:
-    """Marked by the samples there were when they were begun; each event once, in order."""
+    """Flags depend on the samples known when a batch began. Each event comes once, in order."""
     events, stream = random_events(60_000), EncoderStream()
     compensator = Compensator(MODEL, stream, wait_us=0, batch=1024, device=device)
     compensator._least_returned = 2  # as on CUDA
@@ -127,7 +127,7 @@ def test_batches_under_way_come_with_the_next_call(device: str) -> None:
         part = events[start : start + 6000]
         if start == 6000:
             stream.append(ENCODER.t[known], ENCODER.angle[known])
-        if start == 54_000:  # samples come while some are under way
+        if start == 54_000:  # samples arrive while batches are in flight
             compensator.put(part, 0)
             out += compensator.take(10**9)
             stream.append(ENCODER.t[~known], ENCODER.angle[~known])
@@ -144,8 +144,8 @@ def test_batches_under_way_come_with_the_next_call(device: str) -> None:
     sure = flags & (NO_ANGLE | EXTRAPOLATED) == 0
     np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1)[sure], expected[sure])
     last = sure[found.t > 91_000]
-    assert not last[0]  # begun before its samples came
-    assert last[-1]  # put together then, and begun after
+    assert not last[0]  # its batch began before its samples arrived
+    assert last[-1]  # its batch began after they arrived
     assert sure[(found.t > events.t[6000]) & (found.t < 90_000)].all()
 
 
@@ -154,7 +154,7 @@ def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
     compensator = Compensator(MODEL, stream, wait_us=10_000, start_us=500_000)
     early, middle, late = (events[k : k + 1000] for k in (0, 1000, 2000))
     compensator.put(early, 0)
-    assert compensator.take(499_999) == []  # nothing is known of the encoder yet
+    assert compensator.take(499_999) == []  # no encoder sample yet
     known = int(np.searchsorted(ENCODER.t, early.t[-1])) + 1
     stream.append(ENCODER.t[:known], ENCODER.angle[:known])
     assert not joined(compensator.take(499_999))[1].astype(bool).all()
@@ -162,14 +162,14 @@ def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
     compensator.put(late, 504_000)
     assert compensator.take(509_999) == []
     first = compensator.take(510_000)
-    assert [len(p.events) for p in first] == [1000]  # not the late one
+    assert [len(p.events) for p in first] == [1000]  # without the event that still waits
     assert (first[0].flags[-1] & EXTRAPOLATED) == EXTRAPOLATED
     assert first[0].arrived_us == 500_000
     assert compensator.waiting == 1000
     stream.append(ENCODER.t[known:], ENCODER.angle[known:])
     last = compensator.take(510_000)
-    assert not (joined(last)[1] & EXTRAPOLATED).any()  # the samples came in time for it
-    # a constant speed is guessed right
+    assert not (joined(last)[1] & EXTRAPOLATED).any()  # its samples arrived in time
+    # extrapolation is exact at constant speed
     found, _ = joined([*first, *last])
     expected = compensate_events(events[1000:], MODEL, ENCODER)
     np.testing.assert_allclose(np.stack([found.x, found.y], axis=1), expected, atol=2e-3)
@@ -207,7 +207,7 @@ def test_events_before_the_first_sample_have_no_place(device: str) -> None:
     compensator = Compensator(MODEL, stream, device=device)
     compensator.put(events, 0)
     found, flags = joined(compensator.take(0))
-    before = events.t < 49_000  # as in a recording, one interval before the samples is still known
+    before = events.t < 49_000  # as in recordings, angles reach back one interval before the first sample
     np.testing.assert_array_equal((flags & NO_ANGLE) > 0, before)
     np.testing.assert_array_equal((flags & EXTRAPOLATED) > 0, (events.t < 50_000) & ~before)
     np.testing.assert_array_equal(np.isnan(found.x), before)
@@ -227,7 +227,7 @@ def test_a_hole_in_the_samples_is_marked() -> None:
 
 
 def test_nothing_is_interpolated_from_one_zero_to_another() -> None:
-    """After a reset the angle goes on at constant speed up to the first new sample, in one step."""
+    """After a reset, the angle is extrapolated at constant speed up to the first new sample, where it jumps."""
     stream, events = EncoderStream(), random_events(10_000)
     before, after = ENCODER.t <= 40_000, ENCODER.t >= 50_000
     stream.append(ENCODER.t[before], ENCODER.angle[before])
@@ -247,7 +247,7 @@ def test_nothing_is_interpolated_from_one_zero_to_another() -> None:
 
 @pytest.mark.parametrize("seed", range(40))
 def test_every_event_comes_out_once_and_in_order(seed: int) -> None:
-    """Whatever comes when: packets of any size, samples in any number, any time between."""
+    """For packets of any size, any number of samples, and any pauses between them."""
     rng = np.random.default_rng(seed)
     steps = rng.integers(0, [401, 10, 30_001], (int(rng.integers(0, 31)), 3)).tolist()
     events, stream = random_events(sum(n for n, _, _ in steps)), EncoderStream()
@@ -270,7 +270,7 @@ def test_every_event_comes_out_once_and_in_order(seed: int) -> None:
 
 
 def test_pixels_outside_the_sensor_are_placed_as_in_a_recording(device: str) -> None:
-    """Between packets without any: the quick way of placing is for those."""
+    """Packets with such pixels lie between packets without, which are displaced in a faster way."""
     events = random_events(9000)
     x = events.x.copy()
     x[3000:6000:7] = 300
@@ -286,7 +286,7 @@ def test_pixels_outside_the_sensor_are_placed_as_in_a_recording(device: str) -> 
 
 
 def test_strays_leave_nothing_behind_for_events_that_come_after(device: str) -> None:
-    """A block's rest is placed too, with whatever pixels stand there."""
+    """The unused end of a block is displaced too, with old pixel values from earlier events."""
     model = MODELS["ellipse"].from_prism(CAMERA, Prism(math.radians(2.0)), 0.4)
     compensator = Compensator(model, streamed(), batch=64, device=device)
     far = np.full(64, 65535, np.uint16)
@@ -326,7 +326,7 @@ def test_a_packet_that_is_not_sorted_is_told_when_it_is_its_turn(parts: int) -> 
 
 @pytest.mark.parametrize("size", [1000, 70_000, 200_000])
 def test_packets_that_are_ready_together_come_out_together(size: int, device: str) -> None:
-    """By several threads, whatever their sizes."""
+    """Several threads copy the packets, whatever their sizes."""
     events = random_events(200_000)
     compensator = Compensator(MODEL, streamed(), batch=1 << 18, device=device)
     for start in range(0, 200_000, size):
@@ -340,7 +340,7 @@ def test_packets_that_are_ready_together_come_out_together(size: int, device: st
 
 
 def test_what_was_taken_stays_while_it_is_held(device: str) -> None:
-    """On a GPU memory is used again, of what nobody holds."""
+    """On a GPU, the memory of released results is used again."""
     events = random_events(1_500_000)
     compensator = Compensator(MODEL, streamed(), batch=1 << 17, device=device)
     held, sums, places = [], [], set()

@@ -1,4 +1,4 @@
-"""The demo meets its bars, from the picture to the figure."""
+"""The demo keeps its error limits, from the picture to the figure."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ FILES = {"recording.h5", "calibration.json", "compensated.h5", "picture.png", "d
 
 
 def check(data: dict[str, float], out: Path) -> None:
-    """The bars of the demo."""
+    """Check the error limits of the demo."""
     assert data["blur_after_px"] <= 1.05 * data["blur_with_truth_px"]
     assert data["blur_after_px"] <= data["blur_before_px"] / 3.0
     assert data["model_error_px"] <= 0.5
@@ -46,7 +46,7 @@ def test_demo_at_its_default_size(tmp_path: Path) -> None:
 
 
 def test_demo_without_opengl_still_draws(tmp_path: Path, texture: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    """VTK ends its process where there is no OpenGL; here every process ends."""
+    """Without OpenGL, VTK ends its process. Here every such process ends at once."""
     monkeypatch.setattr("sys.executable", "/bin/false")
     photo = tmp_path / "photo.png"
     Image.fromarray(texture).save(photo)
@@ -60,7 +60,7 @@ def test_demo_without_opengl_still_draws(tmp_path: Path, texture: np.ndarray, mo
 def test_clouds_are_drawn_or_said_not_to_be() -> None:
     rng = np.random.default_rng(0)
     cloud = clouds.Cloud(rng.uniform(-0.4, 0.4, (2000, 3)).astype(np.float32), rng.random(2000) < 0.5)
-    # without OpenGL there are the plain ones, held to the same bar
+    # without OpenGL, the plain pictures must keep the same limit
     pictures = clouds.render([cloud, cloud]) or [plain_picture(cloud)]
     for picture in pictures:
         assert picture.ndim == 3

@@ -28,13 +28,13 @@ from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
 from amiwarp.studies.design import Design, Limits, Timing, design
 from amiwarp.studies.design.choice import ACROSS, LEAST_SWING, QUANTISATION_PX
 from amiwarp.studies.design.drawing import chart
-from amiwarp.studies.design.orbit import QUARTER_SWING, orbit_of
+from amiwarp.studies.design.event_volume import TILE, filled, measure, tiles
+from amiwarp.studies.design.orbit_size import QUARTER_SWING, orbit_of
 from amiwarp.studies.design.recommendation import headline, reasons
-from amiwarp.studies.design.volume import TILE, filled, measure, tiles
 
 GLASS = Prism(0.0)
 SMALL = Camera.from_fov(64, 48, math.radians(10.0))
-"""A focal length of 366 px, between those of a 60° and a 90° lens at 640 × 480, and quick."""
+"""A focal length of 366 px, between those of a 60° and a 90° lens at 640 × 480, and fast to simulate."""
 
 
 def angles(*degrees: float) -> list[float]:
@@ -56,7 +56,7 @@ def under(made: Design, **limits: Any) -> Design:
 
 
 def test_least_swing_of_a_quarter_turn() -> None:
-    """Over all edge directions and all starts; the direction in which it is least, and no other, sees so little."""
+    """The least swing over all edge directions and all start angles. No other direction has so small a swing."""
     start, direction = np.meshgrid(np.radians(np.arange(0.0, 360.0, 1.0)), np.radians(np.arange(0.0, 180.0, 1.0)))
     turn = np.linspace(0.0, np.pi / 2.0, 91)
     across = np.cos(start[..., None] + turn - direction[..., None])
@@ -101,7 +101,7 @@ def test_tiles_see_what_their_part_of_the_image_sees() -> None:
 
 
 def test_the_law_predicts_whole_simulations(texture: np.ndarray) -> None:
-    """At an apex and a speed that it has not seen."""
+    """For an apex and a speed that were not used in the fit."""
     camera = Camera.from_fov(240, 180, math.radians(30.0))
     apexes = angles(0.5, 2.0)
     whole = filled(Scene.from_picture(texture), camera, Prism(apexes[-1]))
@@ -116,7 +116,7 @@ def test_the_law_predicts_whole_simulations(texture: np.ndarray) -> None:
 
 
 def test_the_blur_of_jittered_stamps(texture: np.ndarray) -> None:
-    """Compensated with the truth, events lie as far off along the orbit as predicted, before it is seen across."""
+    """Events compensated with the true prism deviate along the orbit as predicted, without the factor for edges."""
     jitter, rpm, prism = 150.0, 720.0, Prism(math.radians(2.0))
     sensor = replace(SensorModel.ideal(), latency_us=4.0 * jitter, latency_jitter_us=jitter)
     simulation = Simulation(Scene.from_picture(texture), SMALL, prism, 0.1, motion=PrismMotion(rpm), sensor=sensor)
@@ -131,7 +131,7 @@ def test_the_blur_of_jittered_stamps(texture: np.ndarray) -> None:
 
 
 def curves(made: Design) -> tuple[list[float], list[float], list[float]]:
-    """For each apex: error of the paper's one circle, blur, events a second."""
+    """Return for each apex the error of the paper's single circle, the blur, and the events per second."""
     circle = [orbit.errors["circle"] for orbit in made.orbits]
     return circle, [c.blur_px for c in made.choices], [c.events_per_s for c in made.choices]
 
@@ -140,9 +140,9 @@ def curves(made: Design) -> tuple[list[float], list[float], list[float]]:
     ("fov", "index", "deflected"), [(60.0, 1.5168, False), (90.0, 1.55, True)], ids=["apex", "deflection"]
 )
 def test_the_paper_is_reproduced(scene: Scene, fov: float, index: float, deflected: bool) -> None:
-    """Of 0.5, 1 and 2° at 640 × 480 and 720 rpm it takes the middle, be these apexes or, at 90°, deflections.
+    """Of 0.5, 1 and 2° at 640 × 480 and 720 rpm, 1° is chosen, whether these are apexes or, at 90°, deflections.
 
-    Error and volume grow with the apex, the error of the one circle a little faster than in proportion.
+    Error and event rate grow with the apex, the error of the single circle slightly faster than in proportion.
     """
     camera = Camera.from_fov(640, 480, math.radians(fov))
     named = angles(0.5, 1.0, 2.0)
@@ -163,7 +163,7 @@ def test_speed_costs_events_and_blur_and_shortens_the_window(made: Design) -> No
         row = [made.at(orbit.apex, rpm) for rpm in made.rpms]
         assert [c.window_ms for c in row] == pytest.approx([83.3333, 20.8333, 5.2083], abs=1e-3)
         assert row[0].events_per_s < row[1].events_per_s < row[2].events_per_s
-        # dead time: in proportion or less
+        # at most in proportion, because of the refractory period
         assert row[2].events_per_s < 4.0 * row[1].events_per_s * 1.02
         assert QUANTISATION_PX < row[0].blur_px < row[1].blur_px < row[2].blur_px
 

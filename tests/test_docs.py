@@ -1,4 +1,4 @@
-"""The documentation's links lead somewhere, headings included, and its index names every page."""
+"""The documentation's links have a target, headings included, and its index names every page."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 MADE = [ROOT / line[1:] for line in (ROOT / ".gitignore").read_text().split() if line.startswith("/docs/")]
-"""What the build of the site writes next to the sources."""
+"""Paths that the build of the site writes next to the sources."""
 SOURCES = [
     page for page in sorted(DOCS.rglob("*.md")) if not any(page == made or made in page.parents for made in MADE)
 ]
@@ -16,7 +16,7 @@ PAGES = [*sorted(ROOT.glob("*.md")), *SOURCES, *sorted((ROOT / "benchmarks" / "r
 
 
 def anchors(page: Path) -> set[str]:
-    """As GitHub makes them of headings: lower case, punctuation dropped, spaces to hyphens."""
+    """Return the anchors that GitHub makes of headings: lower case, no punctuation, hyphens for spaces."""
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
     headings = re.findall(r"^#+ (.*)$", text, re.M)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
@@ -33,7 +33,7 @@ def broken(page: Path) -> list[str]:
 
 
 def unnamed(index: str, names: list[str]) -> list[str]:
-    """Pages that no table of contents of ``index`` names; * stands for any name in a folder, as for Sphinx."""
+    """Return the pages that no table of contents of ``index`` names; * stands for any name in a folder."""
     trees = re.findall(r"```\{toctree\}\n(.*?)```", index, re.S)
     lines = [line.strip() for tree in trees for line in tree.splitlines() if line.strip() and not line.startswith(":")]
     entries = [re.sub(r".*<(.*)>$", r"\1", line) for line in lines]

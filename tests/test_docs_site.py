@@ -1,4 +1,4 @@
-"""What makes the pages of the site: references, tables of measurements, links, and the check for the network."""
+"""The extensions that make pages of the site: references, tables of measurements, links, check for remote files."""
 
 from pathlib import Path
 from types import ModuleType

@@ -22,10 +22,10 @@ CHECKS = {
     "GL03", "GL07", "GL08",  # no double blank lines, sections in order, a docstring at all
     "SS01", "SS02", "SS03", "SS04", "SS05", "SS06",  # one summary line: capital, period, infinitive
     "PR01", "PR02", "PR03", "PR04", "PR06", "PR07", "PR08", "PR09",  # every parameter, its type and a sentence
-    "RT01", "RT03", "RT04", "RT05",  # what is returned
+    "RT01", "RT03", "RT04", "RT05",  # the returned value
     "YD01", "EX01",
 }  # fmt: skip
-"""Of numpydoc's checks, those that are kept here."""
+"""The checks of numpydoc that are applied here."""
 
 
 def _members(name: str) -> Iterator[str]:
@@ -58,7 +58,7 @@ def _plain(public: Any) -> bool:
 
 
 def faults(path: str) -> list[str]:
-    """What numpydoc finds wrong with one public name."""
+    """Return what numpydoc reports about one public name."""
     public = _found(path)
     checks = set(CHECKS)
     if "." in path:

@@ -1,4 +1,4 @@
-"""The emulated controller: what turns behind it, what it sends, how it obeys, and what goes wrong on demand."""
+"""The emulated controller: its motor, its messages, its answers to commands, and its faults."""
 
 import json
 import math
@@ -16,6 +16,7 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.emulated_rotors import Motor, Played
 from amiwarp.live.link.emulator import MOST_RPM, Controller, EmulatedFault
 from amiwarp.live.link.protocol import (
     Answer,
@@ -32,21 +33,20 @@ from amiwarp.live.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.live.link.rotors import Motor, Played
-from amiwarp.live.link.terminal import PseudoTerminal
+from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 
 S = 1_000_000
 LONG_S = 120.0
-"""Limit of waits: only what hangs takes as long [s]."""
+"""Limit of waits [s]. Only a hang takes so long."""
 
 
 def speeds(motor: Motor, t_us: np.ndarray) -> np.ndarray:
-    """[rpm]"""
+    """Return the motor's speed at each time [rpm]."""
     return np.asarray((motor.angle(t_us + 50) - motor.angle(t_us - 50)) / math.tau * 60e4)
 
 
 def sent(controller: Controller, until_us: int, step_us: int = 10_000) -> list[Message]:
-    """All that it sends, whole."""
+    """Return all messages that it sends. Checks that no frame is damaged or lost."""
     decoder = FrameDecoder()
     data = b"".join(controller.advance(t) for t in range(0, until_us + 1, step_us))
     found = [message for _, message in decoder.feed(data)]
@@ -55,7 +55,7 @@ def sent(controller: Controller, until_us: int, step_us: int = 10_000) -> list[M
 
 
 def counted(messages: list[Message]) -> np.ndarray:
-    """Rows (time, count) of the samples."""
+    """Return rows (time, count) of the samples."""
     pairs = [p for m in messages if isinstance(m, Samples) for p in zip(m.t_us, m.count, strict=True)]
     return np.array(pairs, np.int64)
 
@@ -66,7 +66,7 @@ def test_a_motor_goes_to_its_speed_as_its_inertia_lets_it() -> None:
     assert motor.set_speed(600.0, 1000.0, S)
     np.testing.assert_array_equal(motor.angle(np.arange(0, S, 100)), before)
     t = np.array([S + 300_000, S + 600_000, S + 600_000 + 200_000, 5 * S])
-    ramp = 1000.0 * (0.3 - 0.2 * (1 - math.exp(-1.5)))  # a line, followed with a lag
+    ramp = 1000.0 * (0.3 - 0.2 * (1 - math.exp(-1.5)))  # a linear ramp, followed with a lag
     end = 1000.0 * (0.6 - 0.2 * (1 - math.exp(-3.0)))
     expected = [ramp, end, 600.0 - (600.0 - end) * math.exp(-1.0), 600.0]
     np.testing.assert_allclose(speeds(motor, t), expected, atol=0.5)
@@ -185,7 +185,7 @@ def test_faults_are_written_as_name_and_time() -> None:
 
 def test_nothing_is_left_of_a_pseudo_terminal(tmp_path: Path) -> None:
     path = tmp_path / "prism"
-    path.symlink_to(tmp_path / "gone")  # of one that was killed
+    path.symlink_to(tmp_path / "gone")  # left by an emulator that was killed
     with PseudoTerminal(Controller(Motor()), path) as terminal:
         assert terminal.name == str(path)
         assert path.resolve().is_char_device()
@@ -211,7 +211,7 @@ def test_emulate_and_motor_as_commands(tmp_path: Path) -> None:
             started = json.loads(emulator.stdout.readline())
             assert started == {"port": str(path), "try": f"amiwarp motor status --port {path}"}
             until = time.monotonic() + LONG_S
-            while True:  # a busy machine may lose the answer, as any line without flow control
+            while True:  # without flow control, a busy machine may lose the answer
                 done = subprocess.run(
                     amiwarp("motor", "set", "--rpm", "720", "--port", path), capture_output=True, text=True,
                     timeout=LONG_S,

@@ -1,4 +1,4 @@
-"""The encoder: angle at a time, unwrapping, index pulses, gaps and coverage; and its logs as text."""
+"""The encoder: angle at a time, unwrapping, index pulses, gaps, coverage, and logs in text files."""
 
 import numpy as np
 import pytest
@@ -6,16 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.io import read_encoder_csv
 
-SPEED = TURN * 50e-6
+SPEED = TWO_PI * 50e-6
 """3000 turns a minute [rad/us]."""
 
 
 def wrapped(angle):
-    return (angle + np.pi) % TURN - np.pi
+    return (angle + np.pi) % TWO_PI - np.pi
 
 
 def test_constant_speed():
@@ -33,7 +33,7 @@ def test_constant_speed():
 def test_wrapped_angles_unwrap_at_any_epoch(epoch):
     t = epoch + np.arange(0, 200_000, 1000)
     truth = SPEED * (t - epoch) + 0.3
-    for given_angle in (truth, wrapped(truth), truth % TURN):
+    for given_angle in (truth, wrapped(truth), truth % TWO_PI):
         encoder = Encoder.from_angles(t, given_angle)
         middle = t[:-1] + 437
         error = wrapped(encoder.angle_at(middle) - (SPEED * (middle - epoch) + 0.3))
@@ -50,8 +50,8 @@ def test_counts_find_any_speed_below_half_a_turn_per_sample(rpm, phase, seed):
     turns = rpm / 60e6 * (t - t[0]) + phase
     count = np.floor(turns * 4096) % 4096
     encoder = Encoder.from_counts(t, count, counts_per_turn=4096)
-    expected = (turns[-1] - turns[0]) * TURN
-    assert encoder.angle[-1] - encoder.angle[0] == pytest.approx(expected, abs=1.001 * TURN / 4096)
+    expected = (turns[-1] - turns[0]) * TWO_PI
+    assert encoder.angle[-1] - encoder.angle[0] == pytest.approx(expected, abs=1.001 * TWO_PI / 4096)
 
 
 def test_gap_of_many_turns_is_bridged_by_the_speed():
@@ -76,14 +76,14 @@ def test_index_pulses_make_the_angle_absolute_and_show_slip():
     pulses = np.arange(7_300, 400_000 - 100, 20_000)
     turns = 50e-6 * t
     encoder = Encoder.from_counts(t, np.round(turns * 4096) % 4096, counts_per_turn=4096, index_t_us=pulses)
-    count = TURN / 4096
+    count = TWO_PI / 4096
     np.testing.assert_allclose(wrapped(encoder.angle_at(pulses)), 0.0, rtol=0, atol=1.5 * count)
     assert np.abs(encoder.slip()).max() < 1.5 * count
-    # From the ninth turn on the counter misses a quarter of a turn: a minority of pulses disagree.
+    # From the ninth turn on a quarter turn of counts is lost, so a minority of the pulses disagree.
     lost = np.where(t > 300_000, 1024, 0)
     slipped = Encoder.from_counts(t, np.round(turns * 4096) - lost, counts_per_turn=4096, index_t_us=pulses)
     np.testing.assert_allclose(slipped.slip()[pulses < 300_000], 0.0, rtol=0, atol=1.5 * count)
-    np.testing.assert_allclose(slipped.slip()[pulses > 300_100], -TURN / 4, rtol=0, atol=1.5 * count)
+    np.testing.assert_allclose(slipped.slip()[pulses > 300_100], -TWO_PI / 4, rtol=0, atol=1.5 * count)
     assert Encoder.constant_speed(60, 0, 10).slip().size == 0
 
 
@@ -219,7 +219,7 @@ def test_csv_of_angles_counts_and_index(tmp_path):
     )
     encoder = read_encoder_csv(path, counts_per_turn=2000)
     assert encoder.rpm == pytest.approx(3000.0, abs=0.1)
-    # 13 ms lead to the first pulse, and each pulse counts once however long it is high.
+    # The first pulse comes after 13 ms. A pulse counts once, however long it is high.
     assert encoder.index_t is not None
     assert encoder.index_t.tolist() == [13_000, 33_000, 53_000, 73_000, 93_000]
     np.testing.assert_allclose(encoder.slip(), 0.0, rtol=0, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Each example runs, and the README's program is one of them. The tutorials run when the documentation is built."""
+"""Each example runs, and one of them is the README's program. The tutorials run when the documentation is built."""
 
 import re
 import runpy

@@ -1,4 +1,4 @@
-"""HDF5 files that refer to other files, declare what they do not hold, or crash or hang HDF5: one error each."""
+"""HDF5 files that refer to other files, declare more data than they hold, or crash or block HDF5: one error each."""
 
 import os
 import signal
@@ -33,7 +33,7 @@ def dsec(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def secret(tmp_path: Path) -> Path:
-    """Another file of numbers, as raw bytes and as HDF5."""
+    """A file that must not be read: numbers as raw bytes and as HDF5."""
     (tmp_path / "secret").write_bytes(bytes(range(256)) * 10)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = np.arange(600, dtype=np.uint16)
@@ -151,7 +151,7 @@ def all_huge(file: h5py.File) -> None:
 
 
 def zeros_encoder(file: h5py.File) -> None:
-    """Some kilobytes that unpack to 256 MiB."""
+    """Write some kilobytes that unpack to 256 MiB."""
     for name, kind in (("t", "i8"), ("angle", "f8")):
         blosc = hdf5plugin.Zstd()
         stored = file.create_dataset(f"encoder/{name}", (1 << 24,), kind, chunks=(1 << 22,), **blosc)
@@ -188,7 +188,7 @@ def test_an_unallocated_chunk_is_refused(tmp_path):
 
 
 def test_a_replaced_file_is_noticed(dsec, tmp_path):
-    """After Ctrl-C the file is opened again by its name, which may lead to another one by then."""
+    """After Ctrl-C the file is opened again by its name, which may belong to another file by then."""
     source = open_recording(dsec).events
     source._file._process[0].close()
     assert len(source.slice(0, 600)) == 600
@@ -199,7 +199,7 @@ def test_a_replaced_file_is_noticed(dsec, tmp_path):
         source.slice(0, 600)
 
 
-# Functions that misbehave, for the reading process.
+# Faulty functions for the reading process.
 
 
 def crash(number: int) -> Reply:
@@ -399,7 +399,7 @@ def test_damaged_chunks_of_any_filter(dsec, name):
 
 
 def test_a_filter_that_hangs(monkeypatch, dsec):
-    """The bzip2 filter goes round for ever in a stream that breaks off."""
+    """The bzip2 filter loops for ever on a truncated stream."""
     monkeypatch.setattr(reading_process, "CPU_SECONDS", 2)
     with h5py.File(dsec, "r+") as file:
         del file["events/x"]
@@ -412,7 +412,7 @@ def test_a_filter_that_hangs(monkeypatch, dsec):
 
 
 def test_a_forged_chunk_of_the_native_layout(tmp_path):
-    """Damage under a checksum that fits is decoded in this process: Blosc itself must refuse it, or read it."""
+    """Damage with a valid checksum is decoded in this process, so Blosc itself must refuse or read it."""
     write_native(tmp_path / "a.h5", EVENTS)
     source = open_recording(tmp_path / "a.h5").events
     offset, size = source._columns["t"]._stored._places[0]

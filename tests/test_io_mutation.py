@@ -1,4 +1,4 @@
-"""Damaged files of every input: each is read or refused by one AmiwarpError; no crash, no hang, no half output."""
+"""Damaged files of every kind: each is read or refused by one AmiwarpError, without crash, hang or partial output."""
 
 import os
 import random
@@ -11,7 +11,7 @@ from mutation_files import KINDS, Checker, check, mutated, sample
 from amiwarp.io import convert, open_recording
 
 MUTANTS = 60
-"""Per input; with 40 of them more than two thousand. ``mutation_files.py`` runs any number."""
+"""Mutants per kind of input: over two thousand for 40 kinds. ``mutation_files.py`` runs any number."""
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def test_mutants_are_read_or_refused(tmp_path, checker, name):
         path.write_bytes(mutated(sample(name), random.Random(f"{name} {seed}")))
         outcomes["read" if checker.check(path, name) is None else "refused"] += 1
         path.unlink()
-    # Were none refused, the mutants would test nothing. Checksums let hardly one of some inputs pass.
+    # If none were refused, the mutants would test nothing. Nearly all mutants of kinds with checksums are refused.
     assert outcomes["refused"] > 0
 
 

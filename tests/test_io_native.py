@@ -1,4 +1,4 @@
-"""The native recording: written and read back, lazily, by time and index, whole or not at all."""
+"""The native recording: written completely or not at all, and read back in parts by time and index."""
 
 import itertools
 import math
@@ -249,7 +249,7 @@ def test_writer_refuses_its_path(tmp_path):
         write(tmp_path, make(10))
     with pytest.raises(AmiwarpError, match="does not exist"):
         write(tmp_path / "no" / "a.h5", make(10))
-    with pytest.raises(AmiwarpError, match="outside the writer's with block"):
+    with pytest.raises(AmiwarpError, match="outside the writer's 'with' block"):
         RecordingWriter(tmp_path / "b.h5", width=1, height=1).append(make(1))
     del recording
     with pytest.raises(AmiwarpError, match=r"a\.h5: exists; .*overwrite=True"):
@@ -312,7 +312,7 @@ def test_blosc_parameters_that_would_crash_are_noticed(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         for name, kind in (("x", "u2"), ("y", "u2"), ("t", "u4"), ("p", "u1")):
-            # The last number says bytes per chunk: 64 elements would need more.
+            # Filter option 3 is the number of bytes per chunk. The damaged chunk below declares more.
             file.create_dataset(f"events/{name}", data=np.zeros(64, kind), chunks=(64,), compression=32001)
             assert file[f"events/{name}"].id.get_create_plist().get_filter(0)[2][3] == 64 * np.dtype(kind).itemsize
     raw = bytearray(path.read_bytes())
@@ -356,7 +356,7 @@ def test_hdf5_reads_every_chunk_with_its_own_filters(tmp_path):
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int64, np.float32])
 @pytest.mark.parametrize("bits", [0, 3, 13, 40])
 def test_chunks_are_those_of_hdf5(tmp_path, kind, bits):
-    """Files of plain h5py with our filters are read past HDF5, and their checksums are ours, for odd lengths too."""
+    """amiwarp's own decoder reads files written by h5py with the same filters; checksums agree, for odd lengths too."""
     rng = np.random.default_rng(bits)
     values = rng.integers(0, 1 << min(bits, 8 * np.dtype(kind).itemsize - 2), 3 * CHUNK - 5).astype(kind)
     with h5py.File(tmp_path / "a.h5", "w") as file:
@@ -377,7 +377,7 @@ def test_chunks_are_those_of_hdf5(tmp_path, kind, bits):
 
 
 def test_noise_that_does_not_compress(tmp_path):
-    """HDF5 leaves Blosc out of such chunks, we keep its frame: each is read."""
+    """For such chunks HDF5 skips Blosc and amiwarp stores an uncompressed Blosc frame. Both are read."""
     rng = np.random.default_rng(1)
     t = np.arange(CHUNK + 9)
     x, y = rng.integers(0x3F800000, 0x43800000, (2, t.size), dtype=np.uint32).view(np.float32)
@@ -400,7 +400,7 @@ def test_noise_that_does_not_compress(tmp_path):
 @given(st.binary(max_size=3000), st.integers(0, 3))
 @settings(deadline=None, max_examples=200)
 def test_checksum_is_fletchers(data, fill):
-    """Word by word, as HDF5 does it."""
+    """Compare with a computation word by word, as HDF5 does it."""
     data = data + bytes([0, 255, 0, 1][fill : fill + 1]) * (700 * fill)
     first = second = 0
     for at in range(0, len(data) - 1, 2):

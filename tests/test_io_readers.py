@@ -1,4 +1,4 @@
-"""Every format reads back exactly; what is damaged is repaired and counted, or refused with file and place."""
+"""Every format reads back exactly. Damage is repaired and counted, or refused with the file and the position."""
 
 import os
 from pathlib import Path
@@ -10,7 +10,8 @@ from io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sam
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, EventSource, MemoryEvents
-from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording, scan
+from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording
+from amiwarp.io import file_scan as scan
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import Prism
@@ -18,7 +19,7 @@ from amiwarp.optics.prism import Prism
 EVENTS = make_events()
 
 REAL = {
-    # file: (events, span [ms] to the digits that are known, size)
+    # file: (events, span [ms] to the published digits, size)
     "evt/evt3_driving_1280x720.raw": (219_596, 8.8, (1280, 720)),
     "evt/evt2_balls_640x480.raw": (521_252, 95.9, (640, 480)),
     "aedat/aedat4_dvxplorerlite_320x240.aedat4": (111_954, 590, (320, 240)),
@@ -102,7 +103,7 @@ def test_truncated_files(tmp_path, name):
             assert str(path) in said
             assert "\n" not in said
             continue
-        # Whole words are read; the last one may have lost bits that only its place in the file decides.
+        # Whole words are read. How much of the last word is lost depends on its position in the file.
         source = open_recording(path).events
         assert 0 < len(source) < len(EVENTS)
         assert_equal(source.slice(0, len(source) - 1), EVENTS[: len(source) - 1])
@@ -185,7 +186,7 @@ def test_bad_calibration_is_named(tmp_path, calib):
 
 
 def write_unsound(path: Path, name: str, events: Events) -> Path:
-    """DAT, text and npz take events in any order and anywhere; faery's encoders do not."""
+    """Write events out of order or outside the frame: DAT, text and npz allow this, faery's encoders do not."""
     if name == "dat":
         words = np.stack([events.t, events.x | (events.y.astype(int) << 14) | (events.p.astype(int) << 28)], axis=1)
         path.write_bytes(b"% Version 2\n% Width 320\n% Height 240\n\x0c\x08" + words.astype("<u4").tobytes())

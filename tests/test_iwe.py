@@ -1,4 +1,4 @@
-"""The image of warped events against NumPy, its exactness in integers, and its brink."""
+"""The image of warped events against NumPy, exact integer sums, and cells that overflow."""
 
 import math
 
@@ -24,7 +24,7 @@ def random_events(n: int, width: int, height: int, seed: int = 0) -> Events:
 
 
 def bilinear(xy: np.ndarray, height: int, width: int) -> np.ndarray:
-    """NumPy's bilinear votes in float64."""
+    """Return NumPy's bilinear votes in float64."""
     image = np.zeros((height + 2, width + 2))
     low = np.floor(xy).astype(int)
     f = xy - low
@@ -98,7 +98,7 @@ def test_nan_and_far_points_vote_nowhere(device: str) -> None:
 
 
 def fixed_point(xy: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The votes' own integers in 1/256, in NumPy."""
+    """Return the votes in integer multiples of 1/256, computed in NumPy."""
     image = np.zeros((height + 2, width + 2), np.int64)
     low = np.floor(xy).astype(int)
     fx, fy = np.floor((xy - low) * np.float32(256) + np.float32(0.5)).astype(int).T
@@ -110,9 +110,9 @@ def fixed_point(xy: np.ndarray, height: int, width: int) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [1023, 1024, 1025, 5_000_000])
 def test_a_full_cell_loses_nothing(n: int, device: str) -> None:
-    """Driven over the brink: 1,024 events overflow a cell's word, and every field of it in turn."""
+    """1,024 events overflow the word of a cell, and each of its fields in turn."""
     xy = (np.random.default_rng(0).integers(256, 512, (n, 2)) / 256.0).astype(np.float32)
-    xy[: n // 2] = 511 / 256  # nearly a whole vote for the next pixel: the fields fill up as fast as they can
+    xy[: n // 2] = 511 / 256  # nearly a whole vote for the next pixel fills the fields as fast as possible
     votes = Votes(CanvasShape(5, 4), device)
     votes.add_points(*columns(xy, device), wp.zeros(n, dtype=wp.uint8, device=device))
     image = Image(CanvasShape(5, 4), 1, device)
@@ -121,13 +121,13 @@ def test_a_full_cell_loses_nothing(n: int, device: str) -> None:
     np.testing.assert_array_equal(image.numpy()[0], (expected / 256.0).astype(np.float32))
     assert expected.sum() == 256 * n
     np.testing.assert_array_equal(votes.take(), image.numpy())
-    assert votes.take().sum() == 0.0  # and nothing is left of it
+    assert votes.take().sum() == 0.0  # taking the image empties it
 
 
 @pytest.mark.parametrize("name", list(MODELS))
 @pytest.mark.parametrize("vote", list(Vote))
 def test_events_are_voted_as_their_points_are(name: str, vote: Vote, device: str) -> None:
-    """The loop that vectorises against one event at a time, over whole blocks and a rest, both polarities."""
+    """The vectorised loop against one event at a time: whole blocks and a remainder, both polarities."""
     camera = Camera.from_fov(64, 48, math.radians(60))
     model = MODELS[name].from_prism(camera, Prism(math.radians(2)), 0.4)
     events = random_events(70_001, 64, 48)
@@ -139,7 +139,7 @@ def test_events_are_voted_as_their_points_are(name: str, vote: Vote, device: str
     points.add_points(*columns(xy, device), wp.array(events.p, device=device))
     image, expected = fused.take(), points.take()
     assert image.sum(dtype=np.float64) == pytest.approx(expected.sum(dtype=np.float64), abs=2)
-    # places differ by float32 rounding, which may move a nearest vote to the next pixel
+    # positions differ by float32 rounding, which may move a nearest vote to the next pixel
     assert np.abs(image - expected).sum() < (200.0 if vote is Vote.NEAREST else 20.0)
 
 
@@ -148,7 +148,7 @@ def test_events_are_voted_as_their_points_are(name: str, vote: Vote, device: str
 @pytest.mark.parametrize("vote", list(Vote))
 @pytest.mark.parametrize("points", [500, 64 * 48])
 def test_cpu_and_cuda_agree_bit_for_bit(name: str, vote: Vote, points: int) -> None:
-    """On CUDA by the fast way, where words overflow (500 points) and where not, and the rest exactly."""
+    """On CUDA by the fast vote, whose words overflow with 500 points, and by the exact vote for the rest."""
     camera = Camera.from_fov(64, 48, math.radians(60))
     model = MODELS[name].from_prism(camera, Prism(math.radians(2)), 0.4)
     n = FIRST_BATCH + 100_000

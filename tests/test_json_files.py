@@ -1,4 +1,4 @@
-"""JSON that anyone may have written: whatever is in the file, the message names file and field."""
+"""JSON from untrusted sources: whatever the file holds, the message names the file and the field."""
 
 import json
 import math
@@ -70,7 +70,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, reader: str) -> None:
     with pytest.raises(AmiwarpError, match=r"folder\.json: is a folder"):
         READERS[reader](folder)
     with open(tmp_path / "large.json", "wb") as file:
-        file.truncate(1 << 30)  # a hole: no disk is filled
+        file.truncate(1 << 30)  # a sparse file, which takes no room on the disk
     with pytest.raises(AmiwarpError, match=rf"large\.json: is larger than {MOST_BYTES >> 20} MiB"):
         READERS[reader](tmp_path / "large.json")
 
@@ -148,7 +148,7 @@ def test_damage_in_a_calibration_is_named(
 
 
 def leaves(value: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
-    """Places of all values within a JSON value, of a list those of the first entry."""
+    """Return the paths of all values within a JSON value; of a list only those of its first entry."""
     inner: list[tuple[str | int, Any]] = []
     if isinstance(value, dict):
         inner = list(value.items())

@@ -1,4 +1,4 @@
-"""The link: whatever the controller and the line do, angles are right again, and what happened is said."""
+"""The link to the controller: after a fault of controller or line, angles are right again; the fault is reported."""
 
 import contextlib
 import itertools
@@ -18,28 +18,29 @@ from typer.testing import CliRunner
 
 from amiwarp.cli import motor as command
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link import following, updates
+from amiwarp.live.link import follower as following
 from amiwarp.live.link import link as link_module
+from amiwarp.live.link import updates
 from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.emulated_rotors import Motor
 from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault
-from amiwarp.live.link.following import Follower
+from amiwarp.live.link.follower import Follower
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.port import open_port, usb_id
 from amiwarp.live.link.protocol import Answer, ControllerStatus, FrameDecoder, Index, Message, Ping, Samples, encode
-from amiwarp.live.link.rotors import Motor
-from amiwarp.live.link.terminal import PseudoTerminal
+from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 from amiwarp.live.link.updates import LinkUpdate
 
 S = 1_000_000
 RPM = 720.0
 TOLERANCE = math.tau * (1 / 4096 + RPM * 1.05 / 60 / 1000)
-"""A count, and what it turns in a sample."""
+"""Largest angle error [rad]: one count, and the rotation during one sample interval."""
 HOST = 7_000 * S
-"""The host's clock when the world's is 0."""
+"""The host's clock at simulated time 0 [us]."""
 
 
 class Line:
-    """A controller and a follower, in a world of their own time; without latency but for 400 us."""
+    """A controller and a follower on a simulated clock. Data takes 400 us from one to the other."""
 
     def __init__(self, *faults: str, follower: Follower | None = None, **settings: float) -> None:
         self.motor = Motor(RPM)
@@ -50,7 +51,7 @@ class Line:
         self._decoder, self._plugged, self._pings = FrameDecoder(), True, itertools.count()
 
     def run(self, seconds: float, step_us: int = 5000) -> list[LinkUpdate]:
-        """Goes on, by pings ten times a second too; the news of all of it."""
+        """Advance by ``seconds``, with ten pings per second. Return all updates."""
         for now in range(self.now + step_us, self.now + round(seconds * S) + 1, step_us):
             self.now = now
             data = self.controller.advance(self.now)
@@ -67,13 +68,13 @@ class Line:
         return taken(self.follower)
 
     def away(self, news: LinkUpdate) -> np.ndarray:
-        """The angle's errors, by the controller's clock as it is now [rad]."""
+        """Return the angle errors by the controller's present clock [rad]."""
         error = news.angle - self.motor.angle(self.controller.time_at(news.t_us))
         return np.asarray((error + math.pi) % math.tau - math.pi)
 
 
 def taken(follower: Follower) -> list[LinkUpdate]:
-    """All there is."""
+    """Take all updates that are ready."""
     found = [follower.take()]
     while len(found[-1].t_us) or found[-1].messages:
         found.append(follower.take())
@@ -127,7 +128,7 @@ def test_after_a_fault_angles_are_right_and_it_was_said(fault: str, says: str) -
     assert (np.diff(news.t_us) > 0).all()
     name = fault.partition("@")[0]
     begin = EmulatedFault.parse(fault).start_s * S
-    end = begin + EmulatedFault.parse(fault).duration_s * S + 90_000  # a turn: until the next index
+    end = begin + EmulatedFault.parse(fault).duration_s * S + 90_000  # one turn later the index has passed
     away = np.abs(line.away(news))
     world = line.controller.time_at(news.t_us)
     assert away[(world < begin) | (world > end)].max() < TOLERANCE
@@ -236,7 +237,7 @@ def test_counts_per_turn_are_the_controller_s_else_those_given() -> None:
 
 
 def text(times: Iterable[int], per_turn: int = 1000) -> list[bytes]:
-    """A turn a second."""
+    """Return text lines of a prism at one turn per second."""
     return [f"{t % WRAP},{t * per_turn // S}\r\n".encode() for t in times]
 
 
@@ -264,7 +265,7 @@ def test_a_wrong_digit_in_a_line_is_left_out_and_a_reset_is_not() -> None:
     for k, line in enumerate([*lines, *text(range(0, S, 1000))]):
         follower.feed(line, HOST + k * 1000)
     first, second = taken(follower)
-    assert len(first.t_us) == 997  # the first line may be the rest of one
+    assert len(first.t_us) == 997  # the first line may be incomplete
     assert "damaged frames or lines" in said([first])
     assert (second.restarted, len(second.t_us), second.t_us[0]) == (True, 1000, 0)
 
@@ -278,7 +279,7 @@ def test_faults_that_the_controller_reports_are_said_once() -> None:
         "stall",
         "over-current",
     ]
-    line = Line()  # the host is lost before the first ping: no news; after it: some
+    line = Line()  # "host lost" is reported after the first ping only
     line.run(1.0)
     t = line.controller.clock(line.now)
     line.follower.feed(encode(ControllerStatus(t, 1, 16, RPM, RPM, 4096), 0), HOST + line.now)
@@ -286,7 +287,7 @@ def test_faults_that_the_controller_reports_are_said_once() -> None:
 
 
 def test_a_host_that_sleeps_takes_nothing_for_a_reset() -> None:
-    """What waited in the port for ten seconds comes first, then what was sent now."""
+    """Data that waited in the port for ten seconds comes first, then new data."""
     line = Line()
     line.run(1.0)
     waited, line.now = line.controller.advance(1_300_000), 11 * S
@@ -304,7 +305,7 @@ def test_memory_is_bounded_and_what_is_dropped_is_said(monkeypatch: pytest.Monke
     news = [n for n in (line.follower.take(), *line.run(4.0)) if len(n.t_us)]
     assert sum(len(n.t_us) for n in news) == 1000
     assert f"{line.arrived - 1000:,} samples were dropped, the oldest" in said(news)
-    assert news[0].restarted  # told though all from before it are gone
+    assert news[0].restarted  # reported, although all samples before the reset are gone
     assert np.abs(line.away(news[-1])).max() < TOLERANCE
     assert news[-1].index_t_us[0] >= news[-1].t_us[0]
 
@@ -317,7 +318,7 @@ def test_garbage_is_said_in_a_sentence_and_raises_nothing() -> None:
     (news,) = taken(follower)
     assert len(news.messages) == 1
     assert "neither frames nor lines of samples" in news.messages[0]
-    for k in range(2000):  # whole frames of nonsense
+    for k in range(2000):  # complete frames with random content
         t, c = rng.getrandbits(32), rng.getrandbits(31)
         status = ControllerStatus(t, rng.randrange(256), rng.getrandbits(16), math.nan, math.inf, rng.getrandbits(32))
         for message in (Samples((t,), (c,)), status, Index(t, c)):
@@ -346,7 +347,7 @@ def test_the_clock_is_found_with_honest_deviations(drift_ppm: float) -> None:
     assert clock.offset_std_us < 150.0
 
 
-# Over pySerial, through pseudo-terminals.
+# Through pySerial and pseudo-terminals.
 
 
 @pytest.fixture
@@ -379,7 +380,7 @@ class Live:
 
 
 class Paced(Live):
-    """An emulator in a world that begins with its link, waits for it, and stands still while ``running`` is clear."""
+    """An emulator on a simulated clock, which waits for its link and stands still while ``running`` is clear."""
 
     def __init__(self, path: Path, *faults: str, rpm: float = RPM, drift_ppm: float = 0.0) -> None:
         self.running = threading.Event()
@@ -400,7 +401,7 @@ def test_live_angles_and_clock(path: Path) -> None:
         wait(lambda: len(link._follower.trips) >= 11 and link.status is not None)
         news = link.poll()
         assert (news.messages, news.restarted) == ((), False)
-        assert len(news.t_us) > 300  # those before the status too
+        assert len(news.t_us) > 300  # with those before the first status
         assert np.abs(live.away(news)).max() < TOLERANCE
         clock = link.clock()
         assert clock is not None
@@ -432,7 +433,7 @@ def test_a_port_that_was_unplugged_comes_back(path: Path) -> None:
         assert np.diff(t)[gap] > 300_000
         assert gap > 200
         away = angle - live.motor.angle(live.controller.time_at(t))
-        assert np.abs(away - math.tau * np.round(away[0] / math.tau)).max() < TOLERANCE  # turns go on too
+        assert np.abs(away - math.tau * np.round(away[0] / math.tau)).max() < TOLERANCE  # whole turns are counted, too
 
 
 def test_a_link_is_closed_while_its_port_is_gone(path: Path) -> None:
@@ -481,7 +482,7 @@ def test_ports_by_usb_id_and_by_what_they_send(path: Path, tmp_path: Path, monke
         other.controller.plugged = False
         other.controller.advance = lambda now_us: b""  # type: ignore[method-assign]
         listed(monkeypatch, (str(dumb), None, None), (str(tmp_path / "absent"), None, None), (str(path), 0x16C0, 0x483))
-        listened = itertools.count()  # a second goes by with 20 looks at the port that sends nothing
+        listened = itertools.count()  # each of 20 reads of the silent port takes 0.05 s of simulated time
 
         def clock() -> float:
             assert other.terminal._master is not None
@@ -528,7 +529,7 @@ def test_lines_over_a_socket_take_no_commands() -> None:
 
 
 def test_answers_to_no_command_are_not_kept() -> None:
-    """One that came before its command would be taken for the answer to it."""
+    """An answer that arrives before its command would be mistaken for the answer to it."""
     with socket.create_server(("127.0.0.1", 0)) as server, contextlib.ExitStack() as held:
         link = Link(f"socket://127.0.0.1:{server.getsockname()[1]}", counts_per_turn=1000)
         peer = held.enter_context(server.accept()[0])
@@ -556,7 +557,7 @@ def motor(*args: object) -> tuple[int, str, BaseException | None]:
 def test_the_command_sets_shows_and_stops(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_module, "ANSWER_S", LONG_S)
     monkeypatch.setattr(command, "WAIT_S", LONG_S)
-    with Live(path, rpm=0.0, sample_hz=50.0):  # so few that none is lost while the machine is busy
+    with Live(path, rpm=0.0, sample_hz=50.0):  # so slow that no sample is lost on a busy machine
         code, out, _ = motor("set", "--rpm", -300, "--ramp-rpm-s", 10_000, "--port", path)
         assert code == 0
         assert "set to -300 rpm" in out

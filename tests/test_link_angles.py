@@ -11,7 +11,7 @@ PER_TURN = 1000
 
 
 def turned(angles: AngleTracker, first: int, last: int, *, zero: int = 0, index: bool = True) -> list[FaultReport]:
-    """Feeds every tenth count from ``first`` to ``last``, and the index pulse each time that it passes ``zero``."""
+    """Feed every tenth count from ``first`` to ``last``, and an index pulse at each passage of ``zero``."""
     found: list[FaultReport] = []
     way = 10 if last > first else -10
     for count in range(first, last, way):
@@ -36,7 +36,7 @@ def test_the_first_index_is_the_zero() -> None:
 def test_a_slip_is_found_told_and_mended(lost: int) -> None:
     angles = AngleTracker(PER_TURN)
     assert turned(angles, 0, 3500) == []
-    found = turned(angles, 3500 + lost, 8500, zero=lost)  # the counts jump by so many, the disc does not
+    found = turned(angles, 3500 + lost, 8500, zero=lost)  # the counts jump by ``lost``, the disc does not
     assert [(r.fault, r.counts) for r in found] == [(EncoderFault.SLIP, lost)]
     assert angles.count(0, 8500 + lost)[0] == pytest.approx(math.tau * 8.5)
 

@@ -1,4 +1,4 @@
-"""Clocks that wrap, run apart and are read with delay."""
+"""Clocks that wrap, drift apart and are read with a delay."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_pulses_give_offset_and_drift_with_honest_deviations(jitter_us: float) -
         expected = there + OFFSET + DRIFT * (there - own[0])
         assert abs(int(clock(there)) - expected) < 6 * clock.std_us(there) + 1
         assert clock.std_us(there) > clock.std_us(clock.at_us)
-    assert 0.3 < np.std(misses) < 1.4  # time stamps are never trusted to better than a microsecond
+    assert 0.3 < np.std(misses) < 1.4  # time stamps are never assumed more accurate than a microsecond
 
 
 def test_pulses_taken_for_others_are_left_out() -> None:

@@ -1,4 +1,4 @@
-"""The serial protocol: whatever comes, nothing wrong is taken for right, and what was whole is not lost."""
+"""The serial protocol: no damaged frame is accepted, and no undamaged frame is lost."""
 
 import random
 import struct
@@ -41,7 +41,7 @@ MESSAGES = st.one_of(
 
 
 def some(rng: random.Random, n: int) -> list[Message]:
-    """Messages as a controller sends them."""
+    """Return random messages of a controller."""
     out: list[Message] = []
     for k in range(n):
         t = rng.getrandbits(32)
@@ -75,14 +75,14 @@ def test_it_does_not_matter_how_the_bytes_are_cut(messages: list[Message], cuts:
 
 
 def test_layout_is_as_documented() -> None:
-    """By hand, from the page: version 1, type 2, sequence 0x0102, t 0x04030201, count -1, CRC-32."""
+    """Computed by hand from the documentation: version 1, type 2, sequence 0x0102, t 0x04030201, count -1, CRC-32."""
     packet = bytes([1, 2, 0x02, 0x01, 1, 2, 3, 4, 255, 255, 255, 255])
     packet += struct.pack("<I", zlib.crc32(packet))
     assert encode(Index(0x04030201, -1), 0x0102) == cobs.encode(packet) + b"\0"
 
 
 def test_a_hundred_thousand_strings_of_garbage_are_refused() -> None:
-    """Random bytes, and frames with bytes changed, lost, doubled and put in."""
+    """Random bytes, and frames with bytes changed, removed, doubled and inserted."""
     rng = random.Random(1)
     decoder, whole = FrameDecoder(), 0
     for _ in range(50_000):
@@ -100,14 +100,14 @@ def test_a_hundred_thousand_strings_of_garbage_are_refused() -> None:
         else:
             frame[place:] = frame[place : rng.randrange(place + 1, len(frame))] * 2
         whole += len(found := decoder.feed(bytes(frame) + b"\0"))
-        assert found in ([], [(sequence, message)])  # a zero put in before a frame does no harm
+        assert found in ([], [(sequence, message)])  # a zero inserted before a frame is harmless
     assert decoder.received.frames == whole < 100
     assert decoder.received.damaged > 109_000
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_what_was_whole_is_found_among_losses(seed: int) -> None:
-    """A burst of bytes is lost or changed: only the frames that it touched are missing, and they are counted."""
+    """A run of bytes is lost or changed. Only the frames that it touched are missing, and they are counted."""
     rng = random.Random(seed)
     messages = some(rng, 60)
     frames = [encode(m, k) for k, m in enumerate(messages)]
@@ -117,10 +117,10 @@ def test_what_was_whole_is_found_among_losses(seed: int) -> None:
     touched = {k for k in range(60) if ends[k] > first and ends[k] - len(frames[k]) < last}
     if seed % 2:
         del data[first:last]
-        touched |= {max(touched) + 1} if last == ends[max(touched)] else set()  # grown together with the next
+        touched |= {max(touched) + 1} if last == ends[max(touched)] else set()  # joined with the next frame
     else:
         data[first:last] = bytes(rng.randrange(1, 256) for _ in range(last - first))
-        touched |= {max(touched) + 1} if data[ends[max(touched)] - 1] else set()  # its zero is gone
+        touched |= {max(touched) + 1} if data[ends[max(touched)] - 1] else set()  # its final zero is gone
     decoder = FrameDecoder()
     found = dict(decoder.feed(bytes(data)))
     assert all(found[k] == messages[k] for k in found if k is not None)
@@ -165,7 +165,7 @@ def test_a_frame_with_a_line_feed_in_it_is_no_line() -> None:
 
 
 def test_a_frame_that_begins_with_a_line_feed_is_no_line() -> None:
-    """The first byte of COBS says where the first zero was: here the tenth."""
+    """The first byte of a COBS frame is the position of the first zero, here 10, which is also a line feed."""
     message = Sync(0x01010101, 0x01010001)
     frame = encode(message, 0x0101)
     assert frame[0] == 10

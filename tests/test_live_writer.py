@@ -1,4 +1,4 @@
-"""Recordings that grow: whole at the end, and sound whatever ends them."""
+"""Growing recordings: complete at the end, and readable whatever ends the writer."""
 
 import itertools
 import os
@@ -39,7 +39,7 @@ def make(count: int, *, start: int = 5_000_000, seed: int = 0, mean_us: float = 
 
 
 def cut(events: Events, least: int, most: int) -> list[Events]:
-    """In packets of random size."""
+    """Cut the events into packets of random size."""
     rng = np.random.default_rng(1)
     edges = [0]
     while edges[-1] < len(events):
@@ -121,7 +121,7 @@ def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_copy_at_any_moment_is_a_recording(tmp_path, seed):
-    """What is on the disk is what a crash would leave."""
+    """A copy of the file at any moment is what a crash would leave."""
     rng = random.Random(seed)
     events, given = make(CHUNK + 60_000, seed=seed), 0
     with live(tmp_path / "a.h5", flush_s=0.0 if seed else 1e9) as writer:
@@ -159,7 +159,7 @@ with LiveWriter(sys.argv[1], width=320, height=240, flush_s=0.05) as writer:
 
 
 def logged(path):
-    """When each append began and ended [ns], and how many events there were then; whole lines only."""
+    """Return begin and end of each append [ns] and the number of events after it; complete lines only."""
     return [tuple(map(int, line.split())) for line in path.read_text().split("\n")[:-1]]
 
 
@@ -180,7 +180,7 @@ def test_a_killed_recording_lacks_its_last_moment(tmp_path, seed):
     lines = logged(tmp_path / "log")
     recording = open_recording(tmp_path / "a.part.h5")
     count = len(recording.events)
-    # the last append that ended, begun later than the interval of flushes, wrote all that had come before
+    # an append more than a flush interval after others has written their events to the disk
     early = [number for _, ended, number in lines if ended < lines[-1][0] - 50_000_000]
     assert count >= early[-1] > 0
     np.testing.assert_array_equal(np.concatenate([block.t for block in recording.events.blocks()]), np.arange(count))
@@ -231,7 +231,7 @@ def test_a_full_disk_keeps_all_that_came_before(tmp_path, limit, flush_s):
     recording = open_recording(path)
     assert len(read(path)) == len(recording.events) == int(count) > 0
     assert 2 * (int(count) // 10_000) - len(recording.encoder.t) in (0, 2)
-    h5py.File(path).close()  # closed as it should be
+    h5py.File(path).close()  # the file was closed properly
 
 
 def test_an_empty_recording(tmp_path):
@@ -303,7 +303,7 @@ def test_writer_refuses_its_path_and_options(tmp_path):
         LiveWriter(tmp_path / "a.h5", width=10, height=10, camera=CAMERA)
     with pytest.raises(AmiwarpError, match=r"a\.h5: making the file"), live(tmp_path / "a.h5", metadata={"n": "a\0b"}):
         pass
-    with pytest.raises(AmiwarpError, match="outside the writer's with block"):
+    with pytest.raises(AmiwarpError, match="outside the writer's 'with' block"):
         live(tmp_path / "a.h5").append(make(1))
     assert os.listdir(tmp_path) == []
     with live(tmp_path / "a.h5") as writer:

@@ -1,4 +1,4 @@
-"""Blur on edges whose spread is known, and the model error on models whose distance is known."""
+"""Blur of edges with known spread, and model error of models with known distance."""
 
 import math
 
@@ -13,7 +13,7 @@ from amiwarp.optics.prism import Prism
 
 
 def circle_events(sigma: float, noise: int = 0, seed: int = 0) -> np.ndarray:
-    """Events about a circle of radius 40 px, normally spread across it."""
+    """Events about a circle of radius 40 px, with a normal distribution across it."""
     rng = np.random.default_rng(seed)
     n = 200_000
     angle, radius = rng.uniform(0, math.tau, n), 40 + rng.normal(0, sigma, n)
@@ -27,7 +27,7 @@ def test_blur_is_the_spread_across_the_edge(sigma: float) -> None:
 
 
 def test_an_even_background_does_not_count() -> None:
-    """Strewn noise puts 40 % as many events as the edge's own into its strip."""
+    """In the strip along the edge, there are 40 % as many noise events as events of the edge."""
     noisy = edge_blur(circle_events(0.6, noise=800_000), 128, 128)
     assert noisy == pytest.approx(0.6, abs=0.12)
 
@@ -53,7 +53,7 @@ def test_edges_are_sub_pixel_and_normal() -> None:
     edges = find_edges((100 * np.exp(-(line**2) / 2)).astype(np.float32))
     inner = ((edges.xy > 8) & (edges.xy < (72, 52))).all(axis=1)
     away = (edges.xy[inner, 0] - 40.3) * math.cos(0.5) + (edges.xy[inner, 1] - 30) * math.sin(0.5)
-    np.testing.assert_allclose(away, 0.0, rtol=0, atol=0.1)  # px: a parabola stands for the ridge's profile
+    np.testing.assert_allclose(away, 0.0, rtol=0, atol=0.1)  # px: a parabola approximates the ridge's profile
     cosine = np.abs(edges.normal[inner] @ (math.cos(0.5), math.sin(0.5)))
     np.testing.assert_allclose(cosine, 1.0, rtol=0, atol=0.01)
 
@@ -107,7 +107,7 @@ def test_an_exact_picture_has_no_error() -> None:
 
 
 def test_psnr_of_a_known_error() -> None:
-    """Error 0.1 that is uncorrelated with the picture, so the fit leaves it: variance 1, error 0.01, range 2.2."""
+    """The error, 0.1, is uncorrelated with the picture, so the fit keeps it: variance 1, error² 0.01, range 2.2."""
     picture = np.array([[-1.0, -1.0, 1.0, 1.0]] * 100)
     truth = picture + np.array([[-0.1, 0.1, -0.1, 0.1]] * 100)
     quality = picture_quality(picture, truth)
@@ -123,7 +123,7 @@ def test_an_inverted_picture_is_told_by_its_signs() -> None:
 
 
 def test_only_the_pixels_asked_for_are_judged() -> None:
-    """The range stays that of the whole truth; what is wrong elsewhere, or NaN, is not looked at."""
+    """The range is that of the whole truth. Errors and NaN elsewhere are ignored."""
     where = np.zeros(RAMP.shape, np.bool_)
     where[0, :4] = True
     truth, picture = RAMP.copy(), np.full(RAMP.shape, np.nan)

@@ -1,4 +1,4 @@
-"""Calibration while the camera turns, and the scenes that it must not be fooled by."""
+"""Calibration with a rotating camera, and scenes that must not be mistaken for rotation."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -39,7 +39,7 @@ FREE = ("apex", "phase", "motion")
 
 
 def turned(texture: NDArray[np.uint8], rates: Any, **extra: Any) -> Recording:
-    """A little over two turns of the prism in front of the texture, the camera turning."""
+    """Slightly more than two turns of the prism in front of the texture, with a rotating camera."""
     return simulate(
         texture, CAMERA, TRUE_PRISM, duration_s=0.18, camera_motion=CameraMotion(rates), seed=4,
         nominal_prism=replace(TRUE_PRISM, apex=1.2 * TRUE_PRISM.apex), **extra,
@@ -69,7 +69,7 @@ def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -
 
 
 def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8], tmp_path: Path) -> None:
-    """Rates linear in time: the change is found, survives the file, and the reconstruction turns with it."""
+    """Angular velocity linear in time: its change is found, stored in the file, and used by the reconstruction."""
     simulation = Simulation(
         Scene.from_picture(texture), CAMERA, TRUE_PRISM, 0.18, seed=4,
         camera_motion=CameraMotion([[0.0, 0.0, 0.2, 0.0], [0.2, 0.0, 1.2, 0.0]]),
@@ -98,7 +98,7 @@ def test_a_still_camera_is_found_to_be_still(recording: Recording) -> None:
 
 
 def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording) -> None:
-    """At constant speed a clock offset is a phase; this encoder has no counts whose steps would tell them apart."""
+    """At constant speed a clock offset equals a phase. This encoder has no counting steps that would separate them."""
     even = Encoder.constant_speed(720.0, recording.events.t_first, recording.events.t_last)
     recording = replace(recording, encoder=even)
     c = calibrate(recording, free=("apex", "phase", "clock_offset"), photometric=KNOWN, events=200_000)
@@ -110,7 +110,7 @@ def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording
 
 
 def test_index_and_focal_length(recording: Recording) -> None:
-    """They and the apex make nearly the same motion, but not quite."""
+    """Index, focal length and apex make nearly the same motion."""
     c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN, events=200_000)
     assert c.photometric is not None
     assert c.photometric.accepted
@@ -122,11 +122,11 @@ def test_index_and_focal_length(recording: Recording) -> None:
 
 
 def test_linear_unknowns(texture: NDArray[np.uint8]) -> None:
-    """A strong leak is found, and freeing it or the thresholds' ratio costs no accuracy to speak of."""
+    """A strong leak is found. To free it or the ratio of the thresholds costs little accuracy."""
     sensor = SensorModel(contrast_on=0.22, contrast_off=0.28, leak_hz=20.0)
     recording = simulate(texture, CAMERA, TRUE_PRISM, duration_s=0.25, sensor=sensor, seed=5)
     for free in (("leak",), ("off_ratio", "leak")):
-        # a leak shows in places with few events: all the pairs there are
+        # a leak shows where events are few, so all pairs are used
         c = calibrate(recording, free=("apex", "phase", *free), photometric=ALL, events=200_000)
         assert c.photometric is not None
         assert c.photometric.accepted
@@ -137,7 +137,7 @@ def test_linear_unknowns(texture: NDArray[np.uint8]) -> None:
 
 @pytest.mark.parametrize(("name", "gain"), [("shapes_rotation", 2.99), ("dynamic_rotation", 2.06)])
 def test_real_recordings_from_zero(data_dir: Path, name: str, gain: float) -> None:
-    """No prism: both stages find the camera's rotation, and their images are at least as sharp as motion.txt's."""
+    """No prism: both stages find the camera's rotation. Their images are at least as sharp as those of motion.txt."""
     folder = data_dir / "text" / name
     recording = open_recording(folder / "events.txt")
     width, height = recording.events.size
@@ -167,12 +167,12 @@ def test_real_recordings_from_zero(data_dir: Path, name: str, gain: float) -> No
     assert reconstruct(recording, c, length_us=recording.events.t_last - recording.events.t_first).residual < 0.3
 
 
-# -- scenes that break the equations: the answer is refused, or that of sharpness with a reason, never worse in silence
+# -- scenes that violate the model: refused, or the first stage's answer with a warning, never silently worse
 
 
 @dataclass(frozen=True)
 class Film:
-    """A picture a millisecond, made when it is read."""
+    """One picture per millisecond, computed when it is read."""
 
     picture: Callable[[float], NDArray[Any]]
     seconds: float
@@ -200,7 +200,7 @@ def outcome(film: Film) -> tuple[Recording, Calibration | None]:
 
 
 def check_honest(recording: Recording, c: Calibration | None) -> None:
-    """Refused; or the answer of sharpness, said to be so; or better than it."""
+    """Check: no answer, or that of contrast maximisation with a warning, or one at least as accurate."""
     if c is None:
         return
     if c.photometric is None or not c.photometric.accepted:
@@ -211,7 +211,7 @@ def check_honest(recording: Recording, c: Calibration | None) -> None:
 
 
 def test_flickering_light(texture: NDArray[np.uint8]) -> None:
-    """A lamp on the mains: all of the scene to 40 % and back, 100 times a second."""
+    """Mains lighting: the whole scene dims to 40 % and recovers 100 times a second."""
 
     def picture(t: float) -> NDArray[np.float32]:
         light = np.float32(0.7 + 0.3 * math.cos(math.tau * 100.0 * t))
@@ -223,7 +223,7 @@ def test_flickering_light(texture: NDArray[np.uint8]) -> None:
 
 
 def test_an_object_moves_through(texture: NDArray[np.uint8]) -> None:
-    """A third of the image moves on its own, 400 px a second."""
+    """A third of the image moves independently at 400 px/s."""
 
     def picture(t: float) -> NDArray[np.uint8]:
         out = texture.copy()

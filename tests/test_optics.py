@@ -26,7 +26,7 @@ from amiwarp.optics.models import (
 )
 from amiwarp.optics.prism import FlatSide, Prism
 
-ATOL = 1e-3  # px, the promise; docs/explanation/optics.md has what was measured
+ATOL = 1e-3  # px, the documented limit; docs/explanation/optics.md has the measured values
 SIDES = list(FlatSide)
 BARREL = RadialTangential(-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0)
 TURN = np.arange(36) * (2.0 * np.pi / 36)
@@ -41,7 +41,7 @@ def prism(deflection_deg: float = 1.0, side: FlatSide = FlatSide.SCENE, index: f
 
 
 def samples(cam: Camera, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
-    """Random pixels, half of them whole, that float32 holds exactly, and angles; both float64."""
+    """Random pixels that float32 represents exactly, half of them integers, and angles; both float64."""
     rng = np.random.default_rng(1)
     xy = rng.uniform(0.0, [cam.width - 1, cam.height - 1], (count, 2)).astype(np.float32)
     xy[::2] = np.round(xy[::2])
@@ -49,7 +49,7 @@ def samples(cam: Camera, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lattice(cam: Camera, columns: int = 33, rows: int = 25) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels evenly over the image and angles over one turn: the points of the published tables."""
+    """Pixels on a regular grid over the image and angles over one turn, as in the published tables."""
     axes = np.linspace(0, cam.width - 1, columns), np.linspace(0, cam.height - 1, rows), TURN
     mesh = np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
     return mesh[:, :2], mesh[:, 2]
@@ -80,7 +80,7 @@ def test_conversions_meet_the_traced_axial_ray(side: FlatSide, index: float, ape
 
 
 def test_deflection_is_not_the_apex() -> None:
-    for deflection, apex in [(0.5, 0.909), (1.0, 1.817), (2.0, 3.627)]:  # the published pairs, n = 1.55
+    for deflection, apex in [(0.5, 0.909), (1.0, 1.817), (2.0, 3.627)]:  # published pairs [deg], n = 1.55
         assert math.degrees(prism(deflection, FlatSide.CAMERA).apex) == pytest.approx(apex, abs=6e-4)
     thin = Prism(1e-4, 1.55)
     assert thin.deflection == pytest.approx(0.55e-4, abs=1e-11)
@@ -113,7 +113,7 @@ def test_exact_model_meets_the_two_interface_trace(device: str, side: FlatSide, 
 @pytest.mark.parametrize(("side", "sign"), [(FlatSide.SCENE, 1.0), (FlatSide.CAMERA, -1.0)])
 @pytest.mark.parametrize("theta", [0.0, math.pi / 2, -2.0])
 def test_axis_is_moved_along_the_tilt(side: FlatSide, sign: float, theta: float) -> None:
-    """θ is the azimuth of the tilted face's normal, from x right to y down: that is where the scene's pixel lies."""
+    """θ is the azimuth of the tilted face's normal, from x (right) to y (down). The scene's pixel lies there."""
     cam = Camera(641, 481, 600.0, 600.0, 320.0, 240.0)
     radius = sign * 600.0 * math.tan(math.radians(1.0))
     expected = [[320.0 + radius * math.cos(theta), 240.0 + radius * math.sin(theta)]]
@@ -140,7 +140,7 @@ def test_phase_adds_to_the_angle_and_whole_turns_do_not_count() -> None:
 
 
 def test_tilt_about_x_moves_the_axis_of_rotation_up() -> None:
-    """The prism's z axis turned about x by a, then about y by b: its mean image moves by second order only."""
+    """A tilt of 1 degree changes compensated positions by 0.05 to 1 px rms."""
     cam, wedge = camera(), prism(2.0)
     straight, tilted = ExactModel(cam, wedge), ExactModel(cam, wedge, tilt=(math.radians(1.0), 0.0))
     assert 0.05 < predicted_error(tilted, straight).rms < 1.0
@@ -152,7 +152,7 @@ def test_tilt_about_x_moves_the_axis_of_rotation_up() -> None:
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("apex_deg", [1.0, 4.0])
 def test_paper_formula_in_the_plane_of_the_wedge(side: FlatSide, apex_deg: float) -> None:
-    """δ = Φq − Φo + Φp − Φi with signed angles is the trace of rays in the plane of the optical axis and the tilt."""
+    """δ = Φq − Φo + Φp − Φi with signed angles equals the trace in the plane of the optical axis and the tilt."""
     wedge = Prism(math.radians(apex_deg), 1.55, side)
     angle = np.radians(np.linspace(-60.0, 60.0, 121))
     rays = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1)
@@ -164,7 +164,7 @@ def test_paper_formula_in_the_plane_of_the_wedge(side: FlatSide, apex_deg: float
 
 
 def test_paper_formula_needs_signed_angles() -> None:
-    """From the scene at α = 1°, φ = 45°: −0.93°; with both faces' turns counted towards the normal, −34.8°."""
+    """Ray from the scene at α = 1°, φ = 45°: −0.93°. With both refractions counted towards the normal it is −34.8°."""
     apex, phi_i = math.radians(1.0), np.array(math.radians(45.0))
     signed = reference.cross_section(phi_i, apex, 1.55, tilted_first=False)
     assert math.degrees(signed) == pytest.approx(-0.93, abs=5e-3)
@@ -177,7 +177,7 @@ def test_paper_formula_needs_signed_angles() -> None:
 
 @pytest.mark.parametrize("side", SIDES)
 def test_skew_rays_follow_the_cross_section_with_the_bravais_index(side: FlatSide) -> None:
-    """Out of that plane: s = bearing · axis is kept, and the projection refracts by √(n² − s²)/√(1 − s²)."""
+    """Outside that plane s = bearing · axis is constant, and the projection refracts with √(n² − s²)/√(1 − s²)."""
     rng = np.random.default_rng(2)
     rays = reference.pixels_to_rays(camera(80.0), samples(camera(80.0), 500)[0])
     phi = rng.uniform(-np.pi, np.pi, len(rays))
@@ -229,7 +229,7 @@ def growth(rays: np.ndarray, index: float) -> np.ndarray:
 def test_published_circle_table(
     fov: float, deflection: float, one: tuple[float, float], per_pixel: tuple[float, float]
 ) -> None:
-    """Mean and worst error in px of one δ and of δ(φ) of the observed ray, for the flat face to the camera."""
+    """Mean and worst error [px] of a single δ and of δ(φ) of the observed ray; the flat face points to the camera."""
     cam, wedge = camera(fov), prism(deflection, FlatSide.CAMERA)
     xy, theta = lattice(cam)
     exact = reference.move(cam, wedge, xy, theta, to_scene=True)
@@ -259,7 +259,7 @@ def test_radial_circle_takes_its_angle_on_the_tilted_side(device: str, side: Fla
 
 @pytest.mark.parametrize("side", SIDES)
 def test_radial_circle_errs_in_second_order_only(side: FlatSide) -> None:
-    """Four times the error for twice the prism; 0.036 px rms at 60 degrees and 1 degree, either way round."""
+    """Twice the prism has four times the error; 0.036 px rms at 60 degrees and apex 1 degree, for both flat sides."""
     cam = camera(60.0)
     errors = [predicted_error(RadialCircleModel.from_prism(cam, p), ExactModel(cam, p))
               for p in (prism(1.0, side), prism(2.0, side))]  # fmt: skip
@@ -333,7 +333,7 @@ def test_ellipse_of_the_other_models() -> None:
 
 
 def test_ellipse_keeps_invalid_pixels_invalid_and_in_bounds(device: str) -> None:
-    """A lens that folds inside the image leaves corners without a ray; nothing reads beyond the tables for them."""
+    """If the lens folds inside the image, corners have no ray. No read beyond the tables happens there."""
     cam = camera(90.0, RadialTangential(k1=-0.4), (64, 48))
     model = EllipseModel.from_model(ExactModel(cam, prism(1.0)), device)
     broken = [[math.nan, 3.0], [3.0, math.nan], [math.inf, 1.0], [1e30, 0.0]]
@@ -356,11 +356,11 @@ def test_tiny_images(size: tuple[int, int], name: str) -> None:
     seen = model.compensate_points(xy, theta)
     assert distance(seen, ExactModel(cam, prism(1.0)).compensate_points(xy, theta)).max() < 0.1
     assert distance(model.deflect_points(seen, theta), xy).max() < 1e-4
-    assert predicted_error(model, ExactModel(cam, prism(1.0))).worst < 0.2  # 1 x 5 pixels span 110 degrees
+    assert predicted_error(model, ExactModel(cam, prism(1.0))).worst < 0.2  # px; 1 x 5 pixels span 110 degrees
 
 
 def test_fit_recovers_a_known_field() -> None:
-    """Random pairs of a known field of degree 2, with 0.1 px of noise: the field comes back ten times better."""
+    """The fit to random pairs of a known field of degree 2 with 0.1 px of noise is ten times better than the noise."""
     cam = camera(60.0, None, (160, 120))
     rng = np.random.default_rng(3)
     xy, theta = samples(cam, 20_000)
@@ -402,7 +402,7 @@ def test_fit_says_when_pairs_do_not_determine_it() -> None:
 
 @pytest.mark.parametrize("side", SIDES)
 def test_grazing_rays_end_where_the_trace_ends(device: str, side: FlatSide) -> None:
-    """Thick wedge, 170 degree lens: total reflection and rays that miss a face are NaN, the rest exact."""
+    """Thick wedge, 170 degree lens: rays with total reflection and rays that miss a face are NaN, the others exact."""
     focal = 640 / math.radians(170.0)
     cam = Camera(640, 640, focal, focal, 319.5, 319.5, Fisheye())
     wedge = Prism(math.radians(20.0), 1.5, side)
@@ -413,7 +413,7 @@ def test_grazing_rays_end_where_the_trace_ends(device: str, side: FlatSide) -> N
         got, expected = move(points, angles).numpy(), reference.move(cam, wedge, xy, theta, to_scene=to_scene)
         lost = np.isnan(expected).all(axis=1)
         assert 500 < lost.sum() < 15_000
-        assert (np.isnan(got).all(axis=1) != lost).sum() <= 5  # float32 decides otherwise right at the edge
+        assert (np.isnan(got).all(axis=1) != lost).sum() <= 5  # float32 differs from float64 at the very limit
         both = np.isfinite(got).all(axis=1) & ~lost
         assert np.quantile(distance(got[both], expected[both]), 0.99) < ATOL
 
@@ -432,7 +432,7 @@ def test_broken_rows_stay_alone(device: str, name: str) -> None:
 
 @pytest.mark.parametrize("side", SIDES)
 def test_radial_circle_never_returns_an_unsolved_point(device: str, side: FlatSide) -> None:
-    """Near the horizon its angle runs away and the iteration need not settle: such points are marked, not guessed."""
+    """Near the horizon the iteration may not converge. Such points are NaN, not approximations."""
     focal = 640 / math.radians(178.0)
     cam = Camera(640, 640, focal, focal, 319.5, 319.5, Fisheye())
     model = RadialCircleModel.from_prism(cam, prism(2.0, side))

@@ -1,4 +1,4 @@
-"""Properties that hold for every camera and prism in the promised range: 90 degrees across, 4 degrees of apex."""
+"""Properties of every camera and prism in the supported range: field of view to 90 degrees, apex to 4 degrees."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ from amiwarp.optics.models import (
 )
 from amiwarp.optics.prism import FlatSide, Prism
 
-ATOL = 1e-3  # px, the promise for float32
+ATOL = 1e-3  # px, the documented limit for float32
 COUNT = 300
 
 quick = settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -29,7 +29,7 @@ few = settings(quick, max_examples=12)
 
 
 def lens_radius(lens: Distortion | None, half_angle: float) -> float:
-    """Distorted normalised radius of the ray at ``half_angle`` [rad]."""
+    """Return the distorted normalised radius of the ray at ``half_angle`` [rad]."""
     if isinstance(lens, Fisheye):
         return float(reference.polynomial(np.array(half_angle), lens.k1, lens.k2, lens.k3, lens.k4))
     tangent = np.array(math.tan(half_angle))
@@ -37,7 +37,7 @@ def lens_radius(lens: Distortion | None, half_angle: float) -> float:
 
 
 def gentle(lens: Distortion | None, half_angle: float) -> bool:
-    """Scale between 0.4 and 2.5 of the centre's out to ``half_angle``: as of lenses one can buy."""
+    """Whether the scale out to ``half_angle`` is 0.4 to 2.5 times that of the centre, as for real lenses."""
     angles = np.linspace(0.01, half_angle, 50)
     radii = np.array([lens_radius(lens, a) for a in angles])
     slope = np.diff(radii) / np.diff(angles if isinstance(lens, Fisheye) else np.tan(angles))
@@ -122,7 +122,7 @@ def test_circles_round_trip(cam: Camera, wedge: Prism, seed: int, name: str) -> 
 @quick
 @given(cam=cameras(lenses=False), wedge=prisms(), turn=phases, seed=seeds)
 def test_turning_camera_and_prism_together_turns_the_picture(cam: Camera, wedge: Prism, turn: float, seed: int) -> None:
-    """No direction is special: the pinhole's image and the prism turned by one angle give the turned result."""
+    """No direction is special: if image and prism rotate by one angle, the result rotates too."""
     cam = replace(cam, fy=cam.fx)
     xy, theta = samples(cam, seed)
     c, s = math.cos(turn), math.sin(turn)
@@ -154,7 +154,7 @@ def test_conversions_are_inverses(wedge: Prism) -> None:
 @few
 @given(cam=cameras(), wedge=prisms())
 def test_the_ladder_goes_up(cam: Camera, wedge: Prism) -> None:
-    """δ(φ) is never worse than one δ, and within its second-order bound; the exact rung errs by nothing."""
+    """δ(φ) is never worse than a single δ and keeps its second-order bound. The exact model has no error."""
     exact = ExactModel(cam, wedge)
     circle = predicted_error(CircleModel.from_prism(cam, wedge), exact, grid=8)
     radial = predicted_error(RadialCircleModel.from_prism(cam, wedge), exact, grid=8)

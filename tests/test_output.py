@@ -1,4 +1,4 @@
-"""What no command may do: write over a file that it reads, under any name, or over anything else unasked."""
+"""No command overwrites a file that it reads, under any name, or any other existing file without --force."""
 
 import json
 import math
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from PIL import Image
 from typer.testing import CliRunner, Result
 
@@ -26,9 +27,10 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.export import IweFiles
-from amiwarp.io import RecordingWriter, convert, open_recording, output, save_recording
+from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
+from amiwarp.io import atomic_output as output
+from amiwarp.io.atomic_output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.io.output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -57,9 +59,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with open_recording(folder / "a.h5").events.path.open("rb") as file:
         assert file.read(4) == b"\x89HDF"
     values = {"apex": math.radians(2.0), "index": 1.5168, "phase": 0.0, "tilt_x": 0.0, "tilt_y": 0.0}
-    Calibration("exact", CAMERA, Prism(math.radians(2.0)), values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(
-        folder / "cal.json"
-    )
+    exact_calibration(CAMERA, Prism(math.radians(2.0)), values).save(folder / "cal.json")
     camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     (folder / "cam.json").write_text(json.dumps(camera))
     (folder / "enc.csv").write_text("t_us,angle_deg\n-1000,0\n100000,436.3\n201000,872.6\n")
@@ -139,7 +139,7 @@ def roundabout(path: Path) -> Path:
 @pytest.mark.parametrize("name", [same_name, symlink, hard_link, roundabout])
 @pytest.mark.parametrize(("line", "read"), OVER_INPUTS, ids=lambda value: str(value))
 def test_no_command_writes_over_what_it_reads(place: Path, line: str, read: str, name: Callable[[Path], Path]) -> None:
-    """Whatever name the file is given, and though everything may be replaced."""
+    """The input is given under any name, and with --force."""
     target = name(place / read)
     before = snapshot(place)
     for more in ((), ("--force",)):
@@ -266,7 +266,7 @@ def test_outputs_that_are_no_files_are_refused(place: Path, kind: str, line: str
 
 @pytest.fixture
 def impatient() -> Iterator[None]:
-    """A command that waits for what never comes fails."""
+    """Fail a test that still waits after two minutes."""
 
     def late(number: int, frame: object) -> None:
         raise AssertionError("still waiting after two minutes")
@@ -353,7 +353,7 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_file_that_appears_in_the_last_moment_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the last look and the rename: the rename itself replaces nothing."""
+    """The file appears between the last check and the rename. The rename itself replaces nothing."""
     path = tmp_path / "a.txt"
     seen = output.check_output
 
@@ -406,7 +406,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path, dead_pid:
 
 def test_sigkill_leaves_nothing_after_the_next_run(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; from amiwarp.io.output import NewFile\n"
+        "import os, signal, sys; from pathlib import Path; from amiwarp.io.atomic_output import NewFile\n"
         "new = NewFile(Path(sys.argv[1])); new.part.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", script, tmp_path / "a.txt"], env=environment(), check=False)
@@ -464,7 +464,7 @@ def test_a_recording_that_appears_while_one_is_written_is_kept(tmp_path: Path) -
             write(writer)
         assert (tmp_path / "a.h5").read_bytes() == b"theirs"
         (tmp_path / "a.h5").unlink()
-        # what was recorded live is not lost either
+        # a live recording is kept
         assert os.listdir(tmp_path) == ([] if k == 0 else ["a.part.h5"])
     assert len(open_recording(tmp_path / "a.part.h5").events) == 2000
 
@@ -488,7 +488,7 @@ for write in (lambda p: save_grey(noise, p, bits=16), lambda p: save_png(p, np.u
 
 @pytest.mark.parametrize("name", ["a.tif", "a.png"])
 def test_pictures_on_a_full_disk(tmp_path: Path, name: str) -> None:
-    """Pillow itself takes a part of a TIFF for the whole."""
+    """Pillow itself reports no error for a partly written TIFF."""
     words = [sys.executable, "-c", FULL, tmp_path / name]
     done = subprocess.run(words, env=environment(), capture_output=True, text=True, check=True)
     assert [f"{name}: cannot be written: File too large" in line for line in done.stdout.splitlines()] == [True, True]
@@ -496,7 +496,7 @@ def test_pictures_on_a_full_disk(tmp_path: Path, name: str) -> None:
 
 
 def test_a_stack_of_images_takes_its_room_on_the_disk_first(tmp_path: Path) -> None:
-    """A page of a mapped file that finds no room ends the process."""
+    """If the disk has no room for a page of a memory-mapped file, the system ends the process."""
     source = MemoryEvents(events(), *SIZE)
     with IweFiles([tmp_path / "a.npy"], source, window_us=10_000, layers=Layers.MERGED, device="cpu") as files:
         files.add(compensated(events()))

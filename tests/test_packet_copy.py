@@ -1,4 +1,4 @@
-"""Copying of packets into columns, and the pool of arrays for results: the fast ways and the plain ones."""
+"""Copying of packets into columns, and the pool of result arrays: fast and plain implementations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WAYS = pytest.mark.parametrize("find_pointers", [pointers_in_place, listed_point
 
 
 def packets(sizes: list[int]) -> list[Events]:
-    """Packets of random events, sorted from each to the next; those of x have gaps in memory."""
+    """Packets of random events in order of time. The x columns are not contiguous in memory."""
     rng = np.random.default_rng(0)
     t, parts = np.sort(rng.integers(0, 10**6, sum(sizes))), []
     for start, n in zip(np.cumsum([0, *sizes[:-1]]).tolist(), sizes, strict=True):
@@ -47,7 +47,7 @@ def test_packets_are_copied_one_after_the_other(find_pointers: FindPointers, siz
 @WAYS
 @pytest.mark.parametrize("at", [5, PIECE])
 def test_a_step_back_in_a_packet_is_found(find_pointers: FindPointers, at: int) -> None:
-    """Also between the pieces into which a long packet is cut."""
+    """Also at the border between two pieces of a long packet."""
     (part,) = packets([PIECE + 100])
     part.t[at] = part.t[at - 1] - 1
     assert copied(PacketCopier(find_pointers), [part])[1].unsorted

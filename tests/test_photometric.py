@@ -1,4 +1,4 @@
-"""The photometric stage: free of the bias of sharpness, honest where it cannot be."""
+"""The photometric stage: no bias as in contrast maximisation, and a refusal if it cannot determine the answer."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,8 @@ from scipy.sparse.linalg import spsolve
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.brightness.solver import BrightnessMap, Tiles
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings, _spread
+from amiwarp.calib.photometric.pair_collection import van_der_corput
+from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -52,7 +53,7 @@ def test_unequal_thresholds(texture: np.ndarray) -> None:
     c = calibrate(recording, photometric=KNOWN)
     assert error_px(recording, c) < 0.02
     assert c.photometric is not None
-    assert 1.05 < c.photometric.off_over_on < 1.35  # 1.27; noise pairs draw it towards 1
+    assert 1.05 < c.photometric.off_over_on < 1.35  # true value 1.27; noise pairs shift it towards 1
 
 
 def test_every_model_of_the_ladder_runs(recording: Recording) -> None:
@@ -98,7 +99,7 @@ def test_too_few_pairs_are_refused(texture: np.ndarray) -> None:
 
 
 def test_missing_events_are_not_believed(recording: Recording) -> None:
-    """Of every seven events one: what is left is as sharp, but no pair of neighbours is a threshold apart."""
+    """One event of seven is kept. The image is as sharp, but consecutive events are no longer one threshold apart."""
     few = recording.events.slice(0, len(recording.events))[::7]
     thinned = replace(recording, events=MemoryEvents(few, *recording.events.size))
     with pytest.raises(AmiwarpError, match="photometric stage"):
@@ -107,7 +108,7 @@ def test_missing_events_are_not_believed(recording: Recording) -> None:
 
 
 def test_a_camera_that_turns_is_found_out(texture: np.ndarray) -> None:
-    """At 40 deg/s, of which nobody told: recognised by what no map explains, and its motion is then sought too."""
+    """An undeclared 40 deg/s: no brightness map explains the events of a still camera, so motion is estimated."""
     camera = Camera.from_fov(200, 150, math.radians(50))
     recording = simulate(
         texture, camera, TRUE_PRISM, duration_s=0.25, camera_motion=CameraMotion((0.0, 0.7, 0.0)), seed=2
@@ -125,7 +126,7 @@ def test_the_result_survives_its_file(recording: Recording, tmp_path: Path) -> N
 
 
 def test_the_map_is_the_scene(device: str) -> None:
-    """Events written by hand along a ramp of brightness: the map has its slope."""
+    """The map of events computed along a brightness ramp has the slope of the ramp."""
     width, height, slope = 24, 16, 3.0  # thresholds per px
     camera = Camera.from_fov(width, height, math.radians(20))
     model = ExactModel(camera, Prism(math.radians(3.0)))
@@ -159,7 +160,7 @@ def test_the_map_is_the_scene(device: str) -> None:
 
 
 def test_single_precision_is_enough(recording: Recording, device: str) -> None:
-    """The map and its residuals beside a float64 solution of the same equations by SciPy."""
+    """The map and its residuals agree with SciPy's float64 solution of the same equations."""
     events = recording.events.slice(0, 200_000)
     width, height = recording.events.size
     tile_of = np.full((height, width), -1, dtype=np.int32)
@@ -239,12 +240,12 @@ def test_no_pair_is_an_error() -> None:
 
 
 def test_turns_are_spread() -> None:
-    assert sorted(_spread(24)) == list(range(24))
-    assert _spread(8)[:4] == [0, 4, 2, 6]
+    assert sorted(van_der_corput(24)) == list(range(24))
+    assert van_der_corput(8)[:4] == [0, 4, 2, 6]
 
 
 def test_a_memory_source_without_truth(recording: Recording) -> None:
-    """Nothing of the simulation's truth is looked at."""
+    """Calibration does not use the simulation's ground truth."""
     n = len(recording.events)
     bare = replace(recording, events=MemoryEvents(recording.events.slice(0, n), *recording.events.size), truth=None)
     assert calibrate(bare, events=100_000).parameters == calibrate(recording, events=100_000).parameters

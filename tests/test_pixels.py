@@ -1,4 +1,4 @@
-"""Pixels that calibration leaves out: hot ones and flickering ones are found, those of a scene are not."""
+"""Pixels that calibration leaves out: hot and flickering pixels are found, pixels of the scene are not."""
 
 import math
 from collections.abc import Iterator
@@ -11,13 +11,13 @@ from scipy import ndimage
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.bad_pixels import (
-    StrangeSummary,
+    BadPixelSummary,
     bin_times,
-    keep,
-    stands_out,
+    outliers,
     strange_pixels,
     stretch,
-    unlocked_counts,
+    unrepeated_counts,
+    without_pixels,
 )
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -35,13 +35,13 @@ PIXELS = 200 * 150
 PRISM = Prism(math.radians(1.2), 1.52)
 TURN_S = 60.0 / 720.0
 SPARE_S = 1e-3
-"""A recording is this much longer than whole turns."""
+"""Length of a recording beyond whole turns [s]."""
 CLEAN = SensorModel(hot_fraction=0.0)
 
 
 @dataclass(frozen=True)
 class Flicker:
-    """A picture a millisecond, in which a patch's light goes up and down."""
+    """One picture per millisecond, in which the brightness of a patch oscillates."""
 
     light: NDArray[np.float32]
     patch: NDArray[np.bool_]
@@ -72,14 +72,14 @@ def events_of(recording: Recording) -> Events:
     return recording.events.slice(0, len(recording.events))
 
 
-def strange(recording: Recording, every: int = 1) -> tuple[NDArray[np.bool_], StrangeSummary]:
+def strange(recording: Recording, every: int = 1) -> tuple[NDArray[np.bool_], BadPixelSummary]:
     assert recording.encoder is not None
     events = events_of(recording)
     return strange_pixels(events[np.arange(len(events)) // 8 % every == 0], recording.encoder, SIZE)
 
 
 def hot_pixels(fraction: float) -> NDArray[np.bool_]:
-    """Which pixels the simulator makes hot: all that fire in front of a grey wall."""
+    """Mask of the pixels that the simulator makes hot: all that fire in front of a grey wall."""
     sensor = SensorModel(hot_fraction=fraction, hot_hz=5000.0, shot_noise_hz=0.0, leak_hz=0.0)
     return counts(record(np.full((60, 80), 128, np.uint8), 0.5, sensor)) > 20
 
@@ -97,7 +97,7 @@ def counts(recording: Recording) -> NDArray[np.int64]:
     [(0.002, 300.0, 4, 0.97), (0.05, 1000.0, 4, 0.99), (0.02, 2000.0, 1, 0.9), (0.01, 100.0, 8, 0.9)],
 )
 def test_hot_pixels_are_found(texture: NDArray[np.uint8], fraction: float, hz: float, turns: int, least: float) -> None:
-    """Under two turns those that are far too fast for what is around; with more also those as fast as texture."""
+    """Under two turns only pixels that fire far more than their neighbours are found; later also slower ones."""
     true = hot_pixels(fraction)
     mask, summary = strange(record(texture, turns, SensorModel(hot_fraction=fraction, hot_hz=hz)))
     assert (mask & true).sum() >= least * true.sum()
@@ -107,7 +107,7 @@ def test_hot_pixels_are_found(texture: NDArray[np.uint8], fraction: float, hz: f
 
 
 def test_hot_pixels_are_found_while_the_camera_turns(texture: NDArray[np.uint8]) -> None:
-    """Nothing repeats then, so a pixel is hot only by the rate of what does not."""
+    """Events do not repeat then, so hot pixels are found only by their rate of unrepeated events."""
     true = hot_pixels(0.01)
     sensor = SensorModel(hot_fraction=0.01, hot_hz=2000.0)
     mask, _ = strange(record(texture, 4, sensor, camera_motion=CameraMotion((0.0, 0.5, 0.0))))
@@ -125,7 +125,7 @@ def test_a_still_scene_has_no_strange_pixels(texture: NDArray[np.uint8], turns: 
 @pytest.mark.parametrize("every", [1, 8])
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 60.0])
 def test_nor_has_a_turning_camera_or_a_noisy_one(texture: NDArray[np.uint8], degrees: float, every: int) -> None:
-    """As many events of noise as of the scene; also thinned as calibration thins them, in runs."""
+    """A still camera with as many noise events as scene events, or a rotating one; also with thinned runs of events."""
     noise = SensorModel(hot_fraction=0.0, shot_noise_hz=0.0 if degrees else 30.0)
     recording = record(texture, 4, noise, camera_motion=CameraMotion((0.0, math.radians(degrees), 0.0)))
     mask, _ = strange(recording, every)
@@ -133,7 +133,7 @@ def test_nor_has_a_turning_camera_or_a_noisy_one(texture: NDArray[np.uint8], deg
 
 
 def test_what_repeats_counts_for_nothing_and_what_does_not_for_itself() -> None:
-    """Two pixels over eight turns: one fires at the same angles every turn, one at random."""
+    """Two pixels over eight turns: the first fires at the same angles in every turn, the second at random."""
     rng = np.random.default_rng(1)
     encoder = Encoder.constant_speed(-600.0, 0, 800_000)  # 100 ms a turn, backwards
     locked = (np.arange(8)[:, None] * 100_000 + np.array([5_000, 20_000, 21_000, 66_000])).ravel()
@@ -142,16 +142,16 @@ def test_what_repeats_counts_for_nothing_and_what_does_not_for_itself() -> None:
     x = np.concatenate([np.zeros(len(locked)), np.ones(len(random)), [2, 2]]).astype(np.uint16)
     order = np.argsort(t, kind="stable")
     events = Events(x, np.zeros_like(x), t, (t % 2).astype(np.uint8))[order]
-    found = unlocked_counts(events, events.x.astype(np.int32), encoder, (3, 1))
+    found = unrepeated_counts(events, events.x.astype(np.int32), encoder, (3, 1))
     assert found is not None
     assert found[0, 0] == pytest.approx(0.0, abs=1e-9)
-    assert found[0, 1] == pytest.approx(4000.0, rel=0.5)  # 40 squares: a standard deviation of 0.22
-    assert unlocked_counts(events[events.t < 190_000], events.x.astype(np.int32), encoder, (3, 1)) is None
+    assert found[0, 1] == pytest.approx(4000.0, rel=0.5)  # sum of 40 squares, relative standard deviation 0.22
+    assert unrepeated_counts(events[events.t < 190_000], events.x.astype(np.int32), encoder, (3, 1)) is None
 
 
 @pytest.mark.parametrize("rpm", [600.0, -600.0])
 def test_bins_of_the_angle(rpm: float) -> None:
-    """Eight a turn from the first event on, on the events' clock."""
+    """Eight bins per turn, counted from the first event on the events' clock."""
     encoder = Encoder.constant_speed(rpm, 0, 1_000_000).with_clock_offset(4000.0)
     t = np.array([50_000, 400_000])
     none = np.zeros(2, np.uint16)
@@ -162,11 +162,11 @@ def test_bins_of_the_angle(rpm: float) -> None:
 def test_a_fast_pixel_stands_out_a_fast_region_does_not() -> None:
     count = np.full((20, 20), 10.0)
     count[:, 10:] = 1000.0
-    assert not stands_out(count).any()
+    assert not outliers(count).any()
     count[5, 5] = 80.0
     count[0, 0] = count[5, 6] = 200.0
     count[8, 15] = 3500.0
-    assert np.argwhere(stands_out(count)).tolist() == [[0, 0], [5, 5], [5, 6], [8, 15]]
+    assert np.argwhere(outliers(count)).tolist() == [[0, 0], [5, 5], [5, 6], [8, 15]]
 
 
 # -- flicker
@@ -174,7 +174,7 @@ def test_a_fast_pixel_stands_out_a_fast_region_does_not() -> None:
 
 @pytest.mark.parametrize(("hz", "depth", "turns"), [(100.0, 0.3, 4), (100.0, 1.0, 1), (120.0, 0.6, 2)])
 def test_a_flickering_lamp_is_found(texture: NDArray[np.uint8], hz: float, depth: float, turns: int) -> None:
-    """120 Hz is ten times the prism's turns: it repeats every turn as the scene does, but all together."""
+    """120 Hz is ten times the prism's frequency. It repeats every turn as the scene does, but in all pixels at once."""
     light = linear_luminance(texture)
     patch = np.zeros(light.shape, np.bool_)
     patch[60:140, 90:170] = True
@@ -182,7 +182,7 @@ def test_a_flickering_lamp_is_found(texture: NDArray[np.uint8], hz: float, depth
     lit, still = (record(Scene(Flicker(light, patch, hz, d, turns * TURN_S)), turns, sensor) for d in (depth, 0.0))
     mask, summary = strange(lit)
     more = counts(lit) - counts(still)
-    lamp = ndimage.binary_opening(more >= 4)  # without single pixels: chance tells the two recordings apart too
+    lamp = ndimage.binary_opening(more >= 4)  # without single pixels, in which the two recordings differ by chance
     assert more[mask].sum() >= 0.97 * more[lamp].sum()
     assert (mask & ~ndimage.binary_dilation(lamp, iterations=6) & ~hot_pixels(0.001)).sum() <= 1e-3 * PIXELS
     assert summary.lamps_hz[0] == pytest.approx(hz, abs=0.5 / (turns * TURN_S))
@@ -191,13 +191,13 @@ def test_a_flickering_lamp_is_found(texture: NDArray[np.uint8], hz: float, depth
 
 
 def test_calibration_without_them(texture: NDArray[np.uint8]) -> None:
-    """Many fast hot pixels make no motion at all the sharpest; without them sharpness finds the prism."""
+    """With many fast hot pixels, no motion is sharpest. Without them, contrast maximisation finds the prism."""
     recording = record(texture, 4, SensorModel(hot_fraction=0.02, hot_hz=2000.0))
     mask, _ = strange(recording)
     assert recording.camera is not None
     assert recording.truth is not None
     truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
-    cut = replace(recording, events=MemoryEvents(keep(events_of(recording), mask), *SIZE))
+    cut = replace(recording, events=MemoryEvents(without_pixels(events_of(recording), mask), *SIZE))
     settings = {"stages": ("sharpness",), "events": 100_000}
     assert model_error(calibrate(cut, **settings).model, truth).rms < 0.3
     assert model_error(calibrate(recording, **settings).model, truth).rms > 0.5
@@ -207,7 +207,7 @@ def test_calibration_without_them(texture: NDArray[np.uint8]) -> None:
 
 
 def test_a_stretch_of_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two to eight turns in the middle, as many as hold no more events than asked for; of a slow prism less."""
+    """Two to eight turns in the middle, up to the requested number of events; fewer turns if the prism is slow."""
     t = np.arange(0, 2_400_000, 100)
     none = np.zeros(len(t), np.uint16)
     source = MemoryEvents(Events(none, none, t, none.astype(np.uint8)), 4, 3)
@@ -226,9 +226,9 @@ def test_a_stretch_of_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_keep() -> None:
     events = Events.from_arrays([1, 2, 3, 2], [0, 1, 1, 1], [5, 6, 7, 8], [1, 0, 1, 1])
     mask = np.zeros((2, 4), np.bool_)
-    assert keep(events, mask) is events
+    assert without_pixels(events, mask) is events
     mask[1, 2] = True
-    assert keep(events, mask).t.tolist() == [5, 7]
+    assert without_pixels(events, mask).t.tolist() == [5, 7]
 
 
 def test_nothing_to_look_at() -> None:
@@ -241,6 +241,6 @@ def test_nothing_to_look_at() -> None:
 
 
 def test_the_summary_says_what_was_left_out() -> None:
-    assert str(StrangeSummary(1, 0, (), 0.031)) == "1 hot pixel left out, 3 % of the events"
-    text = str(StrangeSummary(12, 3400, (100.2,), 0.41))
+    assert str(BadPixelSummary(1, 0, (), 0.031)) == "1 hot pixel left out, 3 % of the events"
+    text = str(BadPixelSummary(12, 3400, (100.2,), 0.41))
     assert text == "12 hot pixels and 3400 that flicker at 100 Hz left out, 41 % of the events"

@@ -1,4 +1,4 @@
-"""Whatever is given to a public constructor: a valid object, or AmiwarpError in one line; arrays stay as they were."""
+"""Public constructors with any values: a valid object or an AmiwarpError of one line; arrays are not changed."""
 
 import copy
 import math
@@ -31,7 +31,7 @@ STILL = Scene.from_picture(np.ones((4, 4), np.float32))
 
 
 class Odd:
-    """A value of a foreign class, whose text and comparisons fail."""
+    """A value of an unknown class, whose conversion to text and comparisons fail."""
 
     def __repr__(self) -> str:
         raise RuntimeError("no text")
@@ -70,7 +70,7 @@ JUNK = st.one_of(
 
 @dataclass(frozen=True)
 class Door:
-    """A public constructor and arguments that it takes."""
+    """A public constructor and valid arguments."""
 
     make: Callable[..., Any]
     good: dict[str, Any]
@@ -163,7 +163,7 @@ def test_numpy_s_numbers_become_plain_ones() -> None:
 
 @pytest.mark.parametrize("focal", [0.24, 200.0, LARGEST_FOCAL])
 def test_float32_holds_the_promised_focal_lengths(focal: float) -> None:
-    """A pixel's ray comes back to the pixel at both ends of what is promised."""
+    """Pixel to ray and back returns the pixel at both ends of the documented range."""
     camera = Camera(240, 240, focal, focal, 119.5, 119.5)
     xy = np.array([[119.0, 120.0], [30.0, 200.0], [0.0, 239.0]])
     np.testing.assert_allclose(camera.rays_to_pixels(camera.pixels_to_rays(xy)), xy, rtol=0, atol=0.01)

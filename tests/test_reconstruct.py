@@ -1,4 +1,4 @@
-"""Pictures from events: like the truth, honest where there is none, the same each time, whole on disk."""
+"""Pictures from events: close to the truth, unknown pixels marked, reproducible, and written completely."""
 
 import json
 import math
@@ -8,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -52,7 +53,7 @@ def sim(texture: NDArray[np.uint8]) -> Simulation:
 
 @pytest.fixture(scope="module")
 def recording(sim: Simulation) -> Recording:
-    """Noise on: shot noise, leak, hot pixels, mismatch, latency, a refractory time."""
+    """With noise: shot noise, leak, hot pixels, mismatch, latency and a refractory period."""
     return sim.run()
 
 
@@ -81,7 +82,7 @@ def with_events(recording: Recording, events: Events) -> Recording:
 
 def calibration() -> Calibration:
     parameters = {"apex": PRISM.apex, "phase": PHASE}
-    return Calibration("exact", CAMERA, PRISM, parameters, {}, (), "variance", 1.0, 2.0, (), 0, 0.0)
+    return exact_calibration(CAMERA, PRISM, parameters)
 
 
 def test_one_turn_looks_like_the_truth(picture: Picture, truth: NDArray[np.float32]) -> None:
@@ -92,7 +93,7 @@ def test_one_turn_looks_like_the_truth(picture: Picture, truth: NDArray[np.float
 
 
 def test_its_contrast_is_the_threshold(picture: Picture, truth: NDArray[np.float32]) -> None:
-    """Log intensity per unit of the map is the simulated sensor's ON threshold, 0.25."""
+    """One unit of the map is the simulated sensor's ON threshold, a log intensity of 0.25."""
     found, true = picture.log[picture.known], truth[picture.known]
     slope = float(np.cov(found, true)[0, 1] / np.var(found))
     assert slope == pytest.approx(0.25, abs=0.03)
@@ -113,7 +114,7 @@ def test_unequal_thresholds_are_found(texture: NDArray[np.uint8], truth: NDArray
 
 
 def test_nothing_is_claimed_where_nothing_fired() -> None:
-    """Half of the scene is blank; noise fires there all the same."""
+    """Half of the scene is blank, with noise events only."""
     picture = np.full((240, 320), 128, np.uint8)
     picture[:, :150] = (np.indices((240, 150)).sum(axis=0) // 5 % 2 * 180 + 40).astype(np.uint8)
     made = simulation(picture)
@@ -132,7 +133,7 @@ def test_nothing_is_claimed_where_nothing_fired() -> None:
 
 
 def test_noise_makes_nothing_known(texture: NDArray[np.uint8], truth: NDArray[np.float32], picture: Picture) -> None:
-    """20 random events a second of every pixel, a third of all."""
+    """Each pixel fires 20 random events per second, a third of all events."""
     noisy = simulation(texture, sensor=SensorModel(shot_noise_hz=20.0)).run()
     found = reconstruct(noisy, model=MODEL, start_us=START)
     assert found.known.mean() == pytest.approx(picture.known.mean(), abs=0.03)
@@ -146,7 +147,7 @@ def test_edge_fill_breaks_rather_than_bends(recording: Recording, truth: NDArray
     gap = ~found.known[:, 1:] & ~found.known[:, :-1]
 
     def evenness(of: Picture) -> float:
-        """Of the steps between neighbours in the gaps: mean over rms."""
+        """Return mean over rms of the steps between neighbours in the gaps."""
         step = np.abs(np.diff(of.log, axis=1))[gap]
         return float(step.mean() / np.sqrt(np.mean(step**2)))
 
@@ -189,7 +190,7 @@ def test_hot_pixels_are_those_of_a_percentile_filter(device: str) -> None:
     table = EventTable([events], np.zeros(count.shape, np.int32), device)
     table.exclude_hot_pixels()
     expected = count > 3.0 * typical + 5.0 * np.sqrt(typical) + 8.0
-    assert 50 < expected.sum() < (count > 40).sum() - 20  # some stand out, some do not
+    assert 50 < expected.sum() < (count > 40).sum() - 20  # some of the fast pixels are hot, some are not
     assert np.array_equal(table.tile_of.numpy() < 0, expected)
 
 
@@ -237,7 +238,7 @@ def test_while_the_camera_turns(texture: NDArray[np.uint8]) -> None:
 
 @pytest.mark.parametrize(("name", "expected"), [("shapes_rotation", 0.35), ("dynamic_rotation", 0.25)])
 def test_real_rotation_without_a_prism(data_dir: Path, name: str, expected: float) -> None:
-    """Residuals [thresholds]; the sign is that of the data's README."""
+    """``expected``: limit of the residual [thresholds]. The sign of the rotation is that of the data's README."""
     folder = data_dir / "text" / name
     real = open_recording(folder / "events.txt")
     width, height = real.events.size

@@ -1,4 +1,4 @@
-"""What a recording cannot tell is refused with the reason: encoders of a wrong scale, and events of no use."""
+"""Recordings that cannot be calibrated are refused with the reason: wrong encoder scales and useless events."""
 
 import math
 from collections.abc import Callable
@@ -10,14 +10,14 @@ from conftest import TRUE_PRISM
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.checks import check_pulses, check_texture
-from amiwarp.calib.photometric.acceptance import verdict
-from amiwarp.calib.prism_speed import turns_per_turn
-from amiwarp.calib.selection.trial import FARTHEST_PX, in_pixels
+from amiwarp.calib.photometric.acceptance import judge_optimum
+from amiwarp.calib.preparation import prepare
+from amiwarp.calib.prism_speed import encoder_turns_per_period
+from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, in_pixels
 from amiwarp.calib.sharpness.search import Settings
-from amiwarp.calib.single_model import prepare
 from amiwarp.cli.inputs import interval, number
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
@@ -39,7 +39,7 @@ def scaled(recording: Recording, factor: float) -> Recording:
 
 @pytest.mark.parametrize("factor", [0.98, 1.024])
 def test_a_wrong_scale_is_found_in_the_events(recording: Recording, factor: float) -> None:
-    """It was taken for a camera that turns slowly, or confirmed."""
+    """Not mistaken for a slowly rotating camera, and not confirmed."""
     with pytest.raises(AmiwarpError, match=r"a still camera explains the events.*counts_per_turn") as caught:
         calibrate(scaled(recording, factor), model="exact")
     assert float(str(caught.value).rpartition(" times ")[2]) == pytest.approx(factor, abs=0.002)
@@ -49,8 +49,8 @@ def test_a_wrong_scale_is_found_in_the_events(recording: Recording, factor: floa
 def test_a_wrong_scale_is_found_at_the_index_pulses(recording: Recording, factor: float) -> None:
     assert recording.encoder is not None
     true = recording.encoder
-    turns = np.arange(math.ceil(true.angle[0] / TURN), math.floor(true.angle[-1] / TURN) + 1)
-    pulses = np.interp(turns * TURN, true.angle, true.t).astype(np.int64)
+    turns = np.arange(math.ceil(true.angle[0] / TWO_PI), math.floor(true.angle[-1] / TWO_PI) + 1)
+    pulses = np.interp(turns * TWO_PI, true.angle, true.t).astype(np.int64)
     assert len(pulses) >= 3
     good = replace(recording, encoder=true.with_index(pulses))
     prepare(good, Settings())
@@ -84,10 +84,10 @@ def test_the_events_repeat_once_a_turn_of_a_good_encoder(recording: Recording) -
     for factor in (0.5, 0.98, 1.0, 1.024, 2.0):
         wrong = scaled(recording, factor)
         assert wrong.encoder is not None
-        assert turns_per_turn(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
+        assert encoder_turns_per_period(wrong, wrong.encoder) == pytest.approx(factor, rel=0.002)
 
 
-# -- events of no use
+# -- useless events
 
 
 def events(x: object, y: object, t: object, p: object) -> Events:
@@ -102,7 +102,7 @@ def scattered(n: int, width: int = WIDTH, height: int = HEIGHT, length_us: int =
 
 
 def flicker() -> Events:
-    """A still scene whose every eighth pixel fires at each of 40 flashes, ON and OFF in turn."""
+    """Every eighth pixel fires at each of 40 flashes, alternately ON and OFF; the scene is still."""
     at = np.arange(WIDTH * HEIGHT // 8) * 8
     flashes = np.repeat(np.arange(40), len(at))
     return events(np.tile(at % WIDTH, 40), np.tile(at // WIDTH, 40), flashes * 12_500, flashes % 2)
@@ -168,11 +168,11 @@ def test_a_motion_that_turns_all_out_of_view_is_refused() -> None:
 
 def test_words_for_numbers_that_mean_nothing() -> None:
     assert in_pixels(0.25) == "0.250 px"
-    assert in_pixels(27_431.659) == f"more than {FARTHEST_PX:g} px"
-    assert "over 1.5 px" in verdict(0.1, 0.1, 0.1, 3e5)[1]
-    assert "100 %" in verdict(1.7, 0.1, 0.1, 0.0)[1]
-    assert "explains the events better" in verdict(0.1, -0.02, 0.1, 0.0)[1]
-    assert "0.4 % of the residual more" in verdict(0.1, 0.004, 0.1, 0.0)[1]
+    assert in_pixels(27_431.659) == f"more than {LARGEST_MOTION_PX:g} px"
+    assert "over 1.5 px" in judge_optimum(0.1, rise=0.1, moved=0.1, next_step=3e5)[1]
+    assert "100 %" in judge_optimum(1.7, rise=0.1, moved=0.1, next_step=0.0)[1]
+    assert "explains the events better" in judge_optimum(0.1, rise=-0.02, moved=0.1, next_step=0.0)[1]
+    assert "0.4 % of the residual more" in judge_optimum(0.1, rise=0.004, moved=0.1, next_step=0.0)[1]
     worse = np.linspace(0.0, 1.0, 8)
     with pytest.raises(AmiwarpError, match="it is less sharp, or the same"):
         check_texture(worse, worse + 3.0, worse, "recording")

@@ -1,4 +1,4 @@
-"""Inputs that are no regular files, or unpack to more than memory holds, are refused at once."""
+"""Inputs that are not regular files, or unpack to more than the memory holds, are refused at once."""
 
 import json
 import os
@@ -15,8 +15,8 @@ from io_samples import SIZE, make_events, write_text
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import Format, open_recording, read_encoder_csv
+from amiwarp.io.regular_file import check_regular
 from amiwarp.io.text import read_calib
-from amiwarp.regular_file import check_regular
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.translator import open_pictures
 
@@ -123,8 +123,8 @@ def test_npz_of_other_compressions(tmp_path):
 
 
 def test_an_archive_that_unpacks_to_much_takes_little_memory(tmp_path, monkeypatch):
-    """Four arrays of 64 MiB in a quarter of a megabyte."""
-    monkeypatch.setattr("amiwarp.io.scan.KEEP_EVENTS", 0)
+    """An archive of a quarter of a megabyte holds four arrays of 64 MiB."""
+    monkeypatch.setattr("amiwarp.io.file_scan.KEEP_EVENTS", 0)
     path = npz(tmp_path / "a.npz", f"({1 << 23},)", bytes(1 << 26))
     assert path.stat().st_size < 1 << 20
     tracemalloc.start()
@@ -136,7 +136,7 @@ def test_an_archive_that_unpacks_to_much_takes_little_memory(tmp_path, monkeypat
 
 
 def bomb(path: Path, width: int, height: int) -> Path:
-    """A PNG of any declared size in a few bytes."""
+    """Write a PNG of a few bytes that declares any size."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -155,7 +155,7 @@ def test_pictures_of_any_declared_size(tmp_path, size):
 
 
 def test_pictures_that_would_run_a_program(tmp_path):
-    """Pillow hands EPS to Ghostscript."""
+    """Pillow would pass EPS files to Ghostscript, so they are refused."""
     (tmp_path / "a.eps").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n")
     with pytest.raises(AmiwarpError, match=r"a\.eps cannot be read as a picture"):
         read_picture(tmp_path / "a.eps")

@@ -31,11 +31,11 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.frames import MOST_IN_FLIGHT
-from amiwarp.viewer.hosts import HostNames, address, is_local, reachable, warning
+from amiwarp.viewer.host_names import HostNames, address, is_local, reachable, warning
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.message_filter import MOST_BYTES, MessageFilter
+from amiwarp.viewer.page_values import SETTABLE
 from amiwarp.viewer.serve import serve
-from amiwarp.viewer.values import SETTABLE
 
 pytest.importorskip("trame_vuetify")
 

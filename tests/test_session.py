@@ -1,5 +1,7 @@
-"""Live sessions, end to end: an emulated controller over a real serial port, an emulated camera over a socket, and what
-goes wrong with either; compared with offline compensation of what was recorded, and with the truth."""
+"""Live sessions with an emulated controller at a pseudo-terminal and an emulated camera at a socket, and their faults.
+
+Results are compared with offline compensation of the same recording and with the ground truth.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from rig_world import LONG_S, Counted, Wire, World, has_taken_in
 
-from amiwarp.calib.result import Calibration
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.compensation.streams import OUTSIDE, Compensated
 from amiwarp.errors import AmiwarpError
@@ -29,10 +31,10 @@ from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
 from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
-from amiwarp.live.stream.opening import open_source
 from amiwarp.live.stream.packets import Packet, make_packet
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.source_opening import open_source
 from amiwarp.live.stream.status import SessionStatus
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel
@@ -40,17 +42,15 @@ from amiwarp.optics.prism import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.4)
-KNOWN = Calibration(
-    "exact", CAMERA, PRISM, {"apex": PRISM.apex, "phase": 0.4}, {}, (), "variance", 0.0, 0.0, (), 0, 0.0
-)
+KNOWN = exact_calibration(CAMERA, PRISM, {"apex": PRISM.apex, "phase": 0.4})
 COUNTS = 65536
 SPEED_PX_US = 720 / 60e6 * math.tau * math.radians(2.0) * 0.52 * CAMERA.fx
-"""By which the prism moves an event while its clock is wrong by a microsecond."""
+"""Displacement of an event for each microsecond of clock error [px/us]."""
 TURNING = pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
 
 
 def points(n: int, seconds: float, seed: int = 0) -> Recording:
-    """Events of points behind a prism at 720 rpm."""
+    """Events of scene points behind a prism at 720 rpm."""
     rng = np.random.default_rng(seed)
     t = np.sort(rng.integers(0, round(seconds * 1e6), n))
     encoder = Encoder.constant_speed(720.0, -5000, round(seconds * 1e6) + 5000)
@@ -63,7 +63,7 @@ def points(n: int, seconds: float, seed: int = 0) -> Recording:
 
 @dataclass
 class Ran:
-    """What a session left."""
+    """Results of a session."""
 
     status: SessionStatus
     raw: Recording
@@ -73,17 +73,17 @@ class Ran:
 
 
 def world() -> Callable[[], int]:
-    """A clock that begins now [us]."""
+    """Return a clock that begins now [us]."""
     origin = monotonic_us()
     return lambda: monotonic_us() - origin
 
 
 def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran:
-    """The recording played by an emulated rig through a session, which writes both files."""
+    """Play the recording with an emulated rig through a session, which writes both files."""
+    from amiwarp.live.link.emulated_rotors import Played
     from amiwarp.live.link.emulator import Controller, EmulatedFault
     from amiwarp.live.link.link import Link
-    from amiwarp.live.link.rotors import Played
-    from amiwarp.live.link.terminal import PseudoTerminal
+    from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 
     assert recording.encoder is not None
     rotor = Played(recording.encoder)
@@ -126,7 +126,7 @@ def distance(first: np.ndarray, events: Events) -> np.ndarray:
 
 
 def check_all_there(found: Ran, recording: Recording) -> None:
-    """Every event once and in order, in either file."""
+    """Check that both files have every event once and in order."""
     sent = recording.events.slice(0, len(recording.events))
     raw = found.raw.events.slice(0, len(found.raw.events))
     for name in ("x", "y", "t", "p"):
@@ -138,7 +138,7 @@ def check_all_there(found: Ran, recording: Recording) -> None:
 
 @TURNING
 def test_live_is_offline_compensation_of_what_was_recorded(tmp_path: Path) -> None:
-    """Over a pseudo-terminal and a socket, clocks tied by pulses, the controller's clock wrapping on the way."""
+    """Over a pseudo-terminal and a socket. Sync pulses relate the clocks, and the controller's clock wraps."""
     recording = points(60_000, 1.5)
     found = ran(tmp_path, recording)
     check_all_there(found, recording)
@@ -148,7 +148,7 @@ def test_live_is_offline_compensation_of_what_was_recorded(tmp_path: Path) -> No
     apart = np.hypot(found.out.x - offline.x, found.out.y - offline.y)
     assert np.nanmax(apart[~found.guessed]) <= 1e-3
     assert not found.guessed.any()
-    # and the truth: counts of a 65536th turn, clocks to a few microseconds
+    # and with the truth: one count is 1/65536 turn, and clocks are accurate to a few microseconds
     sent = recording.events.slice(0, len(offline))
     assert recording.encoder is not None
     truth = compensate_events(sent, MODEL, recording.encoder)
@@ -173,7 +173,7 @@ def test_a_fault_loses_nothing_and_is_told(tmp_path: Path, fault: str, said: str
     sent = recording.events.slice(0, len(recording.events))
     assert recording.encoder is not None
     away = distance(compensate_events(sent, MODEL, recording.encoder), found.out)
-    # the camera begins a second after the world: well before and well after the fault all is right
+    # the camera starts one second after the clock; well before and after the fault, angles are right
     late = sent.t > 2_400_000 - 300_000
     early = sent.t < 1_400_000 - LEAD_US - 200_000
     assert np.count_nonzero(early) > 1000
@@ -181,13 +181,13 @@ def test_a_fault_loses_nothing_and_is_told(tmp_path: Path, fault: str, said: str
         assert not found.guessed[part].any()
         assert away[part].max() < 0.02
     assert found.status.clock is not None
-    assert found.status.clock.offset_std_us < 1.0  # by pulses, also after the controller began anew
+    assert found.status.clock.offset_std_us < 1.0  # synchronised by pulses, also after the controller's reset
 
 
 def test_an_emulated_camera_sees_the_pulses_of_a_controller_that_was_reset(tmp_path: Path) -> None:
-    """Which counts them from 0 again."""
+    """After a reset, the controller counts its pulses from 0."""
+    from amiwarp.live.link.emulated_rotors import Played
     from amiwarp.live.link.emulator import Controller, EmulatedFault
-    from amiwarp.live.link.rotors import Played
 
     recording, clock = points(1000, 0.1), World()
     assert recording.encoder is not None
@@ -208,8 +208,8 @@ def test_an_emulated_camera_sees_the_pulses_of_a_controller_that_was_reset(tmp_p
 
 @TURNING
 def test_an_emulated_camera_loses_nothing_where_its_client_is_slow(tmp_path: Path) -> None:
+    from amiwarp.live.link.emulated_rotors import Played
     from amiwarp.live.link.emulator import Controller
-    from amiwarp.live.link.rotors import Played
 
     recording, now_us = points(3_000_000, 0.3), world()
     assert recording.encoder is not None
@@ -268,7 +268,7 @@ def test_packets_out_of_order_come_out_sorted_and_once() -> None:
     recording = points(20_000, 0.5)
     given = packets_of(recording, 200)
     rng = np.random.default_rng(0)
-    order = np.argsort(np.arange(len(given)) + rng.uniform(0, 1.6, len(given)))  # late by a packet or two
+    order = np.argsort(np.arange(len(given)) + rng.uniform(0, 1.6, len(given)))  # up to two packets late
     shuffled = [given[k] for k in order]
     samples = [make_packet(0, encoder_t=p.encoder_t, encoder_angle=p.encoder_angle) for p in given]
     out, status = through(Made(samples + [make_packet(0, p.events) for p in shuffled]))
@@ -318,7 +318,7 @@ def test_a_sink_that_fails_ends_the_session_and_says_so() -> None:
 
 
 def test_a_taker_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> None:
-    """A disk that is full: the other file gets all that had come."""
+    """One disk is full. The other file gets all events received so far."""
 
     class Full:
         calls = 0
@@ -340,7 +340,7 @@ def test_a_taker_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> Non
 
 
 class Whole(Made):
-    """A source that knows when the queue has got all its packets."""
+    """A source that reports when it has passed on all its packets."""
 
     def __init__(self, packets: list[Packet]) -> None:
         super().__init__(packets)
@@ -352,7 +352,7 @@ class Whole(Made):
 
 
 def test_samples_that_wait_in_the_queue_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each packet's come after it; a sink was slow for longer than one waits for the encoder."""
+    """The samples of each packet follow it, and a sink is slow for longer than the wait for the encoder."""
     given = packets_of(points(100_000, 0.5))
     apart = [
         make_packet(0, p.events) if k % 2 == 0 else replace(p, events=Events.empty()) for p in given for k in (0, 1)
@@ -392,7 +392,7 @@ def test_a_source_that_does_not_let_go_is_left_behind() -> None:
 
 @pytest.mark.parametrize("offset", [0.0, 700.0])
 def test_the_clock_offset_of_a_file_is_applied_once(tmp_path: Path, offset: float) -> None:
-    """By the calibration's value, live as offline, of the file and of what was recorded of it."""
+    """The calibration's offset applies once, live and offline, to the file and to its live recording."""
     recording = points(20_000, 0.5)
     assert recording.encoder is not None
     late = Encoder(recording.encoder.t + 700, recording.encoder.angle, offset)
@@ -426,7 +426,7 @@ def test_a_slow_sink_makes_a_queue_drop_and_not_grow() -> None:
 
 
 def test_a_status_tells_rate_latency_coverage_and_sharpness(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a stream whose packets each come when their time is over, and are compensated 3 ms later."""
+    """Each packet arrives at the end of its time span and is compensated 3 ms later."""
     seen: list[SessionStatus] = []
     now_us = 0
     monkeypatch.setattr(session_module, "monotonic_us", lambda: now_us)
@@ -446,12 +446,12 @@ def test_a_status_tells_rate_latency_coverage_and_sharpness(monkeypatch: pytest.
     out: list[Compensated] = []
     session = Session(Paced([]), KNOWN, sinks=(out.append,))
     session.run(threading.Event(), lambda status: seen.append(replace(status)), every_s=0.1)
-    between = seen[1:-1]  # the first and the last are of shorter spans
+    between = seen[1:-1]  # the first and the last cover shorter intervals
     assert len(between) >= 25
     assert [s.rate_mev_s for s in between] == pytest.approx([400_000 / 3e6] * len(between), rel=0.1)
     assert {s.latency_ms for s in between} == {(3.0, 3.0)}
     assert {s.covered for s in between} == {1.0}
-    assert min(s.sharpness or 0.0 for s in between) > 2.0  # events at random have 1
+    assert min(s.sharpness or 0.0 for s in between) > 2.0  # random events have sharpness 1
     assert [s.rpm for s in between] == pytest.approx([720.0] * len(between), rel=1e-3)
     assert not any((p.flags & ~np.uint8(OUTSIDE)).any() for p in out)
 

@@ -1,4 +1,4 @@
-"""Sharpness against NumPy, and that each cost is the higher the sharper."""
+"""Sharpness measures against NumPy. Each is higher for sharper images."""
 
 import numpy as np
 import pytest

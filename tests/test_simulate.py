@@ -1,4 +1,4 @@
-"""The simulator against analytic answers, an independent walk in float64, and its own promises."""
+"""The simulator against analytic results, an independent float64 simulation, and its documented properties."""
 
 import itertools
 import math
@@ -29,20 +29,20 @@ from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulat
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)
 SLOPE = 4.0  # log intensity per unit of the picture plane
-FOV = math.radians(100.0)  # of the pictures below
+FOV = math.radians(100.0)  # field of view of the pictures below
 WIDE = Prism(0.0, 1.55)  # no deflection at all
 
 
 def ramp(width: int = 1200, height: int = 20) -> Scene:
-    """Log intensity SLOPE * x on the picture plane, x = tan(angle off the axis)."""
+    """A scene with log intensity SLOPE * x on the picture plane, x = tan(angle from the axis)."""
     half = math.tan(FOV / 2.0)
     x = (np.arange(width) + 0.5) / width * 2.0 * half - half
-    light = np.exp(SLOPE * (x + half)) * 0.5 - DARK  # which is added before the logarithm
+    light = np.exp(SLOPE * (x + half)) * 0.5 - DARK  # DARK is added before the logarithm
     return Scene.from_picture(np.tile(light, (height, 1)).astype(np.float32), fov=FOV, blur=0.0)
 
 
 def texture(seed: int = 1) -> NDArray[np.float32]:
-    """Blocks of random brightness."""
+    """A picture of blocks of random brightness."""
     return np.kron(np.random.default_rng(seed).uniform(0.05, 1.0, (24, 32)), np.ones((4, 4))).astype(np.float32)
 
 
@@ -71,16 +71,16 @@ def base(**changes: object) -> Simulation:
 
 
 def test_turning_camera_crosses_a_ramp_at_analytic_times(device: str) -> None:
-    """A log ramp seen at a steady yaw: pixel u sees SLOPE * tan(a + w t), and fires at each C of change."""
+    """With a log ramp and constant yaw, a pixel sees SLOPE * tan(a + w t) and fires at each change by the threshold."""
     rate, contrast, duration = 1.0, 0.2, 0.1
     recording = simulate(ramp(), CAMERA, WIDE, duration_s=duration, motion=0.0, device=device,
                          camera_motion=CameraMotion((0.0, rate, 0.0)), sensor=SensorModel.ideal(contrast))  # fmt: skip
     events, points = everything(recording)
     assert events.p.min() == 1
-    assert np.allclose(points, np.stack([events.x, events.y], 1), rtol=0, atol=1e-3)  # px; no prism, no shift
+    assert np.allclose(points, np.stack([events.x, events.y], 1), rtol=0, atol=1e-3)  # px; no shift without a prism
     for column in (0, 17, 40, 63):
         angle = math.atan((column - CAMERA.cx) / CAMERA.fx)
-        row = 24  # nearest to the axis
+        row = 24  # row nearest to the axis
         total = SLOPE * (math.tan(angle + rate * duration) - math.tan(angle))
         levels = np.arange(1, int(total / contrast) + 1) * contrast
         expected = (np.arctan(math.tan(angle) + levels / SLOPE) - angle) / rate * 1e6
@@ -92,7 +92,7 @@ def test_turning_camera_crosses_a_ramp_at_analytic_times(device: str) -> None:
 
 @pytest.mark.parametrize("flat_side", list(FlatSide))
 def test_prism_events_match_an_independent_walk(device: str, flat_side: FlatSide) -> None:
-    """One pixel after the other, in float64 and steps of 10 us, through the exact model of amiwarp.optics."""
+    """Reference: pixel by pixel, in float64 and steps of 10 us, through the exact model of amiwarp.optics."""
     prism = replace(PRISM, flat_side=flat_side)
     motion = PrismMotion(-900.0, phase=0.7, tilt=(0.02, -0.01))
     recording = simulate(
@@ -110,7 +110,7 @@ def test_prism_events_match_an_independent_walk(device: str, flat_side: FlatSide
         assert events.p[chosen].tolist() == [p for _, p in expected]
         np.testing.assert_allclose(
             events.t[chosen], [t for t, _ in expected], rtol=0, atol=60.0
-        )  # us, of a step of 1.3 ms
+        )  # us; the simulator's step is 1.3 ms
 
 
 def walk(t: NDArray[np.float64], level: NDArray[np.float64], contrast: float) -> list[tuple[float, int]]:
@@ -142,10 +142,10 @@ def test_nothing_moves_over_half_a_pixel_in_a_step(device: str) -> None:
             turned = camera.pixels_to_rays(after) @ Rotation.from_rotvec(rates * step).as_matrix().T
             moved.append(np.linalg.norm(camera.rays_to_pixels(turned) - before, axis=1))
         assert np.nanmax(moved) <= 0.5  # px
-        assert np.nanmax(moved) > 0.3  # and steps are no shorter than they must be
+        assert np.nanmax(moved) > 0.3  # steps are not shorter than necessary
 
 
-# -- the same every time
+# -- reproducibility
 
 
 def test_same_seed_same_events_other_seed_others(device: str) -> None:
@@ -170,14 +170,14 @@ def test_chunks_do_not_matter(device: str, chunk_us: int) -> None:
 def test_threads_and_room_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     many = base().run()
     monkeypatch.setattr("amiwarp.simulation.engine.CPU_RUN", 100)
-    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
+    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # too small, so the run is repeated
     monkeypatch.setattr(launching, "cpu_threads", lambda: 1)
     assert same(many, base().run())
 
 
 @pytest.mark.parametrize("flat_side", list(FlatSide))
 def test_looking_ahead_changes_nothing(monkeypatch: pytest.MonkeyPatch, flat_side: FlatSide) -> None:
-    """What a CPU does to be fast gives the events of the plain walk, past the picture's edges and in films, too."""
+    """The faster algorithm on CPUs gives the same events as the plain one, also outside the picture and in films."""
     simulation = base(
         scene=Scene(Film(texture(1), texture(2)), fov=math.radians(30.0)),
         prism=replace(PRISM, flat_side=flat_side),
@@ -192,7 +192,7 @@ def test_looking_ahead_changes_nothing(monkeypatch: pytest.MonkeyPatch, flat_sid
 
 
 class Film:
-    """Two pictures, 25 ms apart, in turn."""
+    """Two pictures that alternate every 25 ms."""
 
     interval_us = 25_000.0
 
@@ -213,7 +213,7 @@ def test_progress_rises_to_one() -> None:
     assert seen[-1] == 1.0
 
 
-# -- what pixels do wrong
+# -- imperfections of pixels
 
 
 def quiet_sensor(**changes: float) -> SensorModel:
@@ -221,7 +221,7 @@ def quiet_sensor(**changes: float) -> SensorModel:
 
 
 def still(sensor: SensorModel, duration: float, device: str) -> Events:
-    """Events of a flat picture, so of noise alone."""
+    """Return events of a uniform picture, which are noise only."""
     return everything(simulate(flat(), CAMERA, PRISM, duration_s=duration, sensor=sensor, device=device))[0]
 
 
@@ -235,7 +235,7 @@ def test_shot_noise_is_poisson_at_its_rate_and_of_both_signs(device: str) -> Non
     assert abs(len(events) - mean) < 5.0 * math.sqrt(mean)
     assert abs(events.p.mean() - 0.5) < 5.0 * 0.5 / math.sqrt(mean)
     counts = np.bincount(events.y.astype(int) * 64 + events.x, minlength=64 * 48)
-    # the variance of n Poisson counts of mean m has a standard deviation of about m sqrt(2 / n)
+    # standard deviation of the variance of n Poisson counts of mean m: about m sqrt(2 / n)
     assert abs(counts.var() - 10.0) < 5.0 * 10.0 * math.sqrt(2.0 / (64 * 48)) * 1.1
 
 
@@ -243,7 +243,7 @@ def test_leak_gives_on_events_at_its_rate_from_the_start(device: str) -> None:
     events = still(quiet_sensor(leak_hz=5.0), 0.5, device)
     assert events.p.min() == 1
     pixels = 64 * 48
-    # evenly spaced per pixel with a random start: 2 or 3 each, half and half
+    # evenly spaced with a random start: half of the pixels have 2 events, half have 3
     assert abs(len(events) - 2.5 * pixels) < 5.0 * 0.5 * math.sqrt(pixels)
     early = np.count_nonzero(events.t < 100_000)
     assert abs(early - 0.5 * pixels) < 5.0 * 0.5 * math.sqrt(pixels)
@@ -258,7 +258,7 @@ def test_hot_pixels_are_few_and_loud(device: str) -> None:
 
 
 def test_mismatch_spreads_the_thresholds(device: str) -> None:
-    """Intervals on a log ramp are proportional to a pixel's own threshold."""
+    """On a log ramp, intervals between events are proportional to the pixel's threshold."""
     sensor = quiet_sensor(contrast_on=0.05, mismatch=0.1)
     recording = simulate(ramp(), CAMERA, WIDE, duration_s=0.2, motion=0.0, sensor=sensor, device=device,
                          camera_motion=CameraMotion((0.0, 1.0, 0.0)))  # fmt: skip
@@ -284,7 +284,7 @@ def test_refractory_time_keeps_events_apart(device: str) -> None:
     order = np.lexsort((events.t, pixel))
     gaps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
     assert len(gaps) > 1000
-    assert gaps.min() >= 699  # us; a stamp is rounded
+    assert gaps.min() >= 699  # us; time stamps are rounded
     free, _ = everything(base(sensor=quiet_sensor(shot_noise_hz=200.0), device=device).run())
     assert len(free) > len(events)
 
@@ -296,7 +296,7 @@ def test_latency_delays_every_stamp_and_jitter_spreads_them(device: str) -> None
     np.testing.assert_array_equal(late.t, prompt.t[: len(late)] + 500)
     np.testing.assert_allclose(
         late_points, points[: len(late)], rtol=0, atol=2e-3
-    )  # px: of the crossing, not the stamp
+    )  # px; the truth refers to the crossing, not to the time stamp
     sensor = quiet_sensor(latency_us=500.0, latency_jitter_us=100.0)
     jittered, _ = everything(base(sensor=sensor, device=device).run())
     assert (np.diff(jittered.t) >= 0).all()
@@ -304,7 +304,7 @@ def test_latency_delays_every_stamp_and_jitter_spreads_them(device: str) -> None
         b - a for key in range(0, 64 * 48, 7) for a, b in zip(stamps(prompt, key), stamps(jittered, key), strict=False)
     ]
     assert abs(np.mean(delay) - 500.0) < 10.0  # us
-    assert 70.0 < np.std(delay) < 110.0  # us; order within a pixel takes a little off
+    assert 70.0 < np.std(delay) < 110.0  # us; keeping the order within a pixel lowers it slightly
 
 
 def stamps(events: Events, key: int) -> list[int]:
@@ -325,7 +325,7 @@ def test_truth_agrees_with_the_model_and_the_encoder(device: str, flat_side: Fla
     xy = np.stack([events.x, events.y], 1).astype(np.float64)
     found = ExactModel(CAMERA, prism, 1.1, (0.01, 0.02)).compensate_points(xy, recording.encoder.angle_at(events.t))
     assert np.sqrt(np.mean(np.sum((found - points) ** 2, axis=1))) < 0.01  # px
-    assert np.linalg.norm(xy - points, axis=1).mean() > 0.5  # px: there was something to take out
+    assert np.linalg.norm(xy - points, axis=1).mean() > 0.5  # px: the prism moves events
 
 
 def test_compensated_events_are_sharp(device: str) -> None:
@@ -388,7 +388,7 @@ def test_changing_camera_rates_are_integrated() -> None:
     rates = [[0.0, 0.0, 0.0, 0.0], [1.0, 2.0, -1.0, 3.0]]
     found = CameraMotion(rates).orientation(1.0)(np.array([0.0, 0.7]))
     expected = Rotation.identity()
-    for k in range(70000):  # 10 us each, rates at the middle
+    for k in range(70000):  # steps of 10 us, with the angular velocity at their middle
         expected = expected if k % 10 else expected * Rotation.from_rotvec(np.array([2, -1, 3]) * (k + 5) * 1e-5 * 1e-4)
     np.testing.assert_allclose(found, [np.eye(3), expected.as_matrix()], rtol=0, atol=1e-6)
     assert not CameraMotion(rates).constant
@@ -420,7 +420,7 @@ def test_ideal_encoder_is_exact_and_clock_offset_is_undone() -> None:
     encoder = replace(EncoderModel.ideal(), clock_offset_us=-2500.0).sample(motion, 500_000, seed=0)
     found = encoder.with_clock_offset(-2500.0).angle_at(t)
     np.testing.assert_allclose(found, motion.angle(t), rtol=0, atol=1e-9)  # rad
-    assert np.abs(encoder.angle_at(t) - motion.angle(t)).min() > 0.1  # rad: and it matters
+    assert np.abs(encoder.angle_at(t) - motion.angle(t)).min() > 0.1  # rad: the offset has an effect
 
 
 # -- pictures

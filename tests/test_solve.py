@@ -1,4 +1,4 @@
-"""Every NLopt algorithm by its own name, its budget, its failures."""
+"""All NLopt algorithms by name, their budgets and their failures."""
 
 import gc
 import weakref
@@ -6,7 +6,7 @@ import weakref
 import numpy as np
 import pytest
 
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.errors import AmiwarpError
 
 LOW, HIGH = np.array([-10.0, -10.0]), np.array([10.0, 10.0])
@@ -14,7 +14,7 @@ PEAK = np.array([3.1, -2.3])
 
 
 def hill(x: np.ndarray) -> float:
-    """A broad hill with ripples: several local maxima, one global at PEAK."""
+    """Return the height of a broad hill with ripples: several local maxima, the global one at PEAK."""
     d2 = float(np.sum((x - PEAK) ** 2))
     return float(np.exp(-d2 / 60.0) + 0.15 * np.exp(-d2 / 2.0) + 0.02 * np.cos(2.0 * d2**0.5))
 
@@ -24,7 +24,7 @@ def test_global_algorithms_find_the_hill(algorithm: str) -> None:
     stage = maximise(
         hill, algorithm, low=LOW, high=HIGH, start=np.array([-5.0, 5.0]), evaluations=2000, tolerance=0.01, seed=1
     )
-    assert np.linalg.norm(stage.x - PEAK) < 1.0  # px: near enough for the local stage
+    assert np.linalg.norm(stage.x - PEAK) < 1.0  # px: close enough for the local stage
     assert stage.evaluations <= 2000
     assert len(stage.scores) == len(stage.points) == stage.evaluations
     assert stage.score == stage.scores.max() == hill(stage.x)
@@ -82,7 +82,7 @@ def test_one_dimension_is_refused_where_nlopt_has_no_way() -> None:
 
 
 def test_what_the_score_holds_is_let_go() -> None:
-    """NLopt keeps what it has called; buffers of a search, or a whole page, must not stay with it."""
+    """NLopt keeps references to the functions it called. They must not keep a search's buffers alive."""
 
     class Held:
         def __call__(self, x: np.ndarray) -> float:

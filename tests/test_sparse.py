@@ -1,4 +1,4 @@
-"""Sparse pictures: a photometric stage that did nothing must not confirm an answer."""
+"""Sparse pictures: a photometric stage that could not move must not confirm an answer."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 
 
 def lines_and_dots(seed: int, lines: int, dots: int, contrast: int, width: float) -> np.ndarray:
-    """Short lines and dots on grey, a little brighter or darker; 360 × 480, 8 bit."""
+    """Short lines and dots on grey, slightly brighter or darker; shape (360, 480), 8 bit."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:360, :480].astype(float)
     picture = np.full((360, 480), 110.0)
@@ -37,7 +37,7 @@ def lines_and_dots(seed: int, lines: int, dots: int, contrast: int, width: float
 
 
 def sparse(seed: int, picture: np.ndarray, noise: float) -> Recording:
-    """0.4 s at 720 rpm, apex 1 deg, of which ``noise`` is the share of events at random."""
+    """0.4 s at 720 rpm, apex 1 deg. ``noise`` is the share of random events."""
     sensor = SensorModel(contrast_on=0.25, contrast_off=0.25, shot_noise_hz=0.0, leak_hz=0.0)
     motion = PrismMotion(720.0, phase=np.random.default_rng(seed + 77).uniform(-3, 3))
     made = Simulation(
@@ -52,7 +52,7 @@ def sparse(seed: int, picture: np.ndarray, noise: float) -> Recording:
 
 
 def error_px(recording: Recording) -> float | None:
-    """Of the answer; None if there is none, but an error that says that nothing confirms it."""
+    """Return the model error of the answer; None if calibration refuses because nothing confirms the answer."""
     try:
         found = calibrate(recording, model="exact")
     except AmiwarpError as error:
@@ -64,7 +64,7 @@ def error_px(recording: Recording) -> float | None:
 
 
 def test_a_map_that_follows_a_wrong_answer_confirms_nothing() -> None:
-    """The stage moved by 0.04 px, where no step helped, and confirmed what was 0.17 px off: the map remembered."""
+    """Formerly the stage moved 0.04 px and confirmed an answer 0.17 px off, because its map was not reset."""
     picture = lines_and_dots(156, lines=6, dots=1, contrast=35, width=0.6459406024252121)
     error = error_px(sparse(156, picture, noise=0.0))
     assert error is None or error < 0.1

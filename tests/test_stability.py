@@ -1,4 +1,4 @@
-"""Recordings of the atlas, what runs on them, and what calibration makes of those that it used to get wrong."""
+"""Recordings of the stability study, the methods that run on them, and calibration of formerly failing cases."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +22,7 @@ SMALL = Condition(width=160, height=120, turns=3.0)
 
 
 def error_px(condition: Condition, seed: int) -> tuple[float, str]:
-    """Of the exact model's answer, and what was said beside it."""
+    """Return the model error of the exact model's answer, and the warnings."""
     sample = make(condition, seed)
     found = calibrate(sample.recording)
     assert sample.recording.truth is not None
@@ -135,7 +135,7 @@ def test_what_cannot_be_determined_is_refused(changes: dict[str, float], reason:
 
 
 def test_the_papers_method_on_sparse_edges() -> None:
-    """It finds a circle there, from a start that the hardware tells; on dense texture its cost J prefers others."""
+    """It finds the circle from the phase that the hardware reports. On dense texture its cost J fails."""
     condition = replace(SMALL, scene=SceneKind.EDGES.value, fov_deg=30.0, apex_deg=2.0)
     sample = make(condition, 3)
     found = calibrate_as_paper(sample.recording, start=sample.hardware)

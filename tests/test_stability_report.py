@@ -1,4 +1,4 @@
-"""The atlas' output: rates and aims from cells, files, figures, and the command from one end to the other."""
+"""Output of the stability study: rates and aims from cells, files, figures, and the complete command."""
 
 import csv
 import json
@@ -66,7 +66,7 @@ def poor(hard: float) -> Found:
 
 
 def cells(make: dict[str, Callable[[float], Found]], *, seeds: int = 8, events: int = 100_000) -> list[Stored]:
-    """Every cell of :data:`AXES`, with results by how hard its value is."""
+    """All cells of :data:`AXES`. Results depend on the difficulty: the position on the axis, from 0 to 1."""
     hard: dict[Condition, float] = {}
     for axis in AXES:
         for k, condition in enumerate(axis.conditions()):
@@ -84,7 +84,7 @@ def atlas() -> Atlas:
 
 
 def test_rates_have_wilsons_interval() -> None:
-    """Against its formula: Wilson, "Probable inference", JASA 1927."""
+    """Compare with the formula of Wilson, "Probable inference", JASA 1927."""
     k, n, z = 7, 20, 1.959963984540054
     middle = (k / n + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(k / n * (1 - k / n) / n + z * z / (4 * n * n))
@@ -117,7 +117,7 @@ def test_summary_names_the_values_that_work(atlas: Atlas) -> None:
 
 def test_aims_look_inside_and_outside_of_the_sensible_region(atlas: Atlas) -> None:
     aims = atlas.aims
-    # noise up to a half and a dense texture are sensible; the harmless end belongs to both axes
+    # noise up to half and dense texture are in the sensible range; the harmless value is on both axes
     assert (aims.inside, aims.outside) == (Rate(24, 24), Rate(0, 24))
     assert (set(aims.holds.values()), aims.worse) == ({True}, ())
     few = aggregate(cells({"default": good, "paper": poor}, events=1000), AXES, METHODS, {}).aims
@@ -130,7 +130,7 @@ def test_aims_look_inside_and_outside_of_the_sensible_region(atlas: Atlas) -> No
 
 
 def test_worse_than_the_paper_is_told_by_the_same_recordings() -> None:
-    """McNemar's exact test: of 2^-n where all n that differ speak for the paper."""
+    """McNemar's exact test: the probability is 2^-n if all n differing recordings favour the paper's method."""
     swapped = aggregate(cells({"default": poor, "paper": good}), AXES, METHODS, {}).aims
     assert [(w.axis.name, w.value) for w in swapped.worse] == [
         ("background noise", 0.25), ("background noise", 0.5), ("scene", "one edge direction"),
@@ -173,7 +173,7 @@ def test_files_hold_every_spot(atlas: Atlas, tmp_path: Path) -> None:
 
 
 def test_nothing_to_report_is_an_error() -> None:
-    with pytest.raises(AmiwarpError, match="no cell of these axes"):
+    with pytest.raises(AmiwarpError, match=r"no results of single runs \(cells\) for these axes"):
         aggregate(cells({"gradient": good}), AXES, METHODS[:2], {})
 
 
@@ -188,7 +188,7 @@ def test_cells_are_loaded_and_those_of_other_versions_left_out(tmp_path: Path) -
     (tmp_path / "renamed_0.json").write_text("{")
     with pytest.raises(AmiwarpError, match=r"renamed_0\.json: damaged cell"):
         load(tmp_path)
-    with pytest.raises(AmiwarpError, match="no cells of this version"):
+    with pytest.raises(AmiwarpError, match=r"no results of single runs \(cells\) of this version"):
         load(tmp_path / "empty")
 
 
@@ -221,7 +221,7 @@ def test_figures_are_written_with_a_page_for_each_axis(atlas: Atlas, tmp_path: P
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
-    """The command has one axis with two small cameras."""
+    """Give the command a single axis with two small cameras."""
     axis = Axis("width", "width", (48, 64), "px", (("height", 48), ("turns", 1.0)))
     monkeypatch.setattr(amiwarp.studies.stability, "AXES", (axis,))
     monkeypatch.setattr(amiwarp.studies.stability, "quick_axes", lambda: (replace(axis, values=(48,)),))
@@ -256,7 +256,7 @@ def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:
     words = ("--out", tmp_path, "--device", "cpu")
     assert "unknown axis 'colour'; choose among width" in fails("--axes", "colour", *words)
     assert "unknown method 'magic'; choose among default, paper" in fails("--methods", "magic", *words)
-    assert "no cells of this version" in fails("--redraw", *words)
+    assert "no results of single runs (cells) of this version" in fails("--redraw", *words)
     (tmp_path / "file").write_text("")
     assert "cannot be made a folder" in fails("--out", tmp_path / "file" / "deeper", "--device", "cpu")
 

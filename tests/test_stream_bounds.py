@@ -23,9 +23,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
+from amiwarp.live.link.emulated_rotors import MOST_SEGMENTS, Motor, Played
 from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, EmulatedFault
-from amiwarp.live.link.rotors import MOST_SEGMENTS, Motor, Played
-from amiwarp.live.link.terminal import RETRY_S, PseudoTerminal
+from amiwarp.live.link.pseudo_terminal import RETRY_S, PseudoTerminal
 from amiwarp.live.link.updates import LinkUpdate
 from amiwarp.live.stream import phase_check as watch_module
 from amiwarp.live.stream import recent_events as ring_module
@@ -35,11 +35,11 @@ from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, encode_hello, make_packet
 from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.sockets import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
+from amiwarp.live.stream.socket_sinks import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
 from amiwarp.live.stream.speed_control import SpeedKeeper
 
 MOST = 1 << 20

@@ -20,6 +20,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from rig_world import LONG_S
 from typer.testing import CliRunner
 
@@ -58,11 +59,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_recording(path / "recording.h5", Recording(events, CAMERA, encoder, PRISM))
     save_recording(path / "still.h5", Recording(events, CAMERA))
     values = {"apex": PRISM.apex, "phase": 0.4}
-    Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(path / "c.json")
+    exact_calibration(CAMERA, PRISM, values).save(path / "c.json")
     return path
 
 
-PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.DRAIN_S = 120.0; "
+PATIENT = "import amiwarp.live.stream.socket_sinks as sockets; sockets.DRAIN_S = 120.0; "
 """Code placed before a command that serves packets: at the end it waits longer for slow receivers."""
 
 
@@ -254,9 +255,9 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
 
 def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The motor starts from rest. Random events exceed the allowed event rate, so the speed is reduced."""
+    from amiwarp.live.link.emulated_rotors import Motor
     from amiwarp.live.link.emulator import Controller
-    from amiwarp.live.link.rotors import Motor
-    from amiwarp.live.link.terminal import PseudoTerminal
+    from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 
     motor = Motor()
     monkeypatch.setattr("amiwarp.live.link.link.ANSWER_S", LONG_S)
@@ -316,7 +317,7 @@ def test_bad_input_is_one_line(
 
 def test_another_camera_is_refused(folder: Path, tmp_path: Path) -> None:
     values = {"apex": PRISM.apex, "phase": 0.4}
-    other = Calibration("exact", Camera.from_fov(32, 24, 1.0), PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+    other = exact_calibration(Camera.from_fov(32, 24, 1.0), PRISM, values)
     other.save(tmp_path / "other.json")
     done = CliRunner().invoke(
         app, ["live", str(folder / "recording.h5"), "--calibration", str(tmp_path / "other.json")]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from amiwarp.live.link.clocks import fit_to_round_trips
-from amiwarp.live.stream.clocking import CameraClock
+from amiwarp.live.stream.camera_clock import CameraClock
 
 OFFSET, DRIFT = 1_700_000_000_000_000, 40e-6
 

@@ -15,19 +15,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from test_stream_cli import start
 from typer.testing import CliRunner
 
-from amiwarp.calib.result import Calibration
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import open_recording
 from amiwarp.live.stream.connections import close_listener, listen
-from amiwarp.live.stream.opening import open_source
 from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
 from amiwarp.live.stream.recent_events import RecentEvents, followed
+from amiwarp.live.stream.source_opening import open_source
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -82,7 +82,7 @@ def sender(path: Path, *streams: bytes | Callable[[], bytes]) -> Iterator[str]:
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("known") / "c.json"
     values = {"apex": PRISM.apex, "phase": 0.4}
-    Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(path)
+    exact_calibration(CAMERA, PRISM, values).save(path)
     return path
 
 
@@ -246,7 +246,7 @@ def test_a_view_of_less_than_a_turn_says_how_it_ended(tmp_path: Path) -> None:
     with sender(tmp_path / "s", HELLO) as address:
         source = open_source(address)
         view = followed(source, None, RecentEvents(source), print)
-        with pytest.raises(AmiwarpError, match="no whole turn before the stream ended: it broke off"):
+        with pytest.raises(AmiwarpError, match="less than one full turn before the stream ended: it broke off"):
             view.__enter__()
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.streams import Compensated, Compensator
@@ -24,11 +25,11 @@ from amiwarp.events.recording import Recording
 from amiwarp.io import save_recording
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.live.stream.forward import Forward
-from amiwarp.live.stream.opening import open_source
+from amiwarp.live.stream.forwarding import Forward
 from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
+from amiwarp.live.stream.source_opening import open_source
 from amiwarp.live.stream.sources import FileSource
 from amiwarp.live.stream.speed_control import WINDOW_US, SpeedKeeper
 from amiwarp.optics.camera import Camera
@@ -48,7 +49,7 @@ def recording(texture: np.ndarray) -> Recording:
 def known(recording: Recording, away_deg: float) -> Calibration:
     assert recording.truth is not None
     values = {"apex": PRISM.apex, "phase": recording.truth.parameters["phase"] - math.radians(away_deg)}
-    return Calibration("exact", CAMERA, PRISM, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+    return exact_calibration(CAMERA, PRISM, values)
 
 
 def streamed(recording: Recording) -> EncoderStream:
@@ -243,7 +244,7 @@ def test_a_stream_without_a_turn_is_told(tmp_path: Path, recording: Recording) -
     save_recording(tmp_path / "r.h5", replace(recording, encoder=still, truth=None))
     source = open_source(str(tmp_path / "r.h5"), pace=None)
     with (
-        pytest.raises(AmiwarpError, match="no whole turn"),
+        pytest.raises(AmiwarpError, match="less than one full turn"),
         followed(source, None, RecentEvents(source), lambda _: None),
     ):
         raise AssertionError("followed")

@@ -1,4 +1,4 @@
-"""House rules that a machine can check: budgets of device code, lazy imports, public names, no cycles of imports.
+"""Rules for the code that a program can check: size of device code, lazy imports, public names, no import cycles.
 
 Which room may import which is a contract of import-linter in ``pyproject.toml``.
 """
@@ -22,7 +22,7 @@ PACKAGE = Path(__file__).parents[1] / "amiwarp"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 KERNEL_LINES, KERNEL_PARAMETERS, FILE_LINES = 25, 10, 400
 FUNC_LINES = 18
-"""Aim at 12. A bilinear vote and the steps of the pixel model are one thought each and would not gain by a cut."""
+"""Largest number of lines; aim at 12. A bilinear vote and the steps of the pixel model are one idea each."""
 HEAVY = (
     "warp",
     "nlopt",
@@ -45,7 +45,7 @@ def name_of(path: Path) -> str:
 
 
 def imports_of(path: Path) -> Iterator[str]:
-    """Modules that a file imports at run time, at any depth; ``if TYPE_CHECKING`` does not count."""
+    """Yield modules that a file imports at run time, in functions too; ``if TYPE_CHECKING`` does not count."""
     stack: list[ast.AST] = [ast.parse(path.read_text())]
     while stack:
         node = stack.pop()
@@ -61,7 +61,7 @@ def imports_of(path: Path) -> Iterator[str]:
 
 
 def device_code() -> Iterator[tuple[str, str, ast.FunctionDef]]:
-    """Every Warp kernel and device function: where, which of the two, and its syntax tree."""
+    """Yield the place, the decorator and the syntax tree of every Warp kernel and device function."""
     for path in MODULES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef):
@@ -72,7 +72,7 @@ def device_code() -> Iterator[tuple[str, str, ast.FunctionDef]]:
 
 
 def length(node: ast.FunctionDef) -> int:
-    """Lines of the body, docstring excluded."""
+    """Return the number of lines of the body without the docstring."""
     body = node.body[1:] if ast.get_docstring(node) is not None else node.body
     return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
 
@@ -138,7 +138,7 @@ def test_a_module_can_be_imported_under_another_name() -> None:
 
 
 def test_types_in_public_signatures_are_public() -> None:
-    """Of public functions, and of the fields, properties and methods of public classes."""
+    """Checks public functions, and fields, properties and methods of public classes."""
     missing = {
         f"{name} uses {used}"
         for name in amiwarp.__all__
@@ -178,13 +178,13 @@ def _names(annotations: list[ast.expr | None]) -> Iterator[str]:
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Modules of the package that a file imports at run time, at any depth."""
+    """Return the modules of the package that a file imports at run time, in functions too."""
     known = {name_of(other) for other in MODULES}
     return {module for module in imports_of(path) if module in known} - {name_of(path), "amiwarp"}
 
 
 def test_no_modules_import_each_other() -> None:
-    """No cycle at run time, imports inside functions included; packages that only re-export names do not count."""
+    """No cycles at run time, imports inside functions included. Packages that only re-export names do not count."""
     graph = {name_of(path): imported_modules(path) for path in MODULES if path.name != "__init__.py"}
     order = graphlib.TopologicalSorter({name: used & set(graph) for name, used in graph.items()})
     order.prepare()

@@ -1,4 +1,4 @@
-"""Events sorted by tile and voted in shared memory, against one pass over them."""
+"""Votes of events sorted by tile in shared memory, against a single pass over the events."""
 
 import math
 
@@ -26,12 +26,12 @@ CAMERA = Camera.from_fov(200, 150, math.radians(60))
 def events(n: int = 300_000) -> Events:
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, 200, n), rng.integers(0, 150, n)
-    x[: n // 2], y[: n // 2] = 33, 40  # more than a chunk holds
+    x[: n // 2], y[: n // 2] = 33, 40  # more events than a chunk holds
     return Events.from_arrays(x, y, np.sort(rng.integers(0, 250_000, n)), rng.integers(0, 2, n))
 
 
 def both(canvas: CanvasShape, models: list[Model], **kwargs: object) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Images of all models, by tiles and by one pass."""
+    """Return the images of all models, by tiles and by a single pass."""
     camera_rotation = kwargs.pop("camera_rotation", None)
     middle = None if camera_rotation is None else camera_rotation.middle_us
     uploaded = upload_events(events(), Encoder.constant_speed(720.0, 0, 250_000), "cuda:0", middle_us=middle, **kwargs)
@@ -54,13 +54,13 @@ def both(canvas: CanvasShape, models: list[Model], **kwargs: object) -> tuple[li
 @pytest.mark.parametrize("scale", [0.5, 1.0, 1.7])
 @pytest.mark.parametrize("apex_deg", [2.0, 12.0])
 def test_tiles_vote_as_one_pass_does(vote: Vote, scale: float, apex_deg: float) -> None:
-    """12 degrees: votes leave the tiles' windows; four candidates: more than share a block."""
+    """At 12 degrees votes leave the tiles' windows. Four candidates are more than one block takes."""
     canvas = CanvasShape(200, 150, 5, scale, per_polarity=True, vote=vote)
     models = [ExactModel(CAMERA, Prism(math.radians(apex_deg)), 0.3 * k) for k in range(4)]
     found, expected = both(canvas, models)
     for a, b in zip(found, expected, strict=True):
         assert a.sum(dtype=np.float64) == pytest.approx(b.sum(dtype=np.float64), abs=50)
-        # places differ by the GPU's quick division: a nearest vote may move to the next pixel, half the events as one
+        # the GPU's fast division may move a nearest vote to the next pixel; half of the events share a pixel
         moved = np.abs(a - b).sum()
         assert moved < (400_000 if vote is Vote.NEAREST else 3000)
         if vote is Vote.BILINEAR:

@@ -1,4 +1,4 @@
-"""Pictures in time: when events fire between pictures, and what can be read."""
+"""Sequences of pictures: times of the events between pictures, and inputs that can be read."""
 
 import math
 from pathlib import Path
@@ -18,13 +18,13 @@ from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.simulator import SensorModel
 from amiwarp.simulation.translator import open_pictures, translate, translation
 
-CLEAR = Prism(0.0, 1.5)  # bends nothing
+CLEAR = Prism(0.0, 1.5)  # no deflection
 WEDGE = Prism(math.radians(2.0), 1.55)
 IDEAL = SensorModel.ideal(0.25)
 
 
 def encode(light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Linear light to sRGB, 0 .. 1."""
+    """Convert linear light to sRGB, 0 .. 1."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
@@ -33,7 +33,7 @@ def events_of(recording: Recording) -> Events:
 
 
 def fading(folder: Path) -> Path:
-    """Five pictures at 100 a second whose log intensity is 0, 1, 0.5, 0.5, 1.5 above its lowest."""
+    """Five pictures at 100 per second with log intensities 0, 1, 0.5, 0.5 and 1.5 above the lowest."""
     levels = np.array([0.0, 1.0, 0.5, 0.5, 1.5]) + math.log(0.2)
     path = folder / "fade.npy"
     np.save(path, np.tile(encode(np.exp(levels) - DARK)[:, None, None], (1, 12, 16)).astype(np.float32))
@@ -44,7 +44,7 @@ def test_events_fire_where_log_intensity_crosses_between_pictures(tmp_path: Path
     recording = translate(fading(tmp_path), CLEAR, fps=100.0, sensor=SensorModel.ideal(0.24), device=device)
     events = events_of(recording)
     assert len(events) % (12 * 16) == 0
-    # reference 0: up to 0.24, 0.48, 0.72, 0.96; down to 0.72; up to 0.96, 1.2, 1.44
+    # crossings from reference 0: up at 0.24, 0.48, 0.72, 0.96; down at 0.72; up at 0.96, 1.2, 1.44
     expected = [(2400, 1), (4800, 1), (7200, 1), (9600, 1), (15600, 0), (34600, 1), (37000, 1), (39400, 1)]
     for x, y in ((0, 0), (7, 5), (15, 11)):
         chosen = (events.x == x) & (events.y == y)
@@ -70,7 +70,7 @@ def test_folder_takes_its_times_from_the_table(tmp_path: Path) -> None:
 
 
 def test_long_sequences_are_read_as_they_are_needed(tmp_path: Path) -> None:
-    """Blocks arrive while most pictures are still unread, and do not depend on how they are cut."""
+    """The first events arrive while most pictures are unread. The events do not depend on the size of blocks."""
     stack = np.random.default_rng(0).integers(0, 255, (60, 24, 32), np.uint8)
     np.save(tmp_path / "s.npy", stack)
     simulation = translation(tmp_path / "s.npy", WEDGE, fps=200.0, sensor=IDEAL)
@@ -104,8 +104,8 @@ def test_video_times_and_length(tmp_path: Path) -> None:
     assert [t for t, _ in slow.read()] == [200_000 * i for i in range(10)]
     assert slow.duration_us == pytest.approx(2_000_000)
     events = events_of(translate(tmp_path / "v.mp4", CLEAR, sensor=IDEAL))
-    assert events.p.min() == 1  # it only brightens
-    assert events.t.max() < 450_000  # the last picture stays
+    assert events.p.min() == 1  # brightness only increases
+    assert events.t.max() < 450_000  # the last picture does not change
 
 
 @pytest.mark.parametrize(

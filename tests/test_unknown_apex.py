@@ -1,4 +1,4 @@
-"""An index or a flat side without an apex: what nobody gave stays unknown, in the file, in info and for calibration."""
+"""An index or a flat side without an apex: the apex stays unknown in the file, in info and for calibration."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from amiwarp.cli.inputs import NominalPrismOptions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
-from amiwarp.io.attributes import prism_attributes, read_prism
+from amiwarp.io.camera_attributes import prism_attributes, read_prism
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.simulation.simulator import simulate
@@ -28,7 +28,7 @@ APEX, INDEX = math.radians(1.0), 1.55
 
 @pytest.fixture(scope="module")
 def bare(texture: np.ndarray) -> Recording:
-    """Events behind a prism of 1 deg, of which the recording says nothing."""
+    """Events behind a prism of 1 deg. The recording has no prism."""
     camera = Camera.from_fov(120, 90, math.radians(50))
     recording = simulate(texture, camera, Prism(APEX, INDEX), duration_s=0.2, seed=1)
     return replace(recording, prism=None, truth=None)
@@ -58,7 +58,7 @@ def test_options_over_what_is_known(known: Any, options: NominalPrismOptions, ex
 
 
 def test_convert_info_and_calibrate_with_an_index_alone(bare: Recording, tmp_path: Path) -> None:
-    """The apex of 2 deg that nobody gave used to be stored, and the prism of 1 deg to be refused for it."""
+    """Formerly an apex of 2 deg that nobody gave was stored, and the true prism of 1 deg was refused."""
     save_recording(tmp_path / "bare.h5", bare)
     converted = tmp_path / "indexed.h5"
     run("convert", tmp_path / "bare.h5", converted, "--index", INDEX)
@@ -72,7 +72,7 @@ def test_convert_info_and_calibrate_with_an_index_alone(bare: Recording, tmp_pat
     run("calibrate", converted, tmp_path / "c.json", "--model", "exact")
     found = Calibration.load(tmp_path / "c.json")
     away = Prism(found.parameters["apex"], INDEX).deflection - Prism(APEX, INDEX).deflection
-    assert abs(away) * found.camera.fx < 0.1  # px, of an orbit of 1.2 px
+    assert abs(away) * found.camera.fx < 0.1  # px, for an orbit with a radius of 1.2 px
     assert found.prism.index == INDEX
 
 

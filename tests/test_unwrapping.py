@@ -1,4 +1,4 @@
-"""Counters that wrap at their width, and angles that wrap at whole turns: found or refused, never silently wrong."""
+"""Counters that wrap at their width, and angles that wrap at whole turns: unwrapped or refused, never wrong."""
 
 import pickle
 from pathlib import Path
@@ -9,7 +9,7 @@ from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.unwrapping import UnwrapError
 from amiwarp.io import read_encoder_csv
 
@@ -29,17 +29,17 @@ def steady(rpm, counts_per_turn, *, n=3000, start=0):
 @pytest.mark.parametrize("rpm", [720.0, -720.0])
 @pytest.mark.parametrize("given_bits", [True, False])
 def test_a_counter_that_wraps_is_unwrapped(bits, signed, rpm, given_bits):
-    """At 1000 counts a turn no power of two is a whole number of turns: each wrap that is missed turns the prism."""
+    """At 1000 counts per turn no power of two is a whole number of turns, so a missed wrap gives a wrong angle."""
     t, count = steady(rpm, 1000, start=(2 ** (bits - 1) if signed else 0) + (5000 if rpm < 0 else -5000))
     shown = wrapped(count, bits, signed=signed)
     assert np.ptp(shown) > 0.9 * 2**bits
     encoder = Encoder.from_counts(t, shown, counts_per_turn=1000, counter_bits=bits if given_bits else None)
-    np.testing.assert_allclose(encoder.angle - encoder.angle[0], (count - count[0]) * TURN / 1000, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(encoder.angle - encoder.angle[0], (count - count[0]) * TWO_PI / 1000, rtol=0, atol=1e-6)
 
 
 @st.composite
 def rotations(draw):
-    """Times [us], the true running count, and counts per turn: steady, swinging or speeding up, either way."""
+    """Times [us], true counts and counts per turn of a steady, swinging or accelerating rotation, either way."""
     seed = draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
     n = draw(st.sampled_from([2, 3, 5, 12, 100, 400]))
@@ -67,7 +67,7 @@ def rotations(draw):
 @settings(deadline=None, max_examples=500)
 @given(rotations(), st.integers(8, 32), st.booleans(), st.integers(0, 2**32), st.booleans())
 def test_counts_are_right_or_refused(rotation, bits, signed, start, given_bits):
-    """Steps under half of the counter's period: with its width the true count, without it that or an error."""
+    """Steps are under half of the counter's period. With its width counts are right; without it right or refused."""
     t, progress, per_turn, way, kind = rotation
     count = start + way * np.round(progress * min(2**bits, per_turn)).astype(np.int64)
     assume(np.abs(np.diff(count)).max() < 0.45 * (2**bits if given_bits else min(2**bits, per_turn)))
@@ -78,8 +78,8 @@ def test_counts_are_right_or_refused(rotation, bits, signed, start, given_bits):
         event(f"refused, {kind}, {'width given' if given_bits else 'width sought'}")
         return
     event(f"found, {kind}, {'width given' if given_bits else 'width sought'}")
-    true = (count - count[0]) * (TURN / per_turn)
-    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TURN / per_turn
+    true = (count - count[0]) * (TWO_PI / per_turn)
+    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TWO_PI / per_turn
 
 
 @settings(deadline=None, max_examples=300)
@@ -92,13 +92,13 @@ def test_counters_that_start_anew_each_turn(rotation, start, bits):
         encoder = Encoder.from_counts(t, count % per_turn, counts_per_turn=per_turn, counter_bits=bits)
     except UnwrapError:
         return
-    true = (count - count[0]) * (TURN / per_turn)
-    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TURN / per_turn
+    true = (count - count[0]) * (TWO_PI / per_turn)
+    assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TWO_PI / per_turn
 
 
 @pytest.mark.parametrize("bits", [8, 16, 24, 32])
 def test_a_steady_rotation_is_never_refused(bits):
-    """The wrap of a steady rotation tells the width: found for every width, not only for those that are given."""
+    """A wrap in a steady rotation reveals the width of the counter, for every width."""
     t, count = steady(600.0, 1000, n=800, start=2**bits - 1500)
     encoder = Encoder.from_counts(t, wrapped(count, bits), counts_per_turn=1000)
     assert encoder.rpm == pytest.approx(600.0, abs=0.2)
@@ -133,31 +133,31 @@ def test_a_gap_longer_than_a_counter_lasts_is_refused():
 
 
 def test_lost_counts_and_a_stop_are_no_wraps():
-    """A counter that runs on may lose counts, or stand for a while: its index pulses tell, it is not refused."""
+    """A counter that does not wrap may lose counts or pause. Index pulses show that, and the log is not refused."""
     t, count = steady(720.0, 1000)
     lost = count - np.where(t > 1_000_000, 250, 0)
-    assert Encoder.from_counts(t, lost, counts_per_turn=1000).angle[-1] == pytest.approx(lost[-1] * TURN / 1000)
+    assert Encoder.from_counts(t, lost, counts_per_turn=1000).angle[-1] == pytest.approx(lost[-1] * TWO_PI / 1000)
     stood = np.where(t < 1_000_000, 0, count - 12_000)
-    assert Encoder.from_counts(t, stood, counts_per_turn=1000).angle[-1] == pytest.approx(stood[-1] * TURN / 1000)
+    assert Encoder.from_counts(t, stood, counts_per_turn=1000).angle[-1] == pytest.approx(stood[-1] * TWO_PI / 1000)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 9, 32])
 def test_angles_that_wrap_at_whole_turns(turns):
     t = np.arange(3000) * 1000
-    angle = TURN * 0.012 * np.arange(3000) + 0.3
-    encoder = Encoder.from_angles(t, angle % (turns * TURN))
+    angle = TWO_PI * 0.012 * np.arange(3000) + 0.3
+    encoder = Encoder.from_angles(t, angle % (turns * TWO_PI))
     np.testing.assert_allclose(encoder.angle - encoder.angle[0], angle - angle[0], rtol=0, atol=1e-6)
 
 
 def test_angles_that_wrap_elsewhere_are_refused():
     t = np.arange(3000) * 1000
-    angle = TURN * 0.012 * np.arange(3000)
+    angle = TWO_PI * 0.012 * np.arange(3000)
     with pytest.raises(AmiwarpError, match=r"-3,272.* where about 4\.32"):
         Encoder.from_angles(t, angle % np.radians(3276.7))
     with pytest.raises(AmiwarpError, match="angle wraps by about 1,00"):
         Encoder.from_angles(t, angle % np.radians(1000.0))
     with pytest.raises(AmiwarpError, match=r"where about 4\.32 was expected"):
-        Encoder.from_angles(t, np.where(t == 1_700_000, angle - 2.0, angle) % TURN)
+        Encoder.from_angles(t, np.where(t == 1_700_000, angle - 2.0, angle) % TWO_PI)
 
 
 def test_a_log_names_its_line(tmp_path: Path):

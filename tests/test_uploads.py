@@ -1,4 +1,4 @@
-"""Events on a device: their angles against the encoder in float64, and folding, which loses no event."""
+"""Events on a device: angles against the encoder in float64, and folding, which keeps the number of events."""
 
 import math
 
@@ -16,7 +16,7 @@ from amiwarp.optics.prism import Prism
 
 
 def still_scene(n: int, points: int = 200, seed: int = 0) -> Events:
-    """Events of a few pixels, again at every turn; the last pixel fires far too often."""
+    """Events of a few pixels that repeat every turn. The last pixel fires far too often."""
     rng = np.random.default_rng(seed)
     which = rng.integers(0, points, n)
     which[: n // 4] = points - 1
@@ -59,7 +59,7 @@ def test_points_stand_for_all_events_of_their_bin(device: str) -> None:
     folded = upload_events(events, encoder, device, fold=64)
     weight = folded.arrays.weight.numpy()[: folded.count].astype(int)
     assert weight.sum() == len(events)
-    assert weight.max() == LARGEST_WEIGHT  # of the pixel that fires too often: its points come more than once
+    assert weight.max() == LARGEST_WEIGHT  # the pixel that fires too often has several points of largest weight
     x, y = (a.numpy()[: folded.count].astype(int) for a in (folded.arrays.x, folded.arrays.y))
     expected = np.bincount(events.y.astype(int) * 64 + events.x, minlength=64 * 48)
     np.testing.assert_array_equal(np.bincount(y * 64 + x, weight, minlength=64 * 48), expected)

@@ -28,7 +28,7 @@ from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import jobs
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.layout import KEYS
-from amiwarp.viewer.values import SETTABLE
+from amiwarp.viewer.page_values import SETTABLE
 
 pytest.importorskip("trame_vuetify")
 APEX_DEG, NOMINAL_DEG, RPM = 1.0, 1.2, 720.0

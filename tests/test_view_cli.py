@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from PIL import Image
 from typer.testing import CliRunner
 
 import amiwarp
-from amiwarp.calib import Calibration
 from amiwarp.cli.app import app
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics.camera import Camera
@@ -36,7 +36,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> Path
     save_recording(folder / "recording.h5", recording)
     assert recording.truth is not None
     found = {"apex": prism.apex, "phase": recording.truth.parameters["phase"]}
-    Calibration("exact", camera, prism, found, {}, (), "variance", 1.0, 2.0, (), 10, 0.0).save(folder / "c.json")
+    exact_calibration(camera, prism, found).save(folder / "c.json")
     return folder
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sample import exact_calibration
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from amiwarp.calib import Calibration
-from amiwarp.calib.bad_pixels import Masked
+from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.calib.parameters import build_model
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
@@ -26,9 +27,9 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.colouring import colours_of, residual
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection
-from amiwarp.viewer.scene import Look, Scene
 from amiwarp.viewer.timeline import event_rate, read_span
 
 TRUE = Prism(math.radians(1.0))
@@ -60,7 +61,7 @@ def without_encoder(recording: Recording) -> Recording:
 def calibration_of(recording: Recording, **parameters: float) -> Calibration:
     assert recording.camera is not None
     values = {"apex": TRUE.apex, "phase": 0.2, **parameters}
-    return Calibration("exact", recording.camera, TRUE, values, {}, (), "variance", 1.0, 2.0, (), 10, 0.0)
+    return exact_calibration(recording.camera, TRUE, values)
 
 
 class Counted:
@@ -92,7 +93,7 @@ def test_every_source_finds_a_moment(million: MemoryEvents, tmp_path: Path) -> N
     text = "\n".join(f"{t * 1e-6:.6f} {x} {y} {p}" for t, x, y, p in zip(some.t, some.x, some.y, some.p, strict=True))
     (tmp_path / "events.txt").write_text(text + "\n")
     save_recording(tmp_path / "events.h5", Recording(MemoryEvents(some, 4, 4)))
-    hidden = Masked(MemoryEvents(some, 4, 4), np.zeros((4, 4), np.bool_))
+    hidden = MaskedEventSource(MemoryEvents(some, 4, 4), np.zeros((4, 4), np.bool_))
     sources = [open_recording(tmp_path / name).events for name in ("events.txt", "events.h5")] + [hidden]
     for moment in (-5, int(some.t[0]), 3_456, int(some.t[-1]), 10_000_000):
         assert {source.find(moment) for source in sources} == {int(np.searchsorted(some.t, moment))}

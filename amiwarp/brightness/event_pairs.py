@@ -14,8 +14,8 @@ import warp as wp
 from amiwarp.events.device_encoder import encoder_params
 from amiwarp.kernels import pairs as kernels
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.map_positions import find_places
 from amiwarp.kernels.photometric import BLOCK, HELD, Pairs
-from amiwarp.kernels.places import find_places
 from amiwarp.optics.models import model_camera
 
 if TYPE_CHECKING:

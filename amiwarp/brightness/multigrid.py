@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels import multilevel as k
-from amiwarp.kernels.descent import gather
+from amiwarp.kernels.conjugate_gradients import gather
 
 COARSEST = 6
 """Smallest number of rows or columns of a grid."""

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.kernels.descent import CPU_WIDTH
+from amiwarp.kernels.conjugate_gradients import CPU_WIDTH
 from amiwarp.kernels.photometric import HELD
-from amiwarp.kernels.replay import BLOCK_DIM, Program
-from amiwarp.kernels.slopes import add_clusters, magnitudes, sum_costs, sum_products
+from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
+from amiwarp.kernels.residual_slopes import add_clusters, magnitudes, sum_costs, sum_products
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

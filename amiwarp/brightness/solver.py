@@ -17,16 +17,16 @@ import warp as wp
 from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.brightness.residuals import CHUNKS, Residuals
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import descent as cg
+from amiwarp.kernels import conjugate_gradients as cg
+from amiwarp.kernels import map_positions as places
 from amiwarp.kernels import photometric as kernels
-from amiwarp.kernels import places
-from amiwarp.kernels.descent import dot, gather, gather_diagonal
+from amiwarp.kernels.conjugate_gradients import dot, gather, gather_diagonal
 from amiwarp.kernels.launch import launch, slice_count
+from amiwarp.kernels.map_prior import EXTRA, Prior, link
 from amiwarp.kernels.pairs import keep_nodes
 from amiwarp.kernels.photometric import BLOCK, Geometry, add_diagonal, subtract, weigh
-from amiwarp.kernels.prior import EXTRA, Prior, link
-from amiwarp.kernels.replay import BLOCK_DIM, Program
-from amiwarp.kernels.slopes import slope_between
+from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
+from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.models import model_camera
@@ -75,7 +75,8 @@ class Tiles:
 class BrightnessMap:
     """Brightness map for a set of pairs, and its solver; owns its buffers. A solve starts from the last map.
 
-    Repeated launches are recorded once (:class:`amiwarp.kernels.replay.Program`). Nothing is read back in between.
+    Repeated launches are recorded once (:class:`amiwarp.kernels.recorded_launches.Program`). Nothing is read back in
+    between.
     """
 
     def __init__(
@@ -185,9 +186,10 @@ class BrightnessMap:
         return self._new_geometry(), self._new_geometry()
 
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float) -> Any:
-        """Return the slope of the residuals for a fixed map: a difference quotient of two parameter sets.
+        """Return the derivative of each pair's residual along a line in parameter space, for a fixed map.
 
-        ``plus`` and ``minus``: arguments of :meth:`place`, ``width`` apart. The positions of the pairs do not change.
+        It is the change of the residual from the parameters ``minus`` to ``plus``, divided by their distance ``width``.
+        Both are keyword arguments of :meth:`place`. The positions that :meth:`place` stored remain unchanged.
         """
         for side, at in zip(self._sides, (plus, minus), strict=True):
             self._place(at["model"], at["drift"], at["camera_rotation"], side)
@@ -349,9 +351,9 @@ class _ConjugateGradients:
     def _add_step(self, program: Any) -> None:
         of = self._map
         if of._grids is None:
-            self._add(program, cg.turn, [], [of._u, of._dots])
+            self._add(program, cg.update_search_direction, [], [of._u, of._dots])
         else:
-            self._add(program, cg.turn_to, [of._z], [of._u, of._dots])
+            self._add(program, cg.update_search_direction_with, [of._z], [of._u, of._dots])
         inputs = [*of._equations, of._u.direction]
         if of.device.is_cpu:
             blocks = of.pairs.arrays.stride // int(kernels.BLOCK)

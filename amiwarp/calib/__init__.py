@@ -1,4 +1,4 @@
-"""Calibration: the prism's parameters from the recording itself."""
+"""Calibration: find the prism's parameters in the recording itself."""
 
 from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.result import Calibration

@@ -1,8 +1,9 @@
-"""Pixels whose events have nothing to do with the prism, for calibration to leave out: hot ones, and flickering ones.
+"""Bad pixels, which calibration masks: hot pixels, and pixels that see a flickering lamp.
 
-An edge under a turning prism fires at the same angles every turn. So the events of a pixel, folded over the angle with
-signs that change from turn to turn, cancel; those of a hot pixel, which fires at random, do not. A flickering lamp
-makes a whole patch of pixels rise and fall together, at a frequency that stands alone in the patch's spectrum.
+Behind a rotating prism an edge triggers events at the same prism angles in every turn. If the events of a pixel are
+summed over turns with alternating signs, they cancel. Those of a hot pixel, which fires at random, do not. A flickering
+lamp makes the event rates of many neighbouring pixels oscillate together, at a frequency that appears as an isolated
+line in their spectrum.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.events.encoder import TURN
+from amiwarp.events.encoder import TWO_PI
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,111 +25,131 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events, EventSource
 
 MOST_TURNS, LEAST_TURNS, MOST_EVENTS = 8, 2, 2_500_000
-"""Of the stretch of a recording that is looked at: more show slower hot pixels, and cost time."""
+"""Limits of the analysed part of a recording. A longer part reveals slower hot pixels, but costs time."""
 BINS = 8
-"""Of the angle, per turn."""
+"""Number of angle bins per turn."""
 HARMONICS = 2
-"""Of the angle, that the folded events are measured by: low ones, which an edge that comes a little late cancels in."""
+"""Number of harmonics of the angle that measure the folded events. Low ones tolerate small delays of an edge."""
 BLOCKS = 4
-"""Spans of turns whose events are folded apart: more make the measure less a matter of chance, and cost time."""
-AROUND = 2
-"""Pixels each way with which a pixel is compared."""
+"""Number of spans of turns that are folded separately. More reduce the noise of the measure, but cost time."""
+NEIGHBOURS = 2
+"""Half width of the square of pixels with which a pixel is compared [px]."""
 LEAST_LOW = 19
-"""So many of the 24 around must be too low for what a pixel fires: a corner or a thin line is not alone."""
+"""Number of the 24 neighbours that must count far less than a hot pixel: corners and thin lines have fewer."""
 CELL = 16
-"""Side of the cells in which a lamp is sought [px]."""
+"""Side of the cells in which flicker is detected [px]."""
 BIN_US = 1000
-"""Of time, in which a lamp is sought [us]: up to 500 Hz."""
+"""Time bin for the detection of flicker [us]: it resolves up to 500 Hz."""
 LONGEST_US = 1_000_000
-"""So much of the events, in their middle, is looked at for a lamp."""
+"""Duration from the middle of the events that is searched for flicker [us]."""
 SLOWEST_HZ = 40.0
-"""Slower changes are not told from the scene's own."""
+"""Lowest flicker frequency [Hz]. Slower changes cannot be distinguished from those of the scene."""
 LAMP_CYCLES = 6
-"""Fewer say nothing of a frequency."""
+"""Smallest number of cycles that determine a frequency."""
 LEAST_SHARE = 0.3
-"""Of a cell's, or a pixel's, events that rise and fall together with the lamp; texture alone reaches 0.2."""
+"""Smallest share of a cell's or a pixel's events that follow the lamp. Texture alone reaches 0.2."""
 LEAST_RATIO = 4.0
-"""Of the power at the lamp's frequency to any within :data:`NEAR_TURNS`; texture alone reaches 3."""
+"""Smallest ratio of the lamp's power to that of nearby frequencies, see :data:`NEAR_TURNS`. Texture alone reaches 3."""
 NEAR_TURNS = 2.6
-"""Frequencies compared with, as multiples of the prism's: its own harmonics are among them."""
+"""Range of nearby frequencies, in multiples of the prism's frequency, so that it contains the prism's harmonics."""
 FEWEST_EVENTS = 100
-"""Of a cell whose spectrum is believed."""
+"""Smallest number of events for a cell's spectrum."""
 LEAST_SIGMA = 4.0
-"""By which the events about a pixel rise and fall together more than chance makes them."""
+"""Smallest amplitude of a pixel's oscillation, in standard deviations of random events."""
 MOST_LAMPS = 3
-"""Of different frequencies."""
+"""Largest number of flicker frequencies."""
 SMOOTHING = 5
-"""Side of the square of pixels that are asked together whether they flicker."""
+"""Side of the square of pixels over which the oscillation is summed [px]."""
 
 
 @dataclass(frozen=True, slots=True)
-class StrangeSummary:
-    """How many pixels were found, for a warning."""
+class BadPixelSummary:
+    """Numbers of bad pixels. As text, a warning for the user."""
 
     hot: int
-    """Pixels that fire at random."""
+    """Number of hot pixels, which fire at random."""
     flickering: int
-    """Pixels that see a lamp flicker."""
+    """Number of pixels that see a flickering lamp."""
     lamps_hz: tuple[float, ...]
-    """Frequencies at which they do, the strongest first."""
+    """Flicker frequencies, the strongest first [Hz]."""
     share: float
-    """Of the events that lie on either."""
+    """Share of the events on bad pixels."""
 
     def __str__(self) -> str:
-        """``12 hot pixels and 3400 that flicker at 100 Hz left out, 41 % of the events``."""
-        what = []
+        """Return, for example, ``12 hot pixels and 3400 that flicker at 100 Hz left out, 41 % of the events``."""
+        kinds = []
         if self.hot:
-            what.append(f"{self.hot} hot pixel{'s' if self.hot > 1 else ''}")
+            kinds.append(f"{self.hot} hot pixel{'s' if self.hot > 1 else ''}")
         if self.flickering:
             at = " and ".join(f"{hz:.0f}" for hz in self.lamps_hz)
-            what.append(f"{self.flickering} that flicker at {at} Hz")
-        return f"{' and '.join(what)} left out, {100.0 * self.share:.0f} % of the events" if what else ""
+            kinds.append(f"{self.flickering} that flicker at {at} Hz")
+        return f"{' and '.join(kinds)} left out, {100.0 * self.share:.0f} % of the events" if kinds else ""
 
 
 def stretch(source: EventSource, encoder: Encoder) -> Events:
-    """Events of some whole turns in the middle of a recording, all of them: thinned, they no longer repeat."""
+    """Return all events of some whole turns in the middle of a recording. Thinned events would not repeat by turn."""
     first, whole = source.t_first, source.t_last + 1 - source.t_first
     turn = 60e6 / max(abs(encoder.rpm), 1e-6)
     turns = min(max(MOST_EVENTS * whole / (len(source) * turn), LEAST_TURNS), MOST_TURNS)
-    # two turns may hold more than asked for, but a prism that hardly turns must not load a whole file
+    # two turns may hold more than MOST_EVENTS, but turns of a very slow prism must not load a whole file
     most = min(whole, 4.0 * MOST_EVENTS * whole / len(source))
     length = math.ceil(min((math.floor(turns) + 0.05) * turn, most))
     start = first + (whole - length) // 2
     return source.between(start, start + length)
 
 
-def strange_pixels(events: Events, encoder: Encoder, size: tuple[int, int]) -> tuple[NDArray[np.bool_], StrangeSummary]:
-    """Pixels to leave out, True, shape (height, width), and how many of which kind.
+def strange_pixels(
+    events: Events, encoder: Encoder, size: tuple[int, int]
+) -> tuple[NDArray[np.bool_], BadPixelSummary]:
+    """Find hot and flickering pixels.
 
-    ``events`` are a sensor's (uint16), in order of time, and the ``encoder`` covers them; ``size`` is the sensor's
-    (width, height) [px]. All that fired for some turns (see :func:`stretch`) say more than a thinned selection; under
-    two turns, or while the camera turns fast, only rates can tell that a pixel is hot.
+    Hot pixels are found by their event rate and, from two turns on, by events that do not repeat from turn to turn. The
+    second test fails while the camera rotates fast.
+
+    Parameters
+    ----------
+    events : Events
+        A sensor's events (uint16) in the order of time. Use all events of some turns, see :func:`stretch`; thinned
+        events reveal less.
+    encoder : Encoder
+        Encoder that covers the events.
+    size : (int, int)
+        Width and height of the sensor [px].
+
+    Returns
+    -------
+    mask : ndarray
+        True for bad pixels, shape ``(height, width)``.
+    summary : BadPixelSummary
+        Numbers of bad pixels.
     """
     width, height = size
     pixel = events.y.astype(np.int32) * np.int32(width) + events.x
     count = np.bincount(pixel, minlength=width * height)
-    hot = stands_out(count.reshape(height, width).astype(np.float64))
-    unlocked = unlocked_counts(events, pixel, encoder, size)
-    if unlocked is not None:
-        hot |= stands_out(unlocked)
+    hot = outliers(count.reshape(height, width).astype(np.float64))
+    unrepeated = unrepeated_counts(events, pixel, encoder, size)
+    if unrepeated is not None:
+        hot |= outliers(unrepeated)
     flickering, lamps = _flickering(events, pixel, encoder, hot)
     mask = hot | flickering
     left_out = int(count[mask.ravel()].sum())
     share = left_out / max(len(events), 1)
-    return mask, StrangeSummary(int((hot & ~flickering).sum()), int(flickering.sum()), lamps, share)
+    return mask, BadPixelSummary(int((hot & ~flickering).sum()), int(flickering.sum()), lamps, share)
 
 
-def keep(events: Events, mask: NDArray[np.bool_]) -> Events:
-    """Events of the pixels that ``mask``, shape (height, width), does not leave out; as they are if it leaves none."""
+def without_pixels(events: Events, mask: NDArray[np.bool_]) -> Events:
+    """Return the events outside the masked pixels; ``mask`` is True for masked ones, shape (height, width)."""
     return events[~mask[events.y, events.x]] if mask.any() else events
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Masked:
-    """A source without the events of some pixels, left out as they are read; ``len`` counts them still."""
+class MaskedEventSource:
+    """Event source that drops the events of masked pixels on reading. ``len`` still counts them."""
 
     source: EventSource
+    """The source to read from."""
     mask: NDArray[np.bool_]
+    """True for masked pixels, shape ``(height, width)``."""
 
     def __len__(self) -> int:
         return len(self.source)
@@ -146,47 +167,49 @@ class Masked:
         return self.source.size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Of those ``start <= index < stop`` of the source, what is left."""
-        return keep(self.source.slice(start, stop), self.mask)
+        """Return the remaining ones of the source's events ``start <= index < stop``."""
+        return without_pixels(self.source.slice(start, stop), self.mask)
 
     def find(self, t: int) -> int:
         return self.source.find(t)
 
     def between(self, t_start: int, t_end: int) -> Events:
-        return keep(self.source.between(t_start, t_end), self.mask)
+        return without_pixels(self.source.between(t_start, t_end), self.mask)
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """Blocks of the source, what is left of each."""
-        return (keep(block, self.mask) for block in self.source.blocks(count=count, duration_us=duration_us))
+        """Yield the remaining events of each block of the source."""
+        return (without_pixels(block, self.mask) for block in self.source.blocks(count=count, duration_us=duration_us))
 
 
 # -- hot pixels
 
 
-def stands_out(count: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Pixels that count far more than most around them, which other hot pixels among these do not hide.
+def outliers(count: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the pixels that count far more than at least :data:`LEAST_LOW` of their 24 neighbours.
 
-    Against one of n: more than 3 n + 5 √n + 8, far outside of Poisson's statistics and of a picture's contrast.
+    Far more than a neighbour's n means more than 3 n + 5 √n + 8: beyond Poisson statistics and a picture's contrast. A
+    few neighbours may count as much, so adjacent hot pixels do not hide each other.
     """
     height, width = count.shape
-    own = np.pad(count, AROUND, mode="symmetric")
+    own = np.pad(count, NEIGHBOURS, mode="symmetric")
     enough = (3.0 * own + 5.0 * np.sqrt(own) + 8.0).astype(np.float32)
     own = count.astype(np.float32)
     low = np.zeros(count.shape, np.int8)
-    for i in range(2 * AROUND + 1):
-        for j in range(2 * AROUND + 1):
-            if (i, j) != (AROUND, AROUND):
+    for i in range(2 * NEIGHBOURS + 1):
+        for j in range(2 * NEIGHBOURS + 1):
+            if (i, j) != (NEIGHBOURS, NEIGHBOURS):
                 low += own > enough[i : i + height, j : j + width]
     return low >= LEAST_LOW
 
 
-def unlocked_counts(
+def unrepeated_counts(
     events: Events, pixel: NDArray[np.int32], encoder: Encoder, size: tuple[int, int]
 ) -> NDArray[np.float64] | None:
-    """How many events of each pixel do not repeat from turn to turn, shape (height, width); None under two turns.
+    """Estimate how many events of each pixel do not repeat from turn to turn, shape (height, width).
 
-    Signs by turn that add up to nothing make what repeats vanish. Events at random leave a sum whose square is, in the
-    mean, their number: taken over low harmonics of the angle, both polarities and up to :data:`BLOCKS` spans of turns.
+    Turns get signs that sum to zero, so repeated events cancel. The expected square of the sum of random events is
+    their number. The squares are averaged over low harmonics of the angle and summed over both polarities and up to
+    :data:`BLOCKS` spans of turns. None for less than two turns.
     """
     edges = bin_times(events, encoder)
     pairs = (len(edges) - 1) // BINS // 2
@@ -198,33 +221,33 @@ def unlocked_counts(
     for turns in np.array_split(np.arange(2 * pairs).reshape(-1, 2), min(pairs, BLOCKS)):
         marks = at[turns[0, 0] * BINS : (turns[-1, 1] + 1) * BINS + 1]
         span, lengths = slice(int(marks[0]), int(marks[-1])), np.diff(marks)
-        # Thue and Morse's signs: two states that a pixel takes in turns cancel too
+        # Thue-Morse signs: a response that alternates between two states cancels too
         sign = 1.0 - 2.0 * (np.bitwise_count(np.arange(turns.size)) & 1)
         slots = np.repeat(np.tile(np.arange(BINS, dtype=np.int32) * np.int32(channels), turns.size), lengths)
         key = slots + pixel[span] * np.int32(2) + events.p[span]
         folded = np.bincount(key, np.repeat(np.repeat(sign, BINS), lengths), minlength=BINS * channels)
-        total += ((waves() @ folded.reshape(BINS, channels)) ** 2).mean(axis=0)
+        total += ((harmonics() @ folded.reshape(BINS, channels)) ** 2).mean(axis=0)
     return np.asarray(total.reshape(size[1], size[0], 2).sum(axis=2))
 
 
-def waves() -> NDArray[np.float64]:
-    """Low harmonics of the angle at the middle of its bins, each of mean square 1, shape (waves, BINS)."""
-    phase = np.outer(np.arange(1, HARMONICS + 1), (np.arange(BINS) + 0.5) * (TURN / BINS))
+def harmonics() -> NDArray[np.float64]:
+    """Return low harmonics of the angle at the bin centres, each with mean square 1, shape (harmonics, BINS)."""
+    phase = np.outer(np.arange(1, HARMONICS + 1), (np.arange(BINS) + 0.5) * (TWO_PI / BINS))
     return np.concatenate([np.ones((1, BINS)), math.sqrt(2.0) * np.cos(phase), math.sqrt(2.0) * np.sin(phase)])
 
 
 def bin_times(events: Events, encoder: Encoder) -> NDArray[np.int64]:
-    """Times [us] between which the prism turns by one bin, of whole turns from the first event on, shape (n,)."""
+    """Return the times [us] at which the prism enters each angle bin, for whole turns from the first event on."""
     if not len(events):
         return np.zeros(1, np.int64)
-    # noise of the encoder may step back; its angle must rise to be turned round
-    way = 1.0 if encoder.rpm >= 0.0 else -1.0
-    angle = np.maximum.accumulate(way * (encoder.angle - encoder.angle[0]))
+    # encoder noise may step back, but interpolating time over angle needs rising angles
+    sign = 1.0 if encoder.rpm >= 0.0 else -1.0
+    angle = np.maximum.accumulate(sign * (encoder.angle - encoder.angle[0]))
     elapsed = (encoder.t - encoder.t[0]).astype(np.float64) - encoder.clock_offset_us
     ends = np.array([int(events.t[0]) - int(encoder.t[0]), int(events.t[-1]) + 1 - int(encoder.t[0])])
     first, last = np.interp(ends, elapsed, angle)
-    bins = int((last - first) / TURN + 1e-3) * BINS
-    marks = np.interp(first + np.arange(bins + 1) * (TURN / BINS), angle, elapsed)
+    bins = int((last - first) / TWO_PI + 1e-3) * BINS
+    marks = np.interp(first + np.arange(bins + 1) * (TWO_PI / BINS), angle, elapsed)
     return np.rint(marks).astype(np.int64) + encoder.t[0]
 
 
@@ -234,7 +257,7 @@ def bin_times(events: Events, encoder: Encoder) -> NDArray[np.int64]:
 def _flickering(
     events: Events, pixel: NDArray[np.int32], encoder: Encoder, hot: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], tuple[float, ...]]:
-    """Pixels that see a lamp, shape (height, width), and the lamps' frequencies [Hz]."""
+    """Return the pixels that see a lamp, shape (height, width), and the lamps' frequencies [Hz]."""
     found = np.zeros(hot.shape, np.bool_)
     lamps: list[float] = []
     middle = (int(events.t[0]) + int(events.t[-1])) // 2 if len(events) else 0
@@ -249,7 +272,7 @@ def _flickering(
         if not patch.any():
             break
         found |= patch
-        if all(round(hz) != round(other) for other in lamps):  # what is left of one that was found may be found anew
+        if all(round(hz) != round(other) for other in lamps):  # the rest of a known lamp may be found again
             lamps.append(hz)
     return found, tuple(lamps)
 
@@ -257,7 +280,7 @@ def _flickering(
 def _find_lamp(
     events: Events, pixel: NDArray[np.int32], turns_hz: float, without: NDArray[np.bool_]
 ) -> tuple[float, NDArray[np.bool_]] | None:
-    """Frequency [Hz] of the strongest lamp, and the cells that see it, shape (rows, columns)."""
+    """Return the frequency [Hz] of the strongest lamp and the cells that see it, shape (rows, columns)."""
     signed, count, rows = _signals(events, pixel, without)
     bins = signed.shape[1]
     amplitude = np.abs(np.fft.rfft(signed, axis=1))
@@ -269,7 +292,7 @@ def _find_lamp(
     if not sees.any():
         return None
     seen = np.where(sees, amplitude, 0.0).sum(axis=0)
-    best = int(np.argmax(seen >= 0.5 * seen.max()))  # a lamp's overtones may be nearly as strong
+    best = int(np.argmax(seen >= 0.5 * seen.max()))  # the lowest frequency: overtones may be nearly as strong
     cells = sees[:, best - 1 : best + 2].any(axis=1)
     fine = 8 * bins
     power = (np.abs(np.fft.rfft(signed[cells], fine, axis=1)) ** 2).sum(axis=0)[8 * best - 8 : 8 * best + 9]
@@ -279,13 +302,13 @@ def _find_lamp(
 def _signals(
     events: Events, pixel: NDArray[np.int32], without: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """ON minus OFF events by cell and time, (cells, bins), number of events by cell, (cells,), and rows of cells."""
+    """Return ON minus OFF events, shape (cells, bins), the events per cell, shape (cells,), and the rows of cells."""
     height, width = without.shape
     rows, columns = -(-height // CELL), -(-width // CELL)
     bins = int(events.t[-1] - events.t[0]) // BIN_US + 1
     at = np.searchsorted(events.t, int(events.t[0]) + np.arange(bins + 1) * BIN_US)
     y, x = np.indices(without.shape, np.int32)
-    # pixels left out count to a cell of their own, the last
+    # masked pixels are counted in an extra cell at the end
     cell = np.where(without, rows * columns, y // CELL * columns + x // CELL).astype(np.int32) * np.int32(bins)
     key = cell.ravel()[pixel] + np.repeat(np.arange(bins, dtype=np.int32), np.diff(at))
     shape = (rows * columns + 1, bins)
@@ -295,7 +318,7 @@ def _signals(
 
 
 def _largest_near(amplitude: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
-    """The largest of the spectrum two bins off to ``reach`` bins off, either way: a line alone is two bins wide."""
+    """Return the largest amplitude at distances of 2 to ``reach`` bins: a line itself is up to two bins wide."""
     from scipy.ndimage import maximum_filter1d
 
     window = (reach - 1) | 1  # odd, so that it has a middle
@@ -308,7 +331,7 @@ def _largest_near(amplitude: NDArray[np.float64], reach: int) -> NDArray[np.floa
 def _patch(
     events: Events, pixel: NDArray[np.int32], hz: float, cells: NDArray[np.bool_], without: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Pixels whose events rise and fall at a frequency [Hz], where the cells that see the lamp begin it."""
+    """Return the patch of pixels that oscillate at a frequency [Hz], grown from the cells that see the lamp."""
     from scipy import ndimage
 
     height, width = without.shape
@@ -318,7 +341,7 @@ def _patch(
         smooth = ndimage.uniform_filter(np.where(without, 0.0, counted), SMOOTHING, mode="mirror")
         return np.asarray(np.rint(smooth * SMOOTHING**2) if weights is None else smooth * SMOOTHING**2)
 
-    angle = ((events.t - events.t[0]) * (hz * TURN * 1e-6)).astype(np.float32)
+    angle = ((events.t - events.t[0]) * (hz * TWO_PI * 1e-6)).astype(np.float32)
     sign = 2.0 * events.p - 1.0
     together, count = np.hypot(around(sign * np.cos(angle)), around(sign * np.sin(angle))), around(None)
     sees = (together >= LEAST_SHARE * count) & (together >= LEAST_SIGMA * np.sqrt(count)) & (count > 0.5)

@@ -21,13 +21,49 @@ def calibrate(
     progress: Progress | None = None,
     **changes: Any,
 ) -> Calibration:
-    """Finds the prism's parameters in the recording itself: those that make the IWE sharpest, and from there those
-    that make one brightness map explain the events. Where no map does, the camera may have turned: its motion is then
-    sought too.
+    """Find the prism's parameters in the recording itself.
 
-    ``changes`` are fields of :class:`Settings`, over ``settings``. Raises :class:`AmiwarpError` where the recording
-    cannot determine the parameters: too few events, under a quarter turn, encoder not covering the events, no
-    texture, one edge direction, events that no map explains.
+    Parameters
+    ----------
+    recording : Recording
+        The recording. Its camera must be known.
+    settings : Settings, optional
+        Settings of the calibration; by default ``Settings()``.
+    device : str or warp.context.Device
+        Device that computes, such as ``cpu`` or ``cuda:0``.
+    progress : Progress, optional
+        Function that is called with the current stage and the finished share.
+    **changes : dict
+        Fields of :class:`Settings` that replace those of ``settings``.
+
+    Returns
+    -------
+    Calibration
+        Parameters with their standard deviations, and how they were found.
+
+    Raises
+    ------
+    AmiwarpError
+        If the recording cannot determine the parameters: too few events, less than a quarter turn, an encoder that
+        does not cover the events, no texture, edges in one direction only, or events that no brightness map explains.
+
+    Notes
+    -----
+    The sharpness stage is contrast maximisation: it finds the parameters that make the image of warped events (IWE)
+    sharpest. The photometric stage starts from its answer and finds the parameters for which one brightness map of the
+    scene explains the events. If no map does, the camera may have rotated; its rotation is then calibrated too. The
+    formulas and measured errors are in ``docs/explanation/calibration.md``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> blocks = np.random.default_rng(0).integers(0, 255, (30, 40), dtype=np.uint8)
+    >>> texture = np.kron(blocks, np.ones((8, 8), np.uint8))
+    >>> camera = amiwarp.Camera.from_fov(80, 60, 0.9)
+    >>> recording = amiwarp.simulate(texture, camera, amiwarp.Prism(apex=0.03), duration_s=0.1, seed=0)
+    >>> calibration = amiwarp.calibrate(recording, model="exact")
+    >>> round(calibration.parameters["apex"], 3)
+    0.03
     """
     settings = replace(settings or Settings(), **changes)
     settings.check()

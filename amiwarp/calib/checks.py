@@ -1,4 +1,4 @@
-"""Refusals: what a recording must have before, and after, its parameters can be believed."""
+"""Checks of a recording and of an answer. Each one raises an error that gives the reason and the remedy."""
 
 from __future__ import annotations
 
@@ -15,60 +15,65 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from amiwarp.calib.bad_pixels import StrangeSummary
+    from amiwarp.calib.bad_pixels import BadPixelSummary
     from amiwarp.events.encoder import Encoder
     from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000
-SMALLEST_TURN = math.pi / 2
+"""Smallest number of events."""
+SMALLEST_ROTATION = math.pi / 2
+"""Smallest rotation of the prism during the events [rad]."""
 LEAST_SIGNIFICANCE = 5.0
-"""By how many standard deviations the optimum must be sharper than with the phase turned round, and than still."""
+"""Smallest gain in sharpness over the opposite phase, and over no compensation [standard deviations]."""
 LARGEST_FROM_NOMINAL = 0.18
-"""Relative distance of the prism's size from the nominal one."""
+"""Largest relative difference between the prism's size and the nominal one."""
 LARGEST_FLICKER = 0.7
-"""Share of the pixels that may see a lamp."""
+"""Largest share of bad pixels."""
 LARGEST_DRIFT = 0.02
-"""Turns by which index pulses may drift over a recording."""
+"""Largest drift of the index pulses over a recording [turns]."""
 FEWEST_PULSES = 3
+"""Smallest number of index pulses for the check of an encoder's scale."""
 STEADY = 0.2
-"""Of a drift: pulses that lie no further from a line drift steadily."""
+"""A drift is steady if no pulse deviates from a straight line by more than this share of the drift."""
 LARGEST_COHERENCE = 0.97
-"""Of the edge directions: 0 where all are as frequent, 1 where all edges are parallel."""
+"""Largest coherence of the edge directions: 0 if all directions are equally frequent, 1 if all edges are parallel."""
 
 
-class NotSharp(AmiwarpError):
-    """No motion of a prism explains the events: what a turning camera looks like too."""
+class NoSharpOptimumError(AmiwarpError):
+    """No motion of a prism makes the image of events sharp. A rotating camera can be the cause."""
 
 
 def check_events(count: int, name: str) -> None:
+    """Check the number of events."""
     if count < FEWEST_EVENTS:
         raise AmiwarpError(f"{name}: {count} events are too few to calibrate; record at least {FEWEST_EVENTS}")
 
 
-def check_left(count: int, left_out: NDArray[np.bool_], name: str) -> None:
-    """Enough events must remain without the hot and flickering pixels, True in ``left_out``."""
+def check_unmasked_events(count: int, mask: NDArray[np.bool_], name: str) -> None:
+    """Check the number of events outside the bad pixels; ``mask`` is True for bad ones."""
     if count < FEWEST_EVENTS:
-        pixels = int(np.count_nonzero(left_out))
+        pixels = int(np.count_nonzero(mask))
         raise AmiwarpError(
             f"{name}: without the pixels that flicker or fire at random, {pixels:,} in all, {count} events are left; "
-            f"calibration needs at least {FEWEST_EVENTS}, of edges all over the image that the prism moves"
+            f"record at least {FEWEST_EVENTS} events of edges all over the image"
         )
 
 
 def check_coverage(encoder: Encoder, t_first: int, t_last: int, name: str) -> None:
-    """The encoder must know the angle of every event."""
+    """Check that the encoder gives the angle of every event."""
     if not encoder.covers(t_first, t_last):
         first, last = encoder.coverage
         raise AmiwarpError(
             f"{name}: encoder samples cover {first} .. {last} us, the events {t_first} .. {t_last} us; "
-            "record the encoder for as long as the events, or cut the events with a window"
+            "record the encoder for as long as the events, or select the covered events with a window"
         )
 
 
 def check_pulses(encoder: Encoder, name: str) -> None:
-    """Index pulses must come a turn apart: a steady drift is a wrong scale, counts per turn that are not the encoder's.
+    """Check that successive index pulses are one encoder turn apart.
 
-    Pulses may be missing, or come too often; what drifts in jumps is lost counts, which is not judged here.
+    A steady drift means a wrong scale: the counts per turn do not fit the encoder. Missing or additional pulses are
+    tolerated. A drift in jumps means lost counts, which this check ignores.
     """
     if encoder.index_t is None or len(encoder.index_t) < FEWEST_PULSES:
         return
@@ -81,98 +86,110 @@ def check_pulses(encoder: Encoder, name: str) -> None:
     slope, start = np.polyfit(number, at, 1)
     drift = abs(abs(slope) - 1.0) * float(np.ptp(number))
     off = float(np.abs(at - (start + slope * number)).max())
-    # pulses of which every other is missing come a whole number of turns apart
+    # if every other pulse is missing, the pulses are a whole number of turns apart
     whole = abs(turns - max(1.0, round(turns))) * float(np.ptp(number)) <= LARGEST_DRIFT
     if drift > LARGEST_DRIFT and off <= STEADY * drift and not whole:
         raise wrong_scale(name, float(abs(slope)), "the index pulses come")
 
 
 def wrong_scale(
-    name: str, turns: float, what: str, cost: float | None = None, scaled: float | None = None
+    name: str, turns: float, what: str, cost: float | None = None, scaled_cost: float | None = None
 ) -> AmiwarpError:
-    """The error of an encoder in whose ``turns`` the prism turns once; ``what`` says so, costs are shares."""
-    so = (
+    """Return the error for an encoder that counts ``turns`` while the prism turns once.
+
+    ``what`` begins the sentence "... every 1.02 turns of the encoder". The costs are those of the photometric stage
+    with the given and with the corrected scale.
+    """
+    evidence = (
         "the encoder slips, or"
-        if cost is None or scaled is None
-        else f"with its angles divided by {turns:.4f} a still camera explains the events ({100 * scaled:.0f} % of the "
-        f"residual remains instead of {100 * min(cost, 1.0):.0f} %):"
+        if cost is None or scaled_cost is None
+        else f"with its angles divided by {turns:.4f} a still camera explains the events "
+        f"({100 * scaled_cost:.0f} % of the residual remains instead of {100 * min(cost, 1.0):.0f} %):"
     )
     return AmiwarpError(
-        f"{name}: {what} every {turns:.4f} turns of the encoder, not every turn; {so} its scale is off by a factor of "
-        f"{turns:.4f}: read its log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
+        f"{name}: {what} every {turns:.4f} turns of the encoder, not every turn; {evidence} its scale is off by a "
+        f"factor of {turns:.4f}: read its log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
     )
 
 
-def check_turn(theta: NDArray[np.float64], name: str) -> None:
-    """Under a quarter turn, size and phase trade against each other."""
+def check_turned(theta: NDArray[np.float64], name: str) -> None:
+    """Check that the prism turned far enough.
+
+    In less than a quarter turn, the size and the phase of the prism's orbit cannot be determined separately.
+    """
     turned = float(np.ptp(theta))
-    if turned < SMALLEST_TURN:
+    if turned < SMALLEST_ROTATION:
         raise AmiwarpError(
             f"{name}: the prism turned {math.degrees(turned):.1f} degrees during the events; "
-            "at least a quarter turn (90 degrees) is needed, a whole one is better"
+            "record at least a quarter turn (90 degrees), better a whole one"
         )
 
 
-def check_light(mask: NDArray[np.bool_], summary: StrangeSummary, name: str) -> None:
-    """A scene whose light flickers all over shows no edges of its own."""
+def check_light(mask: NDArray[np.bool_], summary: BadPixelSummary, name: str) -> None:
+    """Check that the light does not flicker in most of the image, which hides the scene's edges."""
     if mask.mean() > LARGEST_FLICKER:
         at = " and ".join(f"{hz:.0f}" for hz in summary.lamps_hz)
         raise AmiwarpError(
-            f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {at} Hz; use light that does not, as the day's"
+            f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {at} Hz; use daylight or flicker-free lighting"
         )
 
 
 def check_nominal(model: str, parameters: Mapping[str, float], nominal: Prism, name: str) -> None:
-    """A prism is made to a few percent; one far from its data sheet is another, or its motion is not all there is."""
+    """Check the prism's size against the nominal one.
+
+    Prisms are made to within a few percent. A larger difference means another prism, or motion that is not the prism's.
+    """
     size = size_name(model)
     if size not in parameters:
         return
     share = parameters[size] / (nominal.apex if size == "apex" else nominal.deflection)
     if not abs(share - 1.0) <= LARGEST_FROM_NOMINAL:
         raise AmiwarpError(
-            f"{name}: the prism seems to have {100 * share:.0f} % of its nominal {size}, "
-            f"{math.degrees(nominal.apex):.4g} deg of apex: the camera shakes with the prism, or the nominal prism or "
-            f"the focal length is wrong; mend these, or give bounds of {size} if it is so"
+            f"{name}: the answer is {100 * share:.0f} % of its nominal {size} (nominal apex "
+            f"{math.degrees(nominal.apex):.4g} deg): the camera shakes with the prism, or the nominal prism or the "
+            f"focal length is wrong; correct these, or give bounds of {size} if the answer is right"
         )
 
 
 def significance(best: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """By how many standard deviations the sharpness of disjoint parts of the events is higher at one point."""
+    """Return the mean gain in sharpness over disjoint parts of the events [standard deviations of the mean]."""
     gain = best - other
     spread = float(gain.std(ddof=1)) / math.sqrt(len(gain))
     return float(gain.mean()) / max(spread, 1e-12)
 
 
-def _by(sure: float) -> str:
-    """A significance in words; far below 0 its number says nothing."""
-    return f"{sure:.1f} standard deviations" if sure > 0.0 else "it is less sharp, or the same"
+def _in_words(gain: float) -> str:
+    """Return a significance in words. A negative number would carry no information."""
+    return f"{gain:.1f} standard deviations" if gain > 0.0 else "it is less sharp, or the same"
 
 
 def check_texture(
-    best: NDArray[np.float64], turned: NDArray[np.float64], still: NDArray[np.float64], name: str
+    best: NDArray[np.float64], opposite: NDArray[np.float64], still: NDArray[np.float64], name: str
 ) -> None:
-    """The optimum must be sharper than chance: each array holds the sharpness of disjoint parts of the events.
+    """Check that the optimum is sharper than chance.
 
-    ``turned`` is the same with half a turn added to the phase, ``still`` without any motion taken out.
+    Each array holds the sharpness of disjoint parts of the events: at the optimum, with half a turn added to the phase,
+    and without motion compensation.
     """
-    sure = significance(best, turned)
-    if not sure >= LEAST_SIGNIFICANCE:
-        raise NotSharp(
-            f"{name}: no motion of a prism makes the image sharper than chance does ({_by(sure)}): "
+    gain = significance(best, opposite)
+    if not gain >= LEAST_SIGNIFICANCE:
+        raise NoSharpOptimumError(
+            f"{name}: no motion of a prism makes the image sharper than chance does ({_in_words(gain)}): "
             "no texture, too few events, or a wrong encoder; show the camera a scene with edges"
         )
-    sure = significance(best, still)
-    if not sure >= LEAST_SIGNIFICANCE:
-        raise NotSharp(
-            f"{name}: the image is as sharp with no motion taken out ({_by(sure)}): "
-            "no prism turned, its apex is too small for these events, or the encoder is wrong; record more events"
+    gain = significance(best, still)
+    if not gain >= LEAST_SIGNIFICANCE:
+        raise NoSharpOptimumError(
+            f"{name}: the image is as sharp with no motion compensation ({_in_words(gain)}): no prism turned, its apex "
+            "is too small for these events, or the encoder is wrong; check prism and encoder, or record more events"
         )
 
 
 def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
-    """Coherence of the edge directions of an image: |Σ g² e^{2iφ}| / Σ g² over gradients (g, φ), 0 to 1.
+    """Return the coherence of an image's edge directions, |Σ g² e^{2iφ}| / Σ g² over gradients (g, φ), 0 to 1.
 
-    Noise has no direction of its own and lowers it, so gradients weaker than the median are left out.
+    Noise has no direction and lowers the coherence, so weak gradients are left out: those with g² below a tenth of the
+    largest.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -185,9 +202,10 @@ def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
 
 
 def check_directions(image: NDArray[np.float32], name: str) -> None:
+    """Check that the edges have more than one direction: motion along an edge is invisible."""
     coherence = edge_coherence(image)
     if coherence > LARGEST_COHERENCE:
         raise AmiwarpError(
-            f"{name}: all edges run in one direction (coherence {coherence:.2f} of 1), so motion along them "
-            "is not seen; show the camera edges in at least two directions"
+            f"{name}: all edges run in one direction (coherence {coherence:.2f} of 1), so motion along them is "
+            "invisible; show the camera edges in at least two directions"
         )

@@ -1,7 +1,7 @@
-"""The calibration of He et al., Science Robotics 2024, to compare with: a circle, their cost J, and a grid.
+"""Calibration method of He et al., Science Robotics 2024, for comparison: circle model, their cost J, grid search.
 
-Coarse to fine about what the hardware says: the nominal prism, and the phase as mounted. The paper gives neither the
-grid nor η; no refusals, no uncertainty, as there.
+The grid is refined about the values that the hardware gives: the nominal prism and the mounted phase. The paper states
+neither the grid nor η. As in the paper there are no checks of the answer and no uncertainty.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.nlopt_solver import best_of
+from amiwarp.calib.preparation import prepare
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.sharpness.search import STAGES, Settings
-from amiwarp.calib.single_model import prepare
-from amiwarp.calib.solve import SearchStage
 from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness
 
@@ -25,18 +25,21 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from amiwarp.calib.nlopt_solver import SearchStage
     from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.recording import Recording
     from amiwarp.progress import Progress
 
 WINDOW_US = 2_000_000
-"""The paper calibrates on 2 s."""
-LEVELS, SIDE = 3, 11
-"""Grids one after the other, each as wide as two steps of the one before; values of a parameter on each."""
+"""Duration of the events that the paper calibrates on [us]."""
+LEVELS = 3
+"""Number of successive grids, each as wide as two steps of the previous one."""
+SIDE = 11
+"""Number of values of each parameter on a grid."""
 SIZE_RANGE = (0.5, 1.5)
-"""Of the nominal deflection."""
+"""Range of the deflection on the first grid, relative to the nominal one."""
 PHASE_RANGE = math.radians(45.0)
-"""About the phase that the hardware tells; the whole turn where it tells none."""
+"""Half width of the phase on the first grid about the mounted phase [rad]. Without one: the full turn."""
 
 
 def calibrate_as_paper(
@@ -46,9 +49,10 @@ def calibrate_as_paper(
     device: Any = "cpu",
     progress: Progress | None = None,
 ) -> Calibration:
-    """The paper's method on the recording's first 2 s; ``start`` may give the phase [rad] as mounted.
+    """Return a calibration by the paper's method from the recording's first 2 s.
 
-    Raises :class:`AmiwarpError` where there is nothing to search: too few events, an encoder that does not cover them.
+    ``start`` may give the mounted phase [rad]. Raises :class:`AmiwarpError` if the recording does not suit a
+    calibration: too few events, or an encoder that does not cover them.
     """
     began = time.perf_counter()
     source = recording.events
@@ -56,7 +60,7 @@ def calibrate_as_paper(
     given = dict(start or {})
     settings = Settings(model="circle", sharpness=Sharpness.PAPER_J, events=len(cut), stages=STAGES[:1], start=given)
     search = prepare(replace(recording, events=MemoryEvents(cut, *source.size)), settings, device=device)[0]
-    stage = _grids(search, "phase" in given, progress)
+    stage = _grid_search(search, mounted="phase" in given, progress=progress)
     best = search.space.to_values(stage.x)
     return Calibration(
         model_name="circle",
@@ -74,7 +78,8 @@ def calibrate_as_paper(
     )
 
 
-def _grids(search: Search, mounted: bool, progress: Progress | None) -> SearchStage:
+def _grid_search(search: Search, *, mounted: bool, progress: Progress | None) -> SearchStage:
+    """Return the best point of successively finer grids; ``mounted``: the start gives the mounted phase."""
     space, began = search.space, time.perf_counter()
     nominal = space.start
     size, phase = nominal[space.size_name], nominal["phase"]
@@ -96,8 +101,4 @@ def _grids(search: Search, mounted: bool, progress: Progress | None) -> SearchSt
                     progress("calibrating, global", len(points) / budget)
         size, phase = (space.to_values(points[int(np.argmax(scores))])[n] for n in (space.size_name, "phase"))
         size_half, phase_half, columns = 2.0 * size_half / (SIDE - 1), 2.0 * phase_half / (columns - 1), SIDE
-    best = int(np.argmax(scores))
-    return SearchStage(
-        "grid", points[best], scores[best], len(points), time.perf_counter() - began, "its budget",
-        np.array(points), np.array(scores),
-    )  # fmt: skip
+    return best_of("grid", points, scores, seconds=time.perf_counter() - began, ended="its budget")

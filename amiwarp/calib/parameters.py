@@ -1,8 +1,8 @@
-"""What is free in a calibration: parameters by name, their bounds and units, and the vector that NLopt moves.
+"""Free parameters of a calibration: their names, bounds and units, and the vector that the optimiser moves.
 
-The vector is in pixels: one unit of any entry moves events by about one pixel (rms over image and turn), so that one
-tolerance and one first step serve all. Size and phase together become Cartesian (size·cos, size·sin) where the phase
-is free over the full turn: no wrap-around, no second optimum at (−size, phase + π), even resolution.
+The vector is in pixels: one unit of any entry moves events by about one pixel (rms over image and turn). One tolerance
+and one first step then fit every parameter. If the phase is free over the full turn, size and phase become Cartesian,
+(size·cos phase, size·sin phase): no wrap-around, no second optimum at (−size, phase + π), even resolution.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.models import MODELS, CircleModel, EllipseModel, ExactModel, RadialCircleModel, deflection_from_apex
+from amiwarp.optics.models import MODELS, CircleModel, EllipseModel, ExactModel, RadialCircleModel
 from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.validation import instance, one_of, real, shown, vector
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 NOMINAL_APEX = math.radians(2.0)
-"""What is assumed where a recording does not say its prism's apex: the apex is sought up to twice this."""
+"""Apex angle assumed if a recording does not give it [rad]. The search goes up to twice this value."""
 UNITS = {
     "apex": "rad",
     "deflection": "rad",
@@ -46,74 +46,118 @@ UNITS = {
     "change_y": "rad/s2",
     "change_z": "rad/s2",
 }
-"""Every parameter that can be free, with its unit. ``clock_offset`` is added to the encoder's (see Encoder);
-``focal_length`` is the camera's fx, fy keeping its ratio; ``rate`` and ``change`` are the camera's :class:`Turning`."""
+"""Unit of every parameter that can be free.
+
+``clock_offset`` is the encoder's clock offset (see :class:`amiwarp.Encoder`). ``focal_length`` is the camera's fx; fy
+keeps its ratio to fx. ``rate_*`` and ``change_*`` describe the camera's rotation (:class:`amiwarp.CameraRotation`).
+"""
 
 DRIFTS = ("clock_offset", "rpm")
+"""Parameters that shift the prism angle of each event by its own amount."""
 RATES = ("rate_x", "rate_y", "rate_z")
+"""Angular velocity of the camera."""
 CHANGES = ("change_x", "change_y", "change_z")
+"""Angular acceleration of the camera."""
 MOTION = (*RATES, *CHANGES)
-LATE = ("index", "focal_length")
-"""They and the apex make nearly the same motion: sharpness is not asked where the photometric stage can be."""
-_EXACT_ONLY = ("tilt_x", "tilt_y", "index")
-_DEFAULT_RANGE = {
-    "tilt_x": math.radians(5.0), "tilt_y": math.radians(5.0), "clock_offset": 5000.0, "index": 0.2,
-    **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0),
-}  # fmt: skip
-"""Half width of the default bounds about the start."""
-TURN = (-math.pi, math.pi)
+"""All parameters of the camera's rotation."""
+EXACT_PARAMETERS = ("apex", "index", "tilt_x", "tilt_y")
+"""Parameters that the circle models do not have."""
+DEGENERATE_WITH_APEX = ("index", "focal_length")
+"""Left to the photometric stage if it runs: nearly degenerate with the apex in sharpness."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ParameterSpace:
-    """Free parameters of one model of one camera: names, bounds, start, and the way to the vector and back."""
+    """Free parameters of one model: names, bounds and start, and their conversion to and from the search vector.
+
+    The search vector has one entry per free parameter, in pixels: one unit of an entry moves events by about one pixel
+    (rms over image and turn).
+    """
 
     model: str
+    """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
+    """Nominal camera. If the focal length is free, its value replaces that of the camera."""
     prism: Prism
+    """Nominal prism. It gives the flat side, and the index if that is not free."""
     names: tuple[str, ...]
+    """Names of the free parameters, in the order of the vector."""
     low: Mapping[str, float]
+    """Lower bound of each free parameter, in its unit."""
     high: Mapping[str, float]
+    """Upper bound of each free parameter, in its unit."""
     start: Mapping[str, float]
-    """All parameters of the model, the free ones' start included."""
+    """Values of all parameters of the model, free ones at their start, in their units."""
     pixels: Mapping[str, float]
-    """Motion of events [px rms] per unit of each free parameter."""
+    """Displacement of events per unit of each free parameter [px rms]."""
     middle_us: int
-    """Time to which a turning camera is turned back."""
+    """Time to whose camera orientation events are rotated back [us]."""
     duration_us: float
+    """Duration of the events [us]."""
     undrifted: Mapping[str, float]
-    """Values of the drifting parameters under which events have the angles that they were given."""
+    """Values of ``clock_offset`` or ``rpm`` for which the events' given prism angles hold, in their units."""
 
     @property
     def size_name(self) -> str:
+        """Name of the parameter that sets the size of the orbit: ``apex`` or ``deflection``."""
         return size_name(self.model)
 
     @property
     def cartesian(self) -> bool:
-        """Whether the first two entries are (size·cos phase, size·sin phase)."""
+        """Whether the vector's first two entries are (size·cos phase, size·sin phase)."""
         full = self.high.get("phase", 0.0) - self.low.get("phase", 0.0) >= 2.0 * math.pi - 1e-9
         return self.names[:2] == (self.size_name, "phase") and full
 
     @property
     def sized(self) -> bool:
-        """Whether a prism is sought, and not only the camera's motion."""
+        """Whether the size of the prism's orbit is free."""
         return self.size_name in self.names
 
     @property
     def moving(self) -> bool:
-        """Whether the camera's motion is sought or given."""
+        """Whether the camera's rotation is free, or given and not zero."""
         return any(self.start.get(n) or n in self.names for n in MOTION)
 
     def without(self, names: tuple[str, ...]) -> ParameterSpace:
-        """The space in which ``names`` are held at their start."""
+        """Return the space in which some parameters are fixed at their start.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Names of the parameters to fix.
+
+        Returns
+        -------
+        ParameterSpace
+            The space without these free parameters.
+        """
         return replace(self, names=tuple(n for n in self.names if n not in names))
 
     def holding(self, values: Mapping[str, float]) -> ParameterSpace:
-        """The same with another start."""
+        """Return the space with other start values.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            New start by parameter name, in the parameters' units. Other parameters keep theirs.
+
+        Returns
+        -------
+        ParameterSpace
+            The space with the new start.
+        """
         return replace(self, start={**self.start, **values})
 
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner of the box in which the vector moves [px]."""
+        """Return the corners of the box in which the vector may move.
+
+        Returns
+        -------
+        low : ndarray
+            Lower corner [px], shape ``(n,)`` for n free parameters.
+        high : ndarray
+            Upper corner [px], shape ``(n,)``.
+        """
         low = np.array([self.low[n] * self.pixels[n] for n in self.names])
         high = np.array([self.high[n] * self.pixels[n] for n in self.names])
         if self.cartesian:
@@ -122,13 +166,37 @@ class ParameterSpace:
         return low, high
 
     def to_vector(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Return the search vector of parameter values.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Value of every free parameter, in its unit.
+
+        Returns
+        -------
+        ndarray
+            The vector [px], shape ``(n,)`` for n free parameters.
+        """
         v = np.array([values[n] * self.pixels[n] for n in self.names])
         if self.cartesian:
             v[:2] = v[0] * math.cos(values["phase"]), v[0] * math.sin(values["phase"])
         return v
 
     def to_values(self, v: NDArray[np.float64]) -> dict[str, float]:
-        """All parameters of the model at ``v``; a size outside its bounds is held at the nearer one."""
+        """Return the parameter values of a search vector.
+
+        Parameters
+        ----------
+        v : ndarray
+            The vector [px], shape ``(n,)`` for n free parameters.
+
+        Returns
+        -------
+        dict
+            Values of all parameters of the model, in their units. A value outside its bounds is moved to the nearer
+            bound.
+        """
         values = dict(self.start)
         for name, entry in zip(self.names, v, strict=True):
             values[name] = float(entry) / self.pixels[name]
@@ -140,7 +208,24 @@ class ParameterSpace:
         return values
 
     def deviations(self, v: NDArray[np.float64], covariance: NDArray[np.float64]) -> dict[str, float]:
-        """Standard deviations of the free parameters at ``v`` from the vector's covariance [px²]."""
+        """Return the standard deviations of the free parameters.
+
+        Parameters
+        ----------
+        v : ndarray
+            The vector [px] at which the covariance holds, shape ``(n,)`` for n free parameters.
+        covariance : ndarray
+            Covariance of the vector [px²], shape ``(n, n)``.
+
+        Returns
+        -------
+        dict
+            Standard deviation of each free parameter, in its unit.
+
+        Notes
+        -----
+        The covariance is propagated to first order, J C Jᵀ, with the Jacobian J of the values by central differences.
+        """
         jacobian = np.empty((len(self.names), len(self.names)))
         for k in range(len(self.names)):
             h = np.zeros(len(self.names))
@@ -151,20 +236,55 @@ class ParameterSpace:
         return {n: float(math.sqrt(max(s, 0.0))) for n, s in zip(self.names, variances, strict=True)}
 
     def build(self, values: Mapping[str, float]) -> Model:
+        """Return the model of parameter values.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values of all parameters of the model, in their units.
+
+        Returns
+        -------
+        Model
+            The model.
+        """
         return build_model(self.model, self.camera, self.prism, values)
 
     def camera_rotation(self, values: Mapping[str, float]) -> CameraRotation:
-        return turning_of(values, self.middle_us)
+        """Return the camera's rotation among parameter values.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Parameter values, in their units. A missing rate counts as 0.
+
+        Returns
+        -------
+        CameraRotation
+            The rotation about the time ``middle_us``.
+        """
+        return rotation_from_values(values, self.middle_us)
 
     def drift(self, values: Mapping[str, float]) -> float:
-        """Distance of the drifting parameter, free or held, from where the events' angles belong to it."""
+        """Return the change of ``clock_offset`` or ``rpm`` since the events got their prism angles.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values of the free parameters, in their units. A parameter that is not free counts at its start.
+
+        Returns
+        -------
+        float
+            Difference from ``undrifted``, in the parameter's unit; 0 if neither parameter is used.
+        """
         return float(sum((values if n in self.names else self.start)[n] - x for n, x in self.undrifted.items()))
 
 
 def check_names(
     free: tuple[str, ...] | None, start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Raise :class:`AmiwarpError` where the names are no texts or their values no finite numbers."""
+    """Check that parameter names are strings and their values finite numbers; else raise :class:`AmiwarpError`."""
     for name in free or ():
         instance(name, str, "free parameter")
     for given, what in ((start, "start"), (bounds, "bounds")):
@@ -177,7 +297,7 @@ def check_names(
 
 
 def nominal(prism: NominalPrism | None) -> Prism:
-    """Return the prism to start from: what a recording says, and of its apex :data:`NOMINAL_APEX` if it is unknown."""
+    """Return a recording's nominal prism, with the apex :data:`NOMINAL_APEX` if its apex is unknown."""
     return prism if isinstance(prism, Prism) else (prism or UnsizedPrism()).with_apex(NOMINAL_APEX)
 
 
@@ -186,19 +306,19 @@ def _difference(name: str, a: float, b: float) -> float:
 
 
 def size_name(model: str) -> str:
-    """The name of the parameter that sizes the orbit in ``model``: its apex, or its deflection."""
+    """Return the name of the parameter that sets the size of the orbit in ``model``: ``apex`` or ``deflection``."""
     return "apex" if model in ("exact", "ellipse") else "deflection"
 
 
-def turning_of(values: Mapping[str, float], middle_us: int) -> CameraRotation:
-    """The camera's motion among parameter values; none where they do not name it."""
+def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraRotation:
+    """Return the camera's rotation among parameter values; a missing rate counts as 0."""
     x, y, z = (values.get(n, 0.0) for n in RATES)
     a, b, c = (values.get(n, 0.0) for n in CHANGES)
     return CameraRotation((x, y, z), (a, b, c), middle_us)
 
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
-    """A model of the ladder from parameter values; what they do not name comes from ``camera`` and ``prism``."""
+    """Return the model of parameter values. What they do not name comes from ``camera`` and ``prism``."""
     one_of(model, MODELS, "model")
     if "focal_length" in values:
         scale = values["focal_length"] / camera.fx
@@ -210,136 +330,3 @@ def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, f
     wedge = replace(prism, apex=values["apex"], index=values.get("index", prism.index))
     exact = ExactModel(camera, wedge, values["phase"], (values.get("tilt_x", 0.0), values.get("tilt_y", 0.0)))
     return EllipseModel.from_model(exact) if model == "ellipse" else exact
-
-
-def make_space(
-    model: str,
-    camera: Camera,
-    prism: Prism,
-    *,
-    free: tuple[str, ...] | None,
-    start: Mapping[str, float],
-    bounds: Mapping[str, tuple[float, float]],
-    rad_per_us: float,
-    duration_us: float,
-    middle_us: int = 0,
-) -> ParameterSpace:
-    """Checks names and bounds and measures how far each parameter moves events.
-
-    ``prism`` is the nominal one: the size may go from 0 to twice its apex unless ``bounds`` say otherwise.
-    ``rad_per_us``: mean speed of the prism; ``duration_us``: of the events, about ``middle_us``.
-
-    Raises :class:`AmiwarpError` for unknown,
-    unfit or contradicting names.
-    """
-    size = size_name(model)
-    names = _order(model, (size, "phase") if free is None else free)
-    _check_given(model, names, start, bounds)
-    nominal = {
-        "apex": prism.apex, "deflection": prism.deflection, "phase": 0.0, "index": prism.index,
-        "focal_length": camera.fx,
-    }  # fmt: skip
-    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (size, "phase", *names, *start)}
-    low, high = {}, {}
-    for name in names:
-        low[name], high[name] = bounds.get(name) or _default_bounds(name, values[name], prism)
-        if not low[name] < high[name]:
-            raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower first")
-        values[name] = min(max(values[name], low[name]), high[name])
-    shifts = _pixels_per_unit(model, camera, prism, names, values, rad_per_us, duration_us)
-    undrifted = {n: x for n, x in values.items() if n in DRIFTS}
-    return ParameterSpace(model, camera, prism, names, low, high, values, shifts, middle_us, duration_us, undrifted)
-
-
-def _order(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
-    size = size_name(model)
-    wanted = {size if n in ("apex", "deflection") else n for n in free if n != "motion"}
-    wanted |= set(RATES if "motion" in free else ())
-    unknown = wanted - set(UNITS)
-    if unknown:
-        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {', '.join(UNITS)}")
-    if not wanted:
-        raise AmiwarpError("no parameter is free; name at least one")
-    if model in ("circle", "radial") and wanted & set(_EXACT_ONLY):
-        raise AmiwarpError(f"the {model} model has no {sorted(wanted & set(_EXACT_ONLY))[0]}; use model 'exact'")
-    if set(DRIFTS) <= wanted:
-        raise AmiwarpError("clock_offset and rpm cannot both be free: rpm is for recordings without an encoder")
-    return tuple(n for n in (size, "phase", *DRIFTS, *_EXACT_ONLY, "focal_length", *MOTION) if n in wanted)
-
-
-def _check_given(
-    model: str, names: tuple[str, ...], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
-) -> None:
-    """Nothing that is given is left out without a word."""
-    exact = () if model in ("circle", "radial") else _EXACT_ONLY
-    known = (size_name(model), "phase", *DRIFTS, *exact, "focal_length", *MOTION)
-    for name in start:
-        if name not in known:
-            raise AmiwarpError(f"start gives {name}, which the {model} model has not; it has {', '.join(known)}")
-    for name in bounds:
-        if name not in names:
-            raise AmiwarpError(f"bounds of {name} are given, which is not free; name it in free too")
-
-
-def _default_bounds(name: str, value: float, prism: Prism) -> tuple[float, float]:
-    if name == "apex":
-        return 0.0, 2.0 * prism.apex
-    if name == "deflection":
-        return 0.0, deflection_from_apex(2.0 * prism.apex, prism.index, prism.flat_side)
-    if name == "phase":
-        return TURN
-    share = {"rpm": 0.02, "focal_length": 0.2}
-    half = share[name] * abs(value) if name in share else _DEFAULT_RANGE[name]
-    return value - half, value + half
-
-
-def _pixels_per_unit(
-    model: str,
-    camera: Camera,
-    prism: Prism,
-    names: tuple[str, ...],
-    values: Mapping[str, float],
-    rad_per_us: float,
-    duration_us: float,
-) -> dict[str, float]:
-    """Finite differences of the displacement over a grid of pixels and angles, at the nominal size."""
-    nominal = {**values, "apex": prism.apex, "deflection": prism.deflection}
-    x, y, theta = (
-        m.ravel()
-        for m in np.meshgrid(
-            np.linspace(0, camera.width - 1, 8), np.linspace(0, camera.height - 1, 6), np.arange(8) * (np.pi / 4),
-            indexing="ij",
-        )
-    )  # fmt: skip
-    xy = np.stack([x, y], axis=1)
-    kind = "exact" if model == "ellipse" else model  # its tables follow the exact model
-
-    def at(name: str, step: float) -> NDArray[np.float64]:
-        built = build_model(kind, camera, prism, {**nominal, name: nominal[name] + step})
-        return cast("NDArray[np.float64]", built.compensate_points(xy, theta))
-
-    def rms(name: str, step: float) -> float:
-        moved = (at(name, step) - at(name, -step)) / (2.0 * step)
-        moved = moved[np.isfinite(moved).all(axis=1)]
-        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-
-    size = size_name(model)
-    steps = {size: 0.25 * nominal[size], "phase": 0.05, **dict.fromkeys(_EXACT_ONLY, 0.02)}
-    shifts = {name: rms(name, step) for name, step in steps.items() if name in names}
-    if set(DRIFTS) & set(names):
-        phase = rms("phase", 0.05)
-        shifts["clock_offset"] = phase * abs(rad_per_us)
-        shifts["rpm"] = phase * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
-    seconds = duration_us * 1e-6
-    radius = math.sqrt((camera.width**2 + camera.height**2) / 12.0)
-    for name, lever in zip(MOTION, (camera.fy, camera.fx, radius) * 2, strict=True):
-        # standard deviation of τ, and of τ²/2, over a window
-        shifts[name] = (
-            lever * seconds * (seconds * math.sqrt(1.0 / 720.0) if name in CHANGES else math.sqrt(1.0 / 12.0))
-        )
-    # what a camera that turns at half a radian a second would show of it
-    if "focal_length" in names:
-        shifts["focal_length"] = max(rms("focal_length", 0.01 * camera.fx), 0.5 * seconds / math.sqrt(12.0))
-    if not all(math.isfinite(shifts[n]) and shifts[n] > 0.0 for n in names):
-        raise AmiwarpError("the nominal prism moves no event; give its nominal apex (above 0) and the encoder's speed")
-    return {n: shifts[n] for n in names}

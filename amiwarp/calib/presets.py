@@ -1,4 +1,4 @@
-"""Presets: settings for ``calibrate`` or ``compensate`` that a chart chose for a budget, as JSON files."""
+"""Presets: JSON files with settings for ``calibrate`` or ``compensate`` that a chart chose for a budget."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib import Settings
-from amiwarp.calib.parameters import size_name
+from amiwarp.calib.parameters import EXACT_PARAMETERS, size_name
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name
+from amiwarp.io.atomic_output import write_text
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
-from amiwarp.io.output import write_text
 from amiwarp.optics.models import MODELS
 from amiwarp.validation import one_of, shown
 
@@ -27,36 +27,38 @@ if TYPE_CHECKING:
 FORMAT, VERSION = "amiwarp-preset", 1
 KINDS = ("calibration", "compensation")
 CALIBRATION = ("model", "global_algorithm", "local_algorithm", "global_evaluations", "events", "fold", "stages")
-"""What a preset may say of :class:`amiwarp.calib.Settings`."""
+"""Fields of :class:`amiwarp.Settings` that a preset may contain."""
 PHOTOMETRIC = ("pairs", "algorithm")
-"""What it may say of :class:`amiwarp.calib.photometric.stage.PhotometricSettings`, under ``photometric``."""
-ONLY_EXACT = ("apex", "index", "tilt_x", "tilt_y")
+"""Fields of :class:`amiwarp.PhotometricSettings` that a preset may contain under ``photometric``."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """What a file holds. ``measured``: of the row of the chart that it comes from."""
+    """Content of a preset file."""
 
     kind: str
+    """``calibration`` or ``compensation``."""
     settings: Mapping[str, Any]
+    """Settings by name, in types that JSON knows."""
     measured: Mapping[str, Any]
+    """Measurements of these settings on the chart: error and time, by name."""
 
     def save(self, path: Path) -> None:
-        """Write the JSON file. Raises :class:`AmiwarpError` if it exists or cannot be made."""
+        """Write the JSON file. Raises :class:`AmiwarpError` if it exists or cannot be written."""
         data = {"format": FORMAT, "version": VERSION, "kind": self.kind, "settings": dict(self.settings),
                 "measured": dict(self.measured)}  # fmt: skip
         write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: Path, kind: str) -> Preset:
-        """Reads a preset of one ``kind``. Raises :class:`AmiwarpError` naming file and field."""
+        """Read a preset of one ``kind``. Raises :class:`AmiwarpError` naming file and field."""
         data = read_json(path, "a preset")
         if data.get("format") != FORMAT or data.get("version") != VERSION:
-            raise AmiwarpError(f"{path}: is no {FORMAT} file of version {VERSION}; make one with 'amiwarp chart'")
+            raise AmiwarpError(f"{path}: is not an {FORMAT} file of version {VERSION}; create one with 'amiwarp chart'")
         if data.get("kind") != kind:
             given = shown(data.get("kind"))
-            raise AmiwarpError(f"{path}: kind is {given}, needed here is a preset for {kind}")
-        with errors_name(path, lambda: "damaged preset, make it again with 'amiwarp chart'"):
+            raise AmiwarpError(f"{path}: kind is {given}; give a preset for {kind}")
+        with errors_name(path, lambda: "damaged preset, create it again with 'amiwarp chart'"):
             fields_of(data, "", "format", "version", "kind", "settings", optional=("measured",))
             settings, measured = data["settings"], data.get("measured") or {}
             for name, value in (("settings", settings), ("measured", measured)):
@@ -66,12 +68,12 @@ class Preset:
         return cls(kind, settings, measured)
 
     def calibration_settings(self) -> Settings:
-        """The settings, what the preset leaves open being the defaults."""
+        """Return the preset's settings; fields that it does not contain have their defaults."""
         return settings_from(self.settings)
 
 
 def settings_from(values: Mapping[str, Any]) -> Settings:
-    """Settings from a preset's plain values."""
+    """Return the settings for a preset's values, given in types that JSON knows."""
     plain: dict[str, Any] = {n: values[n] for n in CALIBRATION if n in values}
     if "stages" in plain:
         plain["stages"] = tuple(plain["stages"])
@@ -79,7 +81,7 @@ def settings_from(values: Mapping[str, Any]) -> Settings:
 
 
 def settings_to(settings: Settings) -> dict[str, Any]:
-    """The reverse: every field that a preset may have, as plain values."""
+    """Return all fields that a preset may contain, in types that JSON knows."""
     out = {n: getattr(settings, n) for n in CALIBRATION}
     out["stages"] = list(settings.stages)
     out["photometric"] = {n: getattr(settings.photometric, n) for n in PHOTOMETRIC}
@@ -87,7 +89,7 @@ def settings_to(settings: Settings) -> dict[str, Any]:
 
 
 def check(kind: str, settings: Mapping[str, Any]) -> None:
-    """Raises :class:`AmiwarpError` naming the field that is unknown, or the value that makes no sense."""
+    """Check a preset's settings; raise :class:`AmiwarpError` naming an unknown field or an invalid value."""
     if kind == "compensation":
         _check_names(settings, ("model",), "")
         one_of(settings.get("model"), MODELS, "model")
@@ -95,7 +97,7 @@ def check(kind: str, settings: Mapping[str, Any]) -> None:
     _check_names(settings, (*CALIBRATION, "photometric"), "")
     photometric = settings.get("photometric", {})
     if not isinstance(photometric, dict):
-        raise AmiwarpError(f"photometric is {shown(photometric)}, not an object")
+        raise AmiwarpError(f"photometric is {shown(photometric)}; expected an object")
     _check_names(photometric, PHOTOMETRIC, "photometric.")
     plain = {n: v for n, v in settings.items() if n != "photometric"}
     for name, value in plain.items():
@@ -108,21 +110,21 @@ def check(kind: str, settings: Mapping[str, Any]) -> None:
 def _check_names(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise AmiwarpError(f"field {where}{shown(unknown[0])[1:-1]} is unknown; a preset may have {', '.join(known)}")
+        raise AmiwarpError(f"field {where}{shown(unknown[0])[1:-1]} is unknown; choose among {', '.join(known)}")
 
 
 def _check_type(name: str, value: Any, default: Any) -> None:
     wanted = (list, tuple) if isinstance(default, tuple) else type(default)
     good = isinstance(value, wanted) and not isinstance(value, bool)
     if not (good or (name == "global_algorithm" and value is None)):
-        raise AmiwarpError(f"{name} is {shown(value)}; it should look like {default!r}")
+        raise AmiwarpError(f"{name} is {shown(value)}; expected a value like {default!r}")
 
 
 def simplified(calibration: Calibration, model: str) -> Calibration:
-    """The same prism by another model of the ladder: an exact calibration as an ellipse, a radial circle or a circle.
+    """Express a calibration by a simpler model of the same prism: an ellipse, a radial circle or a circle.
 
-    Of a circle the size is the one that comes nearest over image and turn. Raises :class:`AmiwarpError` where ``model``
-    needs more than the calibration found.
+    A circle gets the size that fits best over image and turn. Raises :class:`AmiwarpError` if ``model`` needs
+    parameters that the calibration does not have.
     """
     if one_of(model, MODELS, "model") == calibration.model_name:
         return calibration
@@ -132,11 +134,12 @@ def simplified(calibration: Calibration, model: str) -> Calibration:
         return replace(calibration, model_name=model)
     if size_name(model) == "apex" or (model, calibration.model_name) == ("radial", "circle"):
         raise AmiwarpError(
-            f"the model {model} needs more than a calibration by {calibration.model_name} tells; calibrate with exact"
+            f"the model {model} needs parameters that a calibration of the model {calibration.model_name} does not "
+            "have; calibrate with exact"
         )
     prism = replace(calibration.prism, apex=found.get("apex", calibration.prism.apex),
                     index=found.get("index", calibration.prism.index))  # fmt: skip
-    values = {n: v for n, v in found.items() if n not in ONLY_EXACT}
+    values = {n: v for n, v in found.items() if n not in EXACT_PARAMETERS}
     exact = replace(calibration, model_name="exact") if known == "apex" else calibration
     start = found.get("deflection", prism.deflection)
     simple = replace(calibration, model_name=model, prism=prism, parameters={**values, "deflection": start})
@@ -145,7 +148,7 @@ def simplified(calibration: Calibration, model: str) -> Calibration:
 
 
 def _gain(model: Model, other: Model) -> float:
-    """By how much the displacement of ``model`` is too small, by least squares over the image and one turn."""
+    """Return the factor by which ``model``'s displacement must grow to fit ``other``'s, by least squares."""
     x, y, theta = np.meshgrid(
         np.linspace(0, other.camera.width - 1, 24), np.linspace(0, other.camera.height - 1, 18),
         np.arange(16) * (np.pi / 8), indexing="ij",

@@ -1,4 +1,4 @@
-"""The prism's speed from the events alone: a still scene repeats itself every turn. And whether an encoder agrees."""
+"""Speed of the prism from the events alone: the events of a still scene repeat in every turn."""
 
 from __future__ import annotations
 
@@ -21,34 +21,35 @@ CELL = 8
 BIN_US = 1000
 """Length of the time bins [us]."""
 LONGEST_US = 3_000_000
-"""So much of the recording is looked at."""
+"""Duration from the start of the recording that is analysed [us]."""
 FASTEST_BINS = 5
-"""Shortest period sought [bins]: 12,000 rpm."""
+"""Shortest detectable period [bins]: 12,000 rpm."""
 LEAST_CORRELATION = 0.1
+"""Smallest autocorrelation that counts as a repetition."""
 ANGLE_BINS, MOST_TURNS = 96, 24
-"""Bins of a turn, and turns looked at, for comparing an encoder with the events."""
+"""Angle bins per turn and largest number of turns for the check of an encoder's scale."""
 
 
 def estimate_rpm(recording: Recording) -> float:
-    """Speed of the prism [1/min], without its sign, from the autocorrelation of signed event counts per cell.
+    """Return the prism's speed [1/min], without its sign, from the autocorrelation of signed event counts per cell.
 
-    Raises :class:`AmiwarpError` where the events do not repeat, or the recording has under two turns.
+    Raises :class:`AmiwarpError` if the events do not repeat or the recording has less than two turns.
     """
     counts = signed_counts(recording)
     if len(counts) < 2 * FASTEST_BINS:
         raise AmiwarpError(
-            f"{recording.name}: {len(counts) * BIN_US * 1e-3:g} ms of events are too short to find the prism's speed; "
-            "record two turns or more, or give rpm or an encoder"
+            f"{recording.name}: the events last {len(counts) * BIN_US * 1e-3:g} ms, which is too short to estimate the "
+            "prism's speed; record two turns or more, or give rpm or an encoder"
         )
     return 60e6 / (_period(autocorrelation(counts), recording.name) * BIN_US)
 
 
-def turns_per_turn(recording: Recording, encoder: Encoder) -> float:
-    """Turns by the encoder in which the events of a still scene repeat: 1 if the encoder's scale is right.
+def encoder_turns_per_period(recording: Recording, encoder: Encoder) -> float:
+    """Return the encoder turns after which the events of a still scene repeat: 1 if the encoder's scale is right.
 
-    Raises :class:`AmiwarpError` if the events do not repeat, or the recording has under two turns.
+    Raises :class:`AmiwarpError` if the events do not repeat or the recording has less than two turns.
     """
-    first, last = _looked_at(recording)
+    first, last = _analysed_span(recording)
     covered = encoder.coverage
     first, last = max(first, covered[0]), min(last, covered[1])
     last = min(last, first + int(MOST_TURNS * 60e6 / max(abs(encoder.rpm), 1.0)))
@@ -62,12 +63,12 @@ def turns_per_turn(recording: Recording, encoder: Encoder) -> float:
 
 
 def signed_counts(recording: Recording) -> NDArray[np.float32]:
-    """ON minus OFF events, shape (bins, cells)."""
-    first, last = _looked_at(recording)
+    """Return ON minus OFF events per time bin and cell, shape (bins, cells)."""
+    first, last = _analysed_span(recording)
     return _signed_counts(recording, first, last, lambda t: (t - first) // BIN_US)
 
 
-def _looked_at(recording: Recording) -> tuple[int, int]:
+def _analysed_span(recording: Recording) -> tuple[int, int]:
     first = recording.events.t_first
     return first, min(recording.events.t_last, first + LONGEST_US - 1)
 
@@ -75,7 +76,7 @@ def _looked_at(recording: Recording) -> tuple[int, int]:
 def _signed_counts(
     recording: Recording, first: int, last: int, bin_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
 ) -> NDArray[np.float32]:
-    """ON minus OFF events between two times [us], shape (bins, cells); ``bin_of`` gives the bins of times."""
+    """Return ON minus OFF events between two times [us], shape (bins, cells); ``bin_of`` maps times to bins."""
     width, height = recording.events.size
     columns, rows = -(-width // CELL), -(-height // CELL)
     bins = int(bin_of(np.array([last]))[0]) + 1
@@ -83,14 +84,14 @@ def _signed_counts(
     for start in range(first, last + 1, 100 * BIN_US):
         e = recording.events.between(start, min(start + 100 * BIN_US, last + 1))
         cell = (e.y // CELL).astype(np.int64) * columns + e.x // CELL
-        # a prism that turns back leads no further than the last bin
+        # if the prism turns back, events may map beyond the last bin
         flat = np.minimum(bin_of(e.t), bins - 1) * (rows * columns) + cell
         counts += np.bincount(flat, weights=2.0 * e.p - 1.0, minlength=len(counts)).astype(np.float32)
     return counts.reshape(bins, rows * columns)
 
 
 def autocorrelation(counts: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Over time, summed over cells, unbiased, 1 at lag 0; up to three quarters of the length."""
+    """Return the unbiased autocorrelation over bins, summed over cells: 1 at lag 0, lags up to 3/4 of the length."""
     n = len(counts)
     power = np.zeros(n + 1)
     for part in np.array_split(counts - counts.mean(axis=0), max(1, counts.shape[1] // 512), axis=1):
@@ -101,7 +102,7 @@ def autocorrelation(counts: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _period(correlation: NDArray[np.float64], name: str) -> float:
-    """First period of a correlation [bins], refined at its multiples."""
+    """Return the period of a correlation [bins]: its first strong peak, refined at multiples of the period."""
     period = _first_period(correlation, name)
     multiple = 1
     while 2 * multiple * period < 0.6 * len(correlation):
@@ -116,15 +117,15 @@ def _first_period(correlation: NDArray[np.float64], name: str) -> float:
     peaks = peaks[peaks >= FASTEST_BINS]
     if not len(peaks) or correlation[peaks].max() < LEAST_CORRELATION:
         raise AmiwarpError(
-            f"{name}: the events do not repeat, so the prism's speed cannot be found (the scene moves, or under two "
-            "turns are recorded); give rpm or an encoder"
+            f"{name}: the events do not repeat, so the prism's speed cannot be estimated (the scene moves, or the "
+            "recording has less than two turns); give rpm or an encoder"
         )
     first = peaks[correlation[peaks] >= 0.7 * correlation[peaks].max()][0]
     return _peak_near(correlation, float(first), 1.0)
 
 
 def _peak_near(correlation: NDArray[np.float64], lag: float, reach: float) -> float:
-    """Lag of the largest value within ``reach`` bins, refined by a parabola."""
+    """Return the lag of the largest value within ``reach`` bins, refined by a parabola."""
     low = max(1, int(np.floor(lag - reach)))
     high = min(len(correlation) - 2, int(np.ceil(lag + reach)))
     k = low + int(np.argmax(correlation[low : high + 1]))

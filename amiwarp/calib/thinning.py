@@ -1,4 +1,4 @@
-"""Fewer events of a recording, evenly."""
+"""Even thinning of a recording's events."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
 RUN = 8
-"""Events that stay together where a recording is thinned: a cache line of times."""
+"""Number of consecutive events that thinning keeps together: their times fill one cache line."""
 
 
 def thin(recording: Recording, most: int) -> Events:
-    """At most ``most`` events, evenly: every k-th run of the recording's; of a file read in blocks."""
+    """Return about ``most`` events, evenly thinned: every k-th run of :data:`RUN` events. Files are read in blocks."""
     source = recording.events
     step = max(1, -(-len(source) // most))
     if step == 1:
         return Events.concatenate(list(source.blocks()))
     if isinstance(source, MemoryEvents):
-        return _runs(source.slice(0, len(source)), step)
-    # blocks of whole periods, so that every run but the last is whole
+        return _every_run(source.slice(0, len(source)), step)
+    # a block holds a whole number of steps, so that only the last run of the recording can be cut
     blocks = source.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
-    return Events.concatenate([_runs(block, step) for block in blocks])
+    return Events.concatenate([_every_run(block, step) for block in blocks])
 
 
-def _runs(block: Events, step: int) -> Events:
-    """The first of every ``step`` runs, copied, so that the block itself can go."""
+def _every_run(block: Events, step: int) -> Events:
+    """Return copies of the first of every ``step`` runs, so that the block's memory can be freed."""
     whole = len(block) // (step * RUN) * step * RUN
 
     def pick(values: NDArray[Any]) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.io import open_recording
-from amiwarp.io.output import check_output
+from amiwarp.io.atomic_output import check_output
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration

@@ -39,7 +39,7 @@ def run(
     device = choose_device(common.device)
     with progress("starting") as advance:
         from amiwarp.cli.rig import parse_size
-        from amiwarp.io.output import own_folder
+        from amiwarp.io.atomic_output import own_folder
         from amiwarp.studies.demo import Demo, run_demo
 
         width, height = parse_size(size)

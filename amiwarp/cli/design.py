@@ -16,7 +16,7 @@ from amiwarp.cli.console import choose_device, plain, progress, report, table
 from amiwarp.cli.inputs import CameraOptions, numbers
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.cli.rig import parse_size
-from amiwarp.io.output import check_output, make_folder, write_text
+from amiwarp.io.atomic_output import check_output, make_folder, write_text
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 

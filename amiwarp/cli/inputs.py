@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import read_json
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera

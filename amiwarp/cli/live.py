@@ -17,8 +17,8 @@ from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_w
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.live.stream.clocking import clock_offset
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.camera_clock import clock_offset
+from amiwarp.live.stream.queue_policy import Policy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.consumers import RawConsumer
     from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session import Session
-    from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.socket_sinks import PipeSink, SocketSink
     from amiwarp.live.stream.speed_control import SpeedKeeper
     from amiwarp.live.stream.status import SessionStatus
     from amiwarp.optics.models import Model
@@ -144,7 +144,10 @@ class ProcessingOptions:
 
 def run(
     source: Annotated[
-        str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")
+        str,
+        typer.Argument(
+            help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+        ),
     ],
     *,
     calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
@@ -198,7 +201,7 @@ class _Receivers:
         self, options: OutputOptions, source: Source, found: Calibration, *, offset_us: float,
         resources: contextlib.ExitStack, stop: threading.Event, say: Callable[[str], None],
     ) -> None:  # fmt: skip
-        from amiwarp.live.stream.forward import Forward
+        from amiwarp.live.stream.forwarding import Forward
 
         def sink(address: str | None) -> SocketSink | PipeSink | None:
             return None if address is None else _open_sink(address, found, resources, stop=stop, say=say)
@@ -261,7 +264,7 @@ def _open_sink(
     say: Callable[[str], None],
 ) -> SocketSink | PipeSink:  # fmt: skip
     from amiwarp.live.stream.packets import encode_hello
-    from amiwarp.live.stream.sockets import open_sink
+    from amiwarp.live.stream.socket_sinks import open_sink
 
     hello = encode_hello(found.camera.width, found.camera.height, found.camera, found.prism)
     sink = open_sink(address, hello, stop=stop, say=say)

@@ -11,8 +11,8 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from amiwarp.io import output
-from amiwarp.regular_file import check_regular
+from amiwarp.io import atomic_output as output
+from amiwarp.io.regular_file import check_regular
 
 OUTPUT = "output"
 """Mark in ``Annotated`` for an option that names a file to write. Paths without a mark are read."""

@@ -13,14 +13,17 @@ from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.live.stream.clocking import clock_offset
+from amiwarp.live.stream.camera_clock import clock_offset
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"
 
 
 def run(
     source: Annotated[
-        str, typer.Argument(help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, - or a file to replay.")
+        str,
+        typer.Argument(
+            help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+        ),
     ],
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,

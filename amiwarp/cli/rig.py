@@ -28,7 +28,7 @@ class RigOptions:
     size: Annotated[
         str | None,
         typer.Option(
-            help="Size of the camera's image (px). Default: 640x480, or the size of the pictures to translate.",
+            help="Size of the camera's image (px). Default: 640x480; for 'amiwarp translate', its pictures' size.",
             metavar="WIDTHxHEIGHT",
             rich_help_panel=_CAMERA,
         ),

@@ -19,8 +19,8 @@ from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import make_folder, own_folder
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.io.atomic_output import make_folder, own_folder
+from amiwarp.kernels.cpu_threads import cpu_threads
 
 if TYPE_CHECKING:
     from amiwarp.studies.stability import Atlas, Axis, Method, Stored
@@ -34,9 +34,9 @@ QUICK_MINUTES = 9.0
 
 def run(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for cells, figures and tables."), OUTPUT_FOLDER] = Path(
-        "amiwarp-atlas"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Folder for the results of single runs (cells), figures and tables."), OUTPUT_FOLDER
+    ] = Path("amiwarp-atlas"),
     quick: Annotated[
         bool,
         typer.Option("--quick", help="Use three values per axis, three methods and one seed: within ten minutes."),
@@ -48,7 +48,7 @@ def run(
         list[str] | None,
         typer.Option(
             help="Method to run in addition to 'default' and 'paper'. Can be repeated. "
-            "Default: all methods, with --quick three.",
+            "Default: all methods; with --quick, only 'sharpness'.",
             metavar="NAME",
         ),
     ] = None,
@@ -174,7 +174,7 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
         try:
             yield stack.enter_context(client.get_executor())
         except distributed.KilledWorker as error:
-            raise AmiwarpError(f"workers died while running a cell ({error}): out of memory, or killed; "
+            raise AmiwarpError(f"workers died during a single run (cell), out of memory or killed: {error}; "
                                "run the same command again to continue") from error  # fmt: skip
 
 
@@ -186,7 +186,7 @@ def _prepare(device: str, local: bool) -> None:
 
 
 def _about(cells: Sequence[Stored]) -> dict[str, Any]:
-    from amiwarp.studies.machine import versions
+    from amiwarp.studies.machine_info import versions
 
     machines = sorted({r.machine for c in cells for r in c.results.values() if r.machine})
     return {"date": time.strftime("%Y-%m-%d"), "machine": ", ".join(machines), "versions": versions(())}

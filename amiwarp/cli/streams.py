@@ -21,7 +21,7 @@ from amiwarp.live.link.link import Link
 
 if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Source
-    from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.socket_sinks import PipeSink, SocketSink
     from amiwarp.live.stream.status import SessionStatus
 
 _SOURCE = "Source"
@@ -65,7 +65,7 @@ class SourceOptions:
 
     def open(self, spec: str, say: Callable[[str], None]) -> Source:
         """Open the source named ``spec``. ``say`` gets its messages."""
-        from amiwarp.live.stream.opening import open_source
+        from amiwarp.live.stream.source_opening import open_source
 
         return open_source(spec, pace=None if self.fast else 1.0, wait_s=self.wait_for_source, say=say)
 

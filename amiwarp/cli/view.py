@@ -19,7 +19,7 @@ from amiwarp.cli.streams import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.hosts import warning
+from amiwarp.viewer.host_names import warning
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -65,7 +65,7 @@ class ScreenshotOptions:
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
         from amiwarp.viewer.app import save_screenshot
-        from amiwarp.viewer.scene import Look
+        from amiwarp.viewer.cloud_scene import Look
 
         if path.suffix.lower() != ".png":
             raise AmiwarpError(f"{path}: pictures are written as .png; give a name that ends in .png")
@@ -104,8 +104,8 @@ class StreamOptions:
         if not self.live:
             yield None
             return
-        from amiwarp.live.stream.opening import open_source
         from amiwarp.live.stream.recent_events import RecentEvents, followed
+        from amiwarp.live.stream.source_opening import open_source
 
         with SourceOptions(port=self.controller).link() as link:
             stream = open_source(source)
@@ -217,7 +217,7 @@ def run(
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
     from amiwarp.viewer.app import export_folder
-    from amiwarp.viewer.scene import check_display
+    from amiwarp.viewer.cloud_scene import check_display
 
     device = choose_device(common.device)
     check_display()

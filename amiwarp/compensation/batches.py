@@ -20,8 +20,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_encoder import encoder_pieces
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.kernels.compensation import Columns
-from amiwarp.kernels.encoder import EncoderParams
-from amiwarp.kernels.launch import Recorded, beside, launch
+from amiwarp.kernels.encoder_angle import EncoderParams
+from amiwarp.kernels.launch import RecordedLaunch, background_worker, launch
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -100,7 +100,7 @@ class BatchPipeline:
                 setattr(self._host_columns, name, wp.zeros(self._room, dtype=dtype, device="cpu", pinned=True))
         self._host = {name: getattr(self._host_columns, name).numpy() for name in dtypes}
         self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
-        self._recorded: dict[bool, Recorded] = {}
+        self._recorded: dict[bool, RecordedLaunch] = {}
         self._pool = PinnedPool(batch)
         self._copiers = [PacketCopier(), PacketCopier()]  # one may still copy the batch before
         self._votes = Votes(CanvasShape(*self._plan.size), device)
@@ -228,7 +228,7 @@ class BatchPipeline:
             return
         command = self._recorded.get(outside)
         if command is None:
-            command = self._recorded[outside] = Recorded(kernel, inputs, [], device=self._device)
+            command = self._recorded[outside] = RecordedLaunch(kernel, inputs, [], device=self._device)
         command(first, blocks)
 
     def _invalidate(self, start: int, stop: int) -> None:
@@ -248,7 +248,7 @@ class BatchPipeline:
         for start, stop in _joined(self._unvoted):
             blocks = start // self._block, (stop - start) // self._block
             if self._device.is_cpu:
-                self._voting.append((start, stop, beside().submit(self._vote_range, *blocks)))
+                self._voting.append((start, stop, background_worker().submit(self._vote_range, *blocks)))
             else:
                 self._vote_range(*blocks)
         self._unvoted.clear()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.compensation.pointers import FindPointers, Pointers, fastest
 from amiwarp.events.events import Events
-from amiwarp.kernels.launch import Recorded, pool
+from amiwarp.kernels.launch import RecordedLaunch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
 
 PIECE = 1 << 17
@@ -73,7 +73,7 @@ class PacketCopier:
             wp.zeros(rows * FOUND, dtype=int, device="cpu"),
         )
         self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
-        self._commands = [Recorded(gather_parts, [table, found], [], device="cpu") for _ in range(1 + THREADS)]
+        self._commands = [RecordedLaunch(gather_parts, [table, found], [], device="cpu") for _ in range(1 + THREADS)]
 
     def __call__(self, parts: list[Events], n: int, to: list[int], *, with_p: bool) -> CopyInProgress:
         """Start to copy all ``n`` events of ``parts`` to the addresses ``to`` of x, y, t and p (only if ``with_p``).

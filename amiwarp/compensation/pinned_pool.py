@@ -7,6 +7,7 @@ the caller has released them. If the caller keeps more than :data:`POOL_SIZE` of
 
 from __future__ import annotations
 
+import heapq
 import weakref
 from typing import Any, TypeAlias
 
@@ -26,26 +27,30 @@ class PinnedPool:
     def __init__(self, size: int, *, pinned: bool = True) -> None:
         """``size``: largest number of values per array. ``pinned``: page-lock the memory; requires CUDA."""
         self._size, self._pinned = size, pinned
-        self._free: dict[Any, list[Any]] = {np.int64: [], np.float32: [], np.uint8: []}
-        self._allocated = dict.fromkeys(self._free, 0)
+        self._arrays: dict[Any, list[Any]] = {np.int64: [], np.float32: [], np.uint8: []}
+        self._free: dict[Any, list[int]] = {dtype: [] for dtype in self._arrays}  # heaps of numbers
 
     def fill(self, counts: dict[Any, int]) -> None:
         """Allocate arrays now; ``counts``: number of arrays for each type."""
         for dtype, count in counts.items():
-            self._free[dtype] += [self._allocate(dtype) for _ in range(count)]
+            for _ in range(count):
+                heapq.heappush(self._free[dtype], self._allocate(dtype))
 
-    def _allocate(self, dtype: Any) -> Any:
-        self._allocated[dtype] += 1
-        return wp.empty(self._size, dtype=wp.dtype_from_numpy(dtype), device="cpu", pinned=self._pinned)
+    def _allocate(self, dtype: Any) -> int:
+        """Allocate an array; return its number."""
+        arrays = self._arrays[dtype]
+        arrays.append(wp.empty(self._size, dtype=wp.dtype_from_numpy(dtype), device="cpu", pinned=self._pinned))
+        return len(arrays) - 1
 
     def __call__(self, n: int, dtype: Any) -> PooledArray:
         """Return an array of ``n`` uninitialised values."""
         free = self._free[dtype]
-        if not free and self._allocated[dtype] >= POOL_SIZE:
+        if not free and len(self._arrays[dtype]) >= POOL_SIZE:
             view = np.empty(n, dtype)
             return wp.array(view, dtype=wp.dtype_from_numpy(dtype), device="cpu", copy=False), view
-        array = free.pop() if free else self._allocate(dtype)
+        number = heapq.heappop(free) if free else self._allocate(dtype)  # the first free one: few arrays stay in use
+        array = self._arrays[dtype][number]
         # Not a slice: NumPy makes a slice of a slice refer to the base, and the pool would miss that it is in use.
         view = np.frombuffer(memoryview(array.numpy()), dtype, n)
-        weakref.finalize(view, free.append, array).atexit = False
+        weakref.finalize(view, heapq.heappush, free, number).atexit = False
         return array, view

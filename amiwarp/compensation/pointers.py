@@ -43,7 +43,7 @@ def address(array: NDArray[Any]) -> int:
 
 
 def listed_pointers(arrays: list[NDArray[Any]]) -> Pointers:
-    """Return pointers written to a list of their own, by NumPy's public interface."""
+    """Return copies of the pointers in a new array, read through NumPy's public interface."""
     values = np.array([address(array) for array in arrays], np.uint64)
     return Pointers(
         np.uint64(address(values)) + np.uint64(8) * np.arange(len(arrays), dtype=np.uint64), (values, arrays)
@@ -51,7 +51,10 @@ def listed_pointers(arrays: list[NDArray[Any]]) -> Pointers:
 
 
 def pointers_in_place(arrays: list[NDArray[Any]]) -> Pointers:
-    """Return the pointers inside NumPy's array objects; only if :func:`layout_is_known`."""
+    """Return the addresses at which NumPy's array objects store their pointers to the values.
+
+    Nothing is copied. Use it only if :func:`layout_is_known`.
+    """
     return Pointers(np.array(list(map(id, arrays)), np.uint64) + np.uint64(HEAD), arrays)
 
 

@@ -20,7 +20,7 @@ from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.events import Events, check_sensor
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
-from amiwarp.io.native import NativeEvents
+from amiwarp.io.native_reader import NativeEvents
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.launch import launch
 from amiwarp.progress import Progress

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.kernels.encoder import EncoderParams
+from amiwarp.kernels.encoder_angle import EncoderParams
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder

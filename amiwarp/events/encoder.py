@@ -18,7 +18,7 @@ from amiwarp.events.events import TIME_LIMIT, as_times
 from amiwarp.events.unwrapping import unwrap_angles, unwrap_counts
 from amiwarp.validation import array, instance, real, whole
 
-TURN = 2.0 * math.pi
+TWO_PI = 2.0 * math.pi
 """One turn [rad]."""
 MOST_SAMPLES = 1 << 28
 """Largest number of samples of :meth:`Encoder.constant_speed`: three days at one sample per millisecond."""
@@ -162,7 +162,7 @@ class Encoder:
             raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
         t = as_times(t_us)
         counts = unwrap_counts(t, array(count, "encoder count").astype(np.float64), counts_per_turn, counter_bits)
-        encoder = cls(t, counts * (direction * TURN / counts_per_turn), clock_offset_us)
+        encoder = cls(t, counts * (direction * TWO_PI / counts_per_turn), clock_offset_us)
         return encoder if index_t_us is None else encoder.with_index(index_t_us)
 
     @classmethod
@@ -205,7 +205,7 @@ class Encoder:
             given = f"from {t_first} to {t_last} us every {interval_us} us"
             raise AmiwarpError(f"constant speed {given}; expected t_last >= t_first and up to {MOST_SAMPLES} samples")
         elapsed = np.arange(0, t_last - t_first + 2 * interval_us, interval_us, dtype=np.int64)
-        return cls(elapsed + t_first, elapsed.astype(np.float64) * (direction * rpm * TURN / 60e6))
+        return cls(elapsed + t_first, elapsed.astype(np.float64) * (direction * rpm * TWO_PI / 60e6))
 
     def with_clock_offset(self, clock_offset_us: float) -> Encoder:
         """Return the same samples with another clock offset.
@@ -370,7 +370,7 @@ class Encoder:
     @property
     def rpm(self) -> float:
         """Mean speed over all samples [turns/min], negative if the angle decreases."""
-        return float((self.angle[-1] - self.angle[0]) / TURN * 60e6 / float(self.t[-1] - self.t[0]))
+        return float((self.angle[-1] - self.angle[0]) / TWO_PI * 60e6 / float(self.t[-1] - self.t[0]))
 
     def _near(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the encoder times of ``t``, and the times and angles of the samples around them.
@@ -396,4 +396,4 @@ class Encoder:
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Wrap angles [rad] to -pi .. pi."""
-    return np.asarray(angle - TURN * np.round(angle / TURN))
+    return np.asarray(angle - TWO_PI * np.round(angle / TWO_PI))

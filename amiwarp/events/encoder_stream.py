@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import as_times
 
 
@@ -140,7 +140,7 @@ class EncoderStream:
     @property
     def rpm(self) -> float | None:
         """Speed of the latest samples [turns/min], negative if the angle decreases. None with fewer than two."""
-        return None if len(self) < 2 else self._speed() * 60e6 / TURN
+        return None if len(self) < 2 else self._speed() * 60e6 / TWO_PI
 
     def _speed(self) -> float:
         """Return the mean speed of the latest samples [rad/us]."""

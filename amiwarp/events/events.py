@@ -135,7 +135,7 @@ class Events:
 
 @runtime_checkable
 class EventSource(Protocol):
-    """Source of sorted events: memory, a file, or a scanned stream."""
+    """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its beginning."""
 
     def __len__(self) -> int: ...
 
@@ -338,11 +338,11 @@ def regroup(chunks: Iterable[Events], *, count: int | None = None, duration_us: 
         raise AmiwarpError("blocks have both count and duration_us; give one of them")
     if duration_us is not None:
         if duration_us < 1:
-            raise AmiwarpError(f"blocks of duration_us = {duration_us}; expected at least 1 us")
+            raise AmiwarpError(f"duration_us = {duration_us} per block; expected at least 1")
         return _by_duration(chunks, int(duration_us))
     count = DEFAULT_BLOCK if count is None else count
     if count < 1:
-        raise AmiwarpError(f"blocks of count = {count}; expected at least 1 event")
+        raise AmiwarpError(f"count = {count} events per block; expected at least 1")
     return _by_count(chunks, int(count))
 
 

@@ -30,7 +30,10 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events
 
 TURNS = 1 << 16
-"""Number of distinct prism angles per turn. One step is 0.0055 deg, or 0.0005 px on an orbit of 10 px."""
+"""Number of distinct prism angles per turn. One step is 0.0055 deg.
+
+On an orbit with a radius of 10 px, the rounding moves an event by at most 0.0005 px.
+"""
 LARGEST_FOLD = 1 << 16
 """Largest number of angle bins per turn for folding."""
 LARGEST_WEIGHT = 63

@@ -19,7 +19,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.warped_image import PIECE, CanvasShape, Votes
-from amiwarp.io.output import NewFile, allocate, check_output
+from amiwarp.io.atomic_output import NewFile, allocate, check_output
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import warp as wp
 
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels.camera import CameraRotationParams
-from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams
+from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams
 from amiwarp.kernels.tiles import AT_ONCE, THREADS, read_tiles, vote_tiles
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.device_camera import pinhole_params

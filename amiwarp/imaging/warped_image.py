@@ -13,7 +13,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import DeviceEvents, upload_events
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_totals, empty_words, read_votes
-from amiwarp.kernels.launch import Recorded, launch, launch_slices, slice_count
+from amiwarp.kernels.launch import RecordedLaunch, launch, launch_slices, slice_count
 from amiwarp.kernels.votes import (
     BLOCK,
     TRASH,
@@ -24,7 +24,7 @@ from amiwarp.kernels.votes import (
     vote_point_blocks,
     vote_points,
     vote_quickly,
-    vote_turning,
+    vote_rotating_camera,
 )
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.camera_rotation import CameraRotation
@@ -207,7 +207,7 @@ class Votes:
         inputs = [params, camera or model_camera(model, self.device), events.arrays, self._params]
         if camera_rotation is not None and events.arrays.time.shape[0]:
             inputs = [params, model_camera(model, self.device), *inputs[2:], camera_rotation.params()]
-            self._vote_exactly(vote_turning, inputs, events.count)
+            self._vote_exactly(vote_rotating_camera, inputs, events.count)
         elif self.device.is_cuda and not len(events.arrays.weight):
             self._vote_in_batches(inputs, events.count)
         elif self.device.is_cpu and camera is not None:
@@ -233,7 +233,7 @@ class Votes:
         On a CPU, indices count blocks of 64 points, and one thread votes.
         """
         kernel = vote_point_blocks if self.device.is_cpu else vote_points
-        return Recorded(kernel, [x, y, layer, self._params], [self._cells[0]], device=self.device)
+        return RecordedLaunch(kernel, [x, y, layer, self._params], [self._cells[0]], device=self.device)
 
     def add_unmoved(self, events: Events) -> None:
         """Vote events at their coordinates, raw or already compensated. Events with NaN coordinates are not voted."""

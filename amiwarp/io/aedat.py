@@ -16,11 +16,11 @@ from xml.etree import ElementTree
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import errors_name
+from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply
-from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular_file import check_regular
+from amiwarp.io.regular_file import check_regular
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 """First bytes of an AEDAT 4.0 file."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.unwrapping import UnwrapError
-from amiwarp.io.files import errors_name
-from amiwarp.regular_file import check_regular
+from amiwarp.io.input_files import errors_name
+from amiwarp.io.regular_file import check_regular
 
 
 def read_encoder_csv(

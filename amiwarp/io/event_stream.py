@@ -9,11 +9,11 @@ from pathlib import Path
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import errors_name
+from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply
-from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular_file import check_regular
+from amiwarp.io.regular_file import check_regular
 
 
 def open_es(path: Path) -> Recording:

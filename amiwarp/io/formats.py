@@ -9,8 +9,8 @@ from pathlib import Path
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import errors_name
-from amiwarp.regular_file import check_regular
+from amiwarp.io.input_files import errors_name
+from amiwarp.io.regular_file import check_regular
 from amiwarp.validation import choice
 
 
@@ -111,7 +111,7 @@ def _opener(chosen: Format) -> Callable[[Path], Recording]:
     """Return the function that opens a format."""
     # Each reader is imported on use, because its library takes time to load.
     if chosen is Format.HDF5:
-        from amiwarp.io.native import open_native as opener
+        from amiwarp.io.native_reader import open_native as opener
     elif chosen is Format.EVT:
         from amiwarp.io.prophesee import open_evt as opener
     elif chosen is Format.DAT:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name
-from amiwarp.regular_file import check_regular
+from amiwarp.io.input_files import errors_name
+from amiwarp.io.regular_file import check_regular
 from amiwarp.validation import real, shown, whole
 
 Made = TypeVar("Made")

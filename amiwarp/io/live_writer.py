@@ -24,12 +24,12 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, as_times, check_events
 from amiwarp.events.recording import MetadataValue
+from amiwarp.io.atomic_output import allocate, check_output, put_in_place
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
-from amiwarp.io.files import errors_name
-from amiwarp.io.native import open_native
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import Columns, check_frame, check_lengths, make_dataset, ms_entries, write_header
+from amiwarp.io.native_reader import open_native
 from amiwarp.io.native_writer import save_recording
-from amiwarp.io.output import allocate, check_output, put_in_place
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:
@@ -223,7 +223,7 @@ class LiveWriter:
         self.tick()
 
     def set_encoder(self, encoder: Encoder) -> None:
-        """Set the encoder that replaces all appended samples when the file is finished."""
+        """Set the encoder data that the finished file holds instead of the appended encoder samples."""
         self._encoder = encoder
 
     def tick(self) -> None:
@@ -234,9 +234,8 @@ class LiveWriter:
 
     def _check_open(self, what: str) -> None:
         if self._file is None:
-            raise AmiwarpError(
-                f"{self.path}: {what} outside the writer's with block, or after it failed; use a new writer"
-            )
+            given = f"{what}() was called outside the writer's 'with' block, or after it failed"
+            raise AmiwarpError(f"{self.path}: {given}; use a new writer")
 
     def _as_columns(self, events: Events, inside: ArrayLike | None, extrapolated: ArrayLike | None) -> Columns:
         if len(events) and events.x.dtype != self._columns["events/x"].dtype:

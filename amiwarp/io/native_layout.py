@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MetadataValue
-from amiwarp.io.attributes import camera_attributes, prism_attributes
+from amiwarp.io.camera_attributes import camera_attributes, prism_attributes
 from amiwarp.io.chunks import CHUNK
 from amiwarp.optics.camera import Camera, check_size
 

@@ -20,9 +20,10 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, check_events
 from amiwarp.events.recording import MetadataValue, Recording
+from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.copying import copy_events
-from amiwarp.io.files import errors_name
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
     Columns,
     check_frame,
@@ -33,7 +34,6 @@ from amiwarp.io.native_layout import (
     ms_entries,
     write_header,
 )
-from amiwarp.io.output import NewFile
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ class RecordingWriter:
             If events are unsorted or outside the frame, or the arrays differ from those of the first call.
         """
         if self._file is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
+            raise AmiwarpError(f"{self.path}: append() was called outside the writer's 'with' block; call it inside")
         check_events(
             events,
             *self._size,
@@ -218,7 +218,8 @@ class RecordingWriter:
             If other events were written before, or events are unsorted or outside the frame.
         """
         if self._file is None or len(self):
-            raise AmiwarpError(f"{self.path}: fill outside the writer's with block or after other events")
+            given = "fill() was called outside the writer's 'with' block, or after append()"
+            raise AmiwarpError(f"{self.path}: {given}; call it inside the block, before other events")
         self._t_offset = t_first
         with contextlib.closing(in_order(partial(self._compute, piece) for piece in pieces)) as computed:
             for events, inside, columns, encoded in computed:

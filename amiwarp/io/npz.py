@@ -20,9 +20,9 @@ from numpy.lib import format as npy
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import errors_name
-from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular_file import check_regular
+from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.input_files import errors_name
+from amiwarp.io.regular_file import check_regular
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that NumPy writes. Others are refused, because they may take any amount of memory."""

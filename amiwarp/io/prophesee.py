@@ -13,10 +13,10 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import errors_name
+from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets
-from amiwarp.io.scan import FileEvents, Packet
-from amiwarp.regular_file import check_regular
+from amiwarp.io.regular_file import check_regular
 
 WIDEST = (2048, 2048)
 """Largest size that EVT coordinates can represent [px]. The decoder gets it, so that it accepts all events."""

@@ -121,7 +121,8 @@ class ReadingProcess:
             return AmiwarpError(f"reading took over {CPU_SECONDS} s of processor time; the file is damaged")
         if code < 0:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
-        return AmiwarpError(f"the reading process ended with code {code}; check that '{sys.executable}' is Python")
+        remedy = f"check that '{sys.executable}' is Python and that enough memory is free"
+        return AmiwarpError(f"the reading process ended with code {code}; {remedy}")
 
 
 def _end(child: subprocess.Popen[bytes], owner: int) -> None:

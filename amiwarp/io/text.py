@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import errors_name, note_input
-from amiwarp.io.scan import FileEvents, Packet
+from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.input_files import errors_name, note_input
+from amiwarp.io.regular_file import check_regular
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
-from amiwarp.regular_file import check_regular
 
 READ_BYTES = 1 << 22
 """Amount of text that is parsed at once [bytes]: about 200,000 events."""

@@ -207,7 +207,9 @@ class CameraRotationParams:
 
 
 @wp.func
-def turn_back(camera: CameraParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float) -> wp.vec2:
+def undo_camera_rotation(
+    camera: CameraParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float
+) -> wp.vec2:
     """Return the pixel that the scene point seen at ``xy`` at ``time`` [s] has at time 0."""
     rotation = camera_rotation.velocity * time + camera_rotation.acceleration * (0.5 * time * time)
     angle = wp.length(rotation)

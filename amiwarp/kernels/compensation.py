@@ -5,8 +5,9 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, PinholeParams
-from amiwarp.kernels.encoder import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
-from amiwarp.kernels.native import (
+from amiwarp.kernels.encoder_angle import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
+from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
+from amiwarp.kernels.vector_code import (
     load_float,
     load_int64,
     load_uint16,
@@ -15,7 +16,6 @@ from amiwarp.kernels.native import (
     store_uint8,
     store_uint32,
 )
-from amiwarp.kernels.optics import MODEL_STRUCTS, displace
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

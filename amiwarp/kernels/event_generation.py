@@ -8,8 +8,7 @@ order of the threads.
 import warp as wp
 
 from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
-from amiwarp.kernels.optics import trace
-from amiwarp.kernels.sight import (
+from amiwarp.kernels.prism_view import (
     AHEAD,
     Steps,
     View,
@@ -19,6 +18,7 @@ from amiwarp.kernels.sight import (
     see_level,
     texels_ahead,
 )
+from amiwarp.kernels.refraction import trace
 
 wp.set_module_options({"enable_backward": False})
 

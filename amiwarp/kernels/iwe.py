@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.native import load_float, load_word, store_float, store_int
+from amiwarp.kernels.vector_code import load_float, load_word, store_float, store_int
 from amiwarp.kernels.votes import Canvas, Cells
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

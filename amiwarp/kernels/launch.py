@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.cores import cpu_threads
+from amiwarp.kernels.cpu_threads import cpu_threads
 
 SMALLEST_SLICE = 1 << 15  # threads; launching a smaller slice takes longer than running it
 
@@ -23,9 +23,9 @@ def pool() -> ThreadPoolExecutor:
 
 
 @cache
-def beside() -> ThreadPoolExecutor:
+def background_worker() -> ThreadPoolExecutor:
     """Return the shared background worker: a pool of one thread, which keeps the order of its jobs."""
-    return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-background")
+    return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-background-worker")
 
 
 def load(kernel: Any, device: Any) -> None:
@@ -105,8 +105,8 @@ def launch_slices(
     list(pool().map(run, jobs)) if len(jobs) > 1 else run(jobs[0])
 
 
-class Recorded:
-    """Recorded launch that can be repeated, which takes a tenth of the time of a new launch.
+class RecordedLaunch:
+    """Recorded kernel launch that can be repeated, which takes a tenth of the time of a new launch.
 
     The kernel's last input must be ``start: int``.
     """

@@ -6,9 +6,9 @@ other, so that brightness would propagate across the map only slowly with single
 
 import warp as wp
 
-from amiwarp.kernels.descent import add_fixed
+from amiwarp.kernels.conjugate_gradients import add_fixed
+from amiwarp.kernels.map_prior import Prior
 from amiwarp.kernels.photometric import Atlas, Geometry, bilinear, fraction, fractions_of
-from amiwarp.kernels.prior import Prior
 
 wp.set_module_options({"enable_backward": False})
 

@@ -6,7 +6,7 @@ pixel is a candidate for one pair in each time span without events. Candidates a
 
 import warp as wp
 
-from amiwarp.kernels.encoder import THETA_U32_RAD, EncoderParams, piece_at
+from amiwarp.kernels.encoder_angle import THETA_U32_RAD, EncoderParams, piece_at
 from amiwarp.kernels.photometric import HELD, QUIET, Pairs
 
 wp.set_module_options({"enable_backward": False})

@@ -9,9 +9,9 @@ a block of :data:`BLOCK` pairs in vectorised loops.
 import warp as wp
 
 from amiwarp.kernels.camera import NAN
-from amiwarp.kernels.descent import add_fixed, add_two, to_fixed
-from amiwarp.kernels.native import load_float, load_int, load_uint8, store_float
-from amiwarp.kernels.prior import EXTRA
+from amiwarp.kernels.conjugate_gradients import add_fixed, add_two, to_fixed
+from amiwarp.kernels.map_prior import EXTRA
+from amiwarp.kernels.vector_code import load_float, load_int, load_uint8, store_float
 
 wp.set_module_options({"enable_backward": False})
 

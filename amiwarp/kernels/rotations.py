@@ -1,4 +1,4 @@
-"""Rotations of directions, as three floats; see :mod:`amiwarp.kernels.optics`."""
+"""Rotations of directions, as three floats; see :mod:`amiwarp.kernels.refraction`."""
 
 import warp as wp
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
-from amiwarp.kernels.encoder import THETA_U16_RAD
-from amiwarp.kernels.native import load_uint32
-from amiwarp.kernels.optics import CircleParams, ExactParams, RadialCircleParams, displace
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
+from amiwarp.kernels.encoder_angle import THETA_U16_RAD
+from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, displace
 from amiwarp.kernels.shared_memory import add_to_word, get_word, set_word, wait_for_block, window
+from amiwarp.kernels.vector_code import load_uint32
 from amiwarp.kernels.votes import Canvas, dither_offset
 
 # Fast math is on: these sums need not equal those of a CPU bit for bit.
@@ -172,7 +172,7 @@ def without_camera_rotation(
     """Return the position with the candidate's camera rotation removed."""
     if events.time.shape[0] == 0:
         return x, y
-    xy = turn_back(camera, wp.vec2(x, y), motion.camera_rotation[candidate], events.time[i])
+    xy = undo_camera_rotation(camera, wp.vec2(x, y), motion.camera_rotation[candidate], events.time[i])
     return xy[0], xy[1]
 
 

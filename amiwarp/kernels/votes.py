@@ -14,10 +14,10 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
-from amiwarp.kernels.encoder import EncoderParams, theta_u32_at
-from amiwarp.kernels.native import add_word, load_float, load_uint8, load_uint16, store_int, store_word
-from amiwarp.kernels.optics import MODEL_STRUCTS, displace
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
+from amiwarp.kernels.encoder_angle import EncoderParams, theta_u32_at
+from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
+from amiwarp.kernels.vector_code import add_word, load_float, load_uint8, load_uint16, store_int, store_word
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -185,7 +185,7 @@ def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: 
 def vote_blocks(
     model: Any, camera: PinholeParams, events: EventArrays, canvas: Canvas, count: int, start: int, cells: Cells
 ):
-    """Vote one block of events per thread. For CPUs: a vectorised loop finds the votes."""
+    """Vote the events of one block per thread. For CPUs: the loop that computes the votes is vectorised."""
     first = (start + wp.tid()) * BLOCK
     places = wp.zeros(shape=(64,), dtype=int)
     words = wp.zeros(shape=(64,), dtype=wp.uint64)
@@ -206,7 +206,7 @@ def vote_events(model: Any, camera: Any, events: EventArrays, canvas: Canvas, st
 
 
 @wp.kernel
-def vote_turning(
+def vote_rotating_camera(
     model: Any,
     camera: CameraParams,
     events: EventArrays,
@@ -219,7 +219,7 @@ def vote_turning(
     i = start + wp.tid()
     w0, w1 = azimuth_at(model, events, i)
     x, y = displace(model, camera, float(events.x[i]), float(events.y[i]), w0, w1)
-    xy = turn_back(camera, wp.vec2(x, y), camera_rotation, events.time[i])
+    xy = undo_camera_rotation(camera, wp.vec2(x, y), camera_rotation, events.time[i])
     dx, dy = dither_offset(i)
     layer = int(events.layer[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, xy[0] + canvas.dither * dx, xy[1] + canvas.dither * dy, layer)
@@ -348,7 +348,7 @@ def drift_turns(
 
 for _struct in MODEL_STRUCTS:
     wp.overload(vote_blocks, {"model": _struct})
-    wp.overload(vote_turning, {"model": _struct})
+    wp.overload(vote_rotating_camera, {"model": _struct})
     for _camera in (PinholeParams, CameraParams):
         wp.overload(vote_events, {"model": _struct, "camera": _camera})
         wp.overload(vote_quickly, {"model": _struct, "camera": _camera})

@@ -12,8 +12,8 @@ from amiwarp.kernels.event_generation import (
     reconverge,
     shift_times,
 )
-from amiwarp.kernels.optics import ExactParams, trace
-from amiwarp.kernels.sight import Steps
+from amiwarp.kernels.prism_view import Steps
+from amiwarp.kernels.refraction import ExactParams, trace
 from amiwarp.kernels.world import Pose, World, radiance
 
 wp.set_module_options({"enable_backward": False})

@@ -3,8 +3,8 @@
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray
-from amiwarp.kernels.optics import ExactParams, trace
-from amiwarp.kernels.sight import Steps, View
+from amiwarp.kernels.prism_view import Steps, View
+from amiwarp.kernels.refraction import ExactParams, trace
 from amiwarp.kernels.world import FAR, Pose, World, cast, radiance
 
 wp.set_module_options({"enable_backward": False})

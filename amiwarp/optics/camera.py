@@ -15,7 +15,7 @@ from amiwarp.validation import array, real, shown, whole
 LARGEST_SIZE = 65536
 """Largest width and height of a sensor [px]. Columns and rows of events are uint16."""
 LEAST_FOCAL = 1e-3
-"""Least focal length as a multiple of the image's width (fx) or height (fy): a field of view of 179.8 deg."""
+"""Least focal length, as a multiple of the width (fx) or height (fy): its field of view is 179.8 deg."""
 LARGEST_FOCAL = 1e6
 """Largest focal length [px]: one microradian per pixel. Beyond it float32 cannot represent the displacement."""
 LEAST_FOV = 1e-9
@@ -37,8 +37,9 @@ class Camera:
     Raises
     ------
     AmiwarpError
-        If the width or height is not in 1 .. 65536 px, a focal length is not between 0.001 times the image's width or
-        height (179.8 deg) and 1e6 px, or the principal point is more than 65536 px from the first pixel.
+        If the width or height is not in 1 .. 65536 px, ``fx`` is not between 0.001 times the width and 1e6 px, or
+        ``fy`` not between 0.001 times the height and 1e6 px, or a coordinate of the principal point is not in
+        -65536 .. 65536 px. The least focal lengths give a field of view of 179.8 deg.
 
     Examples
     --------

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from amiwarp.kernels.optics import CircleParams, RadialCircleParams
+from amiwarp.kernels.refraction import CircleParams, RadialCircleParams
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import PointDisplacement, set_phase
 from amiwarp.optics.prism import FlatSide, Prism, check_index, check_phase
@@ -80,7 +80,7 @@ class CircleModel(PointDisplacement):
 
         Returns
         -------
-        amiwarp.kernels.optics.CircleParams
+        amiwarp.kernels.refraction.CircleParams
             Deflection and phase as a Warp struct.
         """
         p = CircleParams()
@@ -161,7 +161,7 @@ class RadialCircleModel(PointDisplacement):
 
         Returns
         -------
-        amiwarp.kernels.optics.RadialCircleParams
+        amiwarp.kernels.refraction.RadialCircleParams
             Deflection, phase and index as a Warp struct.
         """
         p = RadialCircleParams()

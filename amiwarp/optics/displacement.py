@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import optics as kernels
+from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.device_camera import camera_params
@@ -88,7 +88,8 @@ def _run(kernel_name: str, model: HasParams, xy: Any, theta: Any) -> Any:
         if not isinstance(theta, wp.array) or theta.device != xy.device or theta.dtype is not wp.float32:
             raise AmiwarpError(f"xy is a Warp array on {xy.device}; give theta as a float32 Warp array there too")
         if xy.dtype is not wp.vec2 or xy.ndim != 1 or xy.shape != theta.shape:
-            raise AmiwarpError(f"xy has type {xy.dtype}, shape {xy.shape}, theta {theta.shape}; give vec2, both (n,)")
+            given = f"xy has type {xy.dtype} and shape {xy.shape}, theta has shape {theta.shape}"
+            raise AmiwarpError(f"{given}; give vec2 for xy, and shape (n,) for both")
         out = wp.empty_like(xy)
         launch(kernel, len(xy), [model.params(xy.device), model_camera(model, xy.device), xy, theta], [out],
                device=xy.device)  # fmt: skip

@@ -11,7 +11,7 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.optics import EllipseParams, fit_harmonics
+from amiwarp.kernels.refraction import EllipseParams, fit_harmonics
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import PointDisplacement, model_camera, set_phase
 from amiwarp.optics.exact_model import ExactModel
@@ -183,7 +183,7 @@ class EllipseModel(PointDisplacement):
 
         Returns
         -------
-        amiwarp.kernels.optics.EllipseParams
+        amiwarp.kernels.refraction.EllipseParams
             The tables and the phase as a Warp struct.
         """
         if str(device) not in self._tables:

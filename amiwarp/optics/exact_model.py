@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from amiwarp.kernels.optics import ExactParams
+from amiwarp.kernels.refraction import ExactParams
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import PointDisplacement, set_phase
 from amiwarp.optics.prism import FlatSide, Prism, check_phase, check_tilt
@@ -92,7 +92,7 @@ class ExactModel(PointDisplacement):
 
         Returns
         -------
-        amiwarp.kernels.optics.ExactParams
+        amiwarp.kernels.refraction.ExactParams
             Apex angle, index, phase and tilt as a Warp struct.
         """
         p = ExactParams()

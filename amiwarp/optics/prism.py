@@ -105,10 +105,35 @@ NominalPrism: TypeAlias = Prism | UnsizedPrism
 
 
 def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
-    """Return the deflection [rad] of the camera's axial ray by a wedge of ``apex`` [rad], about ``(index - 1) * apex``.
+    """Return the deflection of the camera's axial ray by a wedge, about ``(index - 1) * apex``.
 
-    Applies Snell's law at both faces in the plane of the wedge. Raises :class:`AmiwarpError` for total internal
-    reflection.
+    Parameters
+    ----------
+    apex : float
+        Apex angle [rad].
+    index : float
+        Refractive index.
+    flat_side : FlatSide or str, optional
+        Side that the flat face looks to.
+
+    Returns
+    -------
+    float
+        Deflection [rad].
+
+    Raises
+    ------
+    AmiwarpError
+        If the ray is totally reflected.
+
+    Notes
+    -----
+    Snell's law at both faces, in the plane of the wedge.
+
+    Examples
+    --------
+    >>> round(amiwarp.deflection_from_apex(0.02, 1.5168), 6)
+    0.010337
     """
     scene = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE
     # Traced from the camera. With the flat face to the scene the ray enters the tilted face and leaves the flat one.
@@ -122,9 +147,28 @@ def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSi
 
 
 def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
-    """Return the apex angle [rad] for a ``deflection`` [rad] of the camera's axial ray.
+    """Return the apex angle for a deflection of the camera's axial ray.
 
     Inverse of :func:`deflection_from_apex`.
+
+    Parameters
+    ----------
+    deflection : float
+        Deflection [rad].
+    index : float
+        Refractive index.
+    flat_side : FlatSide or str, optional
+        Side that the flat face looks to.
+
+    Returns
+    -------
+    float
+        Apex angle [rad].
+
+    Examples
+    --------
+    >>> round(amiwarp.apex_from_deflection(amiwarp.deflection_from_apex(0.02, 1.5168), 1.5168), 9)
+    0.02
     """
     if choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE:
         return math.atan2(math.sin(deflection), math.sqrt(index**2 - math.sin(deflection) ** 2) - 1.0)

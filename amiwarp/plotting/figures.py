@@ -17,7 +17,7 @@ from amiwarp.compensation.recordings import compensate_events
 from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
 from amiwarp.imaging.warped_image import iwe
-from amiwarp.io.output import write_text
+from amiwarp.io.atomic_output import write_text
 from amiwarp.plotting import clouds
 from amiwarp.reconstruction.choices import Tone
 from amiwarp.reconstruction.export import limits, tones

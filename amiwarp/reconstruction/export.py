@@ -11,7 +11,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import encode_image
-from amiwarp.io.output import NewFile, check_output
+from amiwarp.io.atomic_output import NewFile, check_output
 from amiwarp.reconstruction.choices import CONTRAST, Tone
 from amiwarp.validation import choice
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.brightness.solver import Tiles
-from amiwarp.events.encoder import TURN
+from amiwarp.events.encoder import TWO_PI
 from amiwarp.optics.camera_rotation import CameraRotation, border
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def map_tile(model: Model, camera_rotation: CameraRotation, length_us: int) -> t
 def border_displacements(model: Model) -> NDArray[np.float64]:
     """Return the displacements of the image's border by the prism over one turn [px], shape (n, 2)."""
     xy = border(model.camera)
-    theta = np.arange(24) * (TURN / 24)
+    theta = np.arange(24) * (TWO_PI / 24)
     at = np.repeat(xy, 24, axis=0)
     moved = model.compensate_points(at.astype(np.float32), np.tile(theta, len(xy)))
     away = np.asarray(moved, np.float64) - at

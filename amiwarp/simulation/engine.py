@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.events.events import Events
 from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import launch as launching
-from amiwarp.kernels import sight, world_events
+from amiwarp.kernels import prism_view, world_events
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
@@ -92,7 +92,7 @@ class Engine:
         self._margin = int(kernels.LARGEST_LAG) // (int(kernels.TICKS) * self._step) + 2
         self._axis = axis_rotation(*simulation.motion.tilt)
         self._sensor = sensor_params(simulation.sensor, self._step)
-        self._view = sight.View()
+        self._view = prism_view.View()
         self._view.camera = camera_params(simulation.camera, str(self._device))
         self._view.prism = ExactModel(simulation.camera, simulation.prism, 0.0, simulation.motion.tilt).params(
             self._device
@@ -139,16 +139,18 @@ class Engine:
         simulation, margin = self._simulation, self._margin
         t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
         angle = simulation.motion.phase + simulation.motion.angle(t)
-        steps = sight.Steps()
-        table: NDArray[Any] = np.zeros(len(t), cast("Any", sight.Step).numpy_dtype())
+        steps = prism_view.Steps()
+        table: NDArray[Any] = np.zeros(len(t), cast("Any", prism_view.Step).numpy_dtype())
         table["azimuth"] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         if self._maps is not None:
             self._fill_maps(self._maps, table, t, first, count)
         if self._sight is not None:
             self._sight.set_instants(t, self._view)
-        steps.at = wp.array(table, dtype=sight.Step, device=self._device)
+        steps.at = wp.array(table, dtype=prism_view.Step, device=self._device)
         if self._device.is_cpu:
-            steps.ahead = wp.array(instants_in_blocks(table[margin + 1 :]), dtype=sight.Instants, device=self._device)
+            steps.ahead = wp.array(
+                instants_in_blocks(table[margin + 1 :]), dtype=prism_view.Instants, device=self._device
+            )
         steps.angle = self._upload(wrap_angle(angle))
         steps.turn = self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
         steps.per_tick = 1.0 / (self._step * int(kernels.TICKS))
@@ -301,7 +303,7 @@ def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
 
     The last instant fills the last block.
     """
-    ahead = int(sight.AHEAD)
+    ahead = int(prism_view.AHEAD)
     columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9)], axis=1)
     filled = np.concatenate([columns, np.repeat(columns[-1:], -len(columns) % ahead, axis=0)])
     return np.ascontiguousarray(filled.reshape(-1, ahead, 11).swapaxes(1, 2))

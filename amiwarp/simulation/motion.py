@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.optics.prism import check_phase, check_tilt
 from amiwarp.validation import array, real, whole
 
@@ -93,7 +93,7 @@ class PrismMotion:
         """Return rows (time [s], speed [rad/s])."""
         rpm = array(self.rpm, "prism speed").astype(np.float64)
         table = np.array([[0.0, rpm], [1.0, rpm]]) if rpm.ndim == 0 else rpm
-        return table * np.array([1.0, TURN / 60.0]) if table.ndim == 2 and table.shape[1] == 2 else table
+        return table * np.array([1.0, TWO_PI / 60.0]) if table.ndim == 2 and table.shape[1] == 2 else table
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
         """Return the unwrapped angle, the exact integral of the speed.
@@ -273,7 +273,7 @@ class EncoderModel:
         true_t = np.rint(np.arange(-spare, math.ceil(duration_us / interval) + spare + 1) * interval).astype(np.int64)
         angle = motion.angle(true_t - self.clock_offset_us)
         if self.counts_per_turn is not None:
-            angle = np.rint(angle * (self.counts_per_turn / TURN)) * (TURN / self.counts_per_turn)
+            angle = np.rint(angle * (self.counts_per_turn / TWO_PI)) * (TWO_PI / self.counts_per_turn)
         stamp = true_t + np.rint(rng.normal(0.0, self.jitter_us, len(true_t))).astype(np.int64)
         kept = np.ones(len(stamp), np.bool_)
         for start in rng.uniform(0.0, duration_us, rng.poisson(self.dropouts_hz * duration_us * 1e-6)):

@@ -72,7 +72,10 @@ class Scene:
     frames: Frames
     """The pictures."""
     fov: float | None = None
-    """Horizontal field of view of a picture [rad]. Beyond its edges it is mirrored. None fills everything ever seen."""
+    """Horizontal field of view of a picture [rad]; it is mirrored beyond its edges.
+
+    None: the picture is just large enough to cover everything that the camera sees through the turning prism.
+    """
     blur: float = 0.5
     """Standard deviation of the optical blur, including the pixel's aperture [sensor px]."""
 
@@ -93,7 +96,8 @@ class Scene:
             Picture file, or pixel values of shape ``(height, width)`` or ``(height, width, 3)``. uint8 and uint16
             values are sRGB-encoded; floating values are linear, with white at 1.
         fov : float, optional
-            Horizontal field of view of the picture [rad]; by default it fills everything ever seen.
+            Horizontal field of view of the picture [rad]. By default the picture is just large enough to cover
+            everything that the camera sees through the turning prism.
         blur : float, optional
             Standard deviation of the optical blur [sensor px].
 

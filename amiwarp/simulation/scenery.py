@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import sight
+from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel
@@ -109,13 +109,13 @@ def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
     out = wp.empty(len(xy), dtype=wp.vec3, device=device)
     prism = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt).params(device)
     inputs = [camera_params(camera, str(wp.get_device(device))), prism, xy, angles]
-    launch(sight.scene_bearings, len(xy), inputs, [out], device=device)
+    launch(prism_view.scene_bearings, len(xy), inputs, [out], device=device)
     bearings = out.numpy().astype(np.float64)
     return np.asarray(bearings[np.isfinite(bearings).all(axis=1)])
 
 
 def place_scene(simulation: Simulation) -> Placement:
-    """Place the picture so that it covers everything that is ever seen.
+    """Place the picture so that it covers everything that the camera sees through the turning prism.
 
     Raises :class:`AmiwarpError` if the camera turns away from it.
     """
@@ -175,7 +175,7 @@ class MapRing:
         return np.array(times, np.float64), np.array(slots, np.int32)
 
     def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return matrices (n, 3, 3) from the camera's frame to the pictures' at times [us]; None if the camera rests."""
+        """Return matrices (n, 3, 3) from the camera's frame to the pictures' at times [us]; None at rest."""
         return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
 
     def _slot(self) -> int:
@@ -211,10 +211,10 @@ def log_view(simulation: Simulation) -> NDArray[np.float32]:
     placement = place_scene(simulation)
     ring = MapRing(simulation, placement)
     ring.cover(0, 0)
-    view = sight.View()
+    view = prism_view.View()
     view.camera, view.maps = camera_params(camera, str(device)), ring.maps
     view.width, view.height = placement.width, placement.height
     out = wp.empty(camera.width * camera.height, dtype=float, device=device)
     inputs = [view, wp.mat33(*placement.to_texel().ravel().tolist())]
-    launch(sight.see_without_prism, len(out), inputs, [out], device=device)
+    launch(prism_view.see_without_prism, len(out), inputs, [out], device=device)
     return np.asarray(out.numpy().reshape(camera.height, camera.width))

@@ -20,7 +20,7 @@ from amiwarp.calib.thinning import thin
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.imaging import metrics
 from amiwarp.io import open_recording
-from amiwarp.io.output import check_output, make_folder
+from amiwarp.io.atomic_output import check_output, make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import Reconstructed, draw_demo

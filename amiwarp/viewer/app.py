@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import check_output
+from amiwarp.io.atomic_output import check_output
 from amiwarp.viewer.choices import View
+from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.page_values import SETTABLE
 from amiwarp.viewer.panel import Panel
-from amiwarp.viewer.scene import Look, Scene
 from amiwarp.viewer.serve import serve
-from amiwarp.viewer.values import SETTABLE
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration

@@ -13,8 +13,8 @@ from amiwarp.viewer.choices import Axis, Colour
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.viewer.cloud_scene import Look
     from amiwarp.viewer.inspector import DisplayedWindow
-    from amiwarp.viewer.scene import Look
 
 NEAR_PX = 3.0
 """Size of the neighbourhood whose centre is compared with an event: two standard deviations [px]."""

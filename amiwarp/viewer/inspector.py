@@ -246,9 +246,10 @@ class Inspector:
         kept |= {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
         shown = self.show()
         return Calibration(
-            k.model, self.camera, self.prism, kept, {}, (), Sharpness.VARIANCE.value, shown.sharpness_before,
-            shown.sharpness_after, (), shown.selected, 0.0, ("set by hand in the inspector",),
-            None if self.has_encoder else self.zero_us,
+            model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
+            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=shown.sharpness_before,
+            sharpness_after=shown.sharpness_after, stages=(), events=shown.selected, seconds=0.0,
+            warnings=("set by hand in the inspector",), zero_us=None if self.has_encoder else self.zero_us,
         )  # fmt: skip
 
     def set(self, knobs: Knobs) -> None:

@@ -26,14 +26,14 @@ from amiwarp.reconstruction.export import tones
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.clicks import ClickDetector
+from amiwarp.viewer.cloud_scene import ORBIT_COLOUR, Look, Scene
 from amiwarp.viewer.exports import export_path
 from amiwarp.viewer.frames import wait_until_page_keeps_up
 from amiwarp.viewer.inspector import Selection
 from amiwarp.viewer.jobs import CalibrationJob, Playback
 from amiwarp.viewer.layout import KEYS, NAMES, UNITS, build
 from amiwarp.viewer.message_filter import finite
-from amiwarp.viewer.scene import ORBIT_COLOUR, Look, Scene
-from amiwarp.viewer.values import event_text, initial_state, jpeg, percent_of_range, polyline, source_state
+from amiwarp.viewer.page_values import event_text, initial_state, jpeg, percent_of_range, polyline, source_state
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import DisplayedWindow, Inspector

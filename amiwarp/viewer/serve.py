@@ -19,7 +19,7 @@ from weakref import WeakSet
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.frames import PictureThrottle
-from amiwarp.viewer.hosts import ALL_INTERFACES, HostNames, address, cannot_serve, normalised
+from amiwarp.viewer.host_names import ALL_INTERFACES, HostNames, address, cannot_serve, normalised
 from amiwarp.viewer.message_filter import MOST_BYTES, Check, MessageFilter
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.events.events import Events
-from amiwarp.io.scan import FileEvents
+from amiwarp.io.file_scan import FileEvents
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,1 +1,1 @@
-"""The photometric stage of the calibration."""
+"""Photometric stage of the calibration: one brightness map must explain the events."""

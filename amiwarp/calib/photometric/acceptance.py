@@ -1,37 +1,60 @@
-"""Whether the photometric stage's optimum is one: each bar was set by what failed below it, ``docs/stability.md``."""
+"""Acceptance of the photometric stage's optimum.
 
-FAR_PX = 1.5
-"""The stage looks no further from the sharpness optimum than this."""
-BESIDE_PX, LEAST_RISE = 0.3, 0.01
-"""An orbit that is larger, smaller or turned by this much must cost more by this share of the cost with no map. Else a
-map of few events fits anything, or there is no optimum."""
-LARGEST_STEP_LEFT_PX = 0.06
-"""By which Gauss and Newton's method would still move at the end: 0.01 where the search arrived."""
+Each limit was set by failures that it prevents, see ``docs/explanation/stability.md``.
+"""
+
+LARGEST_MOVE_PX = 1.5
+"""Largest distance from the sharpness optimum in any parameter of the prism [px]."""
+PERTURBATION_PX, LEAST_COST_RISE = 0.3, 0.01
+"""Reject the result if changing the orbit by ``PERTURBATION_PX`` raises the cost by less than ``LEAST_COST_RISE``.
+
+Without such a rise there is no optimum, or a map of few events fits any orbit. The cost is relative to that without a
+map.
+"""
+LARGEST_NEXT_STEP_PX = 0.06
+"""Largest Gauss-Newton step that may remain at the end [px]. It is about 0.01 if the search converged."""
 LARGEST_COST = 0.75
-"""Of the cost with no map at all: above it there is nothing that the equations explain."""
+"""Largest cost relative to that without a map. Above it the equations explain nothing."""
 
 
-def verdict(cost: float, rise: float, moved: float, ahead: float) -> tuple[bool, str]:
-    """Whether to believe an optimum, and why.
+def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -> tuple[bool, str]:
+    """Return whether to accept an optimum, and the reason.
 
-    ``cost``: what is left of the residual, as a share of that with no map; ``rise``: by how much that is more, at
-    least, for an orbit that is :data:`BESIDE_PX` larger, smaller or turned either way; ``moved`` [px] from the answer
-    of sharpness; ``ahead`` [px]: the step that the search would take next.
+    Parameters
+    ----------
+    cost : float
+        Remaining cost, relative to that without a map.
+    rise : float
+        Smallest rise of the cost for an orbit that is :data:`PERTURBATION_PX` larger, smaller or rotated either way.
+    moved : float
+        Distance from the answer of the sharpness stage [px].
+    next_step : float
+        Length of the next Gauss-Newton step [px].
+
+    Returns
+    -------
+    accepted : bool
+        Whether to accept the optimum.
+    reason : str
+        The reason.
     """
     if cost > LARGEST_COST:
         return False, (
-            f"no map of the scene explains the events ({min(100 * cost, 100):.0f} % of the residual remains): the "
-            "scene or the camera moved, light flickered, or the encoder is wrong"
+            f"no brightness map of the scene explains the events ({min(100 * cost, 100):.0f} % of the residual "
+            "remains): the scene or the camera moved, light flickered, or the encoder is wrong"
         )
-    if moved > 0.95 * FAR_PX:
-        return False, f"the optimum lies over {FAR_PX:g} px from that of sharpness"
-    if ahead > LARGEST_STEP_LEFT_PX:
-        far = f"{ahead:.2f} px" if ahead <= FAR_PX else f"over {FAR_PX:g} px"
-        return False, f"no step of the search helps, though it should move {far}: too few events, or many lost"
-    if rise < LEAST_RISE:
+    if moved > 0.95 * LARGEST_MOVE_PX:
+        return False, f"the optimum is over {LARGEST_MOVE_PX:g} px away from that of sharpness"
+    if next_step > LARGEST_NEXT_STEP_PX:
+        size = f"{next_step:.2f} px" if next_step <= LARGEST_MOVE_PX else f"over {LARGEST_MOVE_PX:g} px"
+        return False, (
+            f"the search did not converge: its next step would be {size}, but no step lowers the cost: too few events, "
+            "or many lost"
+        )
+    if rise < LEAST_COST_RISE:
         well = f"as well ({100 * rise:.1f} % of the residual more)" if rise > 0.0 else "better"
         return False, (
-            f"an orbit {BESIDE_PX:g} px larger, smaller or turned explains the events {well}: "
+            f"an orbit that is {PERTURBATION_PX:g} px larger, smaller or rotated explains the events {well}: "
             "too few events, too little contrast, or the scene or the camera moved"
         )
-    return True, f"one map explains the events ({100 * cost:.0f} % of the residual remains)"
+    return True, f"one brightness map explains the events ({100 * cost:.0f} % of the residual remains)"

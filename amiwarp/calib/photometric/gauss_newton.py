@@ -1,4 +1,4 @@
-"""Gauss and Newton's method on a projected least-squares problem, and what the slopes say of the parameters."""
+"""Gauss-Newton method for a least-squares problem with the map projected out, and the parameters' uncertainty."""
 
 from __future__ import annotations
 
@@ -9,71 +9,77 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from amiwarp.calib.nlopt_solver import best_of
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.solve import SearchStage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.calib.nlopt_solver import SearchStage
     from amiwarp.calib.parameters import ParameterSpace
 
     Vector = NDArray[np.float64]
 
 GAUSS_NEWTON = "gauss-newton"
+"""Name of the method in the settings."""
 MOST_STEPS = 15
+"""Largest number of steps."""
 LONGEST_STEP_PX = 1.0
+"""Largest change of any parameter in a step [px]."""
 HALVINGS = 4
+"""Number of step lengths that are tried, each half of the previous one."""
 UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
-"""A parameter of a larger standard deviation, or of less curvature beside the largest, is not determined."""
+"""A parameter is undetermined above this standard deviation [px], or below this share of the largest curvature."""
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """Of a weighted least-squares problem with the map projected out (Kaufman 1975): sums over all pairs."""
+    """Derivatives of a weighted least-squares problem with the map projected out (Kaufman 1975), summed over pairs."""
 
     hessian: Vector
-    """Of the slopes' products, shape (parameters, parameters) [thresholds²/px²]."""
+    """Gauss-Newton Hessian [thresholds²/px²], shape ``(parameters, parameters)``."""
     gradient: Vector
-    """Half the cost's first derivative [thresholds²/px]. It is that with the map as it is: the map is at its best, so
-    it adds nothing."""
+    """Half the cost's gradient [thresholds²/px], shape ``(parameters,)``. The map is optimal, so it adds nothing."""
     parts: Vector
-    """What each cluster of pairs adds to it with the map projected out, shape (parameters, clusters)."""
+    """Contribution of each cluster of pairs to the gradient, shape ``(parameters, clusters)``."""
 
-    def of(self, which: list[int]) -> Slopes:
-        """By some of the parameters alone."""
+    def restricted_to(self, which: list[int]) -> Slopes:
+        """Return the slopes for some of the parameters."""
         return Slopes(self.hessian[np.ix_(which, which)], self.gradient[which], self.parts[which])
 
     def step(self) -> Vector:
-        """Gauss and Newton's."""
+        """Return the Gauss-Newton step [px]."""
         ridge = 1e-6 * float(np.trace(self.hessian)) * np.eye(len(self.hessian))
         return np.asarray(-np.linalg.solve(self.hessian + ridge, self.gradient))
 
     def covariance(self) -> Vector:
-        """Sandwich estimate [px²] from the scatter of the slopes of the cost between clusters."""
-        many = self.parts.shape[1]
+        """Return the covariance [px²], the sandwich estimate from the scatter of the gradient between clusters."""
+        clusters = self.parts.shape[1]
         parts = self.parts - self.parts.mean(axis=1, keepdims=True)
-        scatter = parts @ parts.T * many / max(1, many - 1 - len(parts))
-        # pairs of one pixel share an event, so neighbours count against each other: H alone would be too sure
+        scatter = parts @ parts.T * clusters / max(1, clusters - 1 - len(parts))
+        # successive pairs of a pixel share an event and are correlated, so the inverse Hessian alone is too small
         inverse = _inverse(self.hessian)
         return np.asarray(inverse @ scatter @ inverse)
 
 
 def _inverse(hessian: Vector) -> Vector:
+    """Return the inverse, with very small eigenvalues raised."""
     values, vectors = np.linalg.eigh(hessian)
     return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
 
 
 def determined(slopes: Slopes, space: ParameterSpace, left: float) -> tuple[str, ...]:
-    """Names that the curvature determines; size, phase and rates always stay, of the others the worst goes first.
+    """Return the names of the free parameters that the events determine.
 
-    A parameter is weak where its standard deviation is large, or its curvature, the others left to follow, is nothing
-    beside the largest: there the deviation, which knows no more of that direction, cannot be believed.
+    A parameter is weak if its standard deviation is large, or if its curvature, with all others free, is far below the
+    largest one: then the standard deviation is unreliable. The weakest parameter is removed until none is weak. Size,
+    phase and rates always stay. ``left`` is the share of equations beyond the map's unknowns.
     """
     names = list(space.names)
     core = sum(n in (space.size_name, "phase", *RATES) for n in names)
     names.sort(key=lambda n: n not in (space.size_name, "phase", *RATES))
     while len(names) > max(core, 1):
-        part = slopes.of([space.names.index(n) for n in names])
+        part = slopes.restricted_to([space.names.index(n) for n in names])
         curvature = 1.0 / np.diag(_inverse(part.hessian)) / part.hessian.diagonal().max()
         deviation = np.sqrt(np.diag(part.covariance())) / left
         weak = [
@@ -90,14 +96,16 @@ def iterate(
     score: Callable[[Vector], float],
     slopes: Callable[[Vector], Slopes],
     start: Vector,
+    *,
     low: Vector,
     high: Vector,
     tolerance: float,
-    tell: Callable[[int, int], None],
+    report: Callable[[int, int], None],
 ) -> SearchStage:
-    """Steps until they are shorter than ``tolerance`` [px] in every direction; a step that does not help is halved.
+    """Maximise a score by Gauss-Newton steps until they are shorter than ``tolerance`` [px] in every parameter.
 
-    The best point seen counts; the score is higher where it is better.
+    A step that lowers the score is halved. The search stays in the box ``low .. high`` [px]. Its answer is the best
+    evaluated point. ``report`` gets the number of steps done and the largest number.
     """
     began = time.perf_counter()
     v, points, scores, ended = np.clip(start, low, high), [], [], "budget"
@@ -105,7 +113,7 @@ def iterate(
     points.append(v)
     scores.append(here)
     for k in range(MOST_STEPS):
-        tell(k, MOST_STEPS)
+        report(k, MOST_STEPS)
         step = slopes(v).step()
         step *= min(1.0, LONGEST_STEP_PX / max(float(np.abs(step).max()), 1e-12))
         for _ in range(HALVINGS):
@@ -122,8 +130,4 @@ def iterate(
         if moved < tolerance or value < here:
             ended = "tolerance" if moved < tolerance else "no better step"
             break
-    best = int(np.argmax(scores))
-    seconds = time.perf_counter() - began
-    return SearchStage(
-        GAUSS_NEWTON, points[best], scores[best], len(scores), seconds, ended, np.array(points), np.array(scores)
-    )
+    return best_of(GAUSS_NEWTON, points, scores, seconds=time.perf_counter() - began, ended=ended)

@@ -1,4 +1,4 @@
-"""What an orbit a little larger, smaller or turned costs: an answer of the photometric stage must be the cheapest."""
+"""Check that the photometric stage's answer is a minimum: orbits a little larger, smaller or rotated must cost more."""
 
 from __future__ import annotations
 
@@ -6,39 +6,44 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.calib.photometric.acceptance import BESIDE_PX
+from amiwarp.calib.photometric.acceptance import PERTURBATION_PX
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.calib.photometric.stage import Cost
+    from amiwarp.calib.photometric.cost import Cost
 
 FEW_PAIRS = 50_000
-"""Pairs up to which making the map anew takes less time than it saves in doubt."""
+"""Number of pairs below which a new map is solved for each point."""
 
 
-def around_optimum(cost: Cost, best: NDArray[np.float64], final: float) -> list[tuple[NDArray[np.float64], float]]:
-    """Places :data:`BESIDE_PX` from ``best`` in size and in phase, either way, and by how much each costs more.
+def cost_around_optimum(cost: Cost, best: NDArray[np.float64], final: float) -> list[tuple[NDArray[np.float64], float]]:
+    """Return points :data:`PERTURBATION_PX` from ``best`` in size and phase with their rise in cost, lowest first.
 
-    ``final`` is the cost of ``best`` with the map as it is. A map of few pairs remembers where it was fitted, and
-    would find every other place worse: then it is made anew for each place, the best one included.
+    ``final`` is the cost at ``best`` with the present map. A map of few pairs is biased to the point where it was
+    fitted, and all other points would cost more. Then a new map is solved for each point, ``best`` included.
     """
     few = cost.brightness.count < FEW_PAIRS
 
-    def at(place: NDArray[np.float64]) -> float:
+    def at(point: NDArray[np.float64]) -> float:
         if few:
-            cost.renew(place)
-        cost.residuals(place, rounds=2)
+            cost.renew(point)
+        cost.residuals(point, rounds=2)
         return cost.mean()
 
     reference = at(best) if few else final
-    places = [best + side * along for along in directions(cost.space, best) for side in (BESIDE_PX, -BESIDE_PX)]
-    return sorted(((place, at(place) - reference) for place in places), key=lambda found: found[1])
+    shifts = [
+        side * along
+        for along in size_and_phase_directions(cost.space, best)
+        for side in (PERTURBATION_PX, -PERTURBATION_PX)
+    ]
+    points = [best + shift for shift in shifts]
+    return sorted(((point, at(point) - reference) for point in points), key=lambda found: found[1])
 
 
-def directions(space: ParameterSpace, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Unit vectors along the size and the phase, of those that are free."""
+def size_and_phase_directions(space: ParameterSpace, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return unit vectors along size and phase, as far as these are free."""
     if space.cartesian:
         x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)
         rest = np.zeros(len(best) - 2)

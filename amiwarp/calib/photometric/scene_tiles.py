@@ -1,4 +1,4 @@
-"""Which parts of the scene the photometric stage makes maps of."""
+"""Choice of the parts of the scene that the photometric stage maps."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ if TYPE_CHECKING:
 TILE = 32
 """Side of a tile of the scene [px]."""
 GRID = (4, 3)
-"""One tile, the busiest, from each of so many columns and rows of the image."""
+"""Number of columns and rows of the image from each of which one tile is chosen, the one with most events."""
 
 
 def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
-    """The busiest cell of :data:`TILE` px from each part of the scene: tile of each pixel (or -1), and the tiles.
+    """Choose the tile with most events from each part of the scene.
 
-    ``image``: of events at the first stage's answer, shape (height, width).
+    ``image`` is the IWE at the answer of the sharpness stage, shape (height, width); ``density`` gives map nodes per
+    pixel, and ``margin`` the border of a tile's map [px]. Return the tile number of each pixel, or -1, and the tiles.
     """
     height, width = image.shape
     columns, rows = max(1, width // TILE), max(1, height // TILE)
@@ -41,7 +42,7 @@ def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tup
 
 
 def one_tile(width: int, height: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
-    """The whole image as one tile: where there are few events none is left out."""
+    """Return the whole image as one tile, for recordings with few events; see :func:`choose_tiles`."""
     origin = np.array([[-margin, -margin]], dtype=np.float32)
     rows, columns = (math.ceil((n + 2 * margin) * density) + 2 for n in (height, width))
     return np.zeros((height, width), dtype=np.int32), Tiles(origin, rows, columns, density)

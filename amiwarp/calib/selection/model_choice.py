@@ -1,7 +1,8 @@
-"""The smallest model of the ladder that a scene needs, and which parameters it can tell.
+"""Choice of the smallest model that a scene needs, and of the parameters that a recording determines.
 
-The exact model is calibrated; each smaller one is fitted to its answer where the scene has events, which predicts its
-error. Held-out turns judge beside it: each model, moved to its sharpest on half of the turns, is measured on the rest.
+The exact model is calibrated. Each smaller model is fitted to its answer where the scene has events, which predicts the
+model's error. Held-out turns give independent evidence: each model is moved to its sharpest on half of the turns and
+measured on the other half.
 """
 
 from __future__ import annotations
@@ -11,14 +12,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib.result import Calibration, ModelCandidate, ModelChoice
+from amiwarp.calib.result import Calibration
 from amiwarp.calib.selection import free_parameters
 from amiwarp.calib.selection.smaller_models import fit
-from amiwarp.calib.selection.trial import FACTOR, Trial, by_sharpness, in_pixels, make_trial
-from amiwarp.calib.sharpness.held_out import slope
+from amiwarp.calib.selection.trial import CONVERSION_FACTOR, Trial, in_pixels, make_trial, sharpness_answer
+from amiwarp.calib.sharpness.held_out import gradient
 from amiwarp.calib.sharpness.objective import padding
 from amiwarp.calib.sharpness.search import Settings
 from amiwarp.calib.single_model import calibrate_model
+from amiwarp.calib.summaries import FreedParameter, ModelCandidate, ModelChoice
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
 NUMBERS = {"circle": "2", "radial": "2, index given", "ellipse": "6 a pixel", "exact": "2, index given"}
+"""Number of parameters of each model, as shown in the table of the candidates."""
 
 
 def calibrate_auto(
@@ -42,160 +45,182 @@ def calibrate_auto(
     progress: Progress | None = None,
     budget_px: float | None = None,
 ) -> Calibration:
-    """Calibrates by the exact model, then takes the smallest model that keeps the budget where the scene has events.
+    """Calibrate the exact model, then express the answer by the smallest model that keeps the error budget.
 
-    ``budget_px``: largest error of a model that counts as none [px rms]; None: a tenth of the blur that quantisation
-    and timing leave anyway. Raises :class:`AmiwarpError` where the recording cannot determine the exact model.
+    ``budget_px`` is the largest tolerated model error where the scene has events [px rms]; None: a tenth of the blur
+    by quantisation and timing. Raises :class:`AmiwarpError` if the recording cannot determine the exact model.
     """
     began = time.perf_counter()
     if budget_px is not None and not budget_px > 0.0:
-        raise AmiwarpError(f"budget_px = {budget_px}; give an error above 0, as 0.03")
+        raise AmiwarpError(f"budget_px = {budget_px}; give an error above 0, for example 0.03")
     settings = replace(settings, model="exact")
     first = calibrate_model(recording, settings, device=device, progress=progress)
     if not first.parameters["apex"]:
-        return first  # without a prism all models are one
-    names = free_parameters.candidates(recording, first) if settings.free is None else ()
+        return first  # without a prism all models are the same
+    trial, parameters = _free_parameters(
+        recording, first, settings, device=device, progress=progress, budget_px=budget_px
+    )
+    fitted = fit_models(trial)
+    pick = next(k for k, f in enumerate(fitted) if f.candidate.chosen)
+    chosen = express(trial, fitted[pick], settings, device)
+    whole = time.perf_counter() - began
+    disagreements = [f.candidate for f in fitted[: pick + 1] if not _agree(trial, f.candidate)]
+    choice = ModelChoice(
+        budget_px=trial.budget_px,
+        timing_px=trial.timing_px,
+        agreed=not disagreements,
+        exact=dict(trial.exact.parameters),
+        exact_uncertainty=dict(trial.exact.uncertainty),
+        rungs=tuple(f.candidate for f in fitted),
+        parameters=parameters,
+        seconds=whole - first.seconds,
+    )
+    warnings = (
+        *_whole_image_warning(trial, chosen),
+        *(f"prediction and held-out turns disagree on the {c.model} model: {c.verdict}" for c in disagreements),
+    )
+    return replace(chosen, ladder=choice, seconds=whole, warnings=(*chosen.warnings, *warnings))
+
+
+def _free_parameters(
+    recording: Recording,
+    first: Calibration,
+    settings: Settings,
+    *,
+    device: Any,
+    progress: Progress | None,
+    budget_px: float | None,
+) -> tuple[Trial, tuple[FreedParameter, ...]]:
+    """Free the parameters that the recording determines and calibrate the exact model again with them.
+
+    Return the trial of the final exact answer, and the decision for each parameter.
+    """
+    names = free_parameters.candidate_names(recording, first) if settings.free is None else ()
     trial = make_trial(recording, first, settings, names, device=device, budget_px=budget_px)
     parameters = free_parameters.judge_parameters(trial)
-    while more := free_parameters.wanted(parameters):
+    while more := free_parameters.freed_names(parameters):
         again = free_parameters.freed_settings(first, settings, more)
         try:
             exact = calibrate_model(recording, again, device=device, progress=progress)
         except AmiwarpError as error:
-            parameters = free_parameters.refused(parameters, str(error))
-            break
-        parameters = free_parameters.confirm(trial, parameters, exact)
-        if free_parameters.wanted(parameters) == more:
+            return trial, free_parameters.hold_all(parameters, str(error))
+        parameters = free_parameters.confirm_freed(trial, parameters, exact)
+        if free_parameters.freed_names(parameters) == more:
             exact = replace(exact, stages=(*first.stages, *exact.stages))
-            trial = make_trial(recording, exact, settings, (), device=device, budget_px=budget_px)
-            break
-    judged = judge_rungs(trial)
-    pick = next(k for k, j in enumerate(judged) if j.rung.chosen)
-    chosen = expressed(trial, judged[pick], settings, device)
-    whole = time.perf_counter() - began
-    agreed = all(_agree(trial, j.rung) for j in judged[: pick + 1])
-    ladder = ModelChoice(
-        budget_px=trial.budget_px,
-        timing_px=trial.timing_px,
-        agreed=agreed,
-        exact=dict(trial.exact.parameters),
-        exact_uncertainty=dict(trial.exact.uncertainty),
-        rungs=tuple(j.rung for j in judged),
-        parameters=parameters,
-        seconds=whole - first.seconds,
-    )
-    warnings = (*_elsewhere(trial, chosen), *(
-        f"the judges do not agree on the {j.rung.model} model: {j.rung.verdict}"
-        for j in judged[: pick + 1]
-        if not _agree(trial, j.rung)
-    ))  # fmt: skip
-    return replace(chosen, ladder=ladder, seconds=whole, warnings=(*chosen.warnings, *warnings))
+            return make_trial(recording, exact, settings, (), device=device, budget_px=budget_px), parameters
+    return trial, parameters
 
 
-def _elsewhere(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
-    """A word of caution where a model keeps the budget only because the events are where they are."""
+def _whole_image_warning(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
+    """Return a warning if the model keeps the budget only where this recording has events."""
     away = predicted_error(chosen.model, trial.exact.model).rms
-    if away <= FACTOR * trial.budget_px:
+    if away <= CONVERSION_FACTOR * trial.budget_px:
         return ()
     return (
-        f"the {chosen.model_name} model is enough where this recording has events, but {away:.2f} px off over the "
-        "whole image: for other recordings take calibration.exact, or calibrate with --model exact",
+        f"the {chosen.model_name} model suffices where this recording has events, but its error over the whole image "
+        f"is {away:.2f} px: for other recordings use calibration.exact, or calibrate with --model exact",
     )
 
 
 @dataclass(frozen=True)
-class Judged:
-    """A rung beside its best fit to the exact answer."""
+class FittedCandidate:
+    """A candidate with the parameters of its best fit to the exact answer."""
 
-    rung: ModelCandidate
+    candidate: ModelCandidate
+    """The candidate and its evidence."""
     values: Mapping[str, float]
+    """Parameter values by name, in their units."""
 
 
-def judge_rungs(trial: Trial) -> tuple[Judged, ...]:
-    """Every model of the ladder by both judges; the smallest that neither rejects is the chosen one."""
-    target, sharp = (trial.places.moved(c.model) for c in (trial.exact, by_sharpness(trial.exact)))
-    top = trial.sharpest([0, 1])
-    reference = trial.test.each(trial.space, top)
-    judged: list[Judged] = []
+def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
+    """Fit every model and measure it on held-out turns. The smallest model without an objection is the chosen one."""
+    target, sharp = (trial.sample.compensated(c.model) for c in (trial.exact, sharpness_answer(trial.exact)))
+    sharpest = trial.sharpest([0, 1])
+    reference = trial.test.each(trial.space, sharpest)
+    fitted: list[FittedCandidate] = []
     for name in MODELS:
         if name in ("circle", "radial"):
-            values, predicted = fit(trial.rung(name, trial.exact), target, trial.places)
-            held_out = _refined(trial, trial.rung(name, by_sharpness(trial.exact)), sharp)
+            values, predicted = fit(trial.space_of(name, trial.exact), target, trial.sample)
+            held_out = _refined(trial, trial.space_of(name, sharpness_answer(trial.exact)), sharp)
         elif name == "ellipse":
-            values, predicted, held_out = _as_ellipse(trial, top)
+            values, predicted, held_out = _as_ellipse(trial, sharpest)
         else:
             values, predicted, held_out = dict(trial.exact.parameters), 0.0, reference
-        found = any(j.rung.chosen for j in judged)
-        judged.append(Judged(_rung(trial, name, predicted, reference, held_out, found=found), values))
-    return tuple(judged)
+        found = any(f.candidate.chosen for f in fitted)
+        fitted.append(FittedCandidate(_candidate(trial, name, predicted, reference, held_out, found=found), values))
+    return tuple(fitted)
 
 
 def _refined(trial: Trial, space: ParameterSpace, sharp: Vector) -> Vector:
-    """Held-out sharpness of a smaller model, moved to its sharpest on the other turns from its fit to the exact one."""
-    values, _ = fit(space, sharp, trial.places)
+    """Return the held-out sharpness of a smaller model, moved from its fit to its sharpest on the training turns."""
+    values, _ = fit(space, sharp, trial.sample)
     v = space.to_vector(values)
-    step = trial.bend.of([0, 1]).top(slope(trial.train, space, v))
+    step = trial.quadratic.restricted_to([0, 1]).step_to_maximum(gradient(trial.train, space, v))
     return trial.test.each(space, space.to_values(v + step))
 
 
-def _as_ellipse(trial: Trial, top: Mapping[str, float]) -> tuple[dict[str, float], float, Vector]:
-    """The ellipse follows the exact model: its parameters are the same, its error that beside the exact sharpest."""
+def _as_ellipse(trial: Trial, sharpest: Mapping[str, float]) -> tuple[dict[str, float], float, Vector]:
+    """Return the ellipse's parameters, those of the exact model, its predicted error and its held-out sharpness."""
     space = replace(trial.space, model="ellipse")
-    model = space.build(top)
-    predicted = trial.places.distance(model, trial.space.build(top))
-    trial.train.each(space, top, model)  # for its time
-    return dict(trial.exact.parameters), predicted, trial.test.each(space, top, model)
+    model = space.build(sharpest)
+    predicted = trial.sample.distance(model, trial.space.build(sharpest))
+    trial.train.each(space, sharpest, model)  # a second measurement of its time per event
+    return dict(trial.exact.parameters), predicted, trial.test.each(space, sharpest, model)
 
 
-def _rung(
+def _candidate(
     trial: Trial, name: str, predicted: float, reference: Vector, held_out: Vector, *, found: bool
 ) -> ModelCandidate:
-    mean, std, seen = trial.seen(reference - held_out)
-    takes = predicted <= trial.budget_px and seen[0] <= trial.tells_px and not found
+    """Return a candidate with its evidence; ``found``: a smaller model was chosen already."""
+    mean, std, seen = trial.as_motion(reference - held_out)
+    chosen = predicted <= trial.budget_px and seen[0] <= trial.rejection_px and not found
     verdict = _verdict(trial, name, predicted, seen)
-    if takes or found:
-        verdict = f"{'the smallest that keeps the budget' if takes else 'larger than needed'}; {verdict}"
+    if chosen or found:
+        verdict = f"{'the smallest that keeps the budget' if chosen else 'larger than needed'}; {verdict}"
     numbers = NUMBERS[name]
     if name == "exact" and any(trial.exact.parameters.get(n) for n in ("tilt_x", "tilt_y")):
         numbers = numbers.replace("2", "4")
     cost = 1e9 * min(half.fastest[name] for half in (trial.train, trial.test))
-    return ModelCandidate(name, numbers, predicted, float(held_out.mean()), mean, std, seen, cost, takes, verdict)
+    return ModelCandidate(
+        model=name, numbers=numbers, predicted_px=predicted, sharpness=float(held_out.mean()), loss=mean, loss_std=std,
+        seen_px=seen, cost_ns=cost, chosen=chosen, verdict=verdict,
+    )  # fmt: skip
 
 
 def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float]) -> str:
-    """What both judges say, in words."""
+    """Return what prediction and held-out turns say about a model, in words."""
     budget = trial.budget_px
     if name == "exact":
-        return "the others are measured by it"
-    if seen[1] < -trial.tells_px:
+        return "the reference for the others"
+    if seen[1] < -trial.rejection_px:
         by = in_pixels(-seen[1])
-        return f"sharper on held-out turns than the exact model, by {by}: is index, flat side or lens wrong?"
+        return f"sharper on held-out turns than the exact model, by {by}: check index, flat side and lens"
     if predicted <= budget:
-        if seen[0] > trial.tells_px:
-            return f"under the budget as predicted, but held-out turns miss what {in_pixels(seen[0])} are worth"
-        return f"under the budget; held-out turns {'agree' if seen[1] <= trial.tells_px else 'cannot tell better'}"
-    if seen[1] < budget / FACTOR:
-        return "over the budget as predicted, though held-out turns miss nothing"
-    return f"over the budget; held-out turns {'agree' if seen[0] > budget / FACTOR else 'cannot tell'}"
+        if seen[0] > trial.rejection_px:
+            return f"predicted under the budget, but held-out turns show an error of at least {in_pixels(seen[0])}"
+        return f"under the budget; held-out turns {'agree' if seen[1] <= trial.rejection_px else 'are inconclusive'}"
+    if seen[1] < budget / CONVERSION_FACTOR:
+        return "predicted over the budget, but held-out turns show no error"
+    return f"over the budget; held-out turns {'agree' if seen[0] > budget / CONVERSION_FACTOR else 'are inconclusive'}"
 
 
-def _agree(trial: Trial, rung: ModelCandidate) -> bool:
-    """Neither judge is surely on the other side of the budget."""
-    low, high = rung.seen_px
-    if rung.predicted_px <= trial.budget_px:
-        return -trial.tells_px <= high and low <= trial.tells_px
-    return high >= trial.budget_px / FACTOR
+def _agree(trial: Trial, candidate: ModelCandidate) -> bool:
+    """Return whether held-out turns do not contradict the predicted error."""
+    low, high = candidate.seen_px
+    if candidate.predicted_px <= trial.budget_px:
+        return -trial.rejection_px <= high and low <= trial.rejection_px
+    return high >= trial.budget_px / CONVERSION_FACTOR
 
 
-def expressed(trial: Trial, judged: Judged, settings: Settings, device: Any) -> Calibration:
-    """The exact answer in the terms of one rung: deflection in place of the apex, with its uncertainty.
+def express(trial: Trial, fitted: FittedCandidate, settings: Settings, device: Any) -> Calibration:
+    """Return the exact answer in the parameters of a smaller model: deflection instead of apex, with uncertainty.
 
-    Sharpness is measured as the exact model's was.
+    The sharpness is measured like that of the exact model.
     """
-    exact, name, values = trial.exact, judged.rung.model, judged.values
+    exact, name, values = trial.exact, fitted.candidate.model, fitted.values
     if name in ("exact", "ellipse"):
         return replace(exact, model_name=name)
-    space = trial.rung(name, exact)
+    space = trial.space_of(name, exact)
     gain = values["deflection"] / exact.parameters["apex"]
     known = {
         "deflection" if n == "apex" else n: x * (gain if n == "apex" else 1.0) for n, x in exact.uncertainty.items()
@@ -211,8 +236,8 @@ def expressed(trial: Trial, judged: Judged, settings: Settings, device: Any) -> 
 def _sharpness(
     trial: Trial, space: ParameterSpace, values: Mapping[str, float], settings: Settings, device: Any
 ) -> float:
-    """Of all events, on an image as large as the search's: beside it the number stands."""
-    like = trial.rung("exact", trial.exact)
+    """Return the sharpness of all events, on an image as large as that of the search, so that both compare."""
+    like = trial.space_of("exact", trial.exact)
     largest = settings.bounds.get("apex", (0.0, 2.0 * trial.exact.prism.apex))[1]
     camera, kind = space.camera, settings.sharpness
     plain = kind is Sharpness.PAPER_J
@@ -220,7 +245,7 @@ def _sharpness(
     canvas = CanvasShape(camera.width, camera.height, pad, per_polarity=settings.per_polarity, dither=not plain)
     votes = Votes(canvas, device)
     meter = SharpnessMeter(canvas, kind, smoothing=0.0 if plain else settings.smoothing_px, device=device)
-    events = trial.material.on(device, space.middle_us if space.moving else None)
+    events = trial.calibration_events.on(device, space.middle_us if space.moving else None)
     votes.add_events(
         space.build(values), events, drift=space.drift(values), camera_rotation=space.camera_rotation(values)
     )

@@ -1,4 +1,7 @@
-"""What a smaller model of the ladder makes of the exact answer, where the scene has its events."""
+"""Fit of the models with fewer parameters to the exact model, at the events of a scene.
+
+Also the blur that remains even with the exact model: by encoder noise, clock resolution and latency jitter.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.calib.parameters import ParameterSpace, make_space, size_name
+from amiwarp.calib.parameters import EXACT_PARAMETERS, ParameterSpace, size_name
+from amiwarp.calib.space_setup import make_space
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,54 +23,56 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 SAMPLED = 5_000
-"""Events by which a model's error is weighted: its rms is then good to 1 %."""
+"""Number of sampled events: enough for an rms error accurate to 1 %."""
 SLOPE_PX = 0.25
+"""Step of the finite differences [px]."""
 STEPS = 2
-"""Gauss and Newton's: the displacement is all but linear in the vector, one is within 0.00001 px already."""
+"""Number of Gauss-Newton steps. The displacement is nearly linear: one step is accurate to 0.00001 px."""
 QUANTISATION_PX = 1.0 / math.sqrt(12.0)
+"""Standard deviation of the rounding to whole pixels [px]."""
 CLOCK_US = 1.0 / math.sqrt(12.0)
-"""Of time stamps in whole microseconds."""
+"""Standard deviation of the rounding to whole microseconds [us]."""
 LATENCY_JITTER_US = 30.0
-"""Of a good sensor in good light. A recording does not tell it apart from the rest of its blur."""
+"""Assumed latency jitter of a good sensor in good light [us]. It cannot be measured from a recording."""
 SHARE = 0.1
-"""The budget, as a share of the blur that is there anyway."""
-ONLY_EXACT = ("apex", "index", "tilt_x", "tilt_y")
+"""Default budget for the model error, as a share of the blur by quantisation and timing."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Events, evenly thinned: their pixels are where this scene has events, and when."""
+    """Evenly thinned events, at which models are compared: models count where and when the scene has events."""
 
     xy: NDArray[np.float64]
-    """[px], shape (n, 2)."""
+    """Pixels [px], shape ``(n, 2)``."""
     theta: NDArray[np.float64]
-    """The encoder's angle [rad], shape (n,)."""
+    """Prism angle by the encoder [rad], shape ``(n,)``."""
     speed: NDArray[np.float64]
-    """Of the prism [rad/us], shape (n,)."""
+    """Speed of the prism [rad/us], shape ``(n,)``."""
 
     @classmethod
     def of(cls, events: Events, encoder: Encoder) -> Places:
+        """Return a sample of the events."""
         some = events[:: max(1, len(events) // SAMPLED)]
         xy = np.stack([some.x, some.y], axis=1).astype(np.float64)
         return cls(xy, encoder.angle_at(some.t), encoder.speed_at(some.t) * 1e-6)
 
-    def moved(self, model: Model, ahead: float | NDArray[np.float64] = 0.0) -> NDArray[np.float64]:
-        """Where the model puts them [px], shape (n, 2), with the prism ``ahead`` of the encoder [rad]."""
+    def compensated(self, model: Model, ahead: float | NDArray[np.float64] = 0.0) -> NDArray[np.float64]:
+        """Return the compensated pixels [px], shape (n, 2), with the prism ``ahead`` of the encoder [rad]."""
         return model.compensate_points(self.xy, self.theta + ahead)
 
     def distance(self, model: Model, other: Model, *, remove_lag: bool = False) -> float:
-        """Between two models [px rms over the events]; with ``remove_lag`` but for a constant angle between them."""
-        away = self.moved(model) - self.moved(other)
+        """Return the distance of two models [px rms]; ``remove_lag`` excludes a constant angle between them."""
+        away = self.compensated(model) - self.compensated(other)
         if remove_lag:
             h = 0.01
-            turn = (self.moved(model, h) - self.moved(model, -h)) / (2.0 * h)
-            away = away - turn * (np.nansum(away * turn) / np.nansum(turn**2))
+            per_angle = (self.compensated(model, h) - self.compensated(model, -h)) / (2.0 * h)
+            away = away - per_angle * (np.nansum(away * per_angle) / np.nansum(per_angle**2))
         return _rms(away)
 
-    def lever(self, model: Model) -> float:
-        """Motion of the events per angle of the prism [px/rad, rms]."""
+    def motion_per_angle(self, model: Model) -> float:
+        """Return the motion of the events per angle of the prism [px rms per rad]."""
         h = 0.01
-        return _rms(self.moved(model, h) - self.moved(model, -h)) / (2.0 * h)
+        return _rms(self.compensated(model, h) - self.compensated(model, -h)) / (2.0 * h)
 
 
 def _rms(shift: NDArray[np.float64]) -> float:
@@ -74,18 +80,18 @@ def _rms(shift: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(squares[np.isfinite(squares)])))
 
 
-def timing_blur(model: Model, places: Places, encoder: Encoder, speed: float) -> float:
-    """Blur [px rms] from the encoder's noise, the clock's resolution and a typical jitter of the latency.
-
-    ``speed``: of the prism [rad/us]. The encoder's noise, rounding included, is what neighbouring samples do not
-    explain of one: the median of its second differences' magnitudes, for white noise √6 of its deviation.
-    """
+def timing_blur(model: Model, sample: Places, encoder: Encoder, speed: float) -> float:
+    """Return the blur [px rms] by encoder noise, clock resolution and latency jitter at a prism speed [rad/us]."""
     noise = encoder_noise(encoder)
-    return places.lever(model) * math.hypot(noise, speed * math.hypot(CLOCK_US, LATENCY_JITTER_US))
+    return sample.motion_per_angle(model) * math.hypot(noise, speed * math.hypot(CLOCK_US, LATENCY_JITTER_US))
 
 
 def encoder_noise(encoder: Encoder) -> float:
-    """Standard deviation of the encoder's angles [rad], see :func:`timing_blur`; 0 for fewer than 4 samples."""
+    """Return the standard deviation of an encoder's angle noise [rad], rounding included; 0 for less than 4 samples.
+
+    Each sample is compared with the interpolation between its two neighbours. The median magnitude of the differences
+    gives the standard deviation of white noise.
+    """
     t, angle = encoder.t, encoder.angle
     if len(t) < 4:
         return 0.0
@@ -95,14 +101,17 @@ def encoder_noise(encoder: Encoder) -> float:
     return float(np.median(np.abs(excess) / np.sqrt(share))) / 0.6745
 
 
-def rung_space(
+def candidate_space(
     model: str, exact: Calibration, free: tuple[str, ...], *, rad_per_us: float, duration_us: float
 ) -> ParameterSpace:
-    """The space of one rung about the exact answer, ``free`` beside size and phase."""
+    """Return the parameter space of a model about the exact answer: size, phase and ``free`` are free.
+
+    ``rad_per_us`` is the mean speed of the prism [rad/us], ``duration_us`` the duration of the events [us].
+    """
     found = exact.parameters
     prism = replace(exact.prism, apex=found["apex"], index=found.get("index", exact.prism.index))
     size = size_name(model)
-    start = {n: x for n, x in found.items() if size == "apex" or n not in ONLY_EXACT}
+    start = {n: x for n, x in found.items() if size == "apex" or n not in EXACT_PARAMETERS}
     start[size] = found["apex"] if size == "apex" else prism.deflection
     start["phase"] = math.remainder(found["phase"], math.tau)
     return make_space(
@@ -111,14 +120,14 @@ def rung_space(
     )  # fmt: skip
 
 
-def fit(space: ParameterSpace, target: NDArray[np.float64], places: Places) -> tuple[dict[str, float], float]:
-    """Parameters that bring a model closest to ``target`` [px], shape (n, 2), and the distance left [px rms].
+def fit(space: ParameterSpace, target: NDArray[np.float64], sample: Places) -> tuple[dict[str, float], float]:
+    """Fit a model to compensated pixels ``target`` [px], shape (n, 2).
 
-    Size and phase are moved, so a constant lag is taken out.
+    Return the parameters and the remaining distance [px rms]. The phase is fitted too, which removes a constant lag.
     """
 
     def away(v: NDArray[np.float64]) -> NDArray[np.float64]:
-        return places.moved(space.build(space.to_values(v))) - target
+        return sample.compensated(space.build(space.to_values(v))) - target
 
     v = space.to_vector(space.start)
     for _ in range(STEPS):
@@ -131,24 +140,25 @@ def fit(space: ParameterSpace, target: NDArray[np.float64], places: Places) -> t
     return space.to_values(v), _rms(away(v))
 
 
-def apart(space: ParameterSpace, v: NDArray[np.float64], places: Places) -> NDArray[np.float64]:
-    """Directions that move events by a pixel each, those past size and phase by what these two cannot follow.
+def independent_directions(space: ParameterSpace, v: NDArray[np.float64], sample: Places) -> NDArray[np.float64]:
+    """Return directions in which every parameter moves events by one pixel that size and phase cannot reproduce.
 
-    Rows of vectors of the space, shape (n, n): the identity's first two, then each entry less the size and phase that
-    come nearest to its motion, made as much longer as that motion is then smaller.
+    The rows are search vectors, shape (n, n). The first two are unit vectors along size and phase. Each other row is a
+    unit vector, minus the size and phase that best reproduce its motion of events, scaled so that the remaining motion
+    is one pixel (rms).
     """
     n = len(v)
 
     def at(shift: NDArray[np.float64]) -> NDArray[np.float64]:
         values = space.to_values(v + shift)
-        return places.moved(space.build(values), places.speed * space.drift(values))
+        return sample.compensated(space.build(values), sample.speed * space.drift(values))
 
     fields = np.array([at(h) - at(-h) for h in SLOPE_PX * np.eye(n)]) / (2.0 * SLOPE_PX)
     fields = fields[:, np.isfinite(fields).all(axis=(0, 2))].reshape(n, -1)
     directions = np.eye(n)
     for k in range(2, n):
-        follow = np.linalg.lstsq(fields[:2].T, fields[k], rcond=None)[0]
-        left = fields[k] - follow @ fields[:2]
-        directions[k, :2] = -follow
+        reproduced = np.linalg.lstsq(fields[:2].T, fields[k], rcond=None)[0]
+        left = fields[k] - reproduced @ fields[:2]
+        directions[k, :2] = -reproduced
         directions[k] /= max(float(np.sqrt(2.0 * np.mean(left**2))), 1e-9)
     return directions

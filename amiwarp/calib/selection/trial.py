@@ -1,4 +1,4 @@
-"""An exact answer on trial: the events that judge it, in two halves, and the space of what might be freed."""
+"""Trial of models on held-out turns: the two halves of the events, and the parameters that might be freed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.parameters import LATE
-from amiwarp.calib.selection.smaller_models import QUANTISATION_PX, SHARE, Places, apart, rung_space, timing_blur
+from amiwarp.calib.parameters import DEGENERATE_WITH_APEX
+from amiwarp.calib.preparation import rotation_window
+from amiwarp.calib.selection.smaller_models import (
+    QUANTISATION_PX,
+    SHARE,
+    Places,
+    candidate_space,
+    independent_directions,
+    timing_blur,
+)
+from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness.curvature import STEP_PX
-from amiwarp.calib.sharpness.held_out import Half, Quadratic, halves
-from amiwarp.calib.sharpness.search import Material, Settings
-from amiwarp.calib.single_model import moving_window
+from amiwarp.calib.sharpness.held_out import HalfSharpness, Quadratic, split_turns
+from amiwarp.calib.sharpness.search import Settings
 from amiwarp.calib.thinning import thin
 
 if TYPE_CHECKING:
@@ -25,83 +33,95 @@ if TYPE_CHECKING:
 
     Vector = NDArray[np.float64]
 
-SURE = 2.0
-"""By so many standard deviations a bigger model, or a freed parameter, must win on held-out turns."""
-FACTOR = 2.0
-"""To which sharpness tells pixels: it counts an error where the edges are, and across them."""
+SIGNIFICANT_STD = 2.0
+"""Number of standard deviations by which a larger model, or a freed parameter, must be better on held-out turns."""
+CONVERSION_FACTOR = 2.0
+"""Accuracy, as a factor, with which sharpness measures displacements: it sees them only at edges and across them."""
 BIAS_PX = 0.1
-"""Sharpness prefers parameters that are off by about so much, so that motion which costs less says nothing."""
-FARTHEST_PX = 3.0
-"""A loss of sharpness is not converted to more motion than this: the curvature holds only near the optimum."""
-ROOM = {"clock_offset": 20_000.0, "tilt_x": math.radians(15.0), "tilt_y": math.radians(15.0), "index": 0.4}
-"""Half width of what is tried of each parameter that may be freed."""
+"""Bias of the sharpest parameters [px]. Smaller displacements are not significant in sharpness."""
+LARGEST_MOTION_PX = 3.0
+"""Largest displacement to which a loss of sharpness is converted: the quadratic holds only near the optimum [px]."""
+SEARCH_RANGE = {"clock_offset": 20_000.0, "tilt_x": math.radians(15.0), "tilt_y": math.radians(15.0), "index": 0.4}
+"""Half width of the range that is tested of each parameter that might be freed, in its unit."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Trial:
-    """See :func:`make_trial`."""
+    """Exact answer with the two halves of the events on which models are fitted and compared."""
 
     exact: Calibration
-    material: Material
-    places: Places
+    """Calibration of the exact model."""
+    calibration_events: CalibrationEvents
+    """All events."""
+    sample: Places
+    """Sample of the events for the comparison of models."""
     rad_per_us: float
+    """Mean speed of the prism [rad/us]."""
     duration_us: float
+    """Duration of the events [us]."""
     budget_px: float
+    """Largest tolerated model error [px rms]."""
     timing_px: float
-    train: Half
-    test: Half
-    """The turns that are held out."""
+    """Estimated blur by timing [px rms]."""
+    train: HalfSharpness
+    """Sharpness of the turns to which models are fitted."""
+    test: HalfSharpness
+    """Sharpness of the held-out turns."""
     space: ParameterSpace
+    """Space of the exact model with all parameters that might be freed."""
     start: Vector
-    """The answer of sharpness in the space [px]."""
+    """Answer of the sharpness stage as a vector of the space [px], shape ``(n,)``."""
     directions: Vector
-    """Of the space, see :func:`apart`."""
-    tried: tuple[str, ...]
-    """Names of the directions: size, phase, and of the others those along which there is room for a difference."""
-    bend: Quadratic
-    """Sharpness of the exact model about the start along these, on the turns that are not held out."""
+    """One direction per parameter, see :func:`independent_directions`, shape ``(n, n)``."""
+    tested: tuple[str, ...]
+    """Parameters with a measurable effect within their range: size, phase and possibly others."""
+    quadratic: Quadratic
+    """Sharpness of the exact model about the start along the directions of ``tested``, on the training turns."""
 
     @property
-    def tells_px(self) -> float:
-        """From where on held-out turns contradict a model that keeps the budget as predicted."""
-        return max(FACTOR * self.budget_px, BIAS_PX)
+    def rejection_px(self) -> float:
+        """Displacement on held-out turns from which a model is rejected though its predicted error is small [px]."""
+        return max(CONVERSION_FACTOR * self.budget_px, BIAS_PX)
 
-    def rung(self, model: str, exact: Calibration) -> ParameterSpace:
-        return rung_space(model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us)
+    def space_of(self, model: str, exact: Calibration) -> ParameterSpace:
+        """Return the parameter space of a model about an exact answer, with size and phase free."""
+        return candidate_space(model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us)
 
-    def room(self, name: str) -> float:
-        """Motion of events, past what size and phase can follow, within what is tried of a parameter [px rms]."""
-        return _room(self.space, self.directions, name)
+    def motion_range(self, name: str) -> float:
+        """Return the motion of events by a parameter over its range, beyond that of size and phase [px rms]."""
+        return _motion_range(self.space, self.directions, name)
 
-    def along(self, which: list[int], steps: Vector) -> Vector:
-        """A shift of the space's vector from steps along tried directions."""
-        rows = [self.directions[self.space.names.index(self.tried[k])] for k in which]
+    def shift_along(self, which: list[int], steps: Vector) -> Vector:
+        """Return the shift of the search vector for steps along some of the tested directions [px]."""
+        rows = [self.directions[self.space.names.index(self.tested[k])] for k in which]
         return np.asarray(steps @ np.array(rows))
 
     def sharpest(self, which: list[int]) -> dict[str, float]:
-        """Parameters of the sharpest exact model, some directions free, on the turns that are not held out."""
-        return self.space.to_values(self.start + self.along(which, self.bend.of(which).top()))
+        """Return the parameters of the sharpest exact model on the training turns, free along some directions."""
+        step = self.quadratic.restricted_to(which).step_to_maximum()
+        return self.space.to_values(self.start + self.shift_along(which, step))
 
-    def seen(self, loss: Vector) -> tuple[float, float, tuple[float, float]]:
-        """Mean of a loss of sharpness over disjoint parts, its deviation, and what motion [px rms] the two amount to.
+    def as_motion(self, loss: Vector) -> tuple[float, float, tuple[float, float]]:
+        """Return the mean and standard deviation of a loss of sharpness, and the equivalent displacements [px rms].
 
-        By the curvature; negative if it is a gain. At most :data:`FARTHEST_PX` either way, and both of these if
-        sharpness is not curved.
+        ``loss`` holds the losses of disjoint parts. The curvature of sharpness converts the mean minus and plus
+        :data:`SIGNIFICANT_STD` standard deviations to displacements, negative for a gain, limited to
+        :data:`LARGEST_MOTION_PX`. Without curvature the displacements are the two limits.
         """
         mean, std = float(loss.mean()), float(loss.std(ddof=1)) / math.sqrt(len(loss))
-        bend = self.bend.of([0, 1]).curvature
-        if not bend > 0.0:
-            return mean, std, (-FARTHEST_PX, FARTHEST_PX)
+        curvature = self.quadratic.restricted_to([0, 1]).curvature
+        if not curvature > 0.0:
+            return mean, std, (-LARGEST_MOTION_PX, LARGEST_MOTION_PX)
         low, high = (
-            math.copysign(min(math.sqrt(2.0 * abs(x) / bend), FARTHEST_PX), x)
-            for x in (mean - SURE * std, mean + SURE * std)
+            math.copysign(min(math.sqrt(2.0 * abs(x) / curvature), LARGEST_MOTION_PX), x)
+            for x in (mean - SIGNIFICANT_STD * std, mean + SIGNIFICANT_STD * std)
         )
         return mean, std, (low, high)
 
 
 def in_pixels(px: float) -> str:
-    """Motion in words: its size, or that it is beyond what sharpness can tell."""
-    return f"{px:.3f} px" if px < FARTHEST_PX else f"more than {FARTHEST_PX:g} px"
+    """Return a displacement as text: its size, or that it is above the largest measurable one."""
+    return f"{px:.3f} px" if px < LARGEST_MOTION_PX else f"more than {LARGEST_MOTION_PX:g} px"
 
 
 def make_trial(
@@ -113,49 +133,57 @@ def make_trial(
     device: Any,
     budget_px: float | None,
 ) -> Trial:
-    """Both halves of the events on the device, and the sharpness about the exact answer; ``names``: what to try."""
-    events = thin(moving_window(recording, settings), settings.events)
+    """Return a trial of an exact answer: both halves of the events on the device, and the sharpness about the answer.
+
+    ``names`` are the parameters that might be freed. ``budget_px`` is the largest tolerated model error [px rms]; None:
+    :data:`SHARE` of the blur by quantisation and timing.
+    """
+    events = thin(rotation_window(recording, settings), settings.events)
     first, last = int(events.t[0]), int(events.t[-1])
     encoder = exact.encoder_for(recording.encoder, first, last)
-    if not encoder.covers(first, last):  # a clock offset was found: the first or last events are before or after it
+    if not encoder.covers(first, last):  # a calibrated clock offset may uncover the first or the last events
         events = events[slice(*np.searchsorted(events.t, encoder.coverage))]
         first, last = int(events.t[0]), int(events.t[-1])
     drifts = "clock_offset" in names
-    material = Material(events, encoder, (lambda t: encoder.speed_at(t) * 1e-6) if drifts else None)
+    events_with_angles = CalibrationEvents(events, encoder, (lambda t: encoder.speed_at(t) * 1e-6) if drifts else None)
     duration = float(max(last - first, 1))
     speed = float(np.ptp(encoder.angle_at(events.t[[0, -1]]))) / duration
-    places = Places.of(events, encoder)
-    space = _with_room(rung_space("exact", by_sharpness(exact), names, rad_per_us=speed, duration_us=duration))
-    train, test = (Half(half, material, space, device) for half in halves(material))
+    sample = Places.of(events, encoder)
+    space = candidate_space("exact", sharpness_answer(exact), names, rad_per_us=speed, duration_us=duration)
+    space = _with_search_range(space)
+    train, test = (HalfSharpness(half, events_with_angles, space, device) for half in split_turns(events_with_angles))
     start = space.to_vector(space.start)
-    rows = apart(space, start, places)
-    which = [k for k, n in enumerate(space.names) if _room(space, rows, n) >= STEP_PX]
-    timing = timing_blur(exact.model, places, encoder, speed)
+    rows = independent_directions(space, start, sample)
+    which = [k for k, n in enumerate(space.names) if _motion_range(space, rows, n) >= STEP_PX]
+    timing = timing_blur(exact.model, sample, encoder, speed)
     budget = budget_px or SHARE * math.hypot(QUANTISATION_PX, timing)
     return Trial(
-        exact, material, places, speed, duration, budget, timing, train, test, space, start, rows,
-        tuple(space.names[k] for k in which), Quadratic.about(train, space, start, rows[which]),
+        exact=exact, calibration_events=events_with_angles, sample=sample, rad_per_us=speed, duration_us=duration,
+        budget_px=budget, timing_px=timing, train=train, test=test, space=space, start=start, directions=rows,
+        tested=tuple(space.names[k] for k in which),
+        quadratic=Quadratic.about(train, space, start, rows[which]),
     )  # fmt: skip
 
 
-def by_sharpness(exact: Calibration) -> Calibration:
-    """The answer of sharpness alone: the photometric one is not the sharpest."""
+def sharpness_answer(exact: Calibration) -> Calibration:
+    """Return the calibration with the parameters of the sharpness stage: the photometric ones are less sharp."""
     p = exact.photometric
     if p is None or not p.accepted:
         return exact
-    # what the photometric stage alone was asked for stays, and what of the camera's motion was dropped
-    found = {n: x for n, x in p.sharpness_parameters.items() if n in exact.parameters and n not in LATE}
+    # parameters that only the photometric stage found stay; a camera rotation that was discarded stays discarded
+    found = {n: x for n, x in p.sharpness_parameters.items() if n in exact.parameters and n not in DEGENERATE_WITH_APEX}
     return replace(exact, parameters={**exact.parameters, **found})
 
 
-def _with_room(space: ParameterSpace) -> ParameterSpace:
+def _with_search_range(space: ParameterSpace) -> ParameterSpace:
     return replace(
         space,
-        low={n: space.start[n] - ROOM[n] if n in ROOM else x for n, x in space.low.items()},
-        high={n: space.start[n] + ROOM[n] if n in ROOM else x for n, x in space.high.items()},
+        low={n: space.start[n] - SEARCH_RANGE[n] if n in SEARCH_RANGE else x for n, x in space.low.items()},
+        high={n: space.start[n] + SEARCH_RANGE[n] if n in SEARCH_RANGE else x for n, x in space.high.items()},
     )
 
 
-def _room(space: ParameterSpace, directions: Vector, name: str) -> float:
+def _motion_range(space: ParameterSpace, directions: Vector, name: str) -> float:
+    """Return :meth:`Trial.motion_range`; infinite for parameters without a range."""
     k = space.names.index(name)
-    return ROOM[name] * space.pixels[name] / abs(float(directions[k, k])) if name in ROOM else math.inf
+    return SEARCH_RANGE[name] * space.pixels[name] / abs(float(directions[k, k])) if name in SEARCH_RANGE else math.inf

@@ -1,1 +1,1 @@
-"""The sharpness stage of the calibration: contrast maximisation."""
+"""Sharpness stage of the calibration: contrast maximisation."""

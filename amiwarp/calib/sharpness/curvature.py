@@ -1,4 +1,4 @@
-"""Slopes and curvature of sharpness about a point, by differences, of disjoint parts of the events."""
+"""Gradients and Hessian of sharpness about a point by finite differences, for disjoint parts of the events."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ if TYPE_CHECKING:
     Vector = NDArray[np.float64]
 
 STEP_PX = 0.25
+"""Step of the finite differences, as displacement of events [px]."""
 
 
-def differences(at: Callable[[Vector], Vector], directions: Vector) -> tuple[Vector, Vector]:
-    """Slopes of each part [1/px], shape (n, parts), and the Hessian of their mean [1/px²], shape (n, n).
+def finite_differences(at: Callable[[Vector], Vector], directions: Vector) -> tuple[Vector, Vector]:
+    """Return each part's gradient [1/px], shape (n, parts), and the Hessian of their mean [1/px²], shape (n, n).
 
-    ``at``: sharpness of each part, shape (parts,), at a shift from the point; ``directions``: rows of vectors that
-    each move events by a pixel, shape (n, entries of the shift).
+    ``at`` returns the sharpness of each part, shape (parts,), at a shift from the point. Each row of ``directions`` is
+    a shift that moves events by one pixel, shape (n, entries of the shift).
     """
     n = len(directions)
     steps = STEP_PX * directions

@@ -1,4 +1,4 @@
-"""Sharpness on turns that were held out: what a model fitted to half of the turns makes of the other half."""
+"""Sharpness on held-out turns: models are fitted to half of the turns and measured on the other half."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.calib.sharpness.curvature import STEP_PX, differences
+from amiwarp.calib.sharpness.curvature import STEP_PX, finite_differences
 from amiwarp.calib.sharpness.objective import padding
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import upload_events
@@ -23,28 +23,30 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.calib.sharpness.search import Material
+    from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
     from amiwarp.events.events import Events
     from amiwarp.optics.models import Model
 
     Vector = NDArray[np.float64]
 
 FEWEST_TURNS = 2.0
+"""Number of turns from which whole turns are held out."""
 SPANS = 32
-"""Under two turns: alternate spans of so many are held out."""
+"""Number of angle spans into which fewer turns are divided; every other span is held out."""
 SMOOTHING_PX = 0.6
-"""Of the images: less than calibration's, since small differences between good models are to be seen."""
+"""Standard deviation of the Gaussian that smooths the images [px]: small, to resolve differences of good models."""
 LONGEST_STEP_PX = 0.5
-LEAST_CURVED = 1e-2
-"""Of the largest curvature: along less, no step is taken."""
+"""Largest step towards a maximum [px]."""
+LEAST_CURVATURE_RATIO = 1e-2
+"""No step is taken along directions with less curvature than this share of the largest."""
 PARTS = 8
-"""Disjoint parts of a half, whose scatter tells chance from signal."""
+"""Number of disjoint parts of each half, whose scatter measures the uncertainty."""
 
 
-def halves(material: Material) -> tuple[Events, Events]:
-    """Every other turn of the events, and the turns between; of under two turns every other of :data:`SPANS` spans."""
-    events = material.events
-    angle = material.encoder.angle_at(events.t)
+def split_turns(calibration_events: CalibrationEvents) -> tuple[Events, Events]:
+    """Return the events of the even and of the odd turns, or of alternate spans if there are less than two turns."""
+    events = calibration_events.events
+    angle = calibration_events.encoder.angle_at(events.t)
     turned = np.abs(angle - angle[0])
     whole = float(turned.max())
     span = math.tau if whole >= FEWEST_TURNS * math.tau else whole / SPANS
@@ -52,27 +54,29 @@ def halves(material: Material) -> tuple[Events, Events]:
     return events[np.flatnonzero(~odd)], events[np.flatnonzero(odd)]
 
 
-class Half:
-    """Sharpness of one half of the events, in disjoint parts, under any model."""
+class HalfSharpness:
+    """Sharpness of one half of the events under any model, measured in disjoint parts."""
 
-    def __init__(self, events: Events, material: Material, space: ParameterSpace, device: Any) -> None:
-        """``space``: the largest."""
-        slope = None if material.slope_of is None else material.slope_of(events.t)
+    def __init__(
+        self, events: Events, calibration_events: CalibrationEvents, space: ParameterSpace, device: Any
+    ) -> None:
+        """Upload the events; ``space`` must allow the largest displacements that will be measured."""
+        slope = None if calibration_events.slope_of is None else calibration_events.slope_of(events.t)
         middle = space.middle_us if space.moving else None
-        uploaded = upload_events(events, material.encoder, device, slope=slope, middle_us=middle)
+        uploaded = upload_events(events, calibration_events.encoder, device, slope=slope, middle_us=middle)
         self._events = uploaded.in_parts(PARTS, per_polarity=False)
         camera = space.camera
         canvas = CanvasShape(camera.width, camera.height, padding(space), parts=PARTS, dither=True)
         self._votes = Votes(canvas, device)
         self._meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device)
         self.fastest: dict[str, float] = {}
-        """By kind of model, least time of an event's angle, displacement and vote [s]."""
+        """Shortest time for one event's angle, displacement and vote, by name of the model [s]."""
 
     def each(self, space: ParameterSpace, values: Mapping[str, float], model: Model | None = None) -> Vector:
-        """Sharpness of each part, shape (PARTS,); ``model``: that of the values, where it was built before."""
+        """Return the sharpness of each part, shape (PARTS,). ``model`` may give the already built model."""
         model = model or space.build(values)
         device = self._meter.device
-        model.params(device)  # an ellipse's tables are made once for all events
+        model.params(device)  # build an ellipse's tables before the time is measured
         self._votes.clear()
         wp.synchronize_device(device)
         began = time.perf_counter()
@@ -87,8 +91,8 @@ class Half:
         return np.array(self._meter.results())
 
 
-def slope(half: Half, space: ParameterSpace, v: Vector) -> Vector:
-    """Of the sharpness at a point of a space [1/px]."""
+def gradient(half: HalfSharpness, space: ParameterSpace, v: Vector) -> Vector:
+    """Return the gradient of the mean sharpness at a search vector [1/px]."""
     steps = STEP_PX * np.eye(len(v))
     rise = [half.each(space, space.to_values(v + h)) - half.each(space, space.to_values(v - h)) for h in steps]
     return np.asarray(np.mean(rise, axis=1) / (2.0 * STEP_PX))
@@ -96,41 +100,45 @@ def slope(half: Half, space: ParameterSpace, v: Vector) -> Vector:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """Sharpness about a point of a space along some directions, by differences over :data:`STEP_PX`."""
+    """Quadratic approximation of sharpness about a point along n directions."""
 
     slopes: Vector
-    """Of each part, shape (n, parts) [1/px]."""
+    """Gradient of each part's sharpness [1/px], shape ``(n, parts)``."""
     hessian: Vector
-    """Of their mean, shape (n, n) [1/px²]."""
+    """Hessian of the mean sharpness [1/px²], shape ``(n, n)``."""
 
     @classmethod
-    def about(cls, half: Half, space: ParameterSpace, v: Vector, directions: Vector) -> Quadratic:
-        """``directions``: rows of vectors that each move events by a pixel, shape (n, entries of the space)."""
-        return cls(*differences(lambda shift: half.each(space, space.to_values(v + shift)), directions))
+    def about(cls, half: HalfSharpness, space: ParameterSpace, v: Vector, directions: Vector) -> Quadratic:
+        """Return the approximation about a search vector.
 
-    def of(self, which: list[int]) -> Quadratic:
+        Each row of ``directions`` is a vector that moves events by one pixel, shape (n, entries of the vector).
+        """
+        return cls(*finite_differences(lambda shift: half.each(space, space.to_values(v + shift)), directions))
+
+    def restricted_to(self, which: list[int]) -> Quadratic:
+        """Return the approximation along some of the directions."""
         return Quadratic(self.slopes[which], self.hessian[np.ix_(which, which)])
 
-    def top(self, slope: Vector | None = None) -> Vector:
-        """The way to the sharpest point [px], no longer than :data:`LONGEST_STEP_PX`; none along what is not curved.
+    def step_to_maximum(self, gradient: Vector | None = None) -> Vector:
+        """Return the step to the sharpest point [px], at most :data:`LONGEST_STEP_PX` long, 0 along flat directions.
 
-        ``slope``: of another model of the same curvature, in place of its own.
+        ``gradient`` replaces the own one, for another model with about the same Hessian.
         """
         values, vectors = np.linalg.eigh(-self.hessian)
-        along = vectors.T @ (self.slopes.mean(axis=1) if slope is None else slope)
-        floor = LEAST_CURVED * max(float(values.max()), 1e-12)
+        along = vectors.T @ (self.slopes.mean(axis=1) if gradient is None else gradient)
+        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
         step = vectors @ np.where(values > floor, along / np.maximum(values, floor), 0.0)
         return np.asarray(step * min(1.0, LONGEST_STEP_PX / max(float(np.linalg.norm(step)), 1e-12)))
 
     @property
     def curvature(self) -> float:
-        """Mean of the curvatures [1/px²]."""
+        """Mean curvature [1/px²], positive at a maximum."""
         return -float(np.trace(self.hessian)) / len(self.hessian)
 
     def deviations(self) -> Vector:
-        """Standard deviation along each direction, the others left to follow [px]: the sandwich estimate."""
+        """Return the standard deviation along each direction [px], all others being free: the sandwich estimate."""
         values, vectors = np.linalg.eigh(-self.hessian)
-        floor = LEAST_CURVED * max(float(values.max()), 1e-12)
+        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
         inverse = vectors @ np.diag(1.0 / np.maximum(values, floor)) @ vectors.T
         scatter = np.atleast_2d(np.cov(self.slopes)) / self.slopes.shape[1]
         return np.asarray(np.sqrt(np.diag(inverse @ scatter @ inverse)))

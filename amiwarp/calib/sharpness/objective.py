@@ -1,4 +1,4 @@
-"""Parameters to sharpness, on the device: buffers are allocated once, nothing per call but the result."""
+"""Sharpness as a function of the free parameters, computed on the device. All buffers are allocated once."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ if TYPE_CHECKING:
     from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
-MOTION_ROOM_PX = 16.0
+ROTATION_MARGIN_PX = 16.0
+"""Extra border of the canvas if the camera's rotation is free [px]."""
 
 
 class Objective:
-    """Sharpness of the IWE of a set of events as a function of the free parameters; counts its evaluations.
+    """Sharpness of the IWE of a set of events as a function of the free parameters. Counts its evaluations.
 
-    On CUDA the events are sorted by tile once, and an evaluation is one captured graph.
+    On CUDA the events are sorted into tiles once, and one captured graph is launched per evaluation.
     """
 
     def __init__(
@@ -46,29 +47,48 @@ class Objective:
         parts: int = 1,
         device: Any = "cpu",
     ) -> None:
-        """``events`` are on the device, with slopes where a parameter drifts and times where the camera turns.
+        """Allocate the buffers.
 
-        ``smoothing``: standard deviation [sensor px]; ``scale``: canvas pixels per sensor pixel. ``parts``: disjoint
-        parts of the events that :meth:`each` measures apart.
+        Parameters
+        ----------
+        space : ParameterSpace
+            The free parameters.
+        events : DeviceEvents
+            The events on the device, with slopes for a free clock offset or rpm, and times for a camera rotation.
+        kind : Sharpness
+            Measure of sharpness.
+        smoothing : float
+            Standard deviation of the Gaussian that smooths the image [sensor px].
+        scale : float
+            Canvas pixels per sensor pixel.
+        per_polarity : bool
+            Whether ON and OFF events form separate images.
+        parts : int
+            Number of disjoint parts of the events that :meth:`each` measures separately.
+        device : str or warp.context.Device
+            The device.
         """
         self.space = space
         self.evaluations = 0
         camera = space.camera
-        # the paper's J is left as it was written
+        # the paper's J is computed as published, without dithering
         dither = kind is not Sharpness.PAPER_J
         pad = padding(space)
         canvas = CanvasShape(camera.width, camera.height, pad, scale, per_polarity, parts=parts, dither=dither)
         if parts > 1:
             events = events.in_parts(parts, per_polarity=per_polarity)
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
-        # tiles take their camera as it is when they are prepared
+        # tiles are prepared for one camera, so a free focal length excludes them
         if self._meter.device.is_cuda and "focal_length" not in space.names:
-            self._image: _Voted | _Captured = _Captured(canvas, events, self._meter, self._model(space.start))
+            self._image: _DirectImage | _TiledImage = _TiledImage(canvas, events, self._meter, self._model(space.start))
         else:
-            self._image = _Voted(canvas, events, self._meter)
+            self._image = _DirectImage(canvas, events, self._meter)
 
     def _model(self, values: Mapping[str, float]) -> Model:
-        """The ellipse is the exact model's first harmonic: the same optimum, without tables for every point."""
+        """Return the model to evaluate. The ellipse, the exact model's first harmonic, has the same optimum.
+
+        The exact model stands in for it, because the ellipse would need new tables at every point.
+        """
         kind = "exact" if self.space.model == "ellipse" else self.space.model
         return build_model(kind, self.space.camera, self.space.prism, values)
 
@@ -78,25 +98,25 @@ class Objective:
         return self._meter.results()
 
     def values(self, values: Mapping[str, float]) -> float:
-        """Sharpness at parameter values."""
+        """Return the sharpness at parameter values."""
         return self._measure(values)[0]
 
     def __call__(self, v: NDArray[np.float64]) -> float:
-        """Sharpness at a vector of the space [px]."""
+        """Return the sharpness at a search vector [px]."""
         return self.values(self.space.to_values(v))
 
     def each(self, values: Mapping[str, float]) -> NDArray[np.float64]:
-        """Sharpness of each part at parameter values, shape (parts,)."""
+        """Return the sharpness of each part at parameter values, shape (parts,)."""
         return np.array(self._measure(values))
 
     def image(self, values: Mapping[str, float]) -> NDArray[np.float32]:
-        """The IWE at parameter values, shape (layers, rows, columns), padding included."""
+        """Return the IWE at parameter values with its padding, shape (layers, rows, columns)."""
         self._measure(values)
         return self._meter.image.numpy()
 
 
-class _Voted:
-    """Images by one pass over the events, in their order."""
+class _DirectImage:
+    """Image of events by one pass over the events in their order."""
 
     def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter) -> None:
         self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
@@ -108,8 +128,8 @@ class _Voted:
         self._meter.launch()
 
 
-class _Captured:
-    """Images by tiles, everything in one CUDA graph."""
+class _TiledImage:
+    """Image of events by tiles, launched as one CUDA graph."""
 
     def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter, like: Model) -> None:
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
@@ -120,7 +140,7 @@ class _Captured:
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
-        self._launch()  # once as it is: a capture cannot load modules
+        self._launch()  # without capture first, because modules cannot be loaded during a capture
         wp.synchronize_stream(self._meter.device)
         with wp.ScopedCapture(self._meter.device) as capture:
             self._launch()
@@ -133,18 +153,20 @@ class _Captured:
 
 
 def padding(space: ParameterSpace) -> int:
-    """Border [px] that no event of the image can cross, at the largest size and any phase, or as far as it turns."""
+    """Return the border of the canvas [px] that keeps all events inside at the largest size and at any phase.
+
+    For the camera's rotation it allows twice the start's rates and :data:`ROTATION_MARGIN_PX`; faster answers are
+    wrong anyway. It is never larger than the image.
+    """
     largest = {n: space.high[n] for n in space.names if n == space.size_name}
-    # a search that goes as far as its bounds is lost anyway: twice the start's motion, and a little, is room enough
     faster = {n: 2.0 * abs(space.start.get(n, 0.0)) for n in MOTION if n in space.start}
-    room = MOTION_ROOM_PX if space.moving else 0.0
-    # events that go further are lost to any answer worth having
+    margin = ROTATION_MARGIN_PX if space.moving else 0.0
     most = max(space.camera.width, space.camera.height)
-    return math.ceil(min(reach(space, {**space.start, **largest, **faster}) + room, most)) + 2
+    return math.ceil(min(reach(space, {**space.start, **largest, **faster}) + margin, most)) + 2
 
 
 def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
-    """How far events are moved at ``values``, at most [px], by the prism and by the camera's turning."""
+    """Return the largest displacement of events at ``values`` [px], by the prism and the camera's rotation."""
     camera = space.camera
     kind = "exact" if space.model == "ellipse" else space.model
     at = border(camera)

@@ -1,25 +1,24 @@
-"""One search for the sharpest image: a global stage on a coarse image, then a local one on a fine image."""
+"""Contrast maximisation: a global search on a coarse image of events, then a local search on a fine one."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from amiwarp.calib import checks
-from amiwarp.calib.parameters import LATE, MOTION, UNITS, check_names
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
+from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION, UNITS, check_names
 from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.result import StageSummary
-from amiwarp.calib.sharpness.curvature import differences
+from amiwarp.calib.sharpness.curvature import finite_differences
 from amiwarp.calib.sharpness.objective import Objective
-from amiwarp.calib.solve import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
-from amiwarp.calib.stage_share import stage_share
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.device_events import upload_events
 from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
 from amiwarp.validation import choice, one_of, real, shown, whole
@@ -28,70 +27,88 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.imaging.device_events import DeviceEvents
-
-    SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+    from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 
 CANDIDATES = 3
-"""Optima of the coarse image that are looked at on the fine one."""
+"""Largest number of optima of the coarse image from which the local search starts."""
 PARTS = 8
-"""Disjoint parts of the events that tell chance from signal."""
-
+"""Number of disjoint parts of the events, whose scatter measures the uncertainty."""
 LARGEST_BUDGET = 10**12
-"""Of evaluations and events: more is a mistake."""
+"""Upper limit of the numbers of evaluations and events."""
 LARGEST_FOLD = 1 << 20
+"""Upper limit of the number of angle bins."""
 AUTO = "auto"
+"""Model name in the settings for the automatic choice."""
 STAGES = ("sharpness", "photometric")
-
-"""Called with the stage's name, evaluations done, and its budget."""
+"""Stages of a calibration."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to calibrate; every default was chosen by measurement, see ``docs/calibration.md``."""
+    """Settings of a calibration.
+
+    The defaults were chosen by measurement, see ``docs/explanation/calibration.md``.
+
+    Examples
+    --------
+    >>> amiwarp.Settings(model="circle", events=100_000).sharpness.value
+    'variance'
+    """
 
     model: str = AUTO
-    """One of the ladder, or ``auto``: the smallest that keeps the budget."""
+    """Model: ``circle``, ``radial``, ``ellipse``, ``exact``, or ``auto`` for the smallest with a tolerable error."""
     budget_px: float | None = None
-    """For ``auto``: see :func:`amiwarp.calib.selection.model_choice.calibrate_auto`."""
+    """Largest tolerated model error for ``auto`` [px rms]; None: a tenth of the blur by quantisation and timing."""
     sharpness: Sharpness = Sharpness.VARIANCE
+    """Measure of sharpness that the search maximises."""
     global_algorithm: str | None = "GN_DIRECT_L"
-    """None starts the local search at ``start`` at once."""
+    """NLopt algorithm of the global search; None: no global search, the local search starts at ``start``."""
     local_algorithm: str = "LN_BOBYQA"
+    """NLopt algorithm of the local search."""
     free: tuple[str, ...] | None = None
-    """Names of what to find; None: size and phase (and rpm, without an encoder)."""
+    """Names of the free parameters; None: size and phase, and without an encoder ``rpm``."""
     start: Mapping[str, float] = field(default_factory=dict)
-    """Known values [rad, us, 1/min], by parameter name."""
+    """Known or start values by parameter name [rad, us, 1/min]."""
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Lower and upper bounds of free parameters by name, in the same units."""
     global_evaluations: int = 120
+    """Number of evaluations of the global search."""
     local_evaluations: int = 200
+    """Largest number of evaluations of a local search."""
     tolerance_px: float = 0.002
-    """The local search ends when its steps move events by less [px]."""
+    """The local search ends when its steps move events by less than this [px]."""
     smoothing_px: float = 1.0
-    """Of the fine image [px]; the coarse one has 4 px."""
+    """Standard deviation of the Gaussian that smooths the fine image [px]; 4 px are used for the coarse image."""
     per_polarity: bool = False
-    """ON and OFF events in images of their own."""
+    """Whether ON and OFF events form separate images."""
     events: int = 300_000
-    """At most so many events, thinned evenly; the global search uses a third of them."""
+    """Largest number of events, thinned evenly; the global search uses a third of them."""
     fold: int = 0
-    """Angles a turn into which the events of a pixel are folded, each point then standing for several; 0: none."""
+    """Number of angle bins per turn into which each pixel's events are folded as weighted points; 0: no folding."""
     seed: int = 0
+    """Seed of random algorithms."""
     stages: tuple[str, ...] = STAGES
-    """Without "photometric" the answer of sharpness stands."""
+    """Stages to run: ``("sharpness",)`` or ``("sharpness", "photometric")``."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+    """Settings of the photometric stage."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sharpness", choice(Sharpness, self.sharpness, "sharpness"))
 
     def check(self) -> None:
+        """Check the settings.
+
+        Raises
+        ------
+        AmiwarpError
+            If a name is unknown or a number out of range.
+        """
         one_of(self.model, (AUTO, *MODELS), "model")
         if self.global_algorithm is not None:
             check_algorithm(self.global_algorithm, GLOBAL_ALGORITHMS)
         check_algorithm(self.local_algorithm, LOCAL_ALGORITHMS)
         if not isinstance(self.stages, tuple) or [*map(str, self.stages)] not in ([*STAGES], [*STAGES[:1]]):
-            raise AmiwarpError(f"stages {shown(self.stages)} are not 'sharpness' or 'sharpness, photometric'")
+            raise AmiwarpError(f"stages is {shown(self.stages)}; expected 'sharpness' or 'sharpness, photometric'")
         for name in ("global_evaluations", "local_evaluations", "events"):
             whole(getattr(self, name), name, 1, LARGEST_BUDGET)
         whole(self.fold, "fold", 0, LARGEST_FOLD)
@@ -102,60 +119,38 @@ class Settings:
         self.photometric.check()
 
 
-@dataclass(frozen=True)
-class Material:
-    """The events of a calibration, and what gives them their angles."""
-
-    events: Events
-    encoder: Encoder
-    slope_of: SlopeOf | None
-    """Where a parameter drifts the angle: change of the angle at times [us] per unit of it."""
-    fold: int = 0
-    """See :class:`Settings`."""
-    _uploaded: dict[tuple[str, int | None], DeviceEvents] = field(default_factory=dict, repr=False, init=False)
-
-    def on(self, device: Any, middle_us: int | None) -> DeviceEvents:
-        """The events on a device, put there once; with their times from ``middle_us`` if it is given."""
-        if (str(device), middle_us) not in self._uploaded:
-            slope = None if self.slope_of is None else self.slope_of(self.events.t)
-            events = upload_events(self.events, self.encoder, device, slope=slope, middle_us=middle_us, fold=self.fold)
-            self._uploaded[str(device), middle_us] = events
-        return self._uploaded[str(device), middle_us]
-
-    def every(self, step: int) -> Material:
-        return self if step == 1 else self._cut(slice(0, None, step))
-
-    def central(self, share: float) -> Material:
-        """The events within ``share`` of the time about its middle."""
-        t = self.events.t
-        middle, half = (int(t[0]) + int(t[-1])) / 2.0, share * (int(t[-1]) - int(t[0])) / 2.0
-        first, last = np.searchsorted(t, [middle - half, middle + half])
-        return self._cut(slice(int(first), int(last) + 1))
-
-    def _cut(self, cut: slice) -> Material:
-        return Material(self.events[cut], self.encoder, self.slope_of, self.fold)
-
-
 class Search:
-    """One calibration under way: coarse and fine objective over the same space."""
+    """One search for the parameters that make the image of events sharpest.
+
+    :meth:`run` sets ``best``, the values of all parameters, and ``score``, the sharpness there.
+    """
 
     def __init__(
-        self, space: ParameterSpace, material: Material, settings: Settings, device: Any, progress: Progress | None
+        self,
+        space: ParameterSpace,
+        calibration_events: CalibrationEvents,
+        settings: Settings,
+        device: Any,
+        progress: Progress | None,
     ) -> None:
-        # the whole space is the photometric stage's
-        self.whole = space
-        self.space = space.without(LATE) if "photometric" in settings.stages else space
-        self.material, self.settings, self.device = material, settings, device
+        self.full_space = space
+        """Space of the photometric stage."""
+        self.space = space.without(DEGENERATE_WITH_APEX) if "photometric" in settings.stages else space
+        """Space of the sharpness search."""
+        self.calibration_events, self.settings, self.device = calibration_events, settings, device
         self.progress = progress
         self.stages: list[StageSummary] = []
-        self.fine = self._objective(material, 1.0, settings.smoothing_px)
+        self.fine = self._objective(calibration_events, scale=1.0, smoothing=settings.smoothing_px)
 
-    def _parts(self, kind: Sharpness) -> Objective:
-        return self._objective(self.material, 1.0, max(1.0, self.settings.smoothing_px), kind, parts=PARTS)
+    def _objective_by_parts(self, kind: Sharpness) -> Objective:
+        """Return an objective that measures disjoint parts of the events separately."""
+        smoothing = max(1.0, self.settings.smoothing_px)
+        return self._objective(self.calibration_events, scale=1.0, smoothing=smoothing, kind=kind, parts=PARTS)
 
     def _objective(
         self,
-        m: Material,
+        events: CalibrationEvents,
+        *,
         scale: float,
         smoothing: float,
         kind: Sharpness | None = None,
@@ -165,45 +160,48 @@ class Search:
         s = self.settings
         kind, space = kind or s.sharpness, space or self.space
         if kind is Sharpness.PAPER_J:
-            smoothing = 0.0  # the tails of a Gaussian are pixels with h > 0, each of which J would count
+            smoothing = 0.0  # J counts pixels with h > 0, and a Gaussian's tails would make almost all of them positive
         return Objective(
-            space, m.on(self.device, space.middle_us if space.moving else None),
+            space, events.on(self.device, space.middle_us if space.moving else None),
             kind=kind, smoothing=smoothing, scale=scale,
             per_polarity=s.per_polarity, parts=parts, device=self.device,
         )  # fmt: skip
 
     def run(self) -> None:
-        """Finds ``best``, its ``score``, and keeps the ``stages`` that led there."""
+        """Run the global and the local search; set ``best``, ``score`` and ``stages``."""
         starts = [self.space.to_vector(self.space.start)]
         if self.settings.global_algorithm is not None:
             starts = self._run_global(self.settings.global_algorithm)
         if self.space.moving:
-            starts = [self._follow(start) for start in starts]
+            starts = [self._track_rotation(start) for start in starts]
         runs = [self._run_local(start) for start in starts]
         best = max(runs, key=lambda run: run.score)
         self.stages.extend(StageSummary.of("local", run, self.space) for run in runs)
         self.best, self.score = self.space.to_values(best.x), best.score
 
-    def _coarse(self, material: Material, space: ParameterSpace) -> Objective:
-        step = max(1, len(material.events) // (self.settings.events // 3 + 1))
-        return self._objective(material.every(step), 0.5, 4.0, space=space)
+    def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
+        step = max(1, len(events.events) // (self.settings.events // 3 + 1))
+        return self._objective(events.every(step), scale=0.5, smoothing=4.0, space=space)
 
     def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
-        """Starts for the local search. The camera's motion stays at its start, unless it is all that is sought."""
+        """Return the starts for the local search. The camera's rotation stays at its start."""
         space = self.space.without(MOTION)
         if not space.names:
             return [self.space.to_vector(self.space.start)]
         start = space.to_vector(space.start)
-        objective = self._coarse(self.material, space)
+        objective = self._coarse_objective(self.calibration_events, space)
         stage = self._maximise(objective, algorithm, start, self.settings.global_evaluations, step=1.0)
         self.stages.append(StageSummary.of("global", stage, space))
         return [self.space.to_vector(space.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
 
-    def _follow(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A turning camera followed on the coarse image, through windows that grow about the middle where no prism
-        tells how it turns: a short window blurs less than the smoothing, whatever the speed."""
+    def _track_rotation(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a better start for a rotating camera, by a local search on the coarse image.
+
+        Without a prism there is no estimate of the rotation. Then the events come from windows that grow about the
+        middle: in a short window the blur is smaller than the smoothing, whatever the speed.
+        """
         for share in (1.0,) if self.space.sized else (0.125, 0.25, 0.5, 1.0):
-            objective = self._coarse(self.material.central(share), self.space)
+            objective = self._coarse_objective(self.calibration_events.central(share), self.space)
             stage = self._maximise(
                 objective, self.settings.local_algorithm, start, self.settings.local_evaluations, step=2.0
             )
@@ -233,40 +231,43 @@ class Search:
             inner=s.local_algorithm, seed=s.seed,
         )  # fmt: skip
 
-    def judge(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
-        """Refuses what chance could have made; returns warnings and standard deviations."""
+    def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
+        """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the answer."""
         best = self.best
-        parts = self._parts(self.settings.sharpness)
+        parts = self._objective_by_parts(self.settings.sharpness)
         if self.space.sized:
-            self._check(best, parts, name)
+            self._check_sharper_than_chance(best, parts, name)
         v = self.space.to_vector(best)
-        covariance, warnings = scatter(parts, v)
-        return self._at_bounds(best) + warnings, self.space.deviations(v, covariance)
+        covariance, warnings = estimate_covariance(parts, v)
+        return self._bound_warnings(best) + warnings, self.space.deviations(v, covariance)
 
-    def _check(self, best: dict[str, float], parts: Objective, name: str) -> None:
-        # by variance, whatever the cost: the paper's J may like an image without motion best
-        plain = parts if self.settings.sharpness is Sharpness.VARIANCE else self._parts(Sharpness.VARIANCE)
+    def _check_sharper_than_chance(self, best: dict[str, float], parts: Objective, name: str) -> None:
+        # variance, whatever the measure of the search: the paper's J may prefer an image without compensation
+        variance = (
+            parts if self.settings.sharpness is Sharpness.VARIANCE else self._objective_by_parts(Sharpness.VARIANCE)
+        )
         points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
-        sharp, turned, still = (plain.each(values) for values in points)
-        checks.check_texture(sharp, turned, still, name)
+        sharp, opposite, still = (variance.each(values) for values in points)
+        checks.check_texture(sharp, opposite, still, name)
         checks.check_directions(self.image(), name)
 
     def image(self) -> NDArray[np.float32]:
-        """The IWE at the answer, of the sensor's size, all polarities."""
+        """Return the IWE at the answer, cut to the sensor's size, summed over polarities."""
         image = self.fine.image(self.best).sum(axis=0)
         pad = (image.shape[1] - self.space.camera.width) // 2
         return np.asarray(image[pad:-pad, pad:-pad])
 
-    def _at_bounds(self, best: dict[str, float]) -> tuple[str, ...]:
+    def _bound_warnings(self, best: dict[str, float]) -> tuple[str, ...]:
+        """Return a warning for each parameter that ended on a bound."""
         s = self.space
-        stuck = [
+        at_bound = [
             n for n in s.names if n != "phase" and min(best[n] - s.low[n], s.high[n] - best[n]) * s.pixels[n] < 0.05
         ]
-        return tuple(f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen it" for n in stuck)
+        return tuple(f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
 
 
 def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
-    """The best points of a stage that lie at least ``apart`` px from each better one."""
+    """Return the best points of a stage, at most ``most``, each at least ``apart`` px away from all better ones."""
     chosen: list[NDArray[np.float64]] = []
     for k in np.argsort(-stage.scores, kind="stable"):
         if all(np.linalg.norm(stage.points[k] - other) >= apart for other in chosen):
@@ -276,13 +277,13 @@ def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[N
     return chosen
 
 
-def scatter(parts: Objective, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Covariance of the optimum [px²]: the cost's curvature, and the scatter of its slope over parts of the events.
+def estimate_covariance(parts: Objective, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Return the covariance of the optimum [px²], and warnings that name the parameters of flat directions.
 
-    H⁻¹ cov(g) H⁻¹, the sandwich estimate, g being a part's slope at the whole's optimum and H the mean curvature of
-    the parts; the whole has as many times the events. A direction without curvature is named in a warning.
+    The sandwich estimate H⁻¹ cov(g) H⁻¹ / n from n disjoint parts of the events: g is a part's gradient at the optimum
+    of all events, and H the mean Hessian of the parts.
     """
-    slopes, hessian = differences(lambda shift: parts.each(parts.space.to_values(v + shift)), np.eye(len(v)))
+    slopes, hessian = finite_differences(lambda shift: parts.each(parts.space.to_values(v + shift)), np.eye(len(v)))
     gradients = slopes.T
     values, vectors = np.linalg.eigh(-hessian)
     largest = max(float(values.max()), 1e-12)
@@ -291,7 +292,7 @@ def scatter(parts: Objective, v: NDArray[np.float64]) -> tuple[NDArray[np.float6
     names = parts.space.names
     warnings = tuple(
         f"the events hardly determine {names[int(np.argmax(np.abs(vectors[:, k])))]} (curvature "
-        f"{values[k] / largest:.1e} of the best determined)"
+        f"{values[k] / largest:.1e} of the largest one)"
         for k in np.flatnonzero(weak)
     )
     return inverse @ np.atleast_2d(np.cov(gradients.T)) @ inverse / len(gradients), warnings

@@ -83,9 +83,8 @@ def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0)
     """
     own, other = (np.asarray(t, np.int64) for t in (own_us, other_us))
     if own.shape != other.shape or own.ndim != 1 or len(own) < FEWEST_PAIRS:
-        raise AmiwarpError(
-            f"{own.size} and {other.size} pulses; give the same {FEWEST_PAIRS} or more pulses on both clocks"
-        )
+        expected = f"give the times of the same pulses on both clocks, at least {FEWEST_PAIRS}"
+        raise AmiwarpError(f"{own.size} and {other.size} pulses; {expected}")
     return _fit_line(own, other, np.full(len(own), sigma_us))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.emulated_rotors import Played, Rotor
 from amiwarp.live.link.protocol import (
     FAULTS,
     MOST_SAMPLES,
@@ -32,7 +33,6 @@ from amiwarp.live.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.live.link.rotors import Played, Rotor
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray

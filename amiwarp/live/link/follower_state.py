@@ -1,4 +1,4 @@
-"""State of a :class:`~amiwarp.live.link.following.Follower`, grouped by what resets it."""
+"""State of a :class:`~amiwarp.live.link.follower.Follower`, grouped by what resets it."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.link.following import Follower
+from amiwarp.live.link.follower import Follower
 from amiwarp.live.link.port import open_port, usb_id
 from amiwarp.live.link.protocol import REFUSALS, Message, Ping, SetCounts, SetSpeed, Stop, encode
 

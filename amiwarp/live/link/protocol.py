@@ -211,7 +211,10 @@ class FrameDecoder:
         self._whole = False  # the bytes before the first line end may be the rest of a line
 
     def feed(self, data: bytes) -> list[tuple[int | None, Message]]:
-        """Return the messages completed by ``data``, each with its sequence number, or None for a text line."""
+        """Return the messages completed by ``data``, each as a pair of sequence number and message.
+
+        The number is None for a message from a text line.
+        """
         out: list[tuple[int | None, Message]] = []
         for byte in data:
             if byte == 0 and self._text is not True:

@@ -103,7 +103,10 @@ def _seen_share(travel: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coverage:
-    """Coverage of one window of events."""
+    """Estimated coverage of one window of events: the share of the scene's edges that cause events in it.
+
+    An edge causes events only if it moves across itself. The other fields are the estimates behind that share.
+    """
 
     share: float
     """Share of the scene's edges that the window shows, 0 .. 1."""
@@ -167,7 +170,8 @@ class SpeedController:
             given = f"{self.rpm:g} rpm to start with is not in {self.least_rpm:g} .. {self.most_rpm:g} rpm"
             raise AmiwarpError(f"adaptive speed: {given}; give limits above 0 that include the initial speed")
         if not 0.0 < self.low < self.high < 1.0:
-            raise AmiwarpError(f"adaptive speed: coverage from {self.low:g} to {self.high:g}; give 0 < low < high < 1")
+            given = f"coverage limits low = {self.low:g} and high = {self.high:g}"
+            raise AmiwarpError(f"adaptive speed: {given}; give 0 < low < high < 1")
         for name in ("ramp_rpm_s", "most_mev_s"):
             if not getattr(self, name) > 0.0:
                 raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give more than 0")

@@ -1,4 +1,4 @@
-"""Emulated camera for the emulated controller: serves a recording's events, with triggers at the sync pulses."""
+"""Emulated camera for the emulated controller: serves a recording's events, and a trigger for each sync pulse."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.stream.packets import encode_events, encode_hello, encode_triggers
-from amiwarp.live.stream.sockets import SocketSink
+from amiwarp.live.stream.socket_sinks import SocketSink
 
 if TYPE_CHECKING:
     from types import TracebackType
 
     from amiwarp.events.recording import Recording
+    from amiwarp.live.link.emulated_rotors import Played
     from amiwarp.live.link.emulator import Controller
-    from amiwarp.live.link.rotors import Played
 
 STEP_US, RETRY_S = 2000, 2e-4
 """Duration of an event packet [us], and interval between attempts to send while a client is slow [s]."""
@@ -28,7 +28,7 @@ NEVER_US = 1 << 60
 
 
 class EmulatedCamera:
-    """Serves a recording's events at their recorded pace, and triggers at the controller's sync pulses.
+    """Serves a recording's events at their recorded pace, and one trigger for each of the controller's sync pulses.
 
     Camera and ``rotor`` begin once the first client connects. If reading, sending or a client is slower than the
     recording, events are sent late, but none is lost. ``now_us``: emulation time [us], shared with the controller.

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from amiwarp.live.stream.clocking import CameraClock
+from amiwarp.live.stream.camera_clock import CameraClock
 from amiwarp.live.stream.packets import NO_TIMES
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from amiwarp.compensation.streams import Compensated, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.io.attributes import camera_attributes, prism_attributes, read_camera, read_prism
-from amiwarp.live.stream.hello import read_fields
+from amiwarp.io.camera_attributes import camera_attributes, prism_attributes, read_camera, read_prism
+from amiwarp.live.stream.hello_packet import read_fields
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from amiwarp.calib import calibrate
 from amiwarp.compensation.streams import held_bytes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TURN
+from amiwarp.events.encoder import TWO_PI
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 
@@ -108,11 +108,11 @@ class PhaseCheck:
         if len(events) < FEWEST_EVENTS:
             return False
         samples = encoder.over(int(events.t[0]), int(events.t[-1]))
-        speed = abs(samples.rpm) * TURN / 60e6
-        begin = int(events.t[-1]) - round(1.2 * TURN / speed) if speed else int(events.t[0])
+        speed = abs(samples.rpm) * TWO_PI / 60e6
+        begin = int(events.t[-1]) - round(1.2 * TWO_PI / speed) if speed else int(events.t[0])
         events = events[int(events.t.searchsorted(begin)) :]
         swept = speed * float(events.t[-1] - events.t[0]) if len(events) else 0.0
-        if len(events) < FEWEST_EVENTS or swept < TURN / 2.0 or encoder.guessed(events.t).any():
+        if len(events) < FEWEST_EVENTS or swept < TWO_PI / 2.0 or encoder.guessed(events.t).any():
             return False
         self._thread = threading.Thread(
             target=self._estimate, args=(events, samples), name="amiwarp-phase-check", daemon=True

@@ -11,7 +11,7 @@ import numpy as np
 
 from amiwarp.events.events import Events
 from amiwarp.live.stream.background_worker import QUEUE_BYTES
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:

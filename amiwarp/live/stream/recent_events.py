@@ -16,7 +16,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.session import Session
 
 if TYPE_CHECKING:
@@ -118,7 +118,8 @@ def followed(source: Source, link: Link | None, recent: RecentEvents, say: Calla
                 how = f"in {FIRST_S:g} s" if thread.is_alive() else "before the stream ended"
                 problem = getattr(source, "problem", None)
                 why = "" if problem is None else f": it broke off, {problem}"
-                raise failures[0] if failures else AmiwarpError(f"{source.name}: delivered no whole turn {how}{why}")
+                what = f"{source.name}: delivered less than one full turn {how}{why}"
+                raise failures[0] if failures else AmiwarpError(what)
             time.sleep(0.05)
         yield
     finally:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.compensation.streams import Compensated, Compensator
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.clocking import clock_offset
+from amiwarp.live.stream.camera_clock import clock_offset
 from amiwarp.live.stream.consumers import Consumers, RawConsumer
 from amiwarp.live.stream.encoder_feed import EncoderFeed
 from amiwarp.live.stream.event_sorter import EventSorter
 from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.policy import Policy
+from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.live.stream.status import IntervalFigures, SessionStatus, WindowSharpness
 

@@ -30,7 +30,10 @@ from amiwarp.live.stream.packets import (
 IDLE_S = 0.05
 """Longest time without a packet [s]. After it, an empty packet is delivered."""
 LARGEST_US, LARGEST_RAD = 1 << 60, 1e12
-"""Largest absolute time [us] and angle [rad] in a stream, so that differences stay exact."""
+"""Largest magnitude of a time [us] and of an angle [rad] in a stream.
+
+The difference of two such times fits int64, and float64 resolves such an angle to 0.00012 rad.
+"""
 HELLO_S = 10.0
 """Longest wait for the hello of a sender [s]."""
 

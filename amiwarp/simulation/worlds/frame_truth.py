@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import sight, world_events
+from amiwarp.kernels import prism_view, world_events
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.models import ExactModel, wrap_angle
 from amiwarp.simulation.worlds.device_world import DeviceWorld
@@ -146,14 +146,14 @@ class TruthRenderer:
         """Luminance of all pixels."""
         simulation, device = self._simulation, self._world.device
         given = simulation.prism if prism else replace(simulation.prism, apex=0.0)
-        view = sight.View()
+        view = prism_view.View()
         view.prism = ExactModel(simulation.camera, given, 0.0, simulation.motion.tilt).params(device)
         self._sight.set_instants(np.array([float(t_us)]), view)
         angle = simulation.motion.phase + float(simulation.motion.angle([t_us])[0])
-        table: NDArray[Any] = np.zeros(1, sight.Step.numpy_dtype())
+        table: NDArray[Any] = np.zeros(1, prism_view.Step.numpy_dtype())
         table["azimuth"] = (math.cos(angle), math.sin(angle))
-        steps = sight.Steps()
-        steps.at = wp.array(table, dtype=sight.Step, device=device)
+        steps = prism_view.Steps()
+        steps.at = wp.array(table, dtype=prism_view.Step, device=device)
         out = wp.empty(len(self._rays), dtype=float, device=device)
         inputs = [*self._sight.inputs(), steps, 0]
         launch(world_events.see_pixels, len(out), inputs, [out], device=device, smallest=SMALLEST_LAUNCH)

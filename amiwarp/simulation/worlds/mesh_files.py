@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name, note_input
-from amiwarp.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, note_input
+from amiwarp.io.regular_file import check_regular
 from amiwarp.simulation.pictures import LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, linear_luminance, srgb_to_linear
 from amiwarp.simulation.worlds.scene import Material, Mesh
 from amiwarp.validation import one_of, real

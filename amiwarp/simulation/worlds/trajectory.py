@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import write_text
-from amiwarp.regular_file import check_regular
+from amiwarp.io.atomic_output import write_text
+from amiwarp.io.regular_file import check_regular
 from amiwarp.validation import array, real
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name, note_input
+from amiwarp.io.input_files import errors_name, note_input
 from amiwarp.io.json_files import MOST_BYTES, build, fields_of, read_json
-from amiwarp.regular_file import check_regular
+from amiwarp.io.regular_file import check_regular
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.worlds.mesh_files import LoadedMesh, load_mesh
 from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Sky, Sun, World
@@ -273,9 +273,7 @@ def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) 
     """Return the material of the mesh file, with the fields of the world file in its place."""
     own = part.material
     if texture is not None and part.mesh.uv is None:
-        raise AmiwarpError(
-            f"field {where}.material.texture needs texture coordinates, but the mesh has none; add them"
-        )
+        raise AmiwarpError(f"field {where}.material.texture needs texture coordinates, but the mesh has none; add them")
     reflectance = own.reflectance if texture is None else 1.0
     return Material(
         reflectance if entry.reflectance is None else entry.reflectance,

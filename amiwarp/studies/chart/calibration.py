@@ -1,5 +1,6 @@
-"""Rows of the calibration chart: models, algorithms, numbers of events, folding and the photometric stage.
+"""Rows of the calibration chart: models, algorithms, numbers of events, folding of turns and the photometric stage.
 
+Folding merges the events of all turns that have the same pixel, polarity and bin of the prism angle.
 Each result is compared with the ground truth.
 """
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.calib.presets import Preset
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.device_events import TURNS
-from amiwarp.io.output import check_output, make_folder, write_text
+from amiwarp.io.atomic_output import check_output, make_folder, write_text
 from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.simulator import SensorModel
 from amiwarp.studies.chart import calibration, compensation
@@ -23,7 +23,7 @@ from amiwarp.studies.chart.drawing import draw
 from amiwarp.studies.chart.rows import Row, beaten_by, fastest_within, fronts, most_accurate_within
 from amiwarp.studies.chart.truth import KnownRecording
 from amiwarp.studies.demo import Demo, simulation
-from amiwarp.studies.machine import machine, versions
+from amiwarp.studies.machine_info import machine, versions
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording

@@ -24,7 +24,7 @@ from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import TURNS, upload_events
 from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
 from amiwarp.io import open_recording, save_recording
-from amiwarp.io.output import scratch_folder
+from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.optics.models import MODELS, Model, wrap_angle
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import Row, Task, measure

@@ -14,8 +14,8 @@ from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
-from amiwarp.studies.design.orbit import Orbit, orbit_of
-from amiwarp.studies.design.volume import Volume, filled, measure
+from amiwarp.studies.design.event_volume import Volume, filled, measure
+from amiwarp.studies.design.orbit_size import Orbit, orbit_of
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
@@ -26,7 +26,10 @@ ACROSS = math.sqrt(2.0 / 3.0)
 It is √⟨cos²⟩, weighted by |cos|, the rate at which the edges of each direction fire.
 """
 LEAST_SWING = 1.0
-"""Smallest useful swing [px]. An edge that moves less across itself may not cross any pixel."""
+"""Smallest useful swing [px]: displacement across an edge in a quarter turn.
+
+An edge that moves less may not cross any pixel.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +163,11 @@ class Design:
         return next(c for c in self.choices if c.orbit.apex == apex and c.rpm == rpm)
 
     def range_at(self, rpm: float) -> tuple[float, float]:
-        """Return the smallest and largest apex angle [rad] whose swing and blur keep the limits at this speed.
+        """Return the smallest and the largest suitable apex angle [rad] at this speed [turns/min].
 
-        The model is taken as exact, and radii as proportional to the apex. If the first is above the second, no apex
-        keeps the limits.
+        At the smallest, the swing is :data:`LEAST_SWING`; see :attr:`Orbit.swing`. At the largest, the blur across an
+        edge is ``limits.tolerance_px``. The error of the refraction model is not counted, and radii are taken as
+        proportional to the apex angle. If the smallest exceeds the largest, no apex angle is suitable.
         """
         orbit = min(self.orbits, key=lambda o: abs(math.log(o.swing / LEAST_SWING)))
         room = self.limits.tolerance_px**2 - QUANTISATION_PX**2

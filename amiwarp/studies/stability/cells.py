@@ -25,9 +25,9 @@ from amiwarp.calib.sharpness.search import AUTO, STAGES
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error
-from amiwarp.io.output import write_text
+from amiwarp.io.atomic_output import write_text
 from amiwarp.optics.models import ExactModel, predicted_error
-from amiwarp.studies.machine import machine
+from amiwarp.studies.machine_info import machine
 from amiwarp.studies.stability.conditions import Condition, SimulatedSample, make
 
 if TYPE_CHECKING:

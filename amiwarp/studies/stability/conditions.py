@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.events.encoder import TURN, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
@@ -217,7 +217,7 @@ def _prism_motion(c: Condition, phase: float) -> PrismMotion:
         return PrismMotion(c.rpm, phase)
     hz = 3.0 * c.rpm / 60.0
     return PrismMotion.from_function(
-        lambda t: c.rpm * (1.0 + c.ripple * np.sin(TURN * hz * t)), c.duration_s, phase=phase
+        lambda t: c.rpm * (1.0 + c.ripple * np.sin(TWO_PI * hz * t)), c.duration_s, phase=phase
     )
 
 

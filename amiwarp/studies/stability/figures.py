@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
-from amiwarp.io.output import NewFile
+from amiwarp.io.atomic_output import NewFile
 from amiwarp.plotting.figures import save
 from amiwarp.studies.stability.cells import LIMIT_PX, Outcome
 from amiwarp.studies.stability.conditions import Axis
@@ -101,7 +101,10 @@ def _page(atlas: Atlas, axis: Axis) -> Any:
 
 
 def _overview(atlas: Atlas) -> Any:
-    """Draw the overview: each axis is a block with a strip per method; blocks run down the columns of the sheet."""
+    """Draw the overview: a block for each axis (varied quantity), with one strip per method.
+
+    The blocks fill the columns of the sheet from top to bottom.
+    """
     methods = [m for m in OVERVIEW if m in atlas.methods] or atlas.methods[:1]
     block = HEAD + STRIP * len(methods)
     deep = -(-len(atlas.axes) // COLUMNS)

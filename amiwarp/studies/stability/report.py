@@ -13,7 +13,7 @@ from typing import Any
 from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.output import write_text
+from amiwarp.io.atomic_output import write_text
 from amiwarp.studies.stability.cells import Cell, Method, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.conditions import Axis, Condition, sensible
 from amiwarp.studies.stability.points import AxisPoint, Rate, axis_label, percent, value_label
@@ -170,7 +170,9 @@ def aggregate(cells: Sequence[Stored], axes: Sequence[Axis], methods: Sequence[M
                     spots.append(AxisPoint(axis, value, name, results))
             worse += _worse(axis, value, stored_cells, names)
     if not spots:
-        raise AmiwarpError("no cell of these axes and methods is stored; run without --redraw first")
+        raise AmiwarpError(
+            "found no results of single runs (cells) for these axes and methods; run without --redraw first"
+        )
     return Atlas(tuple(spots), _aims(met.values(), names.get(DEFAULT), worse), len(met), about)
 
 
@@ -281,14 +283,15 @@ def _grid(headings: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
 
 
 def load(folder: Path) -> list[Stored]:
-    """Return all cells in a folder; cells of other versions are left out.
+    """Return all cells (results of single runs) in a folder; cells of other versions are left out.
 
     Raises :class:`AmiwarpError` for a folder without cells, and for damaged cells.
     """
     store = Store(folder)
     out = [store.load(cell) for path in sorted(folder.glob("*.json")) if (cell := _cell(path)) is not None]
     if not out:
-        raise AmiwarpError(f"{folder}: no cells of this version are stored here; run without --redraw first")
+        what = "holds no results of single runs (cells) of this version"
+        raise AmiwarpError(f"{folder}: {what}; run without --redraw first")
     return out
 
 

@@ -21,8 +21,8 @@ from pathlib import Path
 from types import TracebackType
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import inputs_in_use, inputs_noted, same_file
-from amiwarp.regular_file import KINDS
+from amiwarp.io.input_files import inputs_in_use, inputs_noted, same_file
+from amiwarp.io.regular_file import KINDS
 
 HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:32]
 """Name of this machine, in the names of unfinished files. Process ids are valid on one machine only."""

@@ -4,10 +4,10 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, turn_back
-from amiwarp.kernels.native import load_float, load_int, load_uint16, store_float, store_int
-from amiwarp.kernels.optics import MODEL_STRUCTS, compensate, displace
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
 from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs
+from amiwarp.kernels.refraction import MODEL_STRUCTS, compensate, displace
+from amiwarp.kernels.vector_code import load_float, load_int, load_uint16, store_float, store_int
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +47,7 @@ def compensated_position(
         w1 = w1 * c + w0 * s
         w0 = a
     xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), wp.vec2(w0, w1))
-    return turn_back(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
+    return undo_camera_rotation(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
 
 
 @wp.kernel

@@ -50,7 +50,10 @@ def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[floa
 
 
 def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
-    """Return the camera of attributes. Raises :class:`AmiwarpError` for missing or unusable ones."""
+    """Return the camera stored in the attributes of a file or stream.
+
+    Raises :class:`AmiwarpError` if an attribute is missing or unusable.
+    """
     model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*DISTORTIONS, "none"),
                    f"{where} attribute 'distortion_model'")  # fmt: skip
     distortion: Distortion | None = None

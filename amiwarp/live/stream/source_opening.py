@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from amiwarp.live.stream.cameras import DvSource, PropheseeSource
 from amiwarp.live.stream.packets import Source
-from amiwarp.live.stream.returning import SOCKETS, ReturningSource
+from amiwarp.live.stream.reconnecting_source import SOCKETS, ReturningSource
 from amiwarp.live.stream.sources import FileSource, StreamSource, open_stream
 
 

@@ -1,4 +1,4 @@
-"""The only place that knows NLopt: its derivative-free algorithms by their own names, global and local."""
+"""Maximisation of a score by NLopt's derivative-free algorithms. Only this module imports NLopt."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GLOBAL_ALGORITHMS = (
     "G_MLSL",
     "G_MLSL_LDS",
 )
-"""NLopt's derivative-free global algorithms. The MLSL ones run the chosen local algorithm inside."""
+"""NLopt's derivative-free global algorithms. The MLSL algorithms run a local algorithm inside."""
 LOCAL_ALGORITHMS = (
     "LN_COBYLA",
     "LN_BOBYQA",
@@ -44,30 +44,44 @@ LOCAL_ALGORITHMS = (
 )
 """NLopt's derivative-free local algorithms."""
 _NEEDS_TWO = ("LN_BOBYQA", "LN_NEWUOA", "LN_NEWUOA_BOUND")
-"""Quadratic models of Powell's that NLopt gives only from two dimensions up."""
+"""Powell's algorithms with quadratic models, which need at least two dimensions."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SearchStage:
-    """What one run of an algorithm did."""
+    """One run of a search algorithm: its best point and all evaluated points."""
 
     algorithm: str
+    """Name of the algorithm."""
     x: NDArray[np.float64]
-    """Best point seen [px]."""
+    """Best evaluated point [px], shape ``(n,)`` for n free parameters."""
     score: float
-    """Sharpness there."""
+    """Score at the best point."""
     evaluations: int
+    """Number of evaluations of the score."""
     seconds: float
+    """Run time [s]."""
     ended: str
-    """Why it ended, in NLopt's words."""
+    """Reason why the search ended."""
     points: NDArray[np.float64] = field(repr=False)
-    """Every point evaluated, in order, shape (evaluations, dimensions)."""
+    """All evaluated points in order [px], shape ``(evaluations, n)``."""
     scores: NDArray[np.float64] = field(repr=False)
-    """The sharpness at each."""
+    """Score of each point, shape ``(evaluations,)``."""
+
+
+def best_of(
+    algorithm: str, points: list[NDArray[np.float64]], scores: list[float], *, seconds: float, ended: str
+) -> SearchStage:
+    """Return the record of a run, with the best of its evaluated points."""
+    best = int(np.argmax(scores))
+    return SearchStage(
+        algorithm=algorithm, x=points[best], score=float(scores[best]), evaluations=len(scores), seconds=seconds,
+        ended=ended, points=np.array(points), scores=np.array(scores),
+    )  # fmt: skip
 
 
 def check_algorithm(name: str, known: tuple[str, ...]) -> None:
-    """Raises :class:`AmiwarpError` unless ``name`` is one of ``known``."""
+    """Raise :class:`AmiwarpError` unless ``name`` is one of ``known``."""
     one_of(name, known, "algorithm")
 
 
@@ -84,20 +98,52 @@ def maximise(
     inner: str = "LN_SBPLX",
     seed: int = 0,
 ) -> SearchStage:
-    """Runs one algorithm on ``score`` (higher is better) in the box ``low .. high``.
+    """Maximise a score in a box by one algorithm.
 
-    ``tolerance`` and ``step``: end of the search and first step [px], in every dimension. ``inner``: the local
-    algorithm of MLSL. The best point seen counts, whatever NLopt returns: DIRECT ends by its budget, and BOBYQA may
-    stop at round-off. Raises :class:`AmiwarpError` where the score is not finite or the algorithm does not fit.
+    Parameters
+    ----------
+    score : callable
+        Function of a point, shape ``(n,)``; higher is better.
+    algorithm : str
+        Name of the algorithm.
+    low : ndarray
+        Lower corner of the box [px], shape ``(n,)``.
+    high : ndarray
+        Upper corner of the box [px], shape ``(n,)``.
+    start : ndarray
+        First point [px], shape ``(n,)``.
+    evaluations : int
+        Largest number of evaluations.
+    tolerance : float
+        A local search ends when its steps are smaller than this in every dimension [px].
+    step : float
+        First step of a local search [px].
+    inner : str
+        Local algorithm of the MLSL algorithms.
+    seed : int
+        Seed of random algorithms.
+
+    Returns
+    -------
+    SearchStage
+        The run. Its answer is the best evaluated point, whatever NLopt returns: DIRECT ends by its budget, and BOBYQA
+        may stop because of round-off.
+
+    Raises
+    ------
+    AmiwarpError
+        If the score is not finite, or if the algorithm does not suit the problem.
     """
     import nlopt
 
     names = LOCAL_ALGORITHMS if algorithm.startswith("LN_") else GLOBAL_ALGORITHMS
     check_algorithm(algorithm, names)
     began = time.perf_counter()
-    nlopt.srand(seed + 1)  # NLopt takes 0 for the clock
-    optimiser = _optimiser(algorithm, low, high, evaluations, tolerance, step, inner)
-    samples = _Samples(score, evaluations, optimiser.force_stop)
+    nlopt.srand(seed + 1)  # 0 would seed NLopt from the clock
+    optimiser = _optimiser(
+        algorithm, low=low, high=high, evaluations=evaluations, tolerance=tolerance, step=step, inner=inner
+    )
+    samples = _EvaluationLog(score, evaluations, optimiser.force_stop)
     optimiser.set_min_objective(samples.cost)
     try:
         optimiser.optimize(np.clip(start, low, high))
@@ -112,14 +158,11 @@ def maximise(
         samples.release()
     if samples.failure is not None:
         raise samples.failure
-    points, scores = np.array(samples.points), np.array(samples.scores)
-    best = int(np.argmax(scores))
-    seconds = time.perf_counter() - began
-    return SearchStage(algorithm, points[best], float(scores[best]), len(scores), seconds, ended, points, scores)
+    return best_of(algorithm, samples.points, samples.scores, seconds=time.perf_counter() - began, ended=ended)
 
 
-class _Samples:
-    """What NLopt calls: keeps every sample, and stops NLopt at the budget and at a failure."""
+class _EvaluationLog:
+    """Objective for NLopt: records every evaluation, and stops NLopt at the budget or at an exception."""
 
     def __init__(self, score: Callable[[NDArray[np.float64]], float], most: int, stop: Callable[[], None]) -> None:
         self.points: list[NDArray[np.float64]] = []
@@ -130,20 +173,20 @@ class _Samples:
         self._most = most
 
     def release(self) -> None:
-        """Let go of the score and of what it holds: NLopt keeps what it has called for ever."""
+        """Drop the reference to the score, because NLopt never frees its callbacks."""
         self._score = self._stop = None
 
     def cost(self, x: NDArray[np.float64], _gradient: Any) -> float:
         assert self._score is not None
         assert self._stop is not None
-        # NLopt's C code may go on calling after an exception, so none is let through: it is kept, and NLopt stopped.
-        if self.failure is not None or len(self.scores) >= self._most:  # some algorithms overrun their budget
+        # NLopt's C code may continue after an exception. So the exception is stored here and raised after NLopt stops.
+        if self.failure is not None or len(self.scores) >= self._most:  # some algorithms exceed their budget
             self._stop()
             return -min(self.scores, default=0.0)
         try:
             value = self._score(x)
             if not math.isfinite(value):
-                raise AmiwarpError(f"sharpness is {value} at {x} px; check camera and prism")
+                raise AmiwarpError(f"sharpness is {value} at the point {x} px; check camera and prism")
         except BaseException as error:
             self.failure = error
             self._stop()
@@ -158,6 +201,7 @@ _ENDS = {1: "converged", 2: "score reached", 3: "tolerance of the score", 4: "to
 
 def _optimiser(
     algorithm: str,
+    *,
     low: NDArray[np.float64],
     high: NDArray[np.float64],
     evaluations: int,
@@ -165,13 +209,14 @@ def _optimiser(
     step: float,
     inner: str,
 ) -> Any:
+    """Return a configured NLopt optimiser."""
     import nlopt
 
     n = len(low)
     if n < 2 and algorithm in _NEEDS_TWO:
-        raise AmiwarpError(f"{algorithm} needs two free parameters or more; for one use LN_COBYLA or LN_SBPLX")
+        raise AmiwarpError(f"{algorithm} needs at least two free parameters; use LN_COBYLA or LN_SBPLX for one")
     optimiser = nlopt.opt(getattr(nlopt, algorithm), n)
-    if algorithm != "LN_NEWUOA":  # the one without bounds
+    if algorithm != "LN_NEWUOA":  # the only algorithm without bounds
         optimiser.set_lower_bounds(low)
         optimiser.set_upper_bounds(high)
     optimiser.set_maxeval(evaluations)
@@ -180,6 +225,9 @@ def _optimiser(
         optimiser.set_initial_step(np.minimum(step, 0.45 * (high - low)))
     if "MLSL" in algorithm:
         check_algorithm(inner, LOCAL_ALGORITHMS)
-        local = _optimiser(inner, low, high, max(20, evaluations // 8), max(tolerance, 0.05), step, inner)
+        local = _optimiser(
+            inner, low=low, high=high, evaluations=max(20, evaluations // 8), tolerance=max(tolerance, 0.05),
+            step=step, inner=inner,
+        )  # fmt: skip
         optimiser.set_local_optimizer(local)
     return optimiser

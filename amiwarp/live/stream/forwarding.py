@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.events import Events
-    from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.socket_sinks import PipeSink, SocketSink
 
 
 class Forward:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, regroup
-from amiwarp.io.files import errors_name, register_reader
+from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
 
 Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]

@@ -18,7 +18,7 @@ from amiwarp.progress import Progress
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scenery import place_scene, seen_bearings
 from amiwarp.simulation.simulator import Scene, Simulation
-from amiwarp.studies.design.orbit import Orbit, orbit_radii
+from amiwarp.studies.design.orbit_size import Orbit, orbit_radii
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

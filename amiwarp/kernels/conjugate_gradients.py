@@ -7,7 +7,7 @@ and the results are bit-identical on every run.
 
 import warp as wp
 
-from amiwarp.kernels.prior import Prior, prior_diagonal, prior_product
+from amiwarp.kernels.map_prior import Prior, prior_diagonal, prior_product
 
 wp.set_module_options({"enable_backward": False})
 
@@ -149,7 +149,7 @@ def next_ratio(dots: Dots, thread: int) -> float:
 
 
 @wp.kernel
-def turn(width: int, start: int, u: Unknowns, dots: Dots):
+def update_search_direction(width: int, start: int, u: Unknowns, dots: Dots):
     """Compute the search direction p = z + b p, where z = r / diagonal."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
@@ -159,7 +159,7 @@ def turn(width: int, start: int, u: Unknowns, dots: Dots):
 
 
 @wp.kernel
-def turn_to(z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots: Dots):
+def update_search_direction_with(z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots: Dots):
     """Compute the search direction p = z + b p for a given z."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)

@@ -18,14 +18,14 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, check_events, regroup
 from amiwarp.events.recording import MetadataValue, Recording, Truth
-from amiwarp.io.attributes import attribute, read_camera, read_prism
+from amiwarp.io.camera_attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order
-from amiwarp.io.files import errors_name, register_reader
+from amiwarp.io.file_scan import smallest_sensor
 from amiwarp.io.hdf5 import Column, Hdf5File
+from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.io.native_layout import FORMAT, FORMAT_VERSION
-from amiwarp.io.scan import smallest_sensor
+from amiwarp.io.regular_file import check_regular
 from amiwarp.optics.camera import check_size
-from amiwarp.regular_file import check_regular
 
 DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px], which its files do not store."""

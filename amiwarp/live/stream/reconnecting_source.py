@@ -38,9 +38,9 @@ class ReturningSource:
     def __init__(self, spec: str, wait_s: float, say: Callable[[str], None]) -> None:
         kind = spec.partition(":")[0]
         if kind not in SOCKETS:
-            what = "give tcp:, unix:, tcp-listen: or unix-listen:, or omit it"
+            what = "give tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
             raise AmiwarpError(
-                f"{spec}: --wait-for-source applies to sockets only, a file or pipe does not return; {what}"
+                f"{spec}: --wait-for-source applies to sockets only, because a file or pipe cannot be reopened; {what}"
             )
         self._wait_s, self._say, self._listens = wait_s, say, kind.endswith("-listen")
         source = self._source = open_stream(spec)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from amiwarp.kernels.descent import add_fixed, store_partial_sum
+from amiwarp.kernels.conjugate_gradients import add_fixed, store_partial_sum
 from amiwarp.kernels.photometric import Atlas, Geometry, Pairs, difference
 
 wp.set_module_options({"enable_backward": False})

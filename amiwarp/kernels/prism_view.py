@@ -3,7 +3,7 @@
 import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams, pixel_to_ray
-from amiwarp.kernels.optics import ExactParams, trace
+from amiwarp.kernels.refraction import ExactParams, trace
 
 wp.set_module_options({"enable_backward": False})
 

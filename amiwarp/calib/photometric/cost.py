@@ -1,0 +1,97 @@
+"""Cost of the photometric stage: the robust residual that remains with the best brightness map."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.calib.photometric.gauss_newton import Slopes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.brightness.solver import BrightnessMap
+    from amiwarp.calib.parameters import ParameterSpace
+
+FIRST_SCALE = 1.0
+"""Scale of Cauchy's weights until the first map is solved [thresholds]."""
+SLOPE_PX = 0.02
+"""Step of the finite differences that give the residuals' slopes [px]."""
+
+
+class Cost:
+    """Robust residual as a function of the search vector. Each call starts from the last brightness map."""
+
+    def __init__(self, space: ParameterSpace, brightness: BrightnessMap, steps: int) -> None:
+        self.space, self.brightness, self.steps = space, brightness, steps
+        self.scale = FIRST_SCALE
+        self.evaluations = 0
+        self._solved: NDArray[np.float64] | None = None
+        self._changes: list[Any] = []
+        """Derivatives of the map by each parameter [1/px], kept as the start of the next solution."""
+
+    def warm_up(self, v: NDArray[np.float64]) -> None:
+        """Solve the first map at ``v``, and set the scale of the weights from its residuals."""
+        self.residuals(v, rounds=3, steps=2 * self.steps)
+        self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
+        self.residuals(v)
+
+    def renew(self, v: NDArray[np.float64]) -> None:
+        """Discard the map, which is biased to where it was fitted, and solve a new one at ``v``."""
+        unknowns = self.brightness.unknowns
+        unknowns[: self.brightness.tiles.nodes] = 0.0
+        self.brightness.unknowns = unknowns
+        self.brightness.place(**self.at(v))
+        self.brightness.solve(FIRST_SCALE, steps=2 * self.steps, rounds=3)
+
+    def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
+        """Return the arguments of :meth:`BrightnessMap.place`."""
+        values = self.space.to_values(v)
+        space = self.space
+        return {
+            "model": space.build(values),
+            "drift": space.drift(values),
+            "camera_rotation": space.camera_rotation(values),
+        }
+
+    def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> None:
+        """Solve the map at ``v``. The residuals stay on the device."""
+        self.brightness.place(**self.at(v))
+        self.brightness.solve(self.scale, steps=steps or self.steps, rounds=rounds)
+        self._solved = v
+
+    def mean(self) -> float:
+        """Return the pairs' mean Cauchy cost, relative to that without a map. A pair off the map counts as without."""
+        return self.brightness.residuals.mean_cost(self.scale, missing=1.0) / math.log1p(1.0 / self.scale**2)
+
+    def __call__(self, v: NDArray[np.float64], *, steps: int | None = None) -> float:
+        """Return the negative cost at ``v``, a score to be maximised."""
+        self.evaluations += 1
+        self.residuals(v, steps=steps)
+        return -self.mean()
+
+    def settled(self, v: NDArray[np.float64]) -> float:
+        """Return the score with a better converged map: after a long step the last map would make it look worse."""
+        return self(v, steps=3 * self.steps // 2)
+
+    def slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Slopes:
+        """Return the slopes of the residuals at ``v``, minus their part that a change of the map can explain."""
+        b, n = self.brightness, len(v)
+        if self._solved is None or not np.array_equal(self._solved, v):
+            self.residuals(v)
+        if len(self._changes) != n:
+            self._changes = [b.new_change() for _ in v]
+        b.prepare_projection()
+        steps = np.eye(n) * SLOPE_PX
+        plain = [b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX) for step in steps]
+        both = zip(plain, self._changes, strict=True)
+        left = [b.unexplained(row, change, steps=self.steps // 2) for row, change in both]
+        upper = np.triu_indices(n)
+        pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]
+        sums = b.residuals.products([*pairs, *((row, b.residuals.values) for row in plain)])
+        hessian = np.zeros((n, n))
+        hessian[upper] = sums[:-n]
+        hessian.T[upper] = sums[:-n]
+        return Slopes(hessian, sums[-n:], b.residuals.clusters(left) if with_parts else np.empty((n, 0)))

@@ -1,0 +1,125 @@
+"""Collection of the pairs of successive events of a pixel that the photometric stage uses."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
+from amiwarp.calib.photometric.scene_tiles import choose_tiles, one_tile
+from amiwarp.calib.sharpness.objective import reach
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.brightness.solver import Tiles
+    from amiwarp.calib.photometric.stage import PhotometricSettings
+    from amiwarp.calib.sharpness.search import Search
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.recording import Recording
+
+MARGIN_PX, ROTATION_MARGIN_PX = 3, 8
+"""Border of a tile's map, within which the parameters may move events [px]; the second if the camera rotates."""
+LONGEST_GAP_US = 60_000
+"""Longest time between the events of a pair [us]. Noise makes longer ones unreliable."""
+FEWEST_PAIRS = 1_500
+"""Smallest number of pairs."""
+PAIRS_PER_NODE = 1.5
+"""Smallest number of equations per unknown of the map. A map with fewer fits any parameters."""
+FEWEST_TURNS = 2
+"""Number of turns that are always used, if the recording has them."""
+FEWEST_TILES = 6
+"""Number of tiles that are always used."""
+
+
+class _PairCollector:
+    """Collector of pairs of events that both fall on one tile of the scene, at the answer of the sharpness stage."""
+
+    def __init__(self, recording: Recording, search: Search, tile_of: NDArray[np.int32], sensor: SensorTiming) -> None:
+        from scipy import ndimage
+
+        self.recording, self.search, self.sensor, self.tile_of = recording, search, sensor, tile_of
+        far = math.ceil(reach(search.space, search.best)) + 1
+        near = ndimage.maximum_filter((tile_of >= 0).astype(np.uint8), size=2 * far + 1) > 0
+        self.near = np.where(near, 0, -1).astype(np.int32)
+        self._found: list[PairSet] = []
+        self._done = 0
+
+    def pairs_in(self, spans: list[tuple[int, int]]) -> PairSet:
+        """Return the pairs inside the time spans [us]. Spans that extend an earlier list cost only the new ones."""
+        if len(spans) > self._done:
+            self._found.append(self._new_pairs(spans[self._done :]))
+            self._done = len(spans)
+        return PairSet.concatenate(self._found)
+
+    def _new_pairs(self, spans: list[tuple[int, int]]) -> PairSet:
+        search, source = self.search, self.recording.events
+        space, best, calibration_events = search.space, search.best, search.calibration_events
+        table = EventTable([source.between(*span) for span in spans], self.near, search.device)
+        pairs = table.pairs(
+            calibration_events.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
+            sensor=self.sensor, middle_us=space.middle_us,
+        )  # fmt: skip
+        if not len(pairs):
+            return pairs
+        if calibration_events.slope_of is not None:
+            pairs = pairs.with_slope(calibration_events.slope_of, space.middle_us)
+        every = np.ones(int(self.tile_of.max()) + 1, np.bool_)
+        return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self.tile_of, every)
+
+
+def turn_length(recording: Recording, encoder: Encoder) -> float:
+    """Return the duration of a turn [us], or of the recording if that is shorter."""
+    whole = float(recording.events.t_last - recording.events.t_first + 1)
+    return min(60e6 / max(abs(encoder.rpm), 1e-6), whole)
+
+
+def collect_pairs(recording: Recording, search: Search, settings: PhotometricSettings) -> tuple[PairSet, Tiles]:
+    """Return about ``settings.pairs`` pairs of events, from whole turns spread over the recording, and the map's tiles.
+
+    At least :data:`FEWEST_TURNS` turns are used, if the recording has them. If these hold too many pairs, whole tiles
+    are left out: fewer pairs on the same tiles would not determine the map.
+    """
+    first, last = recording.events.t_first, recording.events.t_last
+    turn = turn_length(recording, search.calibration_events.encoder)
+    turns = max(1, int((last - first + 1) / turn))
+    margin = ROTATION_MARGIN_PX if search.full_space.moving else MARGIN_PX
+    if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= settings.pairs:
+        tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
+    else:
+        tile_of, tiles = choose_tiles(search.image(), settings.density, margin)
+    collector = _PairCollector(recording, search, tile_of, settings.sensor)
+    spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
+    if search.full_space.moving:
+        spans = [(first, last + 1)]  # a rotating camera needs successive turns
+    many = min(FEWEST_TURNS, len(spans))
+    pairs = collector.pairs_in(spans[:many])
+    while len(pairs) < settings.pairs and many < len(spans):
+        many = min(len(spans), max(many + 1, math.ceil(many * settings.pairs / max(len(pairs), 1))))
+        pairs = collector.pairs_in(spans[:many])
+    count = len(tiles.origin)
+    keep = max(FEWEST_TILES, round(count * settings.pairs / max(len(pairs), 1)))
+    if keep >= count:
+        return pairs, tiles
+    return pairs.of_tiles(np.isin(np.arange(count), van_der_corput(count)[:keep])), tiles
+
+
+def van_der_corput(n: int) -> list[int]:
+    """Return 0 … n-1 in van der Corput's order: the first numbers of the list are always spread evenly."""
+    bits = max(1, (n - 1).bit_length())
+    order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
+    return [k for k in order if k < n]
+
+
+def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
+    """Return the share of equations beyond the map's unknowns; raise :class:`AmiwarpError` if they are too few."""
+    touched = int((coverage > 0.5).sum())
+    if pairs < max(FEWEST_PAIRS, PAIRS_PER_NODE * touched):
+        raise AmiwarpError(
+            f"{name}: {pairs} pairs of events are too few for the {touched} unknowns of a brightness map; record for "
+            "longer"
+        )
+    return 1.0 - touched / pairs
