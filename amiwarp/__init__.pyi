@@ -50,6 +50,9 @@ from .io.copying import save_recording as save_recording
 from .io.formats import Format as Format
 from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
+from .io.truth_export import save_flow_dsec as save_flow_dsec
+from .io.truth_export import save_flow_mvsec as save_flow_mvsec
+from .io.truth_export import save_poses_tum as save_poses_tum
 from .optics.camera import Camera as Camera
 from .optics.camera_rotation import CameraRotation as CameraRotation
 from .optics.lens import Distortion as Distortion

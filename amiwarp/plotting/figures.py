@@ -203,7 +203,7 @@ class Grid:
         part = min(tall * REGION[0] / REGION[1], (WIDTH - 5 * gap - width) / 3.0)
         third = 4.1
         height = 0.6 + 2 * (title + tall + gap) + title + third + 0.65
-        figure = _blank((WIDTH, height))
+        figure = blank((WIDTH, height))
 
         def place(left: float, top: float, wide: float, high: float) -> Any:
             return figure.add_axes((left / WIDTH, 1.0 - (top + high) / height, wide / WIDTH, high / height))
@@ -314,11 +314,11 @@ def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int
 
 def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[float, ...]) -> tuple[Any, Any]:
     """Return a figure and its grid of axes."""
-    figure = _blank(size, layout="compressed")
+    figure = blank(size, layout="compressed")
     return figure, figure.subplots(rows, columns, width_ratios=widths)
 
 
-def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
+def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
     """Return an empty figure."""
     # Without pyplot, which would change global state and look for a display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
