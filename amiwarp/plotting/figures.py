@@ -329,13 +329,14 @@ def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None
     return figure
 
 
-def save(figure: Any, path: Path, *, overwrite: bool = False) -> None:
-    """Write a figure as a PNG of 256 colours, a third of the full size; the write is atomic."""
+def save(figure: Any, path: Path, *, all_colours: bool = False, overwrite: bool = False) -> None:
+    """Write a figure as a PNG; the write is atomic. It has 256 colours, a third of the size, or ``all_colours``."""
     from PIL import Image
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
-    save_png(path, indexed(np.asarray(Image.open(buffer).convert("RGB"))), overwrite=overwrite)
+    picture = Image.open(buffer).convert("RGB")
+    save_png(path, picture if all_colours else indexed(np.asarray(picture)), overwrite=overwrite)
 
 
 def save_svg(figure: Any, path: Path) -> None:

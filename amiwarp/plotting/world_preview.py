@@ -43,18 +43,18 @@ def draw_preview(path: Path, frame: FrameTruth, *, overwrite: bool = False) -> N
     ):
         ax.imshow(np.clip(light / white, 0.0, 1.0) ** (1.0 / GAMMA), cmap="gray", vmin=0.0, vmax=1.0)
         ax.set_title(f"luminance, {title}")
-    axes[0, 2].imshow(instance_colours(frame.instance))
-    axes[0, 2].set_title("instances")
-    _draw_depth(figure, axes[1, 0], frame.depth)
     for ax, flow, title in (
-        (axes[1, 1], frame.flow, "without the prism"),
-        (axes[1, 2], frame.flow_with_prism, "through the prism"),
+        (axes[1, 0], frame.flow, "without the prism"),
+        (axes[1, 1], frame.flow_with_prism, "through the prism"),
     ):
         _draw_flow(ax, flow, title)
+    _draw_depth(figure, axes[0, 2], frame.depth)
+    axes[1, 2].imshow(instance_colours(frame.instance))
+    axes[1, 2].set_title("instances")
     for ax in axes.ravel():
         ax.set_axis_off()
     figure.suptitle(f"at {frame.t_us * 1e-3:.1f} ms")
-    save(figure, path, overwrite=overwrite)
+    save(figure, path, all_colours=True, overwrite=overwrite)
 
 
 def _draw_depth(figure: Any, ax: Any, depth: NDArray[np.float32]) -> None:
@@ -110,5 +110,6 @@ def flow_colours(flow: NDArray[np.float32], full: float) -> NDArray[np.float64]:
 def instance_colours(instance: NDArray[np.uint16]) -> NDArray[np.float64]:
     """Return instance numbers as colours, shape (height, width, 3). The sky is pale blue."""
     numbers, where = np.unique(instance, return_inverse=True)
-    colours = [SKY if n == 0 else colorsys.hsv_to_rgb(n * GOLDEN % 1.0, 0.65, 0.9) for n in numbers.tolist()]
+    values = (0.95, 0.6, 0.8)
+    colours = [SKY if n == 0 else colorsys.hsv_to_rgb(n * GOLDEN % 1.0, 0.65, values[n % 3]) for n in numbers.tolist()]
     return np.asarray(colours)[where.reshape(instance.shape)]
