@@ -132,10 +132,16 @@ def same_poses(a: amiwarp.Poses, b: amiwarp.Poses) -> None:
         np.testing.assert_array_equal(rows, {**b.bodies, **b.joints}[name], strict=True)
 
 
+def test_codes_of_causes_are_those_of_the_kernels() -> None:
+    from amiwarp.kernels import event_generation as kernels
+
+    assert [cause.code for cause in amiwarp.Cause] == [int(getattr(kernels, cause.name)) for cause in amiwarp.Cause]
+
+
 def test_every_event_has_its_truth(recording: amiwarp.Recording) -> None:
     truth = truth_of(recording).of_events(0, len(recording.events))
-    assert set(np.unique(truth.cause)) <= set(amiwarp.Cause)
-    assert np.count_nonzero(truth.cause == amiwarp.Cause.SIGNAL) > 500
+    assert set(np.unique(truth.cause)) <= {cause.code for cause in amiwarp.Cause}
+    assert np.count_nonzero(truth.cause == amiwarp.Cause.SIGNAL.code) > 500
     assert set(np.unique(truth.instance)) == {0, 1, 2}
     labels = truth_of(recording).labels
     assert labels == amiwarp.WorldLabels("stub", ("wall", "ñ square"), ("building", "thing"))
@@ -474,6 +480,7 @@ def test_simulate_a_named_world(named: Path) -> None:
     assert about["name"] == "room"
     assert (about["instances"], about["categories"]) == (2, ["building", "thing"])
     assert about["per_event"] == ["cause", "instance", "depth", "place"]
+    assert list(about["causes"]) == ["signal", "shot_noise", "leak", "hot_pixel"]
     assert sum(about["causes"].values()) == data["events"]
     assert (about["instants"], about["poses"]) == (3, 41)
     assert (about["moving_bodies"], about["joints"]) == (["ñ square"], ["hand"])

@@ -144,7 +144,7 @@ def _causes(truth: Truth, count: int) -> dict[str, int] | None:
     totals = np.zeros(256, np.int64)
     for start in range(0, count, DEFAULT_BLOCK):
         totals += np.bincount(truth.stored_causes[start : start + DEFAULT_BLOCK], minlength=256)
-    return {cause.name.lower(): int(totals[cause]) for cause in Cause}
+    return {cause.value: int(totals[cause.code]) for cause in Cause}
 
 
 def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:

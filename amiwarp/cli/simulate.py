@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
 
+AVERAGE_S = 600.0
+"""Time over which the speed of a simulation is averaged [s]. A time span of a slow world may take minutes."""
+
 
 @dataclass(frozen=True)
 class SceneOptions:
@@ -116,7 +119,7 @@ def _scene(
 def write(simulation: Simulation, out: Path, common: Common, *, truth_hz: float | None = None) -> None:
     """Run a simulation, write its recording to ``out`` and print the result."""
     began = time.perf_counter()
-    with progress("simulating") as advance:
+    with progress("simulating", average_s=AVERAGE_S) as advance:
         simulation.write(out, truth_hz=truth_hz, progress=advance)
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {

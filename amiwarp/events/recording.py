@@ -46,7 +46,7 @@ class Truth:
     stored_points: PointStore | None = None
     """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``, float32, or None."""
     stored_causes: EventValues | None = None
-    """Cause of each event, a value of :class:`amiwarp.Cause`, shape ``(n,)``, uint8, or None."""
+    """Code of the cause of each event, see :class:`amiwarp.Cause`, shape ``(n,)``, uint8, or None."""
     stored_instances: EventValues | None = None
     """Instance number of the surface that each event saw, shape ``(n,)``, uint16, or None."""
     stored_depths: EventValues | None = None

@@ -13,23 +13,30 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 
-class Cause(enum.IntEnum):
-    """Cause of a simulated event.
+class Cause(enum.StrEnum):
+    """Cause of a simulated event. Arrays hold its code: the position in this list, from 0.
 
     Examples
     --------
-    >>> amiwarp.Cause(1).name
-    'SHOT_NOISE'
+    >>> amiwarp.Cause.HOT_PIXEL.code
+    3
+    >>> list(amiwarp.Cause)[1].value
+    'shot_noise'
     """
 
-    SIGNAL = 0
-    """The light changed by the contrast threshold."""
-    SHOT_NOISE = 1
-    """Shot noise of the photons."""
-    LEAK = 2
-    """The leak of the pixel's stored level."""
-    HOT_PIXEL = 3
-    """The additional rate of a hot pixel."""
+    SIGNAL = "signal"
+    """The light changed by the contrast threshold. Code 0."""
+    SHOT_NOISE = "shot_noise"
+    """Shot noise of the photons. Code 1."""
+    LEAK = "leak"
+    """The leak of the pixel's stored level. Code 2."""
+    HOT_PIXEL = "hot_pixel"
+    """The additional rate of a hot pixel. Code 3."""
+
+    @property
+    def code(self) -> int:
+        """Number that stands for the cause in arrays and files."""
+        return list(Cause).index(self)
 
 
 class EventValues(Protocol):
@@ -50,14 +57,14 @@ class EventTruth:
     --------
     >>> import numpy as np
     >>> truth = amiwarp.EventTruth(cause=np.array([0, 3], np.uint8))
-    >>> amiwarp.Cause(truth.cause[1]).name
-    'HOT_PIXEL'
+    >>> int((truth.cause == amiwarp.Cause.HOT_PIXEL.code).sum())
+    1
     """
 
     points: NDArray[np.float32] | None = None
     """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``."""
     cause: NDArray[np.uint8] | None = None
-    """Cause of each event, a value of :class:`amiwarp.Cause`, shape ``(n,)``."""
+    """Code of the cause of each event, see :class:`amiwarp.Cause`, shape ``(n,)``."""
     instance: NDArray[np.uint16] | None = None
     """Instance number of the surface, shape ``(n,)``: 0 is the sky, i + 1 is ``WorldLabels.instances[i]``."""
     depth: NDArray[np.float32] | None = None
