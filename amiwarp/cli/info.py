@@ -116,7 +116,7 @@ def _camera(recording: Recording) -> dict[str, Any]:
 
 
 def _world(truth: Truth, count: int) -> dict[str, Any] | None:
-    """Return what ground truth is stored besides the parameters, or None if there is none."""
+    """Return the ground truth that is stored in addition to the parameters, or None."""
     stores = {"cause": truth.stored_causes, "instance": truth.stored_instances, "depth": truth.stored_depths,
               "place": truth.stored_places}  # fmt: skip
     stored = [name for name, store in stores.items() if store is not None]

@@ -50,8 +50,8 @@ class EventValues(Protocol):
 class EventTruth:
     """Ground truth of a block of events. An array is None if it is not known.
 
-    The surface of an event is the one that its pixel saw through the prism when the event's signal crossed the
-    threshold. Events of noise see a surface too.
+    An event's surface is what its pixel saw through the prism at the time of the event, before the sensor's latency.
+    Events of noise have a surface too.
 
     Examples
     --------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import warp as wp
@@ -152,7 +152,7 @@ class TruthRenderer:
         view.prism = ExactModel(simulation.camera, given, 0.0, simulation.motion.tilt).params(device)
         self._sight.set_instants(np.array([float(t_us)]), view)
         angle = simulation.motion.phase + float(simulation.motion.angle([t_us])[0])
-        table: NDArray[Any] = np.zeros(1, sight.Step.numpy_dtype())
+        table: NDArray[Any] = np.zeros(1, cast("Any", sight.Step).numpy_dtype())
         table["azimuth"] = (math.cos(angle), math.sin(angle))
         steps = sight.Steps()
         steps.at = wp.array(table, dtype=sight.Step, device=device)
