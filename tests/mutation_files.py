@@ -31,8 +31,9 @@ from PIL import Image
 from amiwarp.calib import Calibration
 from amiwarp.cli.info import describe
 from amiwarp.cli.inputs import read_camera
-from amiwarp.events.events import check_events
-from amiwarp.io import open_recording, read_encoder_csv
+from amiwarp.events.events import Events, check_events
+from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
+from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye
@@ -64,6 +65,39 @@ def write_hdf5(filters: dict[str, Any], libver: str, path: Path) -> None:
         file.create_group("camera").attrs.update(camera, distortion_model="fisheye", distortion=[0.1, 0.0, 0.0, 0.0])
         file.create_group("metadata").attrs.update(place="roof", fixed=np.bytes_("abc"), number=3, flag=True)
         file.create_group("truth").attrs.update(apex=0.03, phase=-1.0)
+
+
+def write_truth(path: Path) -> None:
+    """Write a native file with the ground truth of events, instants and poses."""
+    rng, count, (width, height) = np.random.default_rng(0), len(EVENTS), (8, 6)
+    maps = {name: rng.random((height, width, *tail)).astype(kind) for name, (kind, tail) in MAPS.items()}
+    poses = np.tile([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0], (3, 1))
+    truth = EventTruth(
+        rng.random((count, 2)).astype(np.float32), rng.integers(0, 4, count).astype(np.uint8),
+        rng.integers(0, 3, count).astype(np.uint16), rng.random(count).astype(np.float32),
+        rng.random((count, 3)).astype(np.float32),
+    )  # fmt: skip
+    events = Events.from_arrays(EVENTS.x % width, EVENTS.y % height, EVENTS.t, EVENTS.p)
+    labels = WorldLabels("world", ("wall", "ball"), ("building", ""))
+    with RecordingWriter(path, width=width, height=height, truth_labels=labels) as writer:
+        writer.append(events, truth=truth)
+        for t in (0, 1000):
+            writer.append_frame(
+                FrameTruth(t, **maps, rotation=np.eye(3), position=np.ones(3), joints={"a": np.ones(3)})
+            )
+        writer.append_poses(Poses(np.arange(3) * 1000, poses, {"ball": poses}, {"a": poses[:, :3]}))
+
+
+def write_plain_truth(path: Path) -> None:
+    """Write the same without checksums, so that damage reaches the values and the file's structure."""
+    write_truth(path)
+    with h5py.File(path) as file:
+        found: dict[str, Any] = {}
+        file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    with h5py.File(path, "w", libver="earliest") as file:
+        file.attrs["width"], file.attrs["height"] = 8, 6
+        for name, values in found.items():
+            file[name] = values
 
 
 def write_csv(path: Path) -> None:
@@ -116,7 +150,12 @@ def read_recording(path: Path) -> None:
         assert len(source.between(source.t_first, source.t_last + 1)) == count
         assert len(source.slice(1, 7)) == min(count - 1, 6)
     if recording.truth is not None:
-        recording.truth.points(0, count)
+        recording.truth.of_events(0, count)
+        for index in range(0 if recording.truth.frames is None else len(recording.truth.frames.t)):
+            assert recording.truth.frames is not None
+            assert recording.truth.frames[index].depth.shape == recording.events.size[::-1]
+        if recording.truth.poses is not None:
+            assert len(recording.truth.poses[:]) == len(recording.truth.poses)
     json.dumps(describe(recording, str(path)), ensure_ascii=False).encode()
 
 
@@ -160,6 +199,8 @@ KINDS: dict[str, Kind] = {
         for name, given in PLUGINS.items()
     },
     "hdf5_v110": (".h5", partial(write_hdf5, PLUGINS["gzip"], "v110"), read_recording),
+    "truth": (".h5", write_truth, read_recording),
+    "truth_plain": (".h5", write_plain_truth, read_recording),
     "encoder_csv": (".csv", write_csv, read_log),
     "calib_txt": (".txt", lambda path: path.write_text(CALIB), lambda path: read_calib(path, *SIZE)),
     "camera_json": (".json", write_camera, lambda path: read_camera(path, *SIZE)),

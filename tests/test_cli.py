@@ -34,6 +34,7 @@ from amiwarp.cli import (
     simulate,
     stability,
     translate,
+    truth,
     view,
 )
 from amiwarp.cli.app import app
@@ -54,6 +55,7 @@ COMMANDS = {
         convert,
         simulate,
         translate,
+        truth,
         calibrate,
         compensate,
         reconstruct,

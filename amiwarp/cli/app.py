@@ -30,6 +30,7 @@ from amiwarp.cli import (
     simulate,
     stability,
     translate,
+    truth,
     view,
 )
 from amiwarp.cli.options import command
@@ -86,7 +87,7 @@ def _version(
 
 for module in (
     demo, info, view, convert, simulate, translate, calibrate, compensate, reconstruct, chart, design, stability,
-    motor, record, live, emulate,
+    truth, motor, record, live, emulate,
 ):  # fmt: skip
     command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 

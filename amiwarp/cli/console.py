@@ -58,11 +58,16 @@ def _without(line: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def progress(what: str) -> Iterator[Progress]:
-    """Show a progress bar on stderr and remove it at the end. Print nothing if stderr is not a terminal."""
+def progress(what: str, *, average_s: float = 30.0) -> Iterator[Progress]:
+    """Show a progress bar on stderr and remove it at the end. Print nothing if stderr is not a terminal.
+
+    The remaining time follows from the mean speed of the last ``average_s`` [s].
+    """
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with rich.progress.Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=average_s
+    ) as bar:
         task = bar.add_task(printable(what), total=1.0)
         yield lambda what, share: bar.update(task, completed=share, description=printable(what))
 

@@ -11,6 +11,8 @@ import typer
 
 from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import Common
+from amiwarp.events.events import DEFAULT_BLOCK
+from amiwarp.events.truth import Cause
 from amiwarp.io import open_recording
 from amiwarp.io.conversion import GAP_INTERVALS
 from amiwarp.optics.prism import Prism
@@ -18,7 +20,7 @@ from amiwarp.optics.prism import Prism
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import EventSource
-    from amiwarp.events.recording import Recording
+    from amiwarp.events.recording import Recording, Truth
 
 EXAMPLE = "amiwarp info recording.h5"
 
@@ -48,6 +50,7 @@ def describe(recording: Recording, file: str) -> dict[str, Any]:
         "prism": None,
         "truth": None if recording.truth is None else _degrees(recording.truth.parameters),
         "truth_points": recording.truth is not None and recording.truth.points(0, 1) is not None,
+        "world": None if recording.truth is None else _world(recording.truth, len(source)),
         "repairs": getattr(source, "repairs", {}),
         "metadata": recording.metadata,
     }
@@ -112,6 +115,59 @@ def _camera(recording: Recording) -> dict[str, Any]:
     return {**camera_to_json(camera), "fov_deg": math.degrees(camera.fov)}
 
 
+def _world(truth: Truth, count: int) -> dict[str, Any] | None:
+    """Return the ground truth that is stored in addition to the parameters, or None."""
+    stores = {"cause": truth.stored_causes, "instance": truth.stored_instances, "depth": truth.stored_depths,
+              "place": truth.stored_places}  # fmt: skip
+    stored = [name for name, store in stores.items() if store is not None]
+    if not stored and truth.labels is None and truth.frames is None and truth.poses is None:
+        return None
+    poses = None if truth.poses is None else truth.poses[:0]
+    labels = truth.labels
+    return {
+        "name": None if labels is None else labels.name,
+        "instances": None if labels is None else len(labels.instances),
+        "categories": None if labels is None else sorted({name for name in labels.categories if name}),
+        "per_event": stored,
+        "causes": _causes(truth, count),
+        "instants": 0 if truth.frames is None else len(truth.frames.t),
+        "poses": 0 if truth.poses is None else len(truth.poses),
+        "moving_bodies": [] if poses is None else list(poses.bodies),
+        "joints": [] if poses is None else list(poses.joints),
+    }
+
+
+def _causes(truth: Truth, count: int) -> dict[str, int] | None:
+    """Return the number of events by cause, or None if it is not stored."""
+    if truth.stored_causes is None:
+        return None
+    totals = np.zeros(256, np.int64)
+    for start in range(0, count, DEFAULT_BLOCK):
+        totals += np.bincount(truth.stored_causes[start : start + DEFAULT_BLOCK], minlength=256)
+    return {cause.value: int(totals[cause.code]) for cause in Cause}
+
+
+def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows about the ground truth of events and of a world."""
+    rows = []
+    if d["causes"] is not None:
+        total = max(sum(d["causes"].values()), 1)
+        shares = (f"{100 * n / total:.3g} % {name.replace('_', ' ')}" for name, n in d["causes"].items() if n)
+        rows.append(("causes", ", ".join(shares) or "no events"))
+    if d["name"] is not None:
+        categories = f" of the classes {', '.join(d['categories'])}" if d["categories"] else ""
+        rows.append(("world", f"{d['name']}: {d['instances']} instances{categories}"))
+    surfaces = [name for name in d["per_event"] if name != "cause"]
+    if surfaces:
+        rows.append(("per event", ", ".join(surfaces)))
+    if d["instants"]:
+        rows.append(("instants", f"{d['instants']} with depth, normals, instances, flow and intensity"))
+    if d["poses"]:
+        moving = [f"{len(d[name])} {name.replace('_', ' ')}" for name in ("moving_bodies", "joints") if d[name]]
+        rows.append(("poses", f"{d['poses']:,} of the camera" + (f", {', '.join(moving)}" if moving else "")))
+    return rows
+
+
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
     angles = ("apex", "phase", "tilt_x", "tilt_y")
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
@@ -135,6 +191,8 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
         points = "with the true position of each event" if d["truth_points"] else "without positions"
         shown = [f"{n} {v:.5g}" for n, v in d["truth"].items() if n in ("apex_deg", "phase_deg", "index")]
         rows.append(("truth", f"{', '.join(shown)}; {points}"))
+    if d["world"] is not None:
+        rows += _world_rows(d["world"])
     rows.append(("repairs", ", ".join(f"{name} {count:,}" for name, count in d["repairs"].items()) or "none"))
     rest = {k: v for k, v in d["metadata"].items() if k != "format" and k not in d["repairs"]}
     return rows + [(name, str(value)) for name, value in rest.items()]

@@ -1,4 +1,4 @@
-"""``amiwarp simulate``: simulated recording of a picture, with its ground truth."""
+"""``amiwarp simulate``: simulated recording of a picture or a world, with its ground truth."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.inputs import numbers
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
+from amiwarp.cli.worlds import WorldOptions
+from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.simulation.motion import CameraMotion
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.simulator import Scene, Simulation
+    from amiwarp.simulation.worlds.world_scene import WorldScene
 
 EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
+
+AVERAGE_S = 600.0
+"""Time over which the speed of a simulation is averaged [s]. A time span of a slow world may take minutes."""
 
 
 @dataclass(frozen=True)
@@ -61,20 +67,27 @@ class SceneOptions:
 def run(
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
-    picture: Annotated[Path, typer.Option(help="Picture of the scene: JPEG, PNG, TIFF ...")],
+    picture: Annotated[Path | None, typer.Option(help="Picture of the scene: JPEG, PNG, TIFF ...")] = None,
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,
+    world: WorldOptions,
     scene: SceneOptions,
     rig: RigOptions,
     sensor: SensorOptions,
     encoder: EncoderModelOptions,
     common: Common,
 ) -> None:
-    """Simulate the recording of a picture by an event camera behind the prism, and store its ground truth."""
-    from amiwarp.simulation.simulator import Scene, Simulation
+    """Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.
 
+    A picture lies at infinity. A world is three-dimensional, and the camera moves through it: give --world room.
+    """
+    from amiwarp.simulation.simulator import Simulation
+
+    if (picture is None) == (world.world is None):
+        raise typer.BadParameter("give one of them", param_hint="--picture, --world")
+    world.check()
     device = choose_device(common.device)
     simulation = Simulation(
-        Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px),
+        _scene(picture, world, scene, duration, common.seed),
         rig.build_camera(),
         rig.build_prism(),
         duration,
@@ -86,14 +99,28 @@ def run(
         seed=common.seed,
         device=device,
     )
-    write(simulation, out, common)
+    world.draw_preview(simulation)
+    write(simulation.without_prism() if world.no_prism else simulation, out, common, truth_hz=world.truth_hz)
 
 
-def write(simulation: Simulation, out: Path, common: Common) -> None:
+def _scene(
+    picture: Path | None, world: WorldOptions, scene: SceneOptions, duration: float, seed: int
+) -> Scene | WorldScene:
+    """Return the picture or the world."""
+    from amiwarp.simulation.simulator import Scene
+
+    if picture is not None:
+        return Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px)
+    if scene.fov is not None or any(scene.rates):
+        raise AmiwarpError("--scene-fov-deg and --rotate-deg-s apply to a picture; give --trajectory for a world")
+    return world.build_scene(duration, seed=seed, blur=scene.blur_px)
+
+
+def write(simulation: Simulation, out: Path, common: Common, *, truth_hz: float | None = None) -> None:
     """Run a simulation, write its recording to ``out`` and print the result."""
     began = time.perf_counter()
-    with progress("simulating") as advance:
-        simulation.write(out, progress=advance)
+    with progress("simulating", average_s=AVERAGE_S) as advance:
+        simulation.write(out, truth_hz=truth_hz, progress=advance)
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {
         "file": str(out),

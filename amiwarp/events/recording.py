@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.events import EventSource
+from amiwarp.events.truth import EventTruth, EventValues, FrameStore, PoseStore, WorldLabels
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -32,14 +33,32 @@ class Truth:
 
     Examples
     --------
-    >>> amiwarp.Truth({"apex": 0.03, "phase": 0.5}).points(0, 10) is None
+    >>> import numpy as np
+    >>> truth = amiwarp.Truth({"apex": 0.03, "phase": 0.5}, stored_causes=np.array([0, 1, 0], np.uint8))
+    >>> truth.points(0, 10) is None
     True
+    >>> truth.of_events(1, 3).cause.tolist()
+    [1, 0]
     """
 
     parameters: dict[str, float] = field(default_factory=dict)
     """True parameters by name: apex, phase, tilt_x, tilt_y [rad], index, clock_offset_us [us], and others."""
     stored_points: PointStore | None = None
     """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``, float32, or None."""
+    stored_causes: EventValues | None = None
+    """Code of the cause of each event, see :class:`amiwarp.Cause`, shape ``(n,)``, uint8, or None."""
+    stored_instances: EventValues | None = None
+    """Instance number of the surface that each event saw, shape ``(n,)``, uint16, or None."""
+    stored_depths: EventValues | None = None
+    """Depth of the surface that each event saw [m], shape ``(n,)``, float32, or None."""
+    stored_places: EventValues | None = None
+    """Point in the world that each event saw [m], shape ``(n, 3)``, float32, or None."""
+    labels: WorldLabels | None = None
+    """Names of the world's instances and their classes, or None."""
+    frames: FrameStore | None = None
+    """Ground truth of all pixels at chosen instants, or None."""
+    poses: PoseStore | None = None
+    """Poses of the camera, the moving bodies and the joints over time, or None."""
 
     def points(self, start: int, stop: int) -> NDArray[np.float32] | None:
         """Return the true points of the events with ``start <= index < stop``.
@@ -55,6 +74,23 @@ class Truth:
             Pixels without the prism [px], shape (n, 2), or None if they are not stored.
         """
         return None if self.stored_points is None else self.stored_points[max(start, 0) : max(stop, 0)]
+
+    def of_events(self, start: int, stop: int) -> EventTruth:
+        """Return all ground truth of the events with ``start <= index < stop``.
+
+        Parameters
+        ----------
+        start, stop : int
+            First index, and index after the last, as in the ``slice`` method of event sources.
+
+        Returns
+        -------
+        EventTruth
+            The arrays that are stored, with one row per event.
+        """
+        which = slice(max(start, 0), max(stop, 0))
+        stores = self.stored_causes, self.stored_instances, self.stored_depths, self.stored_places
+        return EventTruth(self.points(start, stop), *(None if store is None else store[which] for store in stores))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,9 +4,10 @@
 """
 
 from amiwarp.io.conversion import ConversionSummary, convert
+from amiwarp.io.copying import save_recording
 from amiwarp.io.encoder_csv import read_encoder_csv
 from amiwarp.io.formats import Format, detect_format, open_recording
-from amiwarp.io.native_writer import RecordingWriter, save_recording
+from amiwarp.io.native_writer import RecordingWriter
 
 __all__ = [
     "ConversionSummary",

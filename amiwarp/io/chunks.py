@@ -67,7 +67,9 @@ def _blosc() -> Any:
 
 def encode(values: NDArray[Any]) -> bytes:
     """Return the stored bytes of a chunk. A shorter array is padded with zeros, as HDF5 does."""
-    whole = values if values.size == CHUNK else np.concatenate([values, np.zeros(CHUNK - values.size, values.dtype)])
+    whole = values
+    if len(values) < CHUNK:
+        whole = np.concatenate([values, np.zeros((CHUNK - len(values), *values.shape[1:]), values.dtype)])
     frame = _blosc().encode(np.ascontiguousarray(whole))
     return b"".join((frame, checksum(frame).to_bytes(4, "little")))
 
@@ -122,9 +124,19 @@ def _fold_carries(total: int) -> int:
 class StoredColumn:
     """A dataset of the native layout. Threads read its chunks in parallel, without HDF5."""
 
-    def __init__(self, handle: int, dtype: np.dtype[Any], count: int, places: Sequence[Sequence[int]]) -> None:
-        """Take the handle of the open file, and ``places``: the offset and size of each chunk [bytes]."""
-        self._handle, self._dtype, self._count, self._places = handle, dtype, count, places
+    def __init__(
+        self,
+        handle: int,
+        dtype: np.dtype[Any],
+        count: int,
+        places: Sequence[Sequence[int]],
+        row: tuple[int, ...] = (),
+    ) -> None:
+        """Take the handle of the open file, and ``places``: the offset and size of each chunk [bytes].
+
+        ``row`` is the shape of an element: empty for numbers.
+        """
+        self._handle, self._dtype, self._count, self._places, self._row = handle, dtype, count, places, row
         self._last: tuple[int, NDArray[Any]] | None = None
 
     def read(self, start: int, stop: int) -> NDArray[Any] | None:
@@ -133,7 +145,7 @@ class StoredColumn:
         if first == last and (stop - start < CHUNK and stop != self._count):
             chunk = self._chunk(first)
             return None if chunk is None else chunk[start - first * CHUNK : stop - first * CHUNK].copy()
-        out = np.empty((last + 1 - first) * CHUNK, self._dtype)
+        out = np.empty(((last + 1 - first) * CHUNK, *self._row), self._dtype)
         for at in range(first, last + 1):
             if not self._decode(at, out[(at - first) * CHUNK : (at + 1 - first) * CHUNK]):
                 return None
@@ -143,7 +155,7 @@ class StoredColumn:
         """Return a whole chunk, or None if it is damaged. The latest chunk is kept, for searches within it."""
         if self._last is not None and self._last[0] == at:
             return self._last[1]
-        out = np.empty(CHUNK, self._dtype)
+        out = np.empty((CHUNK, *self._row), self._dtype)
         if not self._decode(at, out):
             return None
         self._last = at, out
@@ -156,5 +168,6 @@ class StoredColumn:
 
 def append_chunk(dataset: Any, start: int, stored: bytes, count: int) -> None:
     """Append an encoded chunk of ``count`` elements to a dataset of ``start`` elements, a whole number of chunks."""
-    dataset.id.set_extent((start + count,))
-    dataset.id.write_direct_chunk((start,), stored)
+    row = dataset.shape[1:]
+    dataset.id.set_extent((start + count, *row))
+    dataset.id.write_direct_chunk((start, *(0 for _ in row)), stored)

@@ -119,6 +119,7 @@ def convert(
         prism=prism or recording.prism,
         encoder=encoder,
         truth_parameters=None if recording.truth is None else recording.truth.parameters,
+        truth_labels=None if recording.truth is None else recording.truth.labels,
         metadata={"source_name": recording.name, "source_format": recording.metadata["format"], **metadata},
         overwrite=overwrite,
     ) as writer:

@@ -6,6 +6,7 @@ the reading process reads files of other layouts or filters, and everything that
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import weakref
@@ -23,8 +24,8 @@ from amiwarp.io.reading_process import ReadingProcess, borrow, give_back
 PIECE = 1 << 20
 """Number of elements that the reading process reads per request."""
 
-READ_ON_DEMAND = ("events/", "truth/", "ms_to_idx")
-"""Prefixes of the datasets that are still read after a file was opened."""
+READ_ON_DEMAND = ("events/", "truth/x", "truth/y", "truth/events/", "ms_to_idx")
+"""Prefixes of the datasets that are read often after a file was opened."""
 
 SERVER = "amiwarp.io.hdf5_server"
 """Module that runs in the reading process."""
@@ -62,7 +63,7 @@ class Hdf5File:
         return found
 
     def settle(self) -> None:
-        """End the opening. Give the reading process back if the datasets that are read on demand do not need it."""
+        """End the opening. Give the reading process back if the datasets that are read often do not need it."""
         if all(column.is_stored for name, column in self.columns.items() if name.startswith(READ_ON_DEMAND)):
             with self._lock:
                 _give_back(self._process)
@@ -83,7 +84,7 @@ class Hdf5File:
 
 
 class Column:
-    """A one-dimensional dataset."""
+    """A dataset that is read by rows: of numbers, or of arrays of one shape."""
 
     def __init__(self, file: Hdf5File, handle: int, name: str, about: Mapping[str, Any]) -> None:
         self._file = weakref.proxy(file)
@@ -92,7 +93,9 @@ class Column:
         self._filters = ", ".join(about["filters"]) or "no filter"
         self.dtype = np.dtype(about["dtype"])
         places = about["places"]
-        self._stored = None if places is None else StoredColumn(handle, self.dtype, self._count, places)
+        self.row = tuple(int(size) for size in about["row"])
+        """Shape of an element: empty for numbers."""
+        self._stored = None if places is None else StoredColumn(handle, self.dtype, self._count, places, self.row)
 
     def __len__(self) -> int:
         return self._count
@@ -105,7 +108,7 @@ class Column:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return the elements with ``start <= index < stop``. Raises :class:`AmiwarpError` for damaged data."""
         if start >= stop:
-            return np.empty(0, self.dtype)
+            return np.empty((0, *self.row), self.dtype)
         if self._stored is not None:
             values = self._stored.read(start, stop)
             if values is None:
@@ -113,7 +116,8 @@ class Column:
                     f"dataset '{self._name}' has a damaged chunk: its checksum is wrong; copy the file again"
                 )
             return values
-        parts = [self._ask(at, min(at + PIECE, stop)) for at in range(start, stop, PIECE)]
+        piece = max(1, PIECE // max(1, math.prod(self.row)))
+        parts = [self._ask(at, min(at + piece, stop)) for at in range(start, stop, piece)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _ask(self, start: int, stop: int) -> NDArray[Any]:
@@ -122,9 +126,9 @@ class Column:
         except AmiwarpError as error:
             where = f"dataset '{self._name}' ({self._filters}), elements {start} .. {stop}"
             raise AmiwarpError(f"{where}: {error}") from error
-        if values.shape != (stop - start,) or values.dtype != self.dtype:
+        if values.size != (stop - start) * math.prod(self.row) or values.dtype != self.dtype:
             raise AmiwarpError(f"dataset '{self._name}' changed while it was read; open the file again")
-        return values
+        return values.reshape(stop - start, *self.row)
 
 
 def _close(handle: int, process: list[ReadingProcess]) -> None:

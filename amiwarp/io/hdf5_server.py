@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import os
 from collections.abc import Iterator
 from typing import Any
@@ -26,9 +27,10 @@ ATTRIBUTES = {
     "camera": ("width", "height", "fx", "fy", "cx", "cy", "distortion_model", "distortion"),
     "prism": ("apex", "index", "flat_side"),
     "truth": (),
+    "truth/world": ("name",),
     "metadata": (),
 }
-"""Attributes that are read, by group. All attributes of the last two groups are read. Others are ignored."""
+"""Attributes that are read, by group; of ``truth`` and ``metadata`` all. Others are ignored."""
 
 COLUMNS = {
     **{f"events/{name}": "iub" for name in ("t", "p", "inside", "extrapolated")},
@@ -40,10 +42,32 @@ COLUMNS = {
     "encoder/index_t": "iu",
     "truth/x": "f",
     "truth/y": "f",
+    **{f"truth/events/{name}": "iu" for name in ("cause", "instance")},
+    **{f"truth/events/{name}": "f" for name in ("depth", "place")},
+    **{f"truth/frames/{name}": "iu" for name in ("t", "instance")},
+    **{f"truth/frames/{name}": "f" for name in ("pose", "joints", "depth", "normal", "intensity", "flow")},
+    **{f"truth/frames/{name}_with_prism": "f" for name in ("intensity", "flow")},
+    "truth/poses/t": "iu",
+    "truth/poses/camera": "f",
+    "truth/poses/bodies": "f",
+    "truth/joints/position": "f",
+    **{f"truth/{name}": "S" for name in ("world/instances", "world/categories", "poses/body_names", "joints/names")},
 }
 """Datasets that are read, and the allowed kinds of their types, as in NumPy's ``dtype.kind``."""
 
-READ_AT_ONCE = ("t_offset", "encoder/t", "encoder/angle", "encoder/index_t")
+DIMENSIONS = {
+    "t_offset": 0,
+    **{f"truth/{name}": 2 for name in ("events/place", "frames/pose", "poses/camera")},
+    **{f"truth/{name}": 3 for name in ("frames/joints", "poses/bodies", "joints/position")},
+    **{f"truth/frames/{name}": 3 for name in ("depth", "instance", "intensity", "intensity_with_prism")},
+    **{f"truth/frames/{name}": 4 for name in ("normal", "flow", "flow_with_prism")},
+}
+"""Numbers of dimensions of the datasets; 1 for all others."""
+
+READ_AT_ONCE = (
+    "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "truth/frames/t", "truth/world/instances",
+    "truth/world/categories", "truth/poses/body_names", "truth/joints/names",
+)  # fmt: skip
 """Datasets that are read into memory at once, and therefore have stricter size limits."""
 
 AT_ONCE_BYTES, AT_ONCE_RATIO = 1 << 24, 1000
@@ -187,11 +211,15 @@ def _text(value: Any) -> str:
 
 def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) -> dict[str, Any]:
     """Return type, length and filters of a dataset, and the positions of its chunks if they are read without HDF5."""
-    if not isinstance(dataset, h5py.Dataset) or dataset.ndim != (0 if name == "t_offset" else 1):
-        raise AmiwarpError(f"no one-dimensional dataset '{name}'; the file is incomplete")
+    dimensions = DIMENSIONS.get(name, 1)
+    if not isinstance(dataset, h5py.Dataset) or dataset.ndim != dimensions:
+        wanted = "one-dimensional" if dimensions == 1 else f"{dimensions}-dimensional"
+        raise AmiwarpError(f"no {wanted} dataset '{name}'; the file is incomplete")
     dtype = dataset.dtype
     if dtype.kind not in kinds or dtype.fields is not None:
         raise AmiwarpError(f"dataset '{name}' is {dtype}; see docs/reference/recording-format.md")
+    if row_bytes(dataset) > CHUNK_BYTES or (dataset.chunks or dataset.shape)[1:] != dataset.shape[1:]:
+        raise AmiwarpError(f"dataset '{name}' has rows of over {CHUNK_BYTES >> 20} MiB, or chunks of partial rows")
     creation = dataset.id.get_create_plist()
     filters = [creation.get_filter(at) for at in range(creation.get_nfilters())]
     places: list[tuple[int, int]] | None = None
@@ -201,18 +229,23 @@ def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) 
         chunks = _chunks(dataset, name, filters, path, unfinished)
         count = _chunked_length(dataset, name, chunks, unfinished)
         places = stored_places(dataset, filters, chunks[: -(-count // CHUNK)])
-    if name in READ_AT_ONCE and count * dtype.itemsize > max(
+    if name in READ_AT_ONCE and count * row_bytes(dataset) > max(
         AT_ONCE_BYTES, AT_ONCE_RATIO * dataset.id.get_storage_size()
     ):
         raise AmiwarpError(f"dataset '{name}' declares {count} elements, too many for its size; the file is damaged")
     names = [FILTERS.get(code, f"filter {code}") for code, *_ in filters]
-    return {"dtype": dtype.str, "count": count, "filters": names, "places": places}
+    return {"dtype": dtype.str, "count": count, "filters": names, "places": places, "row": dataset.shape[1:]}
+
+
+def row_bytes(dataset: Any) -> int:
+    """Return the size of a row in memory [bytes]; for one-dimensional datasets that of an element."""
+    return int(dataset.dtype.itemsize) * math.prod(dataset.shape[1:])
 
 
 def _plain_length(dataset: Any, name: str, path: str) -> int:
     """Return the length of a dataset without chunks, after checking that the file holds all of it."""
-    count, offset = int(dataset.size), dataset.id.get_offset()
-    declared, stored = count * dataset.dtype.itemsize, dataset.id.get_storage_size()
+    count, offset = int(dataset.shape[0]) if dataset.shape else 1, dataset.id.get_offset()
+    declared, stored = count * row_bytes(dataset), dataset.id.get_storage_size()
     compact = dataset.id.get_create_plist().get_layout() == h5py.h5d.COMPACT
     inside = compact or (offset is not None and offset + declared <= os.path.getsize(path))
     if count and (stored < declared or not inside):
@@ -235,14 +268,14 @@ def _chunked_length(dataset: Any, name: str, chunks: list[Any], unfinished: bool
 
 def _chunks(dataset: Any, name: str, filters: list[Any], path: str, unfinished: bool) -> list[Any]:
     """Return all chunks in order, after checking each. HDF5 and its Blosc filter would read beyond a damaged chunk."""
-    if dataset.chunks[0] * dataset.dtype.itemsize > CHUNK_BYTES:
+    if dataset.chunks[0] * row_bytes(dataset) > CHUNK_BYTES:
         raise AmiwarpError(f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller ones")
     chunks: list[Any] = []
     dataset.id.chunk_iter(chunks.append)
     chunks.sort(key=lambda chunk: chunk.chunk_offset[0])
     file_bytes = os.path.getsize(path)
     # An unfiltered chunk of an interrupted recording may end beyond the file. HDF5 reads zeros there.
-    file_bytes += dataset.chunks[0] * dataset.dtype.itemsize if unfinished and not filters else 0
+    file_bytes += dataset.chunks[0] * row_bytes(dataset) if unfinished and not filters else 0
     damaged = sum(chunk.size for chunk in chunks) > file_bytes or _blosc_disagrees(dataset, filters)
     with open(path, "rb") as raw:
         for chunk in chunks:
@@ -258,13 +291,13 @@ def _blosc_disagrees(dataset: Any, filters: list[Any]) -> bool:
     itemsize = dataset.dtype.itemsize
     # The filter's parameters are two versions, bytes per element and bytes per chunk.
     declared = [tuple(values[2:4]) for code, _, values, _ in filters if code == BLOSC]
-    return any(values != (itemsize, dataset.chunks[0] * itemsize) for values in declared)
+    return any(values != (itemsize, dataset.chunks[0] * row_bytes(dataset)) for values in declared)
 
 
 def _chunk_is_damaged(dataset: Any, filters: list[Any], chunk: Any, raw: Any) -> bool:
     """Return whether a chunk's stored size contradicts the dataset."""
     codes = [code for code, *_ in filters]
-    chunk_bytes = dataset.chunks[0] * dataset.dtype.itemsize
+    chunk_bytes = dataset.chunks[0] * row_bytes(dataset)
     if not codes:
         return bool(chunk.size != chunk_bytes)
     if codes[0] != BLOSC:
@@ -281,7 +314,7 @@ def stored_places(dataset: Any, filters: list[Any], chunks: list[Any]) -> list[t
     """Return offset and size of every chunk in the native layout, or None for other layouts, which HDF5 reads."""
     file = dataset.file
     plain = hasattr(os, "pread") and file.driver == "sec2" and file.userblock_size == 0 and dataset.dtype.isnative
-    if not plain or dataset.chunks != (CHUNK,) or [code for code, *_ in filters] != [BLOSC, FLETCHER32]:
+    if not plain or dataset.chunks[0] != CHUNK or [code for code, *_ in filters] != [BLOSC, FLETCHER32]:
         return None
     if any(chunk.filter_mask for chunk in chunks):
         return None

@@ -26,10 +26,10 @@ from amiwarp.events.events import Events, as_times, check_events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.atomic_output import allocate, check_output, put_in_place
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
+from amiwarp.io.copying import save_recording
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import Columns, check_frame, check_lengths, make_dataset, ms_entries, write_header
 from amiwarp.io.native_reader import open_native
-from amiwarp.io.native_writer import save_recording
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:

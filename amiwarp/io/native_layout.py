@@ -43,9 +43,9 @@ def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> N
 
 
 def check_lengths(columns: Columns, count: int) -> None:
-    """Raise :class:`AmiwarpError` for a column that does not have one element per event."""
+    """Raise :class:`AmiwarpError` for a column that does not have one element, or one row, per event."""
     for name, column in columns.items():
-        if column.shape != (count,):
+        if column.shape[:1] != (count,) or (column.ndim > 1 and not name.startswith("truth/")):
             raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
 
 
@@ -63,7 +63,7 @@ def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) 
 def chunks_of(columns: Columns) -> Iterator[NDArray[Any]]:
     """Yield all chunks of the first column, then those of the next."""
     for column in columns.values():
-        for at in range(0, column.size, CHUNK):
+        for at in range(0, len(column), CHUNK):
             yield column[at : at + CHUNK]
 
 
@@ -72,16 +72,16 @@ def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
 
 
-def make_dataset(file: Any, name: str, dtype: Any) -> Any:
-    """Create an empty dataset of the native layout."""
+def make_dataset(file: Any, name: str, dtype: Any, row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
+    """Create an empty dataset of the native layout, whose rows have the shape ``row``."""
     import hdf5plugin
 
     # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.
     return file.create_dataset(
         name,
-        shape=(0,),
-        maxshape=(None,),
-        chunks=(CHUNK,),
+        shape=(0, *row),
+        maxshape=(None, *row),
+        chunks=(chunk_rows, *row),
         dtype=dtype,
         fletcher32=True,
         compression=hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, check_events, regroup
-from amiwarp.events.recording import MetadataValue, Recording, Truth
+from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.camera_attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order
 from amiwarp.io.file_scan import smallest_sensor
@@ -25,6 +25,7 @@ from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.io.native_layout import FORMAT, FORMAT_VERSION
 from amiwarp.io.regular_file import check_regular
+from amiwarp.io.truth_reader import read_truth
 from amiwarp.optics.camera import check_size
 
 DSEC_SIZE = (640, 480)
@@ -170,19 +171,6 @@ class NativeEvents:
         return low, high
 
 
-class _StoredPoints:
-    """The datasets truth/x and truth/y as one ``(n, 2)`` array [px], read on demand."""
-
-    def __init__(self, path: Path, file: Hdf5File) -> None:
-        self._path, self._file = path, file
-
-    def __getitem__(self, which: slice, /) -> NDArray[np.float32]:
-        with errors_name(self._path, lambda: f"truth {which.start} .. {which.stop}"):
-            columns = [self._file.columns[f"truth/{name}"] for name in ("x", "y")]
-            start, stop, _ = which.indices(len(columns[0]))
-            return np.stack([column.read(start, stop) for column in columns], axis=1).astype(np.float32, copy=False)
-
-
 def open_native(path: Path) -> Recording:
     """Open a native recording or a DSEC event file. Raises :class:`AmiwarpError` for other files."""
     check_regular(path)
@@ -217,7 +205,7 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         camera=found,
         encoder=None if file.attributes("encoder") is None else _read_encoder(path, file),
         prism=None if prism is None else read_prism(prism, f"{path}: /prism"),
-        truth=None if file.attributes("truth") is None else _read_truth(path, file, len(events)),
+        truth=None if file.attributes("truth") is None else read_truth(path, file, len(events), events.size),
         metadata=metadata,
         name=path.stem,
     )
@@ -250,14 +238,3 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
         return None
     offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
     return Encoder(t, angle, offset, index_t)
-
-
-def _read_truth(path: Path, file: Hdf5File, count: int) -> Truth:
-    attributes = _attributes(file, "truth")
-    parameters = {name: attribute(attributes, f"{path}: /truth", name, float) for name in attributes}
-    if "truth/x" not in file.columns:
-        return Truth(parameters)
-    x, y = (_column(file, f"truth/{name}") for name in ("x", "y"))
-    if len(x) != count or len(y) != count:
-        raise AmiwarpError(f"{path}: truth has {len(x)} and {len(y)} points for {count} events; the file is damaged")
-    return Truth(parameters, _StoredPoints(path, file))

@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, check_events
-from amiwarp.events.recording import MetadataValue, Recording
+from amiwarp.events.recording import MetadataValue
+from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
-from amiwarp.io.copying import copy_events
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
     Columns,
@@ -34,6 +34,7 @@ from amiwarp.io.native_layout import (
     ms_entries,
     write_header,
 )
+from amiwarp.io.truth_writer import TruthWriter, event_columns
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ class RecordingWriter:
         The encoder. :meth:`set_encoder` can replace it later.
     truth_parameters : mapping of str to float, optional
         True parameters of a synthetic recording.
+    truth_labels : WorldLabels, optional
+        Names in the world of a synthetic recording.
     metadata : mapping, optional
         Other information: text, numbers and truth values by name.
     overwrite : bool, default False
@@ -93,6 +96,7 @@ class RecordingWriter:
         prism: NominalPrism | None = None,
         encoder: Encoder | None = None,
         truth_parameters: Mapping[str, float] | None = None,
+        truth_labels: WorldLabels | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -100,9 +104,10 @@ class RecordingWriter:
         check_frame(self.path, width, height, camera)
         self._size = (int(width), int(height))
         self._camera, self._prism, self._encoder = camera, prism, encoder
-        self._truth_parameters = truth_parameters
+        self._truth_parameters, self._truth_labels = truth_parameters, truth_labels
         self._metadata = dict(metadata or {})
         self._file: Any = None
+        self._truth: TruthWriter | None = None
         self._datasets: dict[str, Any] = {}
         self._new: NewFile | None = None
         self._pending: list[Columns] = []
@@ -126,6 +131,7 @@ class RecordingWriter:
             with errors_name(self.path, lambda: "making the file"):
                 # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
                 self._file = h5py.File(self._new.part, "x", libver=("v110", "v110"))
+                self._truth = TruthWriter(self._file, self.path, self._size)
                 self._write_header()
         except BaseException:
             self._discard()
@@ -152,6 +158,7 @@ class RecordingWriter:
         events: Events,
         *,
         truth_points: ArrayLike | None = None,
+        truth: EventTruth | None = None,
         inside: ArrayLike | None = None,
         extrapolated: ArrayLike | None = None,
     ) -> None:
@@ -163,6 +170,8 @@ class RecordingWriter:
             The events, not earlier than those before.
         truth_points : array_like, optional
             Pixels of the scene points without the prism [px], shape (n, 2).
+        truth : EventTruth, optional
+            All ground truth of the events, the scene points included; then ``truth_points`` is not used.
         inside : array_like, optional
             For compensated events: whether each lies inside the image, shape (n,). Required if coordinates are NaN.
         extrapolated : array_like, optional
@@ -186,7 +195,8 @@ class RecordingWriter:
         if not len(events):
             return
         with errors_name(self.path, lambda: f"after {len(self)} events"):
-            columns = self._as_columns(events, truth_points, {"inside": inside, "extrapolated": extrapolated})
+            known = truth or EventTruth(points=None if truth_points is None else np.asarray(truth_points, np.float32))
+            columns = self._as_columns(events, known, {"inside": inside, "extrapolated": extrapolated})
             self._index(events.t)
             columns["events/t"] = events.t - self._t_offset
             self._pending.append(columns)
@@ -250,18 +260,39 @@ class RecordingWriter:
         """
         self._encoder = encoder
 
-    def _as_columns(
-        self, events: Events, truth_points: ArrayLike | None, flags: Mapping[str, ArrayLike | None]
-    ) -> Columns:
+    def append_frame(self, frame: FrameTruth) -> None:
+        """Append the ground truth of an instant.
+
+        Parameters
+        ----------
+        frame : FrameTruth
+            Ground truth of all pixels, at a later time than the frame before.
+        """
+        with errors_name(self.path, lambda: f"truth of the instant {frame.t_us} us"):
+            self._open_truth().append_frame(frame)
+
+    def append_poses(self, poses: Poses) -> None:
+        """Append true poses.
+
+        Parameters
+        ----------
+        poses : Poses
+            Poses at later times than those before.
+        """
+        with errors_name(self.path, lambda: "true poses"):
+            self._open_truth().append_poses(poses)
+
+    def _open_truth(self) -> TruthWriter:
+        if self._truth is None:
+            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
+        return self._truth
+
+    def _as_columns(self, events: Events, truth: EventTruth, flags: Mapping[str, ArrayLike | None]) -> Columns:
         columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
         for name, flag in flags.items():
             if flag is not None:
                 columns[f"events/{name}"] = np.asarray(flag).astype(np.uint8)
-        if truth_points is not None:
-            points = np.asarray(truth_points, np.float32)
-            if points.shape != (len(events), 2):
-                raise AmiwarpError(f"truth points have shape {points.shape}; expected ({len(events)}, 2)")
-            columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
+        columns |= event_columns(truth, len(events))
         check_lengths(columns, len(events))
         dtypes = {name: column.dtype for name, column in columns.items()}
         if self._columns is None:
@@ -302,9 +333,9 @@ class RecordingWriter:
         """Append encoded chunks of columns to their datasets."""
         stored = iter(encoded)
         for name, column in columns.items():
-            dataset = self._dataset(name, column.dtype)
-            for at in range(0, column.size, CHUNK):
-                append_chunk(dataset, self._written + at, next(stored), min(CHUNK, column.size - at))
+            dataset = self._dataset(name, column.dtype, column.shape[1:])
+            for at in range(0, len(column), CHUNK):
+                append_chunk(dataset, self._written + at, next(stored), min(CHUNK, len(column) - at))
 
     def _extend(self, name: str, values: NDArray[Any]) -> None:
         """Append values to a small dataset through HDF5."""
@@ -313,9 +344,9 @@ class RecordingWriter:
         dataset.resize(start + values.size, axis=0)
         dataset[start:] = values
 
-    def _dataset(self, name: str, dtype: np.dtype[Any]) -> Any:
+    def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = ()) -> Any:
         if name not in self._datasets:
-            self._datasets[name] = make_dataset(self._file, name, dtype)
+            self._datasets[name] = make_dataset(self._file, name, dtype, row)
         return self._datasets[name]
 
     def _write_header(self) -> None:
@@ -324,6 +355,8 @@ class RecordingWriter:
             group = self._file.create_group("truth")
             for name, value in self._truth_parameters.items():
                 group.attrs[name] = float(value)
+        if self._truth_labels is not None and self._truth is not None:
+            self._truth.write_labels(self._truth_labels)
 
     def _finish(self) -> None:
         self._flush(whole=self._pending_count)
@@ -347,42 +380,3 @@ class RecordingWriter:
                 self._file.close()
         if self._new is not None:
             self._new.discard()
-
-
-def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwrite: bool = False) -> None:
-    """Write a recording to a native HDF5 file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file to write.
-    recording : Recording
-        The recording.
-    overwrite : bool, default False
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    AmiwarpError
-        If the path cannot be written, is being read, or exists without ``overwrite``.
-
-    Examples
-    --------
-    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
-    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4))
-    >>> amiwarp.save_recording("short.h5", recording)
-    """
-    source = recording.events
-    width, height = source.size
-    with RecordingWriter(
-        path,
-        width=width,
-        height=height,
-        camera=recording.camera,
-        prism=recording.prism,
-        encoder=recording.encoder,
-        truth_parameters=None if recording.truth is None else recording.truth.parameters,
-        metadata=recording.metadata,
-        overwrite=overwrite,
-    ) as writer:
-        copy_events(recording, writer)

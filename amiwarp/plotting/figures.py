@@ -203,7 +203,7 @@ class Grid:
         part = min(tall * REGION[0] / REGION[1], (WIDTH - 5 * gap - width) / 3.0)
         third = 4.1
         height = 0.6 + 2 * (title + tall + gap) + title + third + 0.65
-        figure = _blank((WIDTH, height))
+        figure = blank((WIDTH, height))
 
         def place(left: float, top: float, wide: float, high: float) -> Any:
             return figure.add_axes((left / WIDTH, 1.0 - (top + high) / height, wide / WIDTH, high / height))
@@ -314,11 +314,11 @@ def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int
 
 def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[float, ...]) -> tuple[Any, Any]:
     """Return a figure and its grid of axes."""
-    figure = _blank(size, layout="compressed")
+    figure = blank(size, layout="compressed")
     return figure, figure.subplots(rows, columns, width_ratios=widths)
 
 
-def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
+def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
     """Return an empty figure."""
     # Without pyplot, which would change global state and look for a display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -329,13 +329,14 @@ def _blank(size: tuple[float, float], layout: Literal["compressed"] | None = Non
     return figure
 
 
-def save(figure: Any, path: Path, *, overwrite: bool = False) -> None:
-    """Write a figure as a PNG of 256 colours, a third of the full size; the write is atomic."""
+def save(figure: Any, path: Path, *, all_colours: bool = False, overwrite: bool = False) -> None:
+    """Write a figure as a PNG; the write is atomic. It has 256 colours, a third of the size, or ``all_colours``."""
     from PIL import Image
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
-    save_png(path, indexed(np.asarray(Image.open(buffer).convert("RGB"))), overwrite=overwrite)
+    picture = Image.open(buffer).convert("RGB")
+    save_png(path, picture if all_colours else indexed(np.asarray(picture)), overwrite=overwrite)
 
 
 def save_svg(figure: Any, path: Path) -> None:

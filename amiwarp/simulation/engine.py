@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.events.events import Events
+from amiwarp.events.truth import EventTruth
 from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import launch as launching
 from amiwarp.kernels import prism_view, world_events
@@ -65,6 +66,17 @@ class DeviceBlock:
             return Events.empty(), np.empty((0, 2), np.float32)
         b = self.arrays
         return Events(b.x.numpy(), b.y.numpy(), b.t.numpy(), b.p.numpy()), b.points.numpy()
+
+    def truth(self) -> EventTruth:
+        """Return the ground truth of the events."""
+        if not self.count:
+            surfaces = (np.empty(0, np.uint16), np.empty(0, np.float32), np.empty((0, 3), np.float32))
+            points, cause = np.empty((0, 2), np.float32), np.empty(0, np.uint8)
+            return EventTruth(points, cause) if self.seen is None else EventTruth(points, cause, *surfaces)
+        points, cause = self.arrays.points.numpy(), self.arrays.cause.numpy()
+        if self.seen is None:
+            return EventTruth(points, cause)
+        return EventTruth(points, cause, self.seen.instance, self.seen.depth, self.seen.place)
 
 
 class Engine:

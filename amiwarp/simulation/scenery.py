@@ -16,6 +16,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel
 from amiwarp.simulation.pictures import Placement, log_map, place_picture
+from amiwarp.simulation.scene import Scene
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
@@ -137,7 +138,15 @@ def place_scene(simulation: Simulation) -> Placement:
     focal = max(simulation.camera.fx, simulation.camera.fy)
     margin = 2.0 / focal
     view = (*(low - margin).tolist(), *(high + margin).tolist())
-    return place_picture(simulation.scene.frames.size, view, TEXELS_PER_PIXEL * focal, fov=simulation.scene.fov)
+    scene = _pictures(simulation)
+    return place_picture(scene.frames.size, view, TEXELS_PER_PIXEL * focal, fov=scene.fov)
+
+
+def _pictures(simulation: Simulation) -> Scene:
+    """Return the scene of a simulation of pictures."""
+    if not isinstance(simulation.scene, Scene):
+        raise AmiwarpError("a world has no picture at infinity; give a Scene")
+    return simulation.scene
 
 
 class MapRing:
@@ -146,11 +155,12 @@ class MapRing:
     def __init__(self, simulation: Simulation, placement: Placement) -> None:
         """Open the pictures."""
         focal = max(simulation.camera.fx, simulation.camera.fy)
-        self._blur = simulation.scene.blur * math.sqrt(placement.pitch[0] * placement.pitch[1]) / focal
+        scene = _pictures(simulation)
+        self._blur = scene.blur * math.sqrt(placement.pitch[0] * placement.pitch[1]) / focal
         self.placement = placement
         turns = bool(simulation.camera_motion.largest_rates.any())
         self._orientation = simulation.camera_motion.orientation(simulation.duration_s) if turns else None
-        self._frames = simulation.scene.frames.read()
+        self._frames = scene.frames.read()
         self._device = simulation.device
         self._texels = placement.width * placement.height
         self._held: list[tuple[int, int]] = []  # time [us], slot

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import MetadataValue, Recording, Truth
+from amiwarp.events.recording import MetadataValue, Recording
+from amiwarp.events.truth import EventTruth
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -22,6 +23,7 @@ from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.scene import Frames, Scene, Still
 from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.worlds.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.validation import instance, real, whole
 
@@ -61,8 +63,8 @@ class Simulation:
     """Rotation of the camera."""
     sensor: SensorModel = field(default_factory=SensorModel)
     """Pixels of the sensor."""
-    encoder_model: EncoderModel = field(default_factory=EncoderModel)
-    """Errors of the encoder."""
+    encoder_model: EncoderModel | None = field(default_factory=EncoderModel)
+    """Errors of the encoder; None for a camera without a prism, whose recording has neither encoder nor prism."""
     nominal_prism: Prism | None = None
     """The prism stored with the recording; None for the true one."""
     seed: int = 0
@@ -73,8 +75,10 @@ class Simulation:
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
             instance(self.scene, Scene, "simulation's scene")
-        kinds = {"camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
-                 "camera_motion": CameraMotion, "encoder_model": EncoderModel}  # fmt: skip
+        kinds: dict[str, type] = {"camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
+                 "camera_motion": CameraMotion}  # fmt: skip
+        if self.encoder_model is not None:
+            kinds["encoder_model"] = EncoderModel
         for name, kind in kinds.items():
             instance(getattr(self, name), kind, f"simulation's {name}")
         real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
@@ -88,14 +92,26 @@ class Simulation:
         """Duration, rounded [us]."""
         return round(self.duration_s * 1e6)
 
-    def encoder(self) -> Encoder:
+    def without_prism(self) -> Simulation:
+        """Return the same simulation of a plain event camera: the prism is taken out.
+
+        Returns
+        -------
+        Simulation
+            The same scene, sensor and seed with an apex angle of 0. Its recording has neither encoder nor prism.
+        """
+        return replace(self, prism=replace(self.prism, apex=0.0), nominal_prism=None, encoder_model=None)
+
+    def encoder(self) -> Encoder | None:
         """Sample the encoder.
 
         Returns
         -------
-        Encoder
-            Samples of the encoder. Its clock offset is only in the ground truth.
+        Encoder or None
+            Samples of the encoder, or None without a prism. Its clock offset is only in the ground truth.
         """
+        if self.encoder_model is None:
+            return None
         return self.encoder_model.sample(self.motion, self.duration_us, self.seed)
 
     def truth_parameters(self) -> dict[str, float]:
@@ -106,13 +122,17 @@ class Simulation:
         dict
             Values by the names that calibration uses, and those of the sensor.
         """
-        rates = np.asarray(self.camera_motion.rates) if self.camera_motion.constant else np.full(3, np.nan)
+        constant = self.camera_motion.constant and not (
+            isinstance(self.scene, WorldScene) and self.scene.trajectory.moves
+        )  # a trajectory has no constant angular velocity
+        rates = np.asarray(self.camera_motion.rates) if constant else np.full(3, np.nan)
         omega = dict(zip(("omega_x", "omega_y", "omega_z"), rates.ravel()[-3:].tolist(), strict=True))
+        clock = {} if self.encoder_model is None else {"clock_offset_us": self.encoder_model.clock_offset_us}
         return {
             "apex": self.prism.apex,
             "index": self.prism.index,
             "phase": self.motion.phase,
-            "clock_offset_us": self.encoder_model.clock_offset_us,
+            **clock,
             "tilt_x": self.motion.tilt[0],
             "tilt_y": self.motion.tilt[1],
             **{name: value for name, value in omega.items() if math.isfinite(value)},
@@ -147,9 +167,36 @@ class Simulation:
             Events, and the scene point of each event: its pixel without the prism [px], shape ``(n, 2)``, NaN if its
             ray misses the image plane.
         """
+        for events, truth, _ in self._run_engine(chunk_us, progress):
+            points = truth.points
+            assert points is not None
+            yield events, points
+
+    def blocks_with_truth(
+        self, *, chunk_us: int | None = None, progress: Progress | None = None
+    ) -> Iterator[tuple[Events, EventTruth]]:
+        """Yield the events of successive time spans with all their ground truth. Memory use is constant.
+
+        Parameters
+        ----------
+        chunk_us : int, optional
+            Length of a span [us]. The default depends on the device. The events do not depend on it.
+        progress : Progress, optional
+            Called with the finished share.
+
+        Yields
+        ------
+        tuple
+            Events, and their ground truth: points and causes; in a world also instances, depths and places.
+        """
+        for events, truth, _ in self._run_engine(chunk_us, progress):
+            yield events, truth
+
+    def _run_engine(self, chunk_us: int | None, progress: Progress | None) -> Iterator[tuple[Events, EventTruth, int]]:
+        """Yield events, their ground truth, and the end of their time span [us]."""
         engine = Engine(self, chunk_us)
         for block in engine.run():
-            yield block.to_host()
+            yield block.to_host()[0], block.truth(), engine.now_us
             if progress is not None:
                 progress("simulating", min(1.0, engine.now_us / self.duration_us))
 
@@ -165,11 +212,22 @@ class Simulation:
 
         return log_view(self)
 
-    def run(self, *, progress: Progress | None = None) -> Recording:
+    def run(
+        self,
+        *,
+        truth_hz: float | None = None,
+        truth_times_us: ArrayLike | None = None,
+        progress: Progress | None = None,
+    ) -> Recording:
         """Simulate the whole recording in memory.
 
         Parameters
         ----------
+        truth_hz : float, optional
+            Rate of the instants whose depth, normals, instances, flow and luminance are recorded [1/s]. Only worlds
+            have them. By default there are none.
+        truth_times_us : array_like, optional
+            The instants themselves instead of a rate [us], shape (k,), rising.
         progress : Progress, optional
             Called with the finished share.
 
@@ -178,44 +236,71 @@ class Simulation:
         Recording
             The recording, with ground truth.
         """
-        blocks = list(self.blocks(progress=progress))
-        events = Events.concatenate([events for events, _ in blocks])
-        points = np.concatenate([points for _, points in blocks])
+        recorded = RecordedTruth(self, chosen_instants(self.duration_us, truth_hz, truth_times_us))
+        blocks: list[Events] = []
+        for events, truth, now_us in self._run_engine(None, progress):
+            blocks.append(events)
+            recorded.keep(truth, now_us)
         return Recording(
-            MemoryEvents(events, self.camera.width, self.camera.height),
+            MemoryEvents(Events.concatenate(blocks), self.camera.width, self.camera.height),
             self.camera,
             self.encoder(),
-            self.nominal_prism or self.prism,
-            Truth(self.truth_parameters(), points),
+            self._stored_prism,
+            recorded.kept(self.truth_parameters()),
             self.metadata(),
             "simulation",
         )
 
-    def write(self, path: str | Path, *, progress: Progress | None = None, overwrite: bool = False) -> None:
+    @property
+    def _stored_prism(self) -> Prism | None:
+        """The nominal prism of the recording, or None for a plain event camera."""
+        return None if self.encoder_model is None else self.nominal_prism or self.prism
+
+    def write(
+        self,
+        path: str | Path,
+        *,
+        truth_hz: float | None = None,
+        truth_times_us: ArrayLike | None = None,
+        progress: Progress | None = None,
+        overwrite: bool = False,
+    ) -> None:
         """Simulate the whole recording to a file, in constant memory.
 
         Parameters
         ----------
         path : str or Path
             Path of the recording.
+        truth_hz : float, optional
+            Rate of the instants whose depth, normals, instances, flow and luminance are recorded [1/s], as in
+            :meth:`run`.
+        truth_times_us : array_like, optional
+            The instants themselves instead of a rate [us], shape (k,), rising.
         progress : Progress, optional
             Called with the finished share.
         overwrite : bool, optional
             Replace an existing file.
         """
+        recorded = RecordedTruth(self, chosen_instants(self.duration_us, truth_hz, truth_times_us))
         with RecordingWriter(
             path,
             width=self.camera.width,
             height=self.camera.height,
             camera=self.camera,
-            prism=self.nominal_prism or self.prism,
+            prism=self._stored_prism,
             encoder=self.encoder(),
             truth_parameters=self.truth_parameters(),
+            truth_labels=recorded.labels,
             metadata=self.metadata(),
             overwrite=overwrite,
         ) as writer:
-            for events, points in self.blocks(progress=progress):
-                writer.append(events, truth_points=points)
+            for events, truth, now_us in self._run_engine(None, progress):
+                writer.append(events, truth=truth)
+                for frame in recorded.frames_before(now_us):
+                    writer.append_frame(frame)
+                poses = recorded.poses_before(now_us)
+                if poses is not None:
+                    writer.append_poses(poses)
 
 
 def simulate(
@@ -231,6 +316,7 @@ def simulate(
     nominal_prism: Prism | None = None,
     seed: int = 0,
     device: str = "cpu",
+    truth_hz: float | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Simulate a recording.
@@ -261,6 +347,8 @@ def simulate(
         Seed of all random numbers.
     device : str, optional
         Device to compute on.
+    truth_hz : float, optional
+        Rate of the instants whose depth, normals, instances, flow and luminance are recorded [1/s], in a world.
     progress : Progress, optional
         Called with the finished share.
 
@@ -295,7 +383,7 @@ def simulate(
         nominal_prism=nominal_prism,
         seed=seed,
         device=device,
-    ).run(progress=progress)
+    ).run(truth_hz=truth_hz, progress=progress)
 
 
 __all__ = ["Frames", "Scene", "SensorModel", "Simulation", "Still", "simulate"]

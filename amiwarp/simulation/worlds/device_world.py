@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -101,7 +101,7 @@ class DeviceWorld:
 
     def set_instants(self, t: NDArray[np.float64]) -> None:
         """Put the moving bodies and the flickering lamps where they are at times [s], shape ``(n,)``, one row each."""
-        poses = np.zeros((len(t), len(self.movers)), kernels.Pose.numpy_dtype())
+        poses: NDArray[Any] = np.zeros((len(t), len(self.movers)), cast("Any", kernels.Pose).numpy_dtype())
         for k, body in enumerate(self.movers):
             assert body.trajectory is not None
             poses["rotation"][:, k], poses["position"][:, k] = body.trajectory.poses(t)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import warp as wp
@@ -85,7 +85,7 @@ class WorldSight:
         """Put camera and bodies where they are at the instants of a chunk [us]."""
         t = np.maximum(t_us, 0.0) * 1e-6
         self._world.set_instants(t)
-        poses = np.zeros(len(t), kernels.Pose.numpy_dtype())
+        poses: NDArray[Any] = np.zeros(len(t), cast("Any", kernels.Pose).numpy_dtype())
         poses["rotation"], poses["position"] = self._scene.trajectory.poses(t)
         self._view.poses = wp.array(poses, dtype=kernels.Pose, device=self._world.device)
         self._view.prism = view.prism

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,7 +72,6 @@ class Trajectory:
         for name, values in (("t", t), ("position", position), ("rotation", rotation / length)):
             object.__setattr__(self, name, values)
         self._check_jumps()
-        object.__setattr__(self, "_place", None)
 
     def _check_jumps(self) -> None:
         from scipy.spatial.transform import Rotation
@@ -81,7 +81,7 @@ class Trajectory:
             return
         step = np.diff(t)
         speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
-        orientation = Rotation.from_quat(self.rotation)
+        orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
         rate = (orientation[:-1].inv() * orientation[1:]).magnitude() / step
         for what, found, limit, unit in (
             ("moves", speed, LARGEST_SPEED, "m/s"), ("turns", rate, LARGEST_TURN_RATE, "rad/s")
@@ -102,6 +102,16 @@ class Trajectory:
         position, rotation = np.asarray(self.position), np.asarray(self.rotation)
         return bool((position != position[0]).any() or (rotation != rotation[0]).any())
 
+    @cached_property
+    def _splines(self) -> tuple[Any, Any]:
+        """Splines of orientation and position."""
+        from scipy.interpolate import CubicSpline
+        from scipy.spatial.transform import Rotation, RotationSpline
+
+        at, position = self._table()
+        orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
+        return RotationSpline(at, orientation), CubicSpline(at, position)
+
     def poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return orientations and positions at times.
 
@@ -117,11 +127,10 @@ class Trajectory:
         position : ndarray
             Positions in the world [m], shape ``(k, 3)``.
         """
-        from scipy.interpolate import CubicSpline
-        from scipy.spatial.transform import Rotation, RotationSpline, Slerp
+        from scipy.spatial.transform import Rotation, Slerp
 
         at, position = self._table()
-        orientation = Rotation.from_quat(self.rotation)
+        orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
         inside = np.clip(np.atleast_1d(np.asarray(t, np.float64)), at[0], at[-1])
         if at.size == 1:
             ones = np.ones(inside.size)
@@ -130,9 +139,7 @@ class Trajectory:
             along = (inside - at[0]) / (at[1] - at[0])
             between = position[0] + along[:, None] * (position[1] - position[0])
             return Slerp(at, orientation)(inside).as_matrix(), between
-        if self._place is None:  # splines are made once
-            object.__setattr__(self, "_place", (RotationSpline(at, orientation), CubicSpline(at, position)))
-        turn, place = self._place
+        turn, place = self._splines
         return turn(inside).as_matrix(), np.asarray(place(inside))
 
     @classmethod
@@ -156,7 +163,7 @@ class Trajectory:
             One pose, for all times.
         """
         quaternion = rotation if look_at is None else looking_at(position, look_at).as_quat()
-        return cls([0.0], [position], [quaternion])
+        return cls([0.0], np.asarray(position, np.float64)[None], np.asarray(quaternion, np.float64)[None])
 
     @classmethod
     def from_function(
@@ -181,7 +188,8 @@ class Trajectory:
         duration_s = real(duration_s, "duration_s", 1e-6, 1e6, " s")
         t = np.linspace(0.0, duration_s, max(2, round(duration_s * real(rate_hz, "rate_hz", 1e-3, 1e6)) + 1))
         poses = [pose(float(at)) for at in t]
-        return cls(t, [place for _, place in poses], [turn.as_quat() for turn, _ in poses])
+        places = np.stack([np.asarray(place, np.float64) for _, place in poses])
+        return cls(t, places, np.stack([turn.as_quat() for turn, _ in poses]))
 
     @classmethod
     def from_file(cls, path: str | Path) -> Trajectory:

@@ -52,5 +52,16 @@ class WorldScene:
             one_of(str(self.samples), [str(n) for n in SAMPLES], "samples")
 
     def uses_rays(self, *, on_cpu: bool) -> bool:
-        """Whether rays are cast for every step on a device."""
+        """Return whether rays are cast for every step on a device.
+
+        Parameters
+        ----------
+        on_cpu : bool
+            Whether the device is a CPU.
+
+        Returns
+        -------
+        bool
+            True for rays, False for maps.
+        """
         return self.seeing is Seeing.RAYS or (self.seeing is Seeing.AUTO and not on_cpu)

@@ -1,0 +1,86 @@
+"""``amiwarp truth``: the ground truth of a simulated world in the files of other data sets."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from amiwarp.cli.console import progress, report
+from amiwarp.cli.options import OUTPUT_FOLDER, Common
+from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
+from amiwarp.io.atomic_output import make_folder
+from amiwarp.io.truth_export import save_flow_dsec, save_flow_mvsec, save_poses_tum
+
+if TYPE_CHECKING:
+    from amiwarp.events.recording import Truth
+
+EXAMPLE = "amiwarp truth recording.h5 exported --flow dsec --poses tum"
+
+
+def run(
+    recording: Annotated[Path, typer.Argument(help="Native recording of a simulated world (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Folder to write to."), OUTPUT_FOLDER],
+    *,
+    flow: Annotated[
+        Literal["dsec", "mvsec"] | None,
+        typer.Option(
+            help="Optical flow between the recorded instants. dsec: flow/forward/*.png of 16 bits and "
+            "flow/forward_timestamps.txt; mvsec: NAME_gt_flow_dist.npz."
+        ),
+    ] = None,
+    with_prism: Annotated[
+        bool, typer.Option("--with-prism", help="Write the flow that is seen through the turning prism.")
+    ] = False,
+    poses: Annotated[
+        Literal["tum"] | None,
+        typer.Option(help="Poses of the camera and the moving bodies. tum: poses/camera.txt, poses/body_NAME.txt."),
+    ] = None,
+    common: Common,
+) -> None:
+    """Export the ground truth of a simulated world: optical flow as DSEC or MVSEC store it, poses as TUM files.
+
+    Flow needs a recording that was simulated with --truth-hz.
+    """
+    began = time.perf_counter()
+    if flow is None and poses is None:
+        raise AmiwarpError("nothing is chosen to export; give --flow dsec, --flow mvsec or --poses tum")
+    source = open_recording(recording)
+    truth = source.truth
+    if truth is None or (truth.frames is None and truth.poses is None):
+        raise AmiwarpError(f"{recording}: holds no ground truth of a world; simulate one with --world")
+    if flow is not None and truth.frames is None:
+        raise AmiwarpError(f"{recording}: holds no ground truth of instants; simulate it with --truth-hz")
+    make_folder(out)
+    data: dict[str, Any] = {"folder": str(out), "flow_maps": 0, "pose_files": 0}
+    with progress("writing flow") as advance:
+        if truth.frames is not None and flow == "dsec":
+            data["flow_maps"] = save_flow_dsec(out / "flow", truth.frames, with_prism=with_prism, progress=advance)
+        elif truth.frames is not None and flow == "mvsec":
+            path = out / f"{source.name}_gt_flow_dist.npz"
+            data["flow_maps"] = save_flow_mvsec(path, truth.frames, with_prism=with_prism, progress=advance)
+    if poses is not None:
+        data["pose_files"] = _save_poses(out / "poses", truth)
+    data["seconds"] = time.perf_counter() - began
+    line = f"{out}: {data['flow_maps']} maps of flow, {data['pose_files']} files of poses, {data['seconds']:.2f} s"
+    report(common, data, [line])
+
+
+def _save_poses(folder: Path, truth: Truth) -> int:
+    """Write the poses of the camera and of each moving body; return the number of files."""
+    if truth.poses is None:
+        raise AmiwarpError("the recording holds no poses; simulate it with --world")
+    make_folder(folder)
+    save_poses_tum(folder / "camera.txt", truth.poses)
+    names: dict[str, str] = {}
+    for body in truth.poses[:0].bodies:
+        plain = re.sub(r"[^A-Za-z0-9_.-]", "_", body)[:80]
+        name = f"body_{plain}.txt" if f"body_{plain}.txt" not in names else f"body_{plain}_{len(names)}.txt"
+        names[name] = body
+    for name, body in names.items():
+        save_poses_tum(folder / name, truth.poses, body=body)
+    return 1 + len(names)

@@ -1,0 +1,123 @@
+"""Options for simulated worlds: the world, the camera's way through it, what is recorded and drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from amiwarp.cli.options import OUTPUT
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.worlds.scene import World
+    from amiwarp.simulation.worlds.trajectory import Trajectory
+    from amiwarp.simulation.worlds.world_scene import WorldScene
+
+_WORLD = "World"
+WORLD_FILES = (".toml", ".json")
+"""Endings of world files."""
+POSE_FILES = (".txt", ".csv", ".tum")
+"""Endings of files of poses."""
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """Options for a three-dimensional world instead of a picture."""
+
+    world: Annotated[
+        str | None,
+        typer.Option(
+            help="World instead of a picture: room, desk, corridor, street, ball, person, or a world file (.toml, "
+            ".json).",
+            metavar="NAME|FILE",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    trajectory: Annotated[
+        str | None,
+        typer.Option(
+            help="Camera's way through the world: still, handheld or fast, or a file of poses (.txt as TUM, .csv). "
+            "Default: that of the world file, or handheld.",
+            metavar="NAME|FILE",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    no_prism: Annotated[
+        bool,
+        typer.Option(
+            "--no-prism",
+            help="Take the prism out: the same scene, sensor and seed with a plain event camera. The recording then "
+            "has no encoder.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = False
+    truth_hz: Annotated[
+        float | None,
+        typer.Option(
+            help="Rate at which depth, normals, instances, optical flow and intensity are recorded (1/s). Default: "
+            "never.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    preview: Annotated[
+        Path | None,
+        typer.Option(
+            help="Figure to write (.png): what the camera sees in the middle of the recording, with and without the "
+            "prism, and the depth and optical flow.",
+            metavar="<path>",
+            rich_help_panel=_WORLD,
+        ),
+        OUTPUT,
+    ] = None
+
+    def check(self) -> None:
+        """Raise :class:`AmiwarpError` for options that describe a world if none is given."""
+        given = {"--trajectory": self.trajectory, "--truth-hz": self.truth_hz, "--preview": self.preview}
+        if self.world is None:
+            for name, value in given.items():
+                if value is not None:
+                    raise AmiwarpError(f"{name} applies to a world; give --world, or leave it out")
+        if self.preview is not None and self.preview.suffix.lower() != ".png":
+            raise AmiwarpError(f"{self.preview}: a preview is a PNG file; give a name that ends in .png")
+
+    def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
+        """Return the world and the camera's trajectory. ``blur``: of the optics [px]."""
+        from amiwarp.simulation.worlds.world_scene import WorldScene
+
+        world, trajectory = self._load(duration_s, seed)
+        return WorldScene(world, trajectory, blur=blur)
+
+    def _load(self, duration_s: float, seed: int) -> tuple[World, Trajectory]:
+        from amiwarp.simulation.worlds.trajectory import Trajectory
+
+        name, way = self.world or "", self.trajectory
+        poses = Trajectory.from_file(way) if way is not None and way.lower().endswith(POSE_FILES) else None
+        if not name.lower().endswith(WORLD_FILES):
+            from amiwarp.simulation.worlds.named import named_world
+
+            kind = "still" if poses is not None else way or "handheld"
+            world, trajectory = named_world(name, kind, seed=seed, duration_s=duration_s)
+            return world, poses or trajectory
+        from amiwarp.simulation.worlds.world_files import load_world
+
+        world, stored = load_world(Path(name))
+        if way is not None and poses is None:
+            raise AmiwarpError(f"--trajectory {way} belongs to named worlds; give a file of poses for {name}")
+        if poses is None and stored is None:
+            raise AmiwarpError(f"{name}: has no trajectory of the camera; give a file of poses as --trajectory")
+        chosen = poses or stored
+        assert chosen is not None
+        return world, chosen
+
+    def draw_preview(self, simulation: Simulation) -> None:
+        """Write the preview, if one is wanted."""
+        if self.preview is None:
+            return
+        from amiwarp.plotting.world_preview import draw_preview
+        from amiwarp.simulation.worlds.frame_truth import TruthRenderer
+
+        draw_preview(self.preview, TruthRenderer(simulation).at(simulation.duration_us // 2))

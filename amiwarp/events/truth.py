@@ -1,0 +1,264 @@
+"""Ground truth of simulated worlds: of each event, of chosen instants, and the poses of camera and bodies."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+
+
+class Cause(enum.StrEnum):
+    """Cause of a simulated event. Arrays hold its code: the position in this list, from 0.
+
+    Examples
+    --------
+    >>> amiwarp.Cause.HOT_PIXEL.code
+    3
+    >>> list(amiwarp.Cause)[1].value
+    'shot_noise'
+    """
+
+    SIGNAL = "signal"
+    """The light changed by the contrast threshold. Code 0."""
+    SHOT_NOISE = "shot_noise"
+    """Shot noise of the photons. Code 1."""
+    LEAK = "leak"
+    """The leak of the pixel's stored level. Code 2."""
+    HOT_PIXEL = "hot_pixel"
+    """The additional rate of a hot pixel. Code 3."""
+
+    @property
+    def code(self) -> int:
+        """Number that stands for the cause in arrays and files."""
+        return list(Cause).index(self)
+
+
+class EventValues(Protocol):
+    """Array with one row per event that is indexed by slices: in memory, or a file that is read on demand."""
+
+    def __getitem__(self, which: slice, /) -> NDArray[Any]:
+        """Return the rows of a slice, shape ``(n,)`` or ``(n, k)``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EventTruth:
+    """Ground truth of a block of events. An array is None if it is not known.
+
+    An event's surface is what its pixel saw through the prism at the time of the event, before the sensor's latency.
+    Events of noise have a surface too.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> truth = amiwarp.EventTruth(cause=np.array([0, 3], np.uint8))
+    >>> int((truth.cause == amiwarp.Cause.HOT_PIXEL.code).sum())
+    1
+    """
+
+    points: NDArray[np.float32] | None = None
+    """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``."""
+    cause: NDArray[np.uint8] | None = None
+    """Code of the cause of each event, see :class:`amiwarp.Cause`, shape ``(n,)``."""
+    instance: NDArray[np.uint16] | None = None
+    """Instance number of the surface, shape ``(n,)``: 0 is the sky, i + 1 is ``WorldLabels.instances[i]``."""
+    depth: NDArray[np.float32] | None = None
+    """Depth of the surface along the camera's axis [m], shape ``(n,)``; infinite for the sky."""
+    place: NDArray[np.float32] | None = None
+    """Point on the surface in the world's frame [m], shape ``(n, 3)``; NaN for the sky."""
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[EventTruth]) -> EventTruth:
+        """Return the ground truth of successive blocks as one.
+
+        Parameters
+        ----------
+        blocks : sequence of EventTruth
+            The blocks, at least one, with the same arrays.
+
+        Returns
+        -------
+        EventTruth
+            The joined arrays.
+        """
+        joined: dict[str, NDArray[Any]] = {}
+        for name in ("points", "cause", "instance", "depth", "place"):
+            parts = [getattr(block, name) for block in blocks]
+            if parts and all(part is not None for part in parts):
+                joined[name] = np.concatenate(parts)
+        return cls(**joined)
+
+
+@dataclass(frozen=True, slots=True)
+class WorldLabels:
+    """Names in a simulated world.
+
+    Examples
+    --------
+    >>> labels = amiwarp.WorldLabels("room", ("wall", "chair"), ("building", "furniture"))
+    >>> labels.instances[1 - 1]
+    'wall'
+    """
+
+    name: str
+    """Name of the world."""
+    instances: tuple[str, ...]
+    """Labels of the instances. The label at index i has the instance number i + 1; number 0 is the sky."""
+    categories: tuple[str, ...]
+    """Class label of each instance, in the same order; empty for an instance without a class."""
+
+    def __post_init__(self) -> None:
+        if len(self.categories) != len(self.instances):
+            given = f"{len(self.instances)} instances and {len(self.categories)} categories"
+            raise AmiwarpError(f"world labels have {given}; give one category per instance")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTruth:
+    """Ground truth of all pixels at one instant.
+
+    Depth, normals and instances are those that the pixel would see without the prism. The arrays cover the camera's
+    image of (height, width) pixels.
+    """
+
+    t_us: int
+    """Time, on the clock of the events [us]."""
+    depth: NDArray[np.float32]
+    """Depth along the camera's axis [m], shape ``(height, width)``; infinite for the sky."""
+    normal: NDArray[np.float32]
+    """Unit normals in the world's frame, towards the camera, shape ``(height, width, 3)``; zero for the sky."""
+    instance: NDArray[np.uint16]
+    """Instance numbers, shape ``(height, width)``: 0 is the sky, i + 1 is ``WorldLabels.instances[i]``."""
+    flow: NDArray[np.float32]
+    """Optical flow without the prism [px/s], shape ``(height, width, 2)``; NaN where a point leaves the image plane."""
+    flow_with_prism: NDArray[np.float32]
+    """Optical flow of what the pixel sees through the turning prism [px/s], shape ``(height, width, 2)``."""
+    intensity: NDArray[np.float32]
+    """Linear luminance without the prism, shape ``(height, width)``."""
+    intensity_with_prism: NDArray[np.float32]
+    """Linear luminance through the prism, shape ``(height, width)``."""
+    rotation: NDArray[np.float64]
+    """Orientation of the camera: matrix from its frame to the world's, shape ``(3, 3)``."""
+    position: NDArray[np.float64]
+    """Position of the camera in the world [m], shape ``(3,)``."""
+    joints: dict[str, NDArray[np.float64]]
+    """Positions of the world's joints [m], shape ``(3,)`` each."""
+
+
+MAPS = {
+    "depth": (np.float32, ()),
+    "normal": (np.float32, (3,)),
+    "instance": (np.uint16, ()),
+    "flow": (np.float32, (2,)),
+    "flow_with_prism": (np.float32, (2,)),
+    "intensity": (np.float32, ()),
+    "intensity_with_prism": (np.float32, ()),
+}
+"""Maps of :class:`FrameTruth`: their types, and their shapes after (height, width)."""
+
+
+class FrameStore(Protocol):
+    """Ground truth of several instants: in memory, or a file that is read on demand."""
+
+    @property
+    def t(self) -> NDArray[np.int64]:
+        """Times of the instants, rising [us], shape ``(k,)``."""
+
+    def __getitem__(self, index: int, /) -> FrameTruth:
+        """Return the ground truth of the instant ``t[index]``."""
+
+
+class MemoryFrames:
+    """Ground truth of several instants that is held in memory."""
+
+    def __init__(self, frames: list[FrameTruth]) -> None:
+        self._frames = frames
+
+    @property
+    def t(self) -> NDArray[np.int64]:
+        """Times of the instants [us], shape ``(k,)``."""
+        return np.array([frame.t_us for frame in self._frames], np.int64)
+
+    def __getitem__(self, index: int, /) -> FrameTruth:
+        return self._frames[index]
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a camera, of the bodies that move and of joints at several times.
+
+    A pose has seven numbers: position x, y, z in the world [m], and orientation as a unit quaternion x, y, z, w, from
+    the frame of the camera or body to the world's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> poses = amiwarp.Poses(t=np.array([0, 1000]), camera=np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1)))
+    >>> poses[:1].t.tolist()
+    [0]
+    """
+
+    t: NDArray[np.int64]
+    """Times, on the clock of the events, rising [us], shape ``(k,)``."""
+    camera: NDArray[np.float64]
+    """Poses of the camera, shape ``(k, 7)``."""
+    bodies: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Poses of the moving bodies by name, shape ``(k, 7)`` each."""
+    joints: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Positions of the joints by name [m], shape ``(k, 3)`` each."""
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Poses]) -> Poses:
+        """Return successive tables of poses as one.
+
+        Parameters
+        ----------
+        blocks : sequence of Poses
+            The tables, at least one, with the same bodies and joints.
+
+        Returns
+        -------
+        Poses
+            The joined table.
+        """
+        bodies = {name: np.concatenate([block.bodies[name] for block in blocks]) for name in blocks[0].bodies}
+        joints = {name: np.concatenate([block.joints[name] for block in blocks]) for name in blocks[0].joints}
+        camera = np.concatenate([block.camera for block in blocks])
+        return cls(np.concatenate([block.t for block in blocks]), camera, bodies, joints)
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, which: slice, /) -> Poses:
+        bodies, joints = ({name: rows[which] for name, rows in table.items()} for table in (self.bodies, self.joints))
+        return Poses(self.t[which], self.camera[which], bodies, joints)
+
+
+def as_poses(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return poses of matrices ``(..., 3, 3)`` and positions ``(..., 3)`` [m]: shape ``(..., 7)``."""
+    from scipy.spatial.transform import Rotation
+
+    quaternions = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()
+    return np.concatenate([position, quaternions.reshape(*position.shape[:-1], 4)], axis=-1)
+
+
+def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix ``(3, 3)`` of a pose of shape ``(7,)``."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
+
+
+class PoseStore(Protocol):
+    """Poses that are indexed by slices: :class:`amiwarp.Poses`, or a file that is read on demand."""
+
+    def __len__(self) -> int:
+        """Return the number of times."""
+
+    def __getitem__(self, which: slice, /) -> Poses:
+        """Return the poses of a slice."""

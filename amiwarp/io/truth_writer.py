@@ -1,0 +1,131 @@
+"""Writer of the ground truth of worlds into native recordings: of each event, of chosen instants, and poses.
+
+The format is described in ``docs/reference/recording-format.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses
+from amiwarp.io.native_layout import Columns, make_dataset
+
+EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
+    "cause": (np.uint8, ()),
+    "instance": (np.uint16, ()),
+    "depth": (np.float32, ()),
+    "place": (np.float32, (3,)),
+}
+"""Datasets of ``truth/events``: their types, and the shapes of their rows."""
+
+POSE_ROWS = 1024
+"""Rows per chunk of the datasets of poses."""
+
+
+def event_columns(truth: EventTruth, count: int) -> Columns:
+    """Return the datasets of the ground truth of ``count`` events. Raises :class:`AmiwarpError` for other lengths."""
+    columns: Columns = {}
+    if truth.points is not None:
+        points = np.asarray(truth.points, np.float32)
+        if points.shape != (count, 2):
+            raise AmiwarpError(f"truth points have shape {points.shape}; expected ({count}, 2)")
+        columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
+    for name, (dtype, row) in EVENT_COLUMNS.items():
+        given = getattr(truth, name)
+        if given is not None:
+            values = np.asarray(given, dtype)
+            if values.shape != (count, *row):
+                raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
+            columns[f"truth/events/{name}"] = values
+    return columns
+
+
+class TruthWriter:
+    """Writes labels, instants and poses into an open HDF5 file. Each instant and each table must match the first."""
+
+    def __init__(self, file: Any, path: Path, size: tuple[int, int]) -> None:
+        """``size``: width and height of the sensor [px]."""
+        self._file, self._path, self._size = file, path, size
+        self._datasets: dict[str, Any] = {}
+        self._names: dict[str, tuple[str, ...]] = {}
+
+    def write_labels(self, labels: WorldLabels) -> None:
+        """Write the names of a world."""
+        self._file.require_group("truth/world").attrs["name"] = labels.name
+        self._write_names("truth/world/instances", labels.instances)
+        self._write_names("truth/world/categories", labels.categories)
+
+    def append_frame(self, frame: FrameTruth) -> None:
+        """Append the ground truth of an instant, later than those before."""
+        width, height = self._size
+        rows: dict[str, NDArray[Any]] = {}
+        for name, (dtype, tail) in MAPS.items():
+            rows[name] = np.asarray(getattr(frame, name), dtype)
+            if rows[name].shape != (height, width, *tail):
+                raise AmiwarpError(
+                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {rows[name].shape}; "
+                    f"expected {(height, width, *tail)}"
+                )
+        self._check_later("truth/frames/t", frame.t_us)
+        self._append("truth/frames/t", np.array([frame.t_us], np.int64), POSE_ROWS)
+        self._append("truth/frames/pose", as_poses(frame.rotation, frame.position)[None], POSE_ROWS)
+        self._append_joints("truth/frames/joints", {name: at[None] for name, at in frame.joints.items()})
+        for name, values in rows.items():
+            self._append(f"truth/frames/{name}", values[None], 1)
+
+    def append_poses(self, poses: Poses) -> None:
+        """Append poses, later than those before."""
+        if not len(poses):
+            return
+        self._check_later("truth/poses/t", int(poses.t[0]))
+        self._append("truth/poses/t", np.asarray(poses.t, np.int64), POSE_ROWS)
+        self._append("truth/poses/camera", np.asarray(poses.camera, np.float64), POSE_ROWS)
+        self._append_joints("truth/joints/position", poses.joints)
+        if poses.bodies:
+            self._keep_names("truth/poses/body_names", poses.bodies)
+            self._append("truth/poses/bodies", np.stack(list(poses.bodies.values()), axis=1), POSE_ROWS)
+
+    def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
+        if joints:
+            self._keep_names("truth/joints/names", joints)
+            self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), POSE_ROWS)
+
+    def _keep_names(self, name: str, given: Iterable[str]) -> None:
+        """Write names at the first call; check that later calls give the same."""
+        names = tuple(given)
+        if name not in self._names:
+            self._names[name] = names
+            self._write_names(name, names)
+        elif self._names[name] != names:
+            raise AmiwarpError(f"{self._path}: {name} changed between calls; give the same names in the same order")
+
+    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
+        import h5py
+
+        encoded = [text.encode("utf-8", "replace") for text in names]
+        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
+        self._file.create_dataset(name, data=np.array(encoded, kind))
+
+    def _check_later(self, name: str, t: int) -> None:
+        stored = self._datasets.get(name)
+        if stored is not None and t <= int(stored[-1]):
+            raise AmiwarpError(f"{self._path}: {name} {t} us does not follow {int(stored[-1])} us; append in order")
+
+    def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
+        """Append rows to a dataset through HDF5."""
+        if name not in self._datasets:
+            self._datasets[name] = make_dataset(self._file, name, values.dtype, values.shape[1:], chunk_rows)
+        dataset = self._datasets[name]
+        if dataset.shape[1:] != values.shape[1:]:
+            raise AmiwarpError(
+                f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {dataset.shape[1:]}"
+            )
+        start = dataset.shape[0]
+        dataset.resize(start + len(values), axis=0)
+        dataset[start:] = values
