@@ -31,6 +31,7 @@ SIGNAL = wp.constant(0)  # causes of an event
 SHOT_NOISE = wp.constant(1)
 LEAK = wp.constant(2)
 HOT_PIXEL = wp.constant(3)
+SMALLEST_LEAK = wp.constant(0.1)  # relative to the mean leak, so that jitter cannot stop a leak
 LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the step rises by less than this many drifts
 LARGEST_LAG = wp.constant((1 << 19) - 1)
 LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time stamp may make the lag slightly negative
@@ -48,23 +49,31 @@ class SensorParams:
     off: float
     mismatch: float  # relative standard deviation of both thresholds
     leak: float  # thresholds per step
-    noise: float  # events per tick
+    leak_jitter: float  # relative standard deviation of the leak between two events of a pixel
+    noise: float  # shot noise in the dark [events per tick]
+    noise_white: float  # shot noise at white, relative to that in the dark
+    spread: float  # standard deviation of ln(leak) and ln(shot noise) between pixels
     hot_fraction: float
     hot: float  # events per tick
     refractory: wp.int64  # ticks
     latency: float  # ticks
     jitter: float  # ticks, standard deviation
+    bandwidth: float  # photoreceptor's angular cut-off frequency per unit of exp(level) [1/step]
+    dark: float  # luminance added before the logarithm
 
 
 @wp.struct
 class Pixel:
     """State of one pixel."""
 
-    level: float  # level at the last step [log intensity]
+    level: float  # level at the last step, after the photoreceptor [log intensity]
     reference: float  # reference level [log intensity]
     on: float  # ON and OFF thresholds of this pixel [log intensity]
     off: float
-    noise: float  # noise rate of this pixel [events per tick]
+    leak: float  # until the next event [thresholds per step]
+    mean_leak: float  # thresholds per step
+    noise: float  # shot noise of this pixel in the dark [events per tick]
+    hot: float  # additional noise of a hot pixel [events per tick]; 0 for others
     rng: wp.uint32
     blind_until: wp.int64  # end of the refractory period; NEVER if it has passed
     next_noise: wp.int64
@@ -137,11 +146,37 @@ def latency(s: SensorParams, rng: wp.uint32):
 
 
 @wp.func
-def cause_of(p: Pixel, s: SensorParams, slope: float, noise: bool) -> int:
+def cause_of(p: Pixel, steps: Steps, slope: float, noise: bool) -> int:
     """Return the cause of an event in a step in which the level, minus the leaking reference, rises by ``slope``."""
     if noise:
-        return wp.where(p.noise > s.noise, HOT_PIXEL, SHOT_NOISE)
-    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * s.leak * p.on, LEAK, SIGNAL)
+        return wp.where(p.hot > 0.0, HOT_PIXEL, SHOT_NOISE)
+    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * steps.share * p.leak * p.on, LEAK, SIGNAL)
+
+
+@wp.func
+def next_leak(p: Pixel, s: SensorParams, rng: wp.uint32):
+    """Return the leak until the next event [thresholds per step], and the generator's next state."""
+    leak = p.leak
+    if s.leak_jitter > 0.0:
+        leak = p.mean_leak * wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
+    return leak, rng
+
+
+@wp.func
+def thin_noise(p: Pixel, s: SensorParams, t0: wp.int64, steps: Steps, slope: float, f: float) -> Pixel:
+    """Return the pixel before a noise event at fraction ``f`` of the step; postpone the event if it is too bright.
+
+    Noise is drawn at the rate in the dark. Postponing events at random gives the rate at the level of the moment. It
+    falls linearly with luminance, as in v2e (Hu, Liu, Delbruck, CVPR Workshops 2021).
+    """
+    if f < 1.0 and s.noise_white < 1.0:
+        rng = p.rng
+        light = wp.clamp(wp.exp(p.level + f * slope) - s.dark, 0.0, 1.0)
+        rate = p.noise * (1.0 - (1.0 - s.noise_white) * light) + p.hot
+        if wp.randf(rng) * (p.noise + p.hot) >= rate:
+            p.next_noise += draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+        p.rng = rng
+    return p
 
 
 @wp.func
@@ -161,10 +196,12 @@ def fire_event(
         late, rng = latency(s, rng)
         stamp = (t + wp.int64(late) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
         p.last_stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
-        append_key(sink, steps.shift, index, t, p.last_stamp, 2 * cause_of(p, s, slope, noise) + on)
+        append_key(sink, steps.shift, index, t, p.last_stamp, 2 * cause_of(p, steps, slope, noise) + on)
         p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
         if noise or p.next_noise < p.blind_until:
-            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise, wp.randf(rng))
+            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+        leak, rng = next_leak(p, s, rng)
+        p.leak = leak
         p.rng = rng
     return p
 
@@ -186,8 +223,11 @@ def generate_events(
                 p.reference = p.level + f * slope
                 p.blind_until = NEVER
         signal = wp.max(crossing(p.reference, p.on, p.off, p.level, slope), f)
-        f = wp.min(signal, wp.max(float(p.next_noise - t0) * steps.per_tick, f))
-        p = fire_event(p, s, sink, index, t0, steps, slope, f, f < signal)
+        due = p.next_noise
+        f = wp.min(signal, wp.max(float(due - t0) * steps.per_tick, f))
+        if f < signal:
+            p = thin_noise(p, s, t0, steps, slope, f)
+        p = fire_event(p, s, sink, index, t0, steps, slope, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
     return p
 
 
@@ -201,6 +241,15 @@ def reconverge():
 
 
 @wp.func
+def rate_factor(sensor: SensorParams, rng: wp.uint32):
+    """Draw a pixel's leak and shot noise relative to their means; return the generator's next state, too."""
+    factor = float(1.0)
+    if sensor.spread > 0.0:
+        factor = wp.exp(sensor.spread * wp.randn(rng))
+    return factor, rng
+
+
+@wp.func
 def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
     """Draw a pixel's thresholds and noise rate, and set its reference.
 
@@ -211,16 +260,16 @@ def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
     p.level = level
     p.on = sensor.on * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
     p.off = sensor.off * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
-    p.noise = sensor.noise
-    if wp.randf(rng) < sensor.hot_fraction:
-        p.noise = sensor.noise + sensor.hot
+    p.hot = wp.where(wp.randf(rng) < sensor.hot_fraction, sensor.hot, 0.0)
+    factor, rng = rate_factor(sensor, rng)
+    p.noise = sensor.noise * factor
+    p.mean_leak = sensor.leak * factor
+    p.leak = p.mean_leak
     leaked = wp.randf(rng)
-    p.reference = p.level
-    if sensor.leak > 0.0:
-        p.reference = p.level - leaked * p.on
+    p.reference = p.level - wp.where(sensor.leak > 0.0, leaked * p.on, 0.0)
     p.blind_until = NEVER
     p.last_stamp = wp.int64(-1)
-    p.next_noise = draw_waiting_time(p.noise, wp.randf(rng))
+    p.next_noise = draw_waiting_time(p.noise + p.hot, wp.randf(rng))
     p.rng = rng
     return p
 
@@ -233,9 +282,10 @@ def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, star
 
 
 @wp.func
-def advance_pixel(p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float) -> Pixel:
-    """Advance a pixel by one step, at the end of which it sees ``level``."""
-    drift = s.leak * p.on
+def advance_by(
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float, drift: float
+) -> Pixel:
+    """Advance a pixel by a step with ``level`` at its end, in which leakage lowers the reference by ``drift``."""
     end = level + drift
     within = end < p.reference + p.on and end > p.reference - p.off
     quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(steps.ticks)
@@ -243,6 +293,12 @@ def advance_pixel(p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int6
     p.level = level
     p.reference -= drift
     return p
+
+
+@wp.func
+def advance_pixel(p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float) -> Pixel:
+    """Advance a pixel by one step, at the end of which it sees ``level``."""
+    return advance_by(p, s, sink, index, t0, steps, level, p.leak * p.on)
 
 
 @wp.func

@@ -13,6 +13,7 @@ from amiwarp.kernels.event_generation import (
     shift_times,
 )
 from amiwarp.kernels.optics import ExactParams, trace
+from amiwarp.kernels.photoreceptor import advance_filtered
 from amiwarp.kernels.sight import Steps
 from amiwarp.kernels.world import Pose, World, radiance
 
@@ -76,6 +77,32 @@ def run_world_pixels(
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
+
+
+@wp.kernel
+def run_filtered_world_pixels(
+    world: World,
+    view: RayView,
+    steps: Steps,
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+    seen: wp.array(dtype=float),
+    start: int,
+    sink: Sink,
+):
+    """Do the same as :func:`run_world_pixels` with photoreceptors of limited bandwidth; ``seen``: their last inputs."""
+    i = start + wp.tid()
+    p = pixels[i]
+    before = seen[i]
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        level = see_world(world, view, steps, steps.margin + k + 1, i)
+        p = advance_filtered(p, sensor, sink, i, t0, steps, before, level)
+        before = level
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+    seen[i] = before
 
 
 @wp.kernel
