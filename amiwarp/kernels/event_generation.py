@@ -81,6 +81,16 @@ class Pixel:
 
 
 @wp.struct
+class Interval:
+    """A step, or one of the equal pieces of a step."""
+
+    ticks: int
+    per_tick: float  # intervals per tick
+    share: float  # of a step: 1, or less for a piece
+    shift: int  # bit position of the time in a key
+
+
+@wp.struct
 class Sink:
     """Destination of the keys: segments with limited room, each with a counter.
 
@@ -104,6 +114,17 @@ class Block:
     cause: wp.array(dtype=wp.uint8)
     points: wp.array(dtype=wp.vec2)
     ticks: wp.array(dtype=int)  # time of the crossing since the first instant of the table
+
+
+@wp.func
+def whole_step(steps: Steps) -> Interval:
+    """Return a step of a chunk as an interval."""
+    span = Interval()
+    span.ticks = steps.ticks
+    span.per_tick = steps.per_tick
+    span.share = 1.0
+    span.shift = steps.shift
+    return span
 
 
 @wp.func
@@ -146,11 +167,11 @@ def latency(s: SensorParams, rng: wp.uint32):
 
 
 @wp.func
-def cause_of(p: Pixel, steps: Steps, slope: float, noise: bool) -> int:
+def cause_of(p: Pixel, span: Interval, slope: float, noise: bool) -> int:
     """Return the cause of an event in a step in which the level, minus the leaking reference, rises by ``slope``."""
     if noise:
         return wp.where(p.hot > 0.0, HOT_PIXEL, SHOT_NOISE)
-    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * steps.share * p.leak * p.on, LEAK, SIGNAL)
+    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * span.share * p.leak * p.on, LEAK, SIGNAL)
 
 
 @wp.func
@@ -163,7 +184,7 @@ def next_leak(p: Pixel, s: SensorParams, rng: wp.uint32):
 
 
 @wp.func
-def thin_noise(p: Pixel, s: SensorParams, t0: wp.int64, steps: Steps, slope: float, f: float) -> Pixel:
+def thin_noise(p: Pixel, s: SensorParams, t0: wp.int64, span: Interval, slope: float, f: float) -> Pixel:
     """Return the pixel before a noise event at fraction ``f`` of the step; postpone the event if it is too bright.
 
     Noise is drawn at the rate in the dark. Postponing events at random gives the rate at the level of the moment. It
@@ -181,7 +202,7 @@ def thin_noise(p: Pixel, s: SensorParams, t0: wp.int64, steps: Steps, slope: flo
 
 @wp.func
 def fire_event(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, slope: float, f: float, noise: bool
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, f: float, noise: bool
 ) -> Pixel:
     """Return the pixel after an event at fraction ``f`` of the step, and write that event, if f < 1."""
     if f < 1.0:
@@ -192,11 +213,11 @@ def fire_event(
             p.reference = p.level + f * slope
         else:
             p.reference += wp.where(on == 1, p.on, -p.off)
-        t = t0 + wp.int64(f * float(steps.ticks))
+        t = t0 + wp.int64(f * float(span.ticks))
         late, rng = latency(s, rng)
         stamp = (t + wp.int64(late) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
         p.last_stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
-        append_key(sink, steps.shift, index, t, p.last_stamp, 2 * cause_of(p, steps, slope, noise) + on)
+        append_key(sink, span.shift, index, t, p.last_stamp, 2 * cause_of(p, span, slope, noise) + on)
         p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
         if noise or p.next_noise < p.blind_until:
             p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise + p.hot, wp.randf(rng))
@@ -208,7 +229,7 @@ def fire_event(
 
 @wp.func
 def generate_events(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, slope: float, quiet: bool
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, quiet: bool
 ) -> Pixel:
     """Generate all events of a step in which the level, minus the leaking reference, rises by ``slope``.
 
@@ -218,16 +239,16 @@ def generate_events(
     f = wp.where(quiet, PAST_STEP, 0.0)
     while f < 1.0:
         if p.blind_until > NEVER:  # the reference is reset at the end of the refractory period
-            f = wp.max(f, float(p.blind_until - t0) * steps.per_tick)
+            f = wp.max(f, float(p.blind_until - t0) * span.per_tick)
             if f < 1.0:
                 p.reference = p.level + f * slope
                 p.blind_until = NEVER
         signal = wp.max(crossing(p.reference, p.on, p.off, p.level, slope), f)
         due = p.next_noise
-        f = wp.min(signal, wp.max(float(due - t0) * steps.per_tick, f))
+        f = wp.min(signal, wp.max(float(due - t0) * span.per_tick, f))
         if f < signal:
-            p = thin_noise(p, s, t0, steps, slope, f)
-        p = fire_event(p, s, sink, index, t0, steps, slope, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
+            p = thin_noise(p, s, t0, span, slope, f)
+        p = fire_event(p, s, sink, index, t0, span, slope, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
     return p
 
 
@@ -282,23 +303,18 @@ def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, star
 
 
 @wp.func
-def advance_by(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float, drift: float
+def advance_pixel(
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, level: float
 ) -> Pixel:
-    """Advance a pixel by a step with ``level`` at its end, in which leakage lowers the reference by ``drift``."""
+    """Advance a pixel by one interval, at the end of which it sees ``level``."""
+    drift = span.share * p.leak * p.on
     end = level + drift
     within = end < p.reference + p.on and end > p.reference - p.off
-    quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(steps.ticks)
-    p = generate_events(p, s, sink, index, t0, steps, end - p.level, quiet)
+    quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(span.ticks)
+    p = generate_events(p, s, sink, index, t0, span, end - p.level, quiet)
     p.level = level
     p.reference -= drift
     return p
-
-
-@wp.func
-def advance_pixel(p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float) -> Pixel:
-    """Advance a pixel by one step, at the end of which it sees ``level``."""
-    return advance_by(p, s, sink, index, t0, steps, level, p.leak * p.on)
 
 
 @wp.func
@@ -317,10 +333,11 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
+    span = whole_step(steps)
     t0 = wp.int64(0)
     for k in range(steps.count):
         level = see_level(view, steps.at[steps.margin + k + 1], ray)
-        p = advance_pixel(p, sensor, sink, i, t0, steps, level)
+        p = advance_pixel(p, sensor, sink, i, t0, span, level)
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
@@ -337,6 +354,7 @@ def run_pixels_ahead(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
+    span = whole_step(steps)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
@@ -344,7 +362,7 @@ def run_pixels_ahead(
         levels = levels_ahead(view, steps, block, n, at)
         j = int(0)
         while j < n:
-            p = advance_pixel(p, sensor, sink, i, t0, steps, levels[j])
+            p = advance_pixel(p, sensor, sink, i, t0, span, levels[j])
             t0 += wp.int64(steps.ticks)
             j += 1
     pixels[i] = shift_times(p, t0)

@@ -7,7 +7,16 @@ equation is solved exactly for it, so that the events hardly depend on the lengt
 
 import warp as wp
 
-from amiwarp.kernels.event_generation import Pixel, SensorParams, Sink, advance_by, reconverge, shift_times
+from amiwarp.kernels.event_generation import (
+    Interval,
+    Pixel,
+    SensorParams,
+    Sink,
+    advance_pixel,
+    reconverge,
+    shift_times,
+    whole_step,
+)
 from amiwarp.kernels.sight import (
     AHEAD,
     Steps,
@@ -23,14 +32,45 @@ wp.set_module_options({"enable_backward": False})
 
 MOST_PIECES = wp.constant(16)  # of a step: divides its number of ticks, which are 16 per microsecond
 LARGEST_BEND = wp.constant(0.01)  # of the level between the ends of a piece [ON thresholds]
-SMALL_ANGLE = wp.constant(0.1)  # angular frequency times duration below which a series is more precise in float32
+SMALL_ANGLE = wp.constant(0.1)  # duration [time constants] below which a series is more precise in float32
+SMALL_CHANGE = wp.constant(0.3)  # of the log intensity, below which a series is more precise in float32
+
+
+@wp.struct
+class Input:
+    """Input of a photoreceptor at one instant."""
+
+    level: float  # log intensity
+    light: float  # its exponential
 
 
 @wp.func
-def mean_light(before: float, after: float) -> float:
+def last_input(level: float) -> Input:
+    """Return the input for a level."""
+    result = Input()
+    result.level = level
+    result.light = wp.exp(level)
+    return result
+
+
+@wp.func
+def next_input(level: float, last: Input) -> Input:
+    """Return the input for a level; ``last`` saves the exponential if it has the same level."""
+    result = Input()
+    result.level = level
+    result.light = last.light
+    if level != last.level:
+        result.light = wp.exp(level)
+    return result
+
+
+@wp.func
+def mean_light(before: Input, after: Input) -> float:
     """Return the mean of exp(level) over an interval in which the level changes linearly."""
-    half = wp.max(0.5 * wp.abs(after - before), 1.0e-4)
-    return wp.exp(0.5 * (before + after)) * wp.sinh(half) / half
+    change = after.level - before.level
+    if wp.abs(change) > SMALL_CHANGE:
+        return (after.light - before.light) / change
+    return 0.5 * (before.light + after.light) * (1.0 - change * change / 12.0)
 
 
 @wp.func
@@ -40,9 +80,9 @@ def filter_level(level: float, before: float, after: float, angle: float) -> flo
     The input changes linearly from ``before`` to ``after``. ``angle`` is the duration in time constants. The output
     starts anew at the input after an instant without light, which is NaN.
     """
-    lag = 1.0 - (1.0 - wp.exp(-angle)) / angle
-    if angle < SMALL_ANGLE:
-        lag = angle * (0.5 - angle * (1.0 / 6.0 - angle / 24.0))
+    lag = angle * (0.5 - angle * (1.0 / 6.0 - angle / 24.0))
+    if angle > SMALL_ANGLE:
+        lag = 1.0 - (1.0 - wp.exp(-angle)) / angle
     result = level + angle * (1.0 - lag) * (before - level) + lag * (after - before)
     return wp.where(wp.isnan(level) or wp.isnan(before), after, result)
 
@@ -62,23 +102,23 @@ def piece_count(level: float, before: float, after: float, angle: float, toleran
 
 @wp.func
 def advance_filtered(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, before: float, after: float
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, before: Input, after: Input
 ) -> Pixel:
     """Advance a pixel by one step, in which its photoreceptor's input changes from ``before`` to ``after``."""
-    angle = s.bandwidth * mean_light(before, after)
-    n = piece_count(p.level, before, after, angle, LARGEST_BEND * p.on)
-    piece = Steps()
-    piece.ticks = steps.ticks / n
-    piece.per_tick = steps.per_tick * float(n)
+    n = piece_count(p.level, before.level, after.level, s.bandwidth * mean_light(before, after), LARGEST_BEND * p.on)
+    piece = Interval()
+    piece.ticks = span.ticks / n
+    piece.per_tick = span.per_tick * float(n)
     piece.share = 1.0 / float(n)
-    piece.shift = steps.shift
+    piece.shift = span.shift
+    x0 = before
     j = int(0)
     while j < n:
-        x0 = before + (after - before) * piece.share * float(j)
-        x1 = before + (after - before) * piece.share * float(j + 1)
-        level = filter_level(p.level, x0, x1, s.bandwidth * piece.share * mean_light(x0, x1))
-        p = advance_by(p, s, sink, index, t0 + wp.int64(j * piece.ticks), piece, level, piece.share * p.leak * p.on)
         j += 1
+        x1 = next_input(wp.lerp(before.level, after.level, piece.share * float(j)), after)
+        level = filter_level(p.level, x0.level, x1.level, s.bandwidth * piece.share * mean_light(x0, x1))
+        p = advance_pixel(p, s, sink, index, t0 + wp.int64((j - 1) * piece.ticks), piece, level)
+        x0 = x1
     return p
 
 
@@ -90,17 +130,18 @@ def run_filtered_pixels(
     """Advance one pixel per thread through all steps of a chunk; ``seen``: its photoreceptor's last input."""
     i = start + wp.tid()
     p = pixels[i]
-    before = seen[i]
+    before = last_input(seen[i])
+    span = whole_step(steps)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for k in range(steps.count):
-        level = see_level(view, steps.at[steps.margin + k + 1], ray)
-        p = advance_filtered(p, sensor, sink, i, t0, steps, before, level)
-        before = level
+        after = next_input(see_level(view, steps.at[steps.margin + k + 1], ray), before)
+        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
-    seen[i] = before
+    seen[i] = before.level
 
 
 @wp.kernel
@@ -111,7 +152,8 @@ def run_filtered_pixels_ahead(
     """Generate the same events as :func:`run_filtered_pixels`, faster on a CPU."""
     i = start + wp.tid()
     p = pixels[i]
-    before = seen[i]
+    before = last_input(seen[i])
+    span = whole_step(steps)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
@@ -120,10 +162,10 @@ def run_filtered_pixels_ahead(
         levels = levels_ahead(view, steps, block, n, at)
         j = int(0)
         while j < n:
-            level = levels[j]
-            p = advance_filtered(p, sensor, sink, i, t0, steps, before, level)
-            before = level
+            after = next_input(levels[j], before)
+            p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+            before = after
             t0 += wp.int64(steps.ticks)
             j += 1
     pixels[i] = shift_times(p, t0)
-    seen[i] = before
+    seen[i] = before.level

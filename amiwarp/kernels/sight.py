@@ -49,7 +49,6 @@ class Steps:
     count: int
     ticks: int  # ticks per step
     per_tick: float  # steps per tick
-    share: float  # length relative to a step of the chunk: 1, or less for the pieces of a step
     shift: int  # bit position of the time in a key, above the bits of the pixel
 
 

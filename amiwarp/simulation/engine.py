@@ -156,7 +156,7 @@ class Engine:
             steps.ahead = wp.array(instants_in_blocks(table[margin + 1 :]), dtype=sight.Instants, device=self._device)
         steps.angle = self._upload(wrap_angle(angle))
         steps.turn = self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
-        steps.per_tick, steps.share = 1.0 / (self._step * int(kernels.TICKS)), 1.0
+        steps.per_tick = 1.0 / (self._step * int(kernels.TICKS))
         steps.shift = int(kernels.LOW_BITS) + (self._pixels - 1).bit_length()
         steps.margin, steps.count, steps.ticks = margin, count, self._step * int(kernels.TICKS)
         return steps
