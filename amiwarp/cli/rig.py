@@ -162,9 +162,9 @@ class SensorOptions:
     bus_rate_mev_s: Annotated[
         float | None, _sensor("Largest rate that the bus transmits (million events/s); 0: unlimited.")
     ] = None
-    bus_queue: Annotated[
-        float | None, _sensor("Number of events that wait for the bus; further events are lost.")
-    ] = None
+    bus_queue: Annotated[float | None, _sensor("Number of events that wait for the bus; further events are lost.")] = (
+        None
+    )
 
     def build(self) -> SensorModel:
         """Return the sensor model."""

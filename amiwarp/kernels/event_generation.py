@@ -7,8 +7,6 @@ order of the threads.
 
 import warp as wp
 
-from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
-from amiwarp.kernels.optics import trace
 from amiwarp.kernels.sight import (
     AHEAD,
     Steps,
@@ -31,7 +29,6 @@ SIGNAL = wp.constant(0)  # causes of an event
 SHOT_NOISE = wp.constant(1)
 LEAK = wp.constant(2)
 HOT_PIXEL = wp.constant(3)
-SMALLEST_LEAK = wp.constant(0.1)  # relative to the mean leak, so that jitter cannot stop a leak
 LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the step rises by less than this many drifts
 LARGEST_LAG = wp.constant((1 << 19) - 1)
 LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time stamp may make the lag slightly negative
@@ -70,8 +67,7 @@ class Pixel:
     reference: float  # reference level [log intensity]
     on: float  # ON and OFF thresholds of this pixel [log intensity]
     off: float
-    leak: float  # until the next event [thresholds per step]
-    mean_leak: float  # thresholds per step
+    leak: float  # of this pixel, without jitter [thresholds per step]
     noise: float  # shot noise of this pixel in the dark [events per tick]
     hot: float  # additional noise of a hot pixel [events per tick]; 0 for others
     rng: wp.uint32
@@ -86,7 +82,7 @@ class Interval:
 
     ticks: int
     per_tick: float  # intervals per tick
-    share: float  # of a step: 1, or less for a piece
+    drift: float  # of the reference, caused by leakage [log intensity]
     shift: int  # bit position of the time in a key
 
 
@@ -103,26 +99,13 @@ class Sink:
     run: int  # consecutive pixels in a segment
 
 
-@wp.struct
-class Block:
-    """Events unpacked from their keys."""
-
-    x: wp.array(dtype=wp.uint16)
-    y: wp.array(dtype=wp.uint16)
-    t: wp.array(dtype=wp.int64)
-    p: wp.array(dtype=wp.uint8)
-    cause: wp.array(dtype=wp.uint8)
-    points: wp.array(dtype=wp.vec2)
-    ticks: wp.array(dtype=int)  # time of the crossing since the first instant of the table
-
-
 @wp.func
-def whole_step(steps: Steps) -> Interval:
-    """Return a step of a chunk as an interval."""
+def whole_step(steps: Steps, p: Pixel) -> Interval:
+    """Return a step of a chunk as an interval, in which the pixel leaks without jitter."""
     span = Interval()
     span.ticks = steps.ticks
     span.per_tick = steps.per_tick
-    span.share = 1.0
+    span.drift = p.leak * p.on
     span.shift = steps.shift
     return span
 
@@ -171,16 +154,16 @@ def cause_of(p: Pixel, span: Interval, slope: float, noise: bool) -> int:
     """Return the cause of an event in a step in which the level, minus the leaking reference, rises by ``slope``."""
     if noise:
         return wp.where(p.hot > 0.0, HOT_PIXEL, SHOT_NOISE)
-    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * span.share * p.leak * p.on, LEAK, SIGNAL)
+    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * span.drift, LEAK, SIGNAL)
 
 
 @wp.func
-def next_leak(p: Pixel, s: SensorParams, rng: wp.uint32):
-    """Return the leak until the next event [thresholds per step], and the generator's next state."""
-    leak = p.leak
+def next_state(s: SensorParams, rng: wp.uint32) -> wp.uint32:
+    """Return the generator's state after an event. With jitter, the leak until the next event depends on it."""
+    state = rng
     if s.leak_jitter > 0.0:
-        leak = p.mean_leak * wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
-    return leak, rng
+        state = wp.rand_init(int(rng))
+    return state
 
 
 @wp.func
@@ -221,9 +204,7 @@ def fire_event(
         p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
         if noise or p.next_noise < p.blind_until:
             p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise + p.hot, wp.randf(rng))
-        leak, rng = next_leak(p, s, rng)
-        p.leak = leak
-        p.rng = rng
+        p.rng = next_state(s, rng)
     return p
 
 
@@ -284,8 +265,7 @@ def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
     p.hot = wp.where(wp.randf(rng) < sensor.hot_fraction, sensor.hot, 0.0)
     factor, rng = rate_factor(sensor, rng)
     p.noise = sensor.noise * factor
-    p.mean_leak = sensor.leak * factor
-    p.leak = p.mean_leak
+    p.leak = sensor.leak * factor
     leaked = wp.randf(rng)
     p.reference = p.level - wp.where(sensor.leak > 0.0, leaked * p.on, 0.0)
     p.blind_until = NEVER
@@ -307,13 +287,12 @@ def advance_pixel(
     p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, level: float
 ) -> Pixel:
     """Advance a pixel by one interval, at the end of which it sees ``level``."""
-    drift = span.share * p.leak * p.on
-    end = level + drift
+    end = level + span.drift
     within = end < p.reference + p.on and end > p.reference - p.off
     quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(span.ticks)
     p = generate_events(p, s, sink, index, t0, span, end - p.level, quiet)
     p.level = level
-    p.reference -= drift
+    p.reference -= span.drift
     return p
 
 
@@ -333,7 +312,7 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
-    span = whole_step(steps)
+    span = whole_step(steps, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         level = see_level(view, steps.at[steps.margin + k + 1], ray)
@@ -354,7 +333,7 @@ def run_pixels_ahead(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
-    span = whole_step(steps)
+    span = whole_step(steps, p)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
@@ -366,60 +345,3 @@ def run_pixels_ahead(
             t0 += wp.int64(steps.ticks)
             j += 1
     pixels[i] = shift_times(p, t0)
-
-
-# -- keys to events
-
-
-@wp.kernel
-def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.int64, start: int, block: Block):
-    """Unpack event ``i`` of the sorted keys, and compensate it with the true prism angle at its crossing."""
-    i = start + wp.tid()
-    key = keys[i]
-    t = key >> wp.int64(steps.shift)
-    low = int(key & wp.int64(LOW_MASK))
-    index = int((key - (t << wp.int64(steps.shift))) >> wp.int64(LOW_BITS))
-    row = index / view.camera.width
-    col = index - row * view.camera.width
-    block.x[i] = wp.uint16(col)
-    block.y[i] = wp.uint16(row)
-    block.t[i] = t + origin
-    block.p[i] = wp.uint8(low & 1)
-    block.cause[i] = wp.uint8((low >> 1) & 3)
-    lag = LARGEST_LAG - (low >> 3) - LAG_ZERO
-    at = int(t) * TICKS - lag + steps.margin * steps.ticks
-    block.ticks[i] = at
-    k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
-    angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
-    ray = pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
-    w = wp.vec2(wp.cos(angle), wp.sin(angle))
-    block.points[i] = ray_to_pixel(view.camera, trace(view.prism, ray, w, view.prism.flat_to_scene))
-
-
-@wp.kernel
-def pack(sink: Sink, offset: wp.array(dtype=int), out: wp.array(dtype=wp.int64)):
-    """Join the segments: segment ``i`` begins at ``offset[i]``."""
-    segment, place = wp.tid()
-    if place < sink.count[segment, 0]:
-        out[offset[segment] + place] = sink.keys[segment, place]
-
-
-@wp.kernel
-def rebase(keys: wp.array(dtype=wp.int64), passed: wp.int64):
-    """Subtract the duration of a finished chunk from the keys of later events."""
-    i = wp.tid()
-    keys[i] -= passed
-
-
-@wp.kernel
-def find(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64, found: wp.array(dtype=int)):
-    """Find the number of sorted keys below ``limit``, by bisection in one thread."""
-    low = wp.int32(0)
-    high = int(n)
-    while low < high:
-        middle = (low + high) / 2
-        if keys[middle] < limit:
-            low = middle + 1
-        else:
-            high = middle
-    found[0] = low

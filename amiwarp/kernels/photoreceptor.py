@@ -1,8 +1,9 @@
 """Photoreceptors of the simulated pixels: first-order low-pass filters whose bandwidth is proportional to the light.
 
-These kernels replace those of :mod:`amiwarp.kernels.event_generation` if the sensor's bandwidth is limited. The level of
-a pixel is then the output of its photoreceptor. The input is linear in time between two instants, and the filter's
-equation is solved exactly for it, so that the events hardly depend on the length of the steps.
+These kernels replace those of :mod:`amiwarp.kernels.event_generation` if the sensor's bandwidth is limited, or if its
+leak has jitter. The level of a pixel is then the output of its photoreceptor. The input is linear in time between two
+instants, and the filter's equation is solved exactly for it, so that the events hardly depend on the length of the
+steps.
 """
 
 import warp as wp
@@ -32,6 +33,7 @@ wp.set_module_options({"enable_backward": False})
 
 MOST_PIECES = wp.constant(16)  # of a step: divides its number of ticks, which are 16 per microsecond
 LARGEST_BEND = wp.constant(0.01)  # of the level between the ends of a piece [ON thresholds]
+SMALLEST_LEAK = wp.constant(0.1)  # relative to the mean leak, so that jitter cannot stop a leak
 SMALL_ANGLE = wp.constant(0.1)  # duration [time constants] below which a series is more precise in float32
 SMALL_CHANGE = wp.constant(0.3)  # of the log intensity, below which a series is more precise in float32
 
@@ -101,6 +103,16 @@ def piece_count(level: float, before: float, after: float, angle: float, toleran
 
 
 @wp.func
+def jittered_leak(p: Pixel, s: SensorParams) -> float:
+    """Return a pixel's leak [thresholds per step]. It changes with the generator's state, hence at every event."""
+    leak = p.leak
+    if s.leak_jitter > 0.0:
+        rng = wp.rand_init(int(p.rng), 1)
+        leak *= wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
+    return leak
+
+
+@wp.func
 def advance_filtered(
     p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, before: Input, after: Input
 ) -> Pixel:
@@ -109,14 +121,17 @@ def advance_filtered(
     piece = Interval()
     piece.ticks = span.ticks / n
     piece.per_tick = span.per_tick * float(n)
-    piece.share = 1.0 / float(n)
     piece.shift = span.shift
+    share = 1.0 / float(n)
     x0 = before
     j = int(0)
     while j < n:
         j += 1
-        x1 = next_input(wp.lerp(before.level, after.level, piece.share * float(j)), after)
-        level = filter_level(p.level, x0.level, x1.level, s.bandwidth * piece.share * mean_light(x0, x1))
+        x1 = next_input(wp.lerp(before.level, after.level, share * float(j)), after)
+        level = x1.level
+        if s.bandwidth > 0.0:
+            level = filter_level(p.level, x0.level, x1.level, s.bandwidth * share * mean_light(x0, x1))
+        piece.drift = share * jittered_leak(p, s) * p.on
         p = advance_pixel(p, s, sink, index, t0 + wp.int64((j - 1) * piece.ticks), piece, level)
         x0 = x1
     return p
@@ -131,7 +146,7 @@ def run_filtered_pixels(
     i = start + wp.tid()
     p = pixels[i]
     before = last_input(seen[i])
-    span = whole_step(steps)
+    span = whole_step(steps, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for k in range(steps.count):
@@ -153,7 +168,7 @@ def run_filtered_pixels_ahead(
     i = start + wp.tid()
     p = pixels[i]
     before = last_input(seen[i])
-    span = whole_step(steps)
+    span = whole_step(steps, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):

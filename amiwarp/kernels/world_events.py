@@ -72,7 +72,7 @@ def run_world_pixels(
     """Walk through the steps of a chunk, as :func:`amiwarp.kernels.event_generation.run_pixels` does."""
     i = start + wp.tid()
     p = pixels[i]
-    span = whole_step(steps)
+    span = whole_step(steps, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         p = advance_pixel(p, sensor, sink, i, t0, span, see_world(world, view, steps, steps.margin + k + 1, i))
@@ -96,7 +96,7 @@ def run_filtered_world_pixels(
     i = start + wp.tid()
     p = pixels[i]
     before = last_input(seen[i])
-    span = whole_step(steps)
+    span = whole_step(steps, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         after = next_input(see_world(world, view, steps, steps.margin + k + 1, i), before)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from amiwarp.events.events import Events
 from amiwarp.kernels import event_generation as kernels
+from amiwarp.kernels import event_keys, photoreceptor, readout, sight, world_events
 from amiwarp.kernels import launch as launching
-from amiwarp.kernels import photoreceptor, readout, sight, world_events
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
 from amiwarp.simulation.pictures import DARK
@@ -56,7 +56,7 @@ class DeviceBlock:
     """Sorted events of one time span on the device."""
 
     arrays: Any
-    """The kernels' struct :class:`amiwarp.kernels.event_generation.Block`."""
+    """The kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     count: int
     """Number of events."""
     seen: SeenSurfaces | None = None
@@ -102,7 +102,8 @@ class Engine:
         )
         if self._maps is not None:
             self._view.width, self._view.height = self._maps.placement.width, self._maps.placement.height
-        self._filters = simulation.sensor.cutoff_hz > 0.0
+        sensor = simulation.sensor
+        self._filters = bool(sensor.cutoff_hz or (sensor.leak_hz and sensor.leak_jitter_fraction))
         self._readout = Readout(simulation, self._device)
         self._state = [wp.empty(self._pixels, dtype=kernels.Pixel, device=self._device)]
         self._buffer = KeyBuffer(self._pixels, self._device)
@@ -214,7 +215,7 @@ class Engine:
         cut = self._sort(keys, total, limit << steps.shift, top)
         keys, self._carry = keys[:cut], wp.clone(keys[cut:total]) if cut < total else self._nothing
         if len(self._carry):  # times relative to the next chunk
-            wp.launch(kernels.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
+            wp.launch(event_keys.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
                       device=self._device)  # fmt: skip
         return keys
 
@@ -229,19 +230,19 @@ class Engine:
         order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
         wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
         found = wp.empty(1, dtype=int, device=self._device)
-        wp.launch(kernels.find, dim=1, inputs=[keys, total, limit], outputs=[found], device=self._device)
+        wp.launch(event_keys.find, dim=1, inputs=[keys, total, limit], outputs=[found], device=self._device)
         return int(found.numpy()[0])
 
     def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
         """Read out the events of sorted keys."""
         keys, stamps = self._readout.read(keys, steps.shift, first * self._step)
         n = len(keys)
-        block = kernels.Block()
+        block = event_keys.Block()
         for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8),
                             ("cause", wp.uint8), ("points", wp.vec2), ("ticks", int)):  # fmt: skip
             setattr(block, name, wp.empty(n, dtype=dtype, device=self._device))
         inputs = [self._view, steps, keys, first * self._step]
-        launching.launch(kernels.unpack, n, inputs, [block], device=self._device)
+        launching.launch(event_keys.unpack, n, inputs, [block], device=self._device)
         if stamps is not None:
             block.t = stamps
         return DeviceBlock(block, n, None if self._sight is None else self._sight.look(self._view, steps, block, n))
@@ -293,7 +294,7 @@ class KeyBuffer:
             np.concatenate([*parts, carry.numpy()], out=keys.numpy()[:n])
             return keys
         offset = wp.array((ends - counts).astype(np.int32), dtype=int, device=self._device)
-        wp.launch(kernels.pack, dim=(self._segments, int(counts.max())), inputs=[self._sink, offset, keys],
+        wp.launch(event_keys.pack, dim=(self._segments, int(counts.max())), inputs=[self._sink, offset, keys],
                   device=self._device)  # fmt: skip
         if len(carry):
             wp.copy(keys, carry, dest_offset=int(ends[-1]))
@@ -333,7 +334,7 @@ def sensor_params(sensor: SensorModel, step: int) -> Any:
     s.noise = sensor.shot_noise_hz * sensor.shot_noise_dark * 1e-6 / ticks
     s.noise_white = 1.0 / sensor.shot_noise_dark
     s.spread = math.log(10.0) * sensor.noise_rate_cov_decades
-    s.bandwidth = 2.0 * math.pi * sensor.cutoff_hz * step * 1e-6 / (1.0 + DARK)
+    s.bandwidth = 2.0 * math.pi * (sensor.cutoff_hz or 0.0) * step * 1e-6 / (1.0 + DARK)
     s.dark = DARK
     s.hot_fraction, s.hot = sensor.hot_fraction, sensor.hot_hz * 1e-6 / ticks
     s.refractory = round(sensor.refractory_us * ticks)

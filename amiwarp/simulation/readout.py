@@ -27,8 +27,10 @@ class Readout:
         sensor, camera = simulation.sensor, simulation.camera
         scan_us = sensor.row_us * camera.height
         if scan_us > LONGEST_SCAN_US:
-            raise AmiwarpError(f"sensor row_us = {sensor.row_us} makes a scan of {camera.height} rows take "
-                               f"{scan_us:.0f} us; the limit is {LONGEST_SCAN_US:.0f} us; give a smaller row_us")  # fmt: skip
+            raise AmiwarpError(
+                f"sensor row_us = {sensor.row_us} makes a scan of {camera.height} rows take {scan_us:.0f} us; "
+                f"the limit is {LONGEST_SCAN_US:.0f} us; give a smaller row_us"
+            )
         self._device, self._width = device, camera.width
         self._duration_us = simulation.duration_us
         self._row_ps = round(sensor.row_us * 1e6)
