@@ -3,12 +3,14 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from amiwarp.cli.rig import SensorOptions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.kernels import event_generation, photoreceptor
@@ -39,7 +41,7 @@ def texture() -> Scene:
     return Scene.from_picture(np.kron(light, np.ones((4, 4))).astype(np.float32))
 
 
-def seen_through_prism(sensor: SensorModel, device: str = "cpu", **changes: object) -> Simulation:
+def seen_through_prism(sensor: SensorModel, device: str = "cpu", **changes: Any) -> Simulation:
     return replace(Simulation(texture(), CAMERA, PRISM, 0.06, sensor=sensor, seed=3, device=device), **changes)
 
 
@@ -324,7 +326,16 @@ def test_an_unknown_preset_names_the_known_ones() -> None:
         SensorModel.preset("eye")
 
 
-def test_a_recording_stores_the_sensor(tmp_path: object) -> None:
+def test_options_change_a_preset() -> None:
+    found = SensorOptions(sensor="gen4", bus_rate_mev_s=4.0, cutoff_hz=0.0).build()
+    assert found == replace(SensorModel.preset("gen4"), bus_rate_mev_s=4.0, cutoff_hz=0.0)
+    assert SensorOptions().build() == SensorModel()
+    assert SensorOptions(ideal=True, row_us=2.0).build() == quiet_sensor(row_us=2.0)
+    with pytest.raises(AmiwarpError, match="give one of them"):
+        SensorOptions(ideal=True, sensor="gen4").build()
+
+
+def test_a_recording_stores_the_sensor() -> None:
     parameters = seen_through_prism(SensorModel(cutoff_hz=None, bus_rate_mev_s=3)).truth_parameters()
     assert parameters["cutoff_hz"] == 0.0
     assert parameters["bus_rate_mev_s"] == 3.0

@@ -147,9 +147,9 @@ class SensorModel:
         a scan of the rows; the chip scans columns. Estimated: bandwidth, mean latency, queue, mismatch, noise.
 
         ``davis346`` (iniVation DAVIS346, 346x260). Published in G. Gallego et al., "Event-based Vision: A Survey",
-        IEEE TPAMI 2022, table 1: threshold 14.3 % ON and 22.5 % OFF, latency 20 us, 12 million events/s. Bandwidth of
-        300 Hz and shot noise that is four times stronger in the dark are settings of v2e for DAVIS346 recordings.
-        Estimated: jitter, refractory period, queue, mismatch, leak and shot noise.
+        IEEE TPAMI 2022, table 1: threshold 14.3 % ON and 22.5 % OFF, latency 20 us, 12 million events/s. The bandwidth
+        of 300 Hz, the refractory period of 500 us, and shot noise that is four times stronger in the dark are v2e's.
+        Estimated: jitter, queue, mismatch, leak and shot noise.
 
         ``gen4`` (Prophesee Gen4 and Sony IMX636, 1280x720). Published by T. Finateu et al., "A 1280x720
         Back-Illuminated Stacked Temporal Contrast Event-Based Vision Sensor with 4.86 um Pixels, 1.066 GEPS Readout",
