@@ -167,13 +167,13 @@ def next_state(s: SensorParams, rng: wp.uint32) -> wp.uint32:
 
 
 @wp.func
-def thin_noise(p: Pixel, s: SensorParams, t0: wp.int64, span: Interval, slope: float, f: float) -> Pixel:
-    """Return the pixel before a noise event at fraction ``f`` of the step; postpone the event if it is too bright.
+def thin_noise(p: Pixel, s: SensorParams, slope: float, f: float, noise: bool) -> Pixel:
+    """Return the pixel before an event at fraction ``f`` of the step; postpone a noise event if it is too bright.
 
     Noise is drawn at the rate in the dark. Postponing events at random gives the rate at the level of the moment. It
     falls linearly with luminance, as in v2e (Hu, Liu, Delbruck, CVPR Workshops 2021).
     """
-    if f < 1.0 and s.noise_white < 1.0:
+    if noise and f < 1.0 and s.noise_white < 1.0:
         rng = p.rng
         light = wp.clamp(wp.exp(p.level + f * slope) - s.dark, 0.0, 1.0)
         rate = p.noise * (1.0 - (1.0 - s.noise_white) * light) + p.hot
@@ -227,8 +227,7 @@ def generate_events(
         signal = wp.max(crossing(p.reference, p.on, p.off, p.level, slope), f)
         due = p.next_noise
         f = wp.min(signal, wp.max(float(due - t0) * span.per_tick, f))
-        if f < signal:
-            p = thin_noise(p, s, t0, span, slope, f)
+        p = thin_noise(p, s, slope, f, f < signal)
         p = fire_event(p, s, sink, index, t0, span, slope, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
     return p
 

@@ -127,7 +127,7 @@ def advance_filtered(
     j = int(0)
     while j < n:
         j += 1
-        x1 = next_input(wp.lerp(before.level, after.level, share * float(j)), after)
+        x1 = next_input(wp.where(j == n, after.level, wp.lerp(before.level, after.level, share * float(j))), after)
         level = x1.level
         if s.bandwidth > 0.0:
             level = filter_level(p.level, x0.level, x1.level, s.bandwidth * share * mean_light(x0, x1))
