@@ -54,6 +54,12 @@ def test_the_harmless_end_is_run_once() -> None:
     assert set(conditions(quick_axes())) <= set(every)
 
 
+def test_earlier_conditions_keep_their_keys() -> None:
+    assert Condition().key == "898bfb2cde7c0008"
+    assert replace(Condition(), noise=0.1).key == "e73b64fa3a7134e3"
+    assert replace(Condition(), cutoff_hz=300.0).key not in {Condition().key, replace(Condition(), cutoff_hz=100.0).key}
+
+
 @pytest.mark.parametrize("kind", SceneKind)
 def test_scenes(kind: SceneKind) -> None:
     light = draw(kind, 200, 150, period=12.0, seed=3)
@@ -75,6 +81,12 @@ def test_what_is_asked_for_is_made() -> None:
     scans = make(replace(SMALL, readout_us=500.0), 0).recording.events.slice(0, 10**9)
     assert not (scans.t % 500).any()
     assert (np.diff(scans.t) >= 0).all()
+    slow = make(replace(SMALL, cutoff_hz=30.0), 0).recording
+    assert len(slow.events) < 0.6 * len(plain.events)
+    most = 0.3 * SMALL.duration_s * 1e6
+    assert len(plain.events) > 1.2 * most
+    jammed = make(replace(SMALL, bus_rate_mev_s=0.3), 0).recording.events
+    assert len(jammed) <= most + 1
     lost = make(replace(SMALL, lost=0.3), 0).recording
     assert len(lost.events) == pytest.approx(0.7 * len(plain.events), rel=0.02)
     back = make(replace(SMALL, backwards=True), 0).recording

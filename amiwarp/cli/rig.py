@@ -129,6 +129,10 @@ class SensorOptions:
         bool,
         typer.Option("--ideal", help="Simulate a sensor without noise, mismatch and latency.", rich_help_panel=_SENSOR),
     ] = False
+    sensor: Annotated[
+        str | None,
+        _sensor("Known camera whose sensor is simulated: dvxplorer, davis346 or gen4. Other options change it."),
+    ] = None
     contrast_on: Annotated[float | None, _sensor("ON threshold: rise of log intensity.")] = None
     contrast_off: Annotated[float | None, _sensor("OFF threshold: fall of log intensity.")] = None
     mismatch: Annotated[float | None, _sensor("Relative standard deviation of the thresholds between pixels.")] = None
@@ -139,13 +143,39 @@ class SensorOptions:
     shot_noise_hz: Annotated[float | None, _sensor("Rate of random events per pixel (1/s).")] = None
     hot_fraction: Annotated[float | None, _sensor("Fraction of hot pixels (0 to 1).")] = None
     hot_hz: Annotated[float | None, _sensor("Additional event rate of a hot pixel (1/s).")] = None
+    cutoff_hz: Annotated[
+        float | None,
+        _sensor("Bandwidth of the photoreceptor at white (Hz), proportional to the light; 0: unlimited."),
+    ] = None
+    shot_noise_dark: Annotated[
+        float | None, _sensor("Rate of random events in the dark, relative to that at white (1 or more).")
+    ] = None
+    leak_jitter_fraction: Annotated[
+        float | None, _sensor("Relative standard deviation of the time between leak events.")
+    ] = None
+    noise_rate_cov_decades: Annotated[
+        float | None, _sensor("Spread of leak and random-event rates between pixels (standard deviation of log10).")
+    ] = None
+    row_us: Annotated[
+        float | None, _sensor("Time to read out a row (us), one row after the other; 0: events are read out at once.")
+    ] = None
+    bus_rate_mev_s: Annotated[
+        float | None, _sensor("Largest rate that the bus transmits (million events/s); 0: unlimited.")
+    ] = None
+    bus_queue: Annotated[float | None, _sensor("Number of events that wait for the bus; further events are lost.")] = (
+        None
+    )
 
     def build(self) -> SensorModel:
         """Return the sensor model."""
         from amiwarp.simulation.simulator import SensorModel
 
-        given = {name: value for name, value in vars(self).items() if name != "ideal" and value is not None}
-        return replace(SensorModel.ideal() if self.ideal else SensorModel(), **given)
+        if self.ideal and self.sensor is not None:
+            raise AmiwarpError("--ideal and --sensor both describe the sensor; give one of them")
+        given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
+        ideal, preset = given.pop("ideal"), given.pop("sensor", None)
+        sensor = SensorModel.preset(preset) if preset is not None else SensorModel()
+        return replace(SensorModel.ideal() if ideal else sensor, **given)
 
 
 def _encoder(text: str) -> Any:

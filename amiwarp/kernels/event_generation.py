@@ -7,7 +7,6 @@ order of the threads.
 
 import warp as wp
 
-from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.prism_view import (
     AHEAD,
     Steps,
@@ -18,7 +17,6 @@ from amiwarp.kernels.prism_view import (
     see_level,
     texels_ahead,
 )
-from amiwarp.kernels.refraction import trace
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,27 +46,44 @@ class SensorParams:
     off: float
     mismatch: float  # relative standard deviation of both thresholds
     leak: float  # thresholds per step
-    noise: float  # events per tick
+    leak_jitter: float  # relative standard deviation of the leak between two events of a pixel
+    noise: float  # shot noise in the dark [events per tick]
+    noise_white: float  # shot noise at white, relative to that in the dark
+    spread: float  # standard deviation of ln(leak) and ln(shot noise) between pixels
     hot_fraction: float
     hot: float  # events per tick
     refractory: wp.int64  # ticks
     latency: float  # ticks
     jitter: float  # ticks, standard deviation
+    bandwidth: float  # photoreceptor's angular cut-off frequency per unit of exp(level) [1/step]
+    dark: float  # luminance added before the logarithm
 
 
 @wp.struct
 class Pixel:
     """State of one pixel."""
 
-    level: float  # level at the last step [log intensity]
+    level: float  # level at the last step, after the photoreceptor [log intensity]
     reference: float  # reference level [log intensity]
     on: float  # ON and OFF thresholds of this pixel [log intensity]
     off: float
-    noise: float  # noise rate of this pixel [events per tick]
+    leak: float  # of this pixel, without jitter [thresholds per step]
+    noise: float  # shot noise of this pixel in the dark [events per tick]
+    hot: float  # additional noise of a hot pixel [events per tick]; 0 for others
     rng: wp.uint32
     blind_until: wp.int64  # end of the refractory period; NEVER if it has passed
     next_noise: wp.int64
     last_stamp: wp.int64  # [us]
+
+
+@wp.struct
+class Interval:
+    """A step, or one of the equal pieces of a step."""
+
+    ticks: int
+    per_tick: float  # intervals per tick
+    drift: float  # of the reference, caused by leakage [log intensity]
+    shift: int  # bit position of the time in a key
 
 
 @wp.struct
@@ -84,17 +99,15 @@ class Sink:
     run: int  # consecutive pixels in a segment
 
 
-@wp.struct
-class Block:
-    """Events unpacked from their keys."""
-
-    x: wp.array(dtype=wp.uint16)
-    y: wp.array(dtype=wp.uint16)
-    t: wp.array(dtype=wp.int64)
-    p: wp.array(dtype=wp.uint8)
-    cause: wp.array(dtype=wp.uint8)
-    points: wp.array(dtype=wp.vec2)
-    ticks: wp.array(dtype=int)  # time of the crossing since the first instant of the table
+@wp.func
+def whole_step(steps: Steps, p: Pixel) -> Interval:
+    """Return a step of a chunk as an interval, in which the pixel leaks without jitter."""
+    span = Interval()
+    span.ticks = steps.ticks
+    span.per_tick = steps.per_tick
+    span.drift = p.leak * p.on
+    span.shift = steps.shift
+    return span
 
 
 @wp.func
@@ -137,16 +150,42 @@ def latency(s: SensorParams, rng: wp.uint32):
 
 
 @wp.func
-def cause_of(p: Pixel, s: SensorParams, slope: float, noise: bool) -> int:
+def cause_of(p: Pixel, span: Interval, slope: float, noise: bool) -> int:
     """Return the cause of an event in a step in which the level, minus the leaking reference, rises by ``slope``."""
     if noise:
-        return wp.where(p.noise > s.noise, HOT_PIXEL, SHOT_NOISE)
-    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * s.leak * p.on, LEAK, SIGNAL)
+        return wp.where(p.hot > 0.0, HOT_PIXEL, SHOT_NOISE)
+    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * span.drift, LEAK, SIGNAL)
+
+
+@wp.func
+def next_state(s: SensorParams, rng: wp.uint32) -> wp.uint32:
+    """Return the generator's state after an event. With jitter, the leak until the next event depends on it."""
+    state = rng
+    if s.leak_jitter > 0.0:
+        state = wp.rand_init(int(rng))
+    return state
+
+
+@wp.func
+def thin_noise(p: Pixel, s: SensorParams, slope: float, f: float, noise: bool) -> Pixel:
+    """Return the pixel before an event at fraction ``f`` of the step; postpone a noise event if it is too bright.
+
+    Noise is drawn at the rate in the dark. Postponing events at random gives the rate at the level of the moment. It
+    falls linearly with luminance, as in v2e (Hu, Liu, Delbruck, CVPR Workshops 2021).
+    """
+    if noise and f < 1.0 and s.noise_white < 1.0:
+        rng = p.rng
+        light = wp.clamp(wp.exp(p.level + f * slope) - s.dark, 0.0, 1.0)
+        rate = p.noise * (1.0 - (1.0 - s.noise_white) * light) + p.hot
+        if wp.randf(rng) * (p.noise + p.hot) >= rate:
+            p.next_noise += draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+        p.rng = rng
+    return p
 
 
 @wp.func
 def fire_event(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, slope: float, f: float, noise: bool
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, f: float, noise: bool
 ) -> Pixel:
     """Return the pixel after an event at fraction ``f`` of the step, and write that event, if f < 1."""
     if f < 1.0:
@@ -157,21 +196,21 @@ def fire_event(
             p.reference = p.level + f * slope
         else:
             p.reference += wp.where(on == 1, p.on, -p.off)
-        t = t0 + wp.int64(f * float(steps.ticks))
+        t = t0 + wp.int64(f * float(span.ticks))
         late, rng = latency(s, rng)
         stamp = (t + wp.int64(late) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
         p.last_stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
-        append_key(sink, steps.shift, index, t, p.last_stamp, 2 * cause_of(p, s, slope, noise) + on)
+        append_key(sink, span.shift, index, t, p.last_stamp, 2 * cause_of(p, span, slope, noise) + on)
         p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
         if noise or p.next_noise < p.blind_until:
-            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise, wp.randf(rng))
-        p.rng = rng
+            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+        p.rng = next_state(s, rng)
     return p
 
 
 @wp.func
 def generate_events(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, slope: float, quiet: bool
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, quiet: bool
 ) -> Pixel:
     """Generate all events of a step in which the level, minus the leaking reference, rises by ``slope``.
 
@@ -181,13 +220,15 @@ def generate_events(
     f = wp.where(quiet, PAST_STEP, 0.0)
     while f < 1.0:
         if p.blind_until > NEVER:  # the reference is reset at the end of the refractory period
-            f = wp.max(f, float(p.blind_until - t0) * steps.per_tick)
+            f = wp.max(f, float(p.blind_until - t0) * span.per_tick)
             if f < 1.0:
                 p.reference = p.level + f * slope
                 p.blind_until = NEVER
         signal = wp.max(crossing(p.reference, p.on, p.off, p.level, slope), f)
-        f = wp.min(signal, wp.max(float(p.next_noise - t0) * steps.per_tick, f))
-        p = fire_event(p, s, sink, index, t0, steps, slope, f, f < signal)
+        due = p.next_noise
+        f = wp.min(signal, wp.max(float(due - t0) * span.per_tick, f))
+        p = thin_noise(p, s, slope, f, f < signal)
+        p = fire_event(p, s, sink, index, t0, span, slope, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
     return p
 
 
@@ -201,6 +242,15 @@ def reconverge():
 
 
 @wp.func
+def rate_factor(sensor: SensorParams, rng: wp.uint32):
+    """Draw a pixel's leak and shot noise relative to their means; return the generator's next state, too."""
+    factor = float(1.0)
+    if sensor.spread > 0.0:
+        factor = wp.exp(sensor.spread * wp.randn(rng))
+    return factor, rng
+
+
+@wp.func
 def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
     """Draw a pixel's thresholds and noise rate, and set its reference.
 
@@ -211,16 +261,15 @@ def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
     p.level = level
     p.on = sensor.on * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
     p.off = sensor.off * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
-    p.noise = sensor.noise
-    if wp.randf(rng) < sensor.hot_fraction:
-        p.noise = sensor.noise + sensor.hot
+    p.hot = wp.where(wp.randf(rng) < sensor.hot_fraction, sensor.hot, 0.0)
+    factor, rng = rate_factor(sensor, rng)
+    p.noise = sensor.noise * factor
+    p.leak = sensor.leak * factor
     leaked = wp.randf(rng)
-    p.reference = p.level
-    if sensor.leak > 0.0:
-        p.reference = p.level - leaked * p.on
+    p.reference = p.level - wp.where(sensor.leak > 0.0, leaked * p.on, 0.0)
     p.blind_until = NEVER
     p.last_stamp = wp.int64(-1)
-    p.next_noise = draw_waiting_time(p.noise, wp.randf(rng))
+    p.next_noise = draw_waiting_time(p.noise + p.hot, wp.randf(rng))
     p.rng = rng
     return p
 
@@ -233,15 +282,16 @@ def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, star
 
 
 @wp.func
-def advance_pixel(p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, steps: Steps, level: float) -> Pixel:
-    """Advance a pixel by one step, at the end of which it sees ``level``."""
-    drift = s.leak * p.on
-    end = level + drift
+def advance_pixel(
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, level: float
+) -> Pixel:
+    """Advance a pixel by one interval, at the end of which it sees ``level``."""
+    end = level + span.drift
     within = end < p.reference + p.on and end > p.reference - p.off
-    quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(steps.ticks)
-    p = generate_events(p, s, sink, index, t0, steps, end - p.level, quiet)
+    quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(span.ticks)
+    p = generate_events(p, s, sink, index, t0, span, end - p.level, quiet)
     p.level = level
-    p.reference -= drift
+    p.reference -= span.drift
     return p
 
 
@@ -261,10 +311,11 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
+    span = whole_step(steps, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         level = see_level(view, steps.at[steps.margin + k + 1], ray)
-        p = advance_pixel(p, sensor, sink, i, t0, steps, level)
+        p = advance_pixel(p, sensor, sink, i, t0, span, level)
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
@@ -281,6 +332,7 @@ def run_pixels_ahead(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
+    span = whole_step(steps, p)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
@@ -288,64 +340,7 @@ def run_pixels_ahead(
         levels = levels_ahead(view, steps, block, n, at)
         j = int(0)
         while j < n:
-            p = advance_pixel(p, sensor, sink, i, t0, steps, levels[j])
+            p = advance_pixel(p, sensor, sink, i, t0, span, levels[j])
             t0 += wp.int64(steps.ticks)
             j += 1
     pixels[i] = shift_times(p, t0)
-
-
-# -- keys to events
-
-
-@wp.kernel
-def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.int64, start: int, block: Block):
-    """Unpack event ``i`` of the sorted keys, and compensate it with the true prism angle at its crossing."""
-    i = start + wp.tid()
-    key = keys[i]
-    t = key >> wp.int64(steps.shift)
-    low = int(key & wp.int64(LOW_MASK))
-    index = int((key - (t << wp.int64(steps.shift))) >> wp.int64(LOW_BITS))
-    row = index / view.camera.width
-    col = index - row * view.camera.width
-    block.x[i] = wp.uint16(col)
-    block.y[i] = wp.uint16(row)
-    block.t[i] = t + origin
-    block.p[i] = wp.uint8(low & 1)
-    block.cause[i] = wp.uint8((low >> 1) & 3)
-    lag = LARGEST_LAG - (low >> 3) - LAG_ZERO
-    at = int(t) * TICKS - lag + steps.margin * steps.ticks
-    block.ticks[i] = at
-    k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
-    angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
-    ray = pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
-    w = wp.vec2(wp.cos(angle), wp.sin(angle))
-    block.points[i] = ray_to_pixel(view.camera, trace(view.prism, ray, w, view.prism.flat_to_scene))
-
-
-@wp.kernel
-def pack(sink: Sink, offset: wp.array(dtype=int), out: wp.array(dtype=wp.int64)):
-    """Join the segments: segment ``i`` begins at ``offset[i]``."""
-    segment, place = wp.tid()
-    if place < sink.count[segment, 0]:
-        out[offset[segment] + place] = sink.keys[segment, place]
-
-
-@wp.kernel
-def rebase(keys: wp.array(dtype=wp.int64), passed: wp.int64):
-    """Subtract the duration of a finished chunk from the keys of later events."""
-    i = wp.tid()
-    keys[i] -= passed
-
-
-@wp.kernel
-def find(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64, found: wp.array(dtype=int)):
-    """Find the number of sorted keys below ``limit``, by bisection in one thread."""
-    low = wp.int32(0)
-    high = int(n)
-    while low < high:
-        middle = (low + high) / 2
-        if keys[middle] < limit:
-            low = middle + 1
-        else:
-            high = middle
-    found[0] = low

@@ -11,7 +11,9 @@ from amiwarp.kernels.event_generation import (
     new_pixel,
     reconverge,
     shift_times,
+    whole_step,
 )
+from amiwarp.kernels.photoreceptor import advance_filtered, last_input, next_input
 from amiwarp.kernels.prism_view import Steps
 from amiwarp.kernels.refraction import ExactParams, trace
 from amiwarp.kernels.world import Pose, World, radiance
@@ -70,12 +72,40 @@ def run_world_pixels(
     """Walk through the steps of a chunk, as :func:`amiwarp.kernels.event_generation.run_pixels` does."""
     i = start + wp.tid()
     p = pixels[i]
+    span = whole_step(steps, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
-        p = advance_pixel(p, sensor, sink, i, t0, steps, see_world(world, view, steps, steps.margin + k + 1, i))
+        p = advance_pixel(p, sensor, sink, i, t0, span, see_world(world, view, steps, steps.margin + k + 1, i))
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
+
+
+@wp.kernel
+def run_filtered_world_pixels(
+    world: World,
+    view: RayView,
+    steps: Steps,
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+    seen: wp.array(dtype=float),
+    start: int,
+    sink: Sink,
+):
+    """Do the same as :func:`run_world_pixels` with photoreceptors of limited bandwidth; ``seen``: their last inputs."""
+    i = start + wp.tid()
+    p = pixels[i]
+    before = last_input(seen[i])
+    span = whole_step(steps, p)
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        after = next_input(see_world(world, view, steps, steps.margin + k + 1, i), before)
+        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        before = after
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+    seen[i] = before.level
 
 
 @wp.kernel

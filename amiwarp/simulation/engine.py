@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -13,10 +14,12 @@ from numpy.typing import NDArray
 from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
 from amiwarp.kernels import event_generation as kernels
+from amiwarp.kernels import event_keys, photoreceptor, prism_view, readout, world_events
 from amiwarp.kernels import launch as launching
-from amiwarp.kernels import prism_view, world_events
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
+from amiwarp.simulation.pictures import DARK
+from amiwarp.simulation.readout import Readout
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.map_ring import WorldMapRing
@@ -54,7 +57,7 @@ class DeviceBlock:
     """Sorted events of one time span on the device."""
 
     arrays: Any
-    """The kernels' struct :class:`amiwarp.kernels.event_generation.Block`."""
+    """The kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     count: int
     """Number of events."""
     seen: SeenSurfaces | None = None
@@ -111,7 +114,10 @@ class Engine:
         )
         if self._maps is not None:
             self._view.width, self._view.height = self._maps.placement.width, self._maps.placement.height
-        self._state = wp.empty(self._pixels, dtype=kernels.Pixel, device=self._device)
+        sensor = simulation.sensor
+        self._filters = bool(sensor.cutoff_hz or (sensor.leak_hz and sensor.leak_jitter_fraction))
+        self._readout = Readout(simulation, self._device)
+        self._state = [wp.empty(self._pixels, dtype=kernels.Pixel, device=self._device)]
         self._buffer = KeyBuffer(self._pixels, self._device)
         self._nothing: wp.array = wp.empty(0, dtype=wp.int64, device=self._device)
         self._carry = self._nothing
@@ -188,7 +194,10 @@ class Engine:
     def _kernel(self) -> Any:
         """Return the kernel that runs the pixels."""
         if self._maps is None:
-            return world_events.run_world_pixels
+            return world_events.run_filtered_world_pixels if self._filters else world_events.run_world_pixels
+        if self._filters:
+            ahead = self._device.is_cpu
+            return photoreceptor.run_filtered_pixels_ahead if ahead else photoreceptor.run_filtered_pixels
         return kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
 
     def _views(self) -> list[Any]:
@@ -201,22 +210,26 @@ class Engine:
 
     def _start_pixels(self, steps: Any) -> None:
         """Initialise the pixels."""
-        inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, self._state]
+        inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
+        if self._filters:  # the photoreceptors have settled; their inputs are what they see
+            levels = np.ascontiguousarray(self._state[0].numpy()["level"])
+            self._state.append(wp.array(levels, dtype=float, device=self._device))
 
     def _generate_keys(self, steps: Any, count: int) -> wp.array:
         """Run the steps; return the sorted keys of the events before the chunk's end. Later ones are carried over."""
-        keys = self._buffer.run(self._kernel(), [*self._views(), steps, self._sensor, self._state], self._carry)
+        keys = self._buffer.run(self._kernel(), [*self._views(), steps, self._sensor], self._state, self._carry)
         limit = min(count * self._step, self._simulation.duration_us - self.now_us)
         total = len(keys) // 2
         if not total:  # Warp cannot slice an empty array
             return keys
+        self._readout.stamp_rows(keys, total - len(self._carry), steps.shift, self.now_us)
         top = (limit + LATEST_US).bit_length() + steps.shift
         cut = self._sort(keys, total, limit << steps.shift, top)
         keys, self._carry = keys[:cut], wp.clone(keys[cut:total]) if cut < total else self._nothing
         if len(self._carry):  # times relative to the next chunk
-            wp.launch(kernels.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
+            wp.launch(event_keys.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
                       device=self._device)  # fmt: skip
         return keys
 
@@ -226,22 +239,26 @@ class Engine:
             values = keys.numpy()[:total]  # shares the memory of keys
             values.sort()
             return int(np.searchsorted(values, limit))
-        # no two events of a pixel share a microsecond, so the bits below the pixel need no sorting
+        # without a row scan, no two events of a pixel share a microsecond: the bits below the pixel need no sorting
+        lowest = int(readout.LAG_BIT) if self._readout.scans_rows else int(kernels.LOW_BITS)
         order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
-        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=int(kernels.LOW_BITS), end_bit=top)
+        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
         found = wp.empty(1, dtype=int, device=self._device)
-        wp.launch(kernels.find, dim=1, inputs=[keys, total, limit], outputs=[found], device=self._device)
+        wp.launch(event_keys.find, dim=1, inputs=[keys, total, limit], outputs=[found], device=self._device)
         return int(found.numpy()[0])
 
     def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
-        """Convert keys to events."""
+        """Read out the events of sorted keys."""
+        keys, stamps = self._readout.read(keys, steps.shift, first * self._step)
         n = len(keys)
-        block = kernels.Block()
+        block = event_keys.Block()
         for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8),
                             ("cause", wp.uint8), ("points", wp.vec2), ("ticks", int)):  # fmt: skip
             setattr(block, name, wp.empty(n, dtype=dtype, device=self._device))
         inputs = [self._view, steps, keys, first * self._step]
-        launching.launch(kernels.unpack, n, inputs, [block], device=self._device)
+        launching.launch(event_keys.unpack, n, inputs, [block], device=self._device)
+        if stamps is not None:
+            block.t = stamps
         return DeviceBlock(block, n, None if self._sight is None else self._sight.look(self._view, steps, block, n))
 
 
@@ -263,21 +280,21 @@ class KeyBuffer:
         self._capacity = capacity
         self._sink.keys = wp.empty((self._segments, capacity), dtype=wp.int64, device=self._device)
 
-    def run(self, kernel: Any, inputs: list[Any], carry: wp.array) -> wp.array:
-        """Run the pixels, whose state is the last of ``inputs``; return the keys of their events, unsorted.
+    def run(self, kernel: Any, inputs: list[Any], state: list[wp.array], carry: wp.array) -> wp.array:
+        """Run the pixels, whose ``state`` follows the ``inputs``; return the keys of their events, unsorted.
 
         ``carry`` is appended. The array has twice the needed length, because sorting on CUDA needs scratch memory
         behind the keys.
         """
-        state = inputs[-1]
-        before = wp.clone(state)
+        before = [wp.clone(array) for array in state]
         while True:
             self._sink.count.zero_()
-            self._launch(kernel, inputs)
+            self._launch(kernel, [*inputs, *state])
             counts = self._sink.count.numpy()[:, 0]
             if counts.max() <= self._capacity:
                 return self._pack(counts, carry)
-            wp.copy(state, before)  # the buffer was too small: restore the state and run again
+            for array, copy in zip(state, before, strict=True):  # the buffer was too small: run again
+                wp.copy(array, copy)
             self._reserve(int(counts.max()) * 5 // 4)
 
     def _pack(self, counts: NDArray[np.int32], carry: wp.array) -> wp.array:
@@ -291,7 +308,7 @@ class KeyBuffer:
             np.concatenate([*parts, carry.numpy()], out=keys.numpy()[:n])
             return keys
         offset = wp.array((ends - counts).astype(np.int32), dtype=int, device=self._device)
-        wp.launch(kernels.pack, dim=(self._segments, int(counts.max())), inputs=[self._sink, offset, keys],
+        wp.launch(event_keys.pack, dim=(self._segments, int(counts.max())), inputs=[self._sink, offset, keys],
                   device=self._device)  # fmt: skip
         if len(carry):
             wp.copy(keys, carry, dest_offset=int(ends[-1]))
@@ -327,7 +344,12 @@ def sensor_params(sensor: SensorModel, step: int) -> Any:
     s = kernels.SensorParams()
     s.on, s.off, s.mismatch = sensor.contrast_on, sensor.contrast_off, sensor.mismatch
     s.leak = sensor.leak_hz * step * 1e-6
-    s.noise = sensor.shot_noise_hz * 1e-6 / ticks
+    s.leak_jitter = sensor.leak_jitter_fraction
+    s.noise = sensor.shot_noise_hz * sensor.shot_noise_dark * 1e-6 / ticks
+    s.noise_white = 1.0 / sensor.shot_noise_dark
+    s.spread = math.log(10.0) * sensor.noise_rate_cov_decades
+    s.bandwidth = 2.0 * math.pi * (sensor.cutoff_hz or 0.0) * step * 1e-6 / (1.0 + DARK)
+    s.dark = DARK
     s.hot_fraction, s.hot = sensor.hot_fraction, sensor.hot_hz * 1e-6 / ticks
     s.refractory = round(sensor.refractory_us * ticks)
     s.latency, s.jitter = sensor.latency_us * ticks, sensor.latency_jitter_us * ticks

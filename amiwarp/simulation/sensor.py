@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from amiwarp.validation import real
+from amiwarp.validation import one_of, real
 
 
 @dataclass(frozen=True, slots=True)
 class SensorModel:
-    """Pixels of an event camera. The defaults are those of a good sensor in good light, with fast biases.
+    """Pixels and readout of an event camera. The defaults are those of a good sensor in good light, with fast biases.
+
+    By default, the photoreceptors have unlimited bandwidth, noise does not depend on light, and every event is read out
+    at once.
+
+    Notes
+    -----
+    Photoreceptor, leak and shot noise follow v2e (Y. Hu, S.-C. Liu and T. Delbruck, "v2e: From Video Frames to
+    Realistic DVS Events", CVPR Workshops 2021).
 
     Examples
     --------
@@ -40,12 +49,52 @@ class SensorModel:
     """Fraction of hot pixels."""
     hot_hz: float = 100.0
     """Additional rate of random events of a hot pixel [1/s]."""
+    cutoff_hz: float | None = 0.0
+    """Bandwidth of the photoreceptor at white [Hz]; 0 or None for unlimited bandwidth.
+
+    The photoreceptor is a first-order low-pass filter of the log intensity, with the time constant
+    ``1 / (2 pi cutoff)``. Its cut-off frequency is proportional to the luminance plus 0.02, the stray light and dark
+    current that the simulator adds to every picture.
+    """
+    shot_noise_dark: float = 1.0
+    """Rate of random events in the dark, relative to that at white, 1 to 1000; v2e uses 4.
+
+    The rate falls linearly with luminance from the dark to white.
+    """
+    leak_jitter_fraction: float = 0.0
+    """Relative standard deviation of the time between leak events of a pixel.
+
+    The leak rate is drawn anew after each event of the pixel, and is never below a tenth of its mean.
+    """
+    noise_rate_cov_decades: float = 0.0
+    """Standard deviation of the decimal logarithm of leak and random-event rates between pixels.
+
+    The rates are log-normal; their medians are ``leak_hz`` and ``shot_noise_hz``.
+    """
+    row_us: float = 0.0
+    """Time to read out a row [us]; 0 if every event is read out at once.
+
+    The rows are read one after the other, from the first to the last and again, without a pause. The events of a row
+    share the time stamp of their readout. A pixel that fires several times between two readouts gives one event, the
+    first. A scan of all rows must not take longer than 10 ms.
+    """
+    bus_rate_mev_s: float = 0.0
+    """Largest rate of events that the bus transmits [million events/s]; 0 for unlimited.
+
+    Events wait in a queue, and their time stamp is the time at which the bus transmits them.
+    """
+    bus_queue: float = 4096.0
+    """Number of events that the queue of the bus holds. Further events are lost."""
 
     def __post_init__(self) -> None:
         limits = {"mismatch": 0.5, "refractory_us": 1e6, "latency_us": 1e4, "latency_jitter_us": 1e3, "leak_hz": 1e3,
-                  "shot_noise_hz": 1e5, "hot_fraction": 1.0, "hot_hz": 1e5}  # fmt: skip
+                  "shot_noise_hz": 1e5, "hot_fraction": 1.0, "hot_hz": 1e5, "leak_jitter_fraction": 1.0,
+                  "noise_rate_cov_decades": 1.0, "row_us": 1e4, "bus_queue": 1e9}  # fmt: skip
         for name, limit in limits.items():
             object.__setattr__(self, name, real(getattr(self, name), f"sensor {name}", 0.0, limit))
+        for name, least, limit in (("cutoff_hz", 0.01, 1e7), ("bus_rate_mev_s", 1e-3, 1e5)):
+            object.__setattr__(self, name, _real_or_none(getattr(self, name), f"sensor {name}", least, limit))
+        object.__setattr__(self, "shot_noise_dark", real(self.shot_noise_dark, "sensor shot_noise_dark", 1.0, 1e3))
         for name in ("contrast_on", "contrast_off"):
             value = real(getattr(self, name), f"sensor {name}", 0.01, 10.0, " (log intensity)")
             object.__setattr__(self, name, value)
@@ -65,3 +114,80 @@ class SensorModel:
             The sensor.
         """
         return cls(contrast, contrast, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def preset(cls, name: str) -> SensorModel:
+        """Return the model of a known event camera.
+
+        Published values are those of data sheets and papers, at the manufacturer's biases in good light. Everything
+        that they do not state is an estimate.
+
+        Parameters
+        ----------
+        name : str
+            Camera: ``dvxplorer``, ``davis346`` or ``gen4``.
+
+        Returns
+        -------
+        SensorModel
+            The sensor.
+
+        Raises
+        ------
+        AmiwarpError
+            If there is no preset of that name.
+
+        Notes
+        -----
+        Data sheets state the contrast threshold C as a relative change of light: the model uses ln(1 + C).
+
+        ``dvxplorer`` (iniVation DVXplorer, 640x480). Published by iniVation (docs.inivation.com, DVXplorer): threshold
+        27.5 % (at which 99.9 % of the pixels respond; 13 % for half of them), of which the model takes 20 % in the
+        middle; latency below 1 ms; time resolution 200 us; 165 million events/s. The time resolution is modelled as
+        a scan of the rows; the chip scans columns. Estimated: bandwidth, mean latency, queue, mismatch, noise.
+
+        ``davis346`` (iniVation DAVIS346, 346x260). Published in G. Gallego et al., "Event-based Vision: A Survey",
+        IEEE TPAMI 2022, table 1: threshold 14.3 % ON and 22.5 % OFF, latency 20 us, 12 million events/s. The bandwidth
+        of 300 Hz, the refractory period of 500 us, and shot noise that is four times stronger in the dark are v2e's.
+        Estimated: jitter, queue, mismatch, leak and shot noise.
+
+        ``gen4`` (Prophesee Gen4 and Sony IMX636, 1280x720). Published by T. Finateu et al., "A 1280x720
+        Back-Illuminated Stacked Temporal Contrast Event-Based Vision Sensor with 4.86 um Pixels, 1.066 GEPS Readout",
+        ISSCC 2020, and in the survey's table 1: threshold 11 %, latency 20 to 150 us, 1066 million events/s. IMX636's
+        data sheet: latency below 100 us at 1000 lux. Estimated: bandwidth, latency, queue, mismatch, noise; the
+        default biases have a higher threshold than the smallest, and the model takes 25 %.
+
+        Examples
+        --------
+        >>> amiwarp.SensorModel.preset("davis346").bus_rate_mev_s
+        12.0
+        """
+        return cls(**_PRESETS[one_of(name, _PRESETS, "sensor preset")])
+
+
+def _real_or_none(value: float | None, what: str, least: float, limit: float) -> float:
+    """Return a value in least .. limit, or 0.0 for None and 0."""
+    number = 0.0 if value is None else real(value, what, 0.0, limit)
+    return number if number == 0.0 else real(number, what, least, limit, " (or 0 for none)")
+
+
+_PRESETS: dict[str, dict[str, float]] = {
+    "dvxplorer": {
+        "contrast_on": math.log(1.20), "contrast_off": math.log(1.20), "mismatch": 0.06, "refractory_us": 200.0,
+        "latency_us": 200.0, "latency_jitter_us": 50.0, "leak_hz": 0.05, "shot_noise_hz": 0.5, "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 1000.0, "row_us": 0.4,
+        "bus_rate_mev_s": 165.0, "bus_queue": 16384.0,
+    },
+    "davis346": {
+        "contrast_on": math.log(1.143), "contrast_off": math.log(1.225), "mismatch": 0.1, "refractory_us": 500.0,
+        "latency_us": 20.0, "latency_jitter_us": 10.0, "leak_hz": 0.1, "shot_noise_hz": 1.0, "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 300.0, "bus_rate_mev_s": 12.0,
+        "bus_queue": 4096.0,
+    },
+    "gen4": {
+        "contrast_on": math.log(1.25), "contrast_off": math.log(1.25), "mismatch": 0.03, "refractory_us": 100.0,
+        "latency_us": 100.0, "latency_jitter_us": 30.0, "leak_hz": 0.05, "shot_noise_hz": 0.5, "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 2000.0, "bus_rate_mev_s": 1066.0,
+        "bus_queue": 65536.0,
+    },
+}  # fmt: skip

@@ -74,6 +74,10 @@ class Condition:
     """Refractory period [us]."""
     readout_us: float = 0.0
     """Interval of readout scans [us]; time stamps are moved to the end of their scan. 0 for none."""
+    cutoff_hz: float = 0.0
+    """Bandwidth of the photoreceptor at white [Hz]; 0 for unlimited."""
+    bus_rate_mev_s: float = 0.0
+    """Largest rate of events on the sensor's bus [million events/s]; 0 for unlimited."""
     counts_per_turn: int = 8192
     """Encoder counts per turn."""
     jitter_deg: float = 0.0
@@ -107,8 +111,12 @@ class Condition:
 
     @property
     def key(self) -> str:
-        """Hash of the settings, which identifies the condition."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+        """Hash of the settings, which identifies the condition.
+
+        Later fields count only if they differ from the default, so that earlier results stay valid.
+        """
+        settings = {name: value for name, value in asdict(self).items() if value or name not in _LATER_FIELDS}
+        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def camera(self) -> Camera:
@@ -136,6 +144,10 @@ class Condition:
     def duration_s(self) -> float:
         """Length of the recording [s]."""
         return self.turns * 60.0 / self.rpm
+
+
+_LATER_FIELDS = ("cutoff_hz", "bus_rate_mev_s")
+"""Fields of :class:`Condition`, with the default 0, that the first atlases did not have."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +194,7 @@ def _simulation(c: Condition, seed: int, rng: np.random.Generator, device: str) 
     sensor = SensorModel(
         contrast_on=c.contrast, contrast_off=c.contrast, mismatch=c.mismatch, latency_us=c.latency_us,
         refractory_us=c.refractory_us, hot_fraction=c.hot, hot_hz=500.0, shot_noise_hz=0.1, leak_hz=0.1,
+        cutoff_hz=c.cutoff_hz, bus_rate_mev_s=c.bus_rate_mev_s,
     )  # fmt: skip
     encoder = EncoderModel(
         counts_per_turn=c.counts_per_turn, clock_offset_us=c.clock_offset_us, dropouts_hz=c.dropouts_hz, jitter_us=1.0
@@ -315,6 +328,8 @@ AXES = (
     Axis("latency", "latency_us", (0.0, 100.0, 300.0, 1000.0, 3000.0), "µs"),
     Axis("refractory time", "refractory_us", (0.0, 100.0, 1000.0, 3000.0, 10_000.0), "µs"),
     Axis("readout in scans", "readout_us", (0.0, 200.0, 500.0, 1000.0, 2000.0), "µs"),
+    Axis("bandwidth", "cutoff_hz", (3000.0, 1000.0, 300.0, 100.0, 30.0), "Hz at white"),
+    Axis("bus rate", "bus_rate_mev_s", (10.0, 3.0, 1.0, 0.3, 0.1), "million events/s"),
     Axis("encoder resolution", "counts_per_turn", (8192, 1024, 256, 64, 16, 4), "counts a turn"),
     Axis("encoder jitter", "jitter_deg", (0.0, 0.1, 0.5, 2.0, 5.0, 20.0), "°"),
     Axis("clock offset", "clock_offset_us", (0.0, 100.0, 1000.0, 5000.0, 20_000.0), "µs", (("ripple", 0.05),)),
@@ -349,6 +364,8 @@ _SMALLEST: dict[str, float] = {"turns": 0.5, "counts_per_turn": 64, "distortion"
 """Smallest values of the sensible region. An apex of 0.5 degrees gives an orbit of 1.2 px; at 0.25 degrees the orbit
 lies within a pixel.
 """
+_SMALLEST_OR_NONE: dict[str, float] = {"cutoff_hz": 300.0, "bus_rate_mev_s": 3.0}
+"""Smallest values of the sensible region, in which 0 stands for no limit, too."""
 FEWEST_EVENTS = 20_000
 """Smallest number of events of the sensible region."""
 
@@ -360,4 +377,5 @@ def sensible(c: Condition, events: int) -> bool:
         and c.scene in _scene_values(SceneKind.TEXTURE, SceneKind.EDGES)
         and all(getattr(c, name) <= most for name, most in _LARGEST.items())
         and all(getattr(c, name) >= least for name, least in _SMALLEST.items())
+        and all(not getattr(c, name) or getattr(c, name) >= least for name, least in _SMALLEST_OR_NONE.items())
     )
