@@ -259,11 +259,16 @@ def light_at(world: World, instant: int, place: wp.vec3, normal: wp.vec3) -> flo
 
 
 @wp.func
-def radiance(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, cone: float) -> float:
-    """Luminance along a ray of angular width ``cone`` [rad], its direction of length one."""
-    hit = cast(world, instant, origin, direction, FAR)
+def shade(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, hit: Hit, cone: float) -> float:
+    """Return the luminance of what a ray of angular width ``cone`` [rad] hit."""
     if hit.face < 0:
         return sky(world, direction)
     place = origin + hit.distance * direction + LIFT * (hit.distance + 0.1) * hit.normal
     s = world.surfaces[world.body[hit.face]]
     return s.emission + reflectance(world, hit, direction, cone) * light_at(world, instant, place, hit.normal)
+
+
+@wp.func
+def radiance(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, cone: float) -> float:
+    """Return the luminance along a ray of angular width ``cone`` [rad]; its direction has length one."""
+    return shade(world, instant, origin, direction, cast(world, instant, origin, direction, FAR), cone)

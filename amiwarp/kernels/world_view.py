@@ -5,11 +5,13 @@ import warp as wp
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray
 from amiwarp.kernels.prism_view import Steps, View
 from amiwarp.kernels.refraction import ExactParams, trace
-from amiwarp.kernels.world import FAR, Pose, World, cast, radiance
+from amiwarp.kernels.world import FAR, Pose, World, cast, radiance, shade
 
 wp.set_module_options({"enable_backward": False})
 
 NAN = wp.constant(float("nan"))
+CONTRAST = wp.constant(0.1)  # difference over sum of two texels' light, above which they are sampled more finely
+LEAST_LIGHT = wp.constant(0.04)
 
 
 @wp.struct
@@ -36,16 +38,50 @@ def map_direction(f: MapFrame, x: float, y: float) -> wp.vec3:
 
 
 @wp.kernel
-def render_map(world: World, f: MapFrame, start: int, out: wp.array(dtype=float)):
-    """Luminance of each texel, the mean of its samples."""
+def render_map(world: World, f: MapFrame, start: int, light: wp.array(dtype=float), body: wp.array(dtype=int)):
+    """Render one ray per texel, through its centre: luminance, and the body that it hits."""
     i = start + wp.tid()
     row = i / f.width
     col = i - row * f.width
-    total = float(0.0)
-    for k in range(f.offsets.shape[0]):
-        direction = map_direction(f, float(col) + f.offsets[k][0], float(row) + f.offsets[k][1])
-        total += radiance(world, f.instant, f.pose.position, direction, f.cone)
-    out[i] = total / float(f.offsets.shape[0])
+    origin = f.pose.position
+    direction = map_direction(f, float(col), float(row))
+    hit = cast(world, f.instant, origin, direction, FAR)
+    light[i] = shade(world, f.instant, origin, direction, hit, f.cone)
+    body[i] = -1
+    if hit.face >= 0:
+        body[i] = world.body[hit.face]
+
+
+@wp.func
+def differs(f: MapFrame, light: wp.array(dtype=float), body: wp.array(dtype=int), col: int, row: int) -> bool:
+    """Return whether any of the eight neighbours of a texel shows another body, or light of clear contrast."""
+    here = row * f.width + col
+    found = bool(False)
+    for k in range(9):
+        c = wp.clamp(col + k % 3 - 1, 0, f.width - 1)
+        r = wp.clamp(row + k / 3 - 1, 0, f.height - 1)
+        there = r * f.width + c
+        apart = wp.abs(light[there] - light[here])
+        found = found or body[there] != body[here] or apart > CONTRAST * (light[here] + light[there] + LEAST_LIGHT)
+    return found
+
+
+@wp.kernel
+def refine_map(
+    world: World, f: MapFrame, light: wp.array(dtype=float), body: wp.array(dtype=int), start: int,
+    out: wp.array(dtype=float),
+):  # fmt: skip
+    """Replace the luminance of texels at edges by the mean of several rays."""
+    i = start + wp.tid()
+    row = i / f.width
+    col = i - row * f.width
+    value = float(light[i])
+    if differs(f, light, body, col, row):
+        value = float(0.0)
+        for k in range(f.offsets.shape[0]):
+            direction = map_direction(f, float(col) + f.offsets[k][0], float(row) + f.offsets[k][1])
+            value += radiance(world, f.instant, f.pose.position, direction, f.cone) / float(f.offsets.shape[0])
+    out[i] = value
 
 
 @wp.kernel

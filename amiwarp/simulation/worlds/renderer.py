@@ -89,6 +89,7 @@ class MapRenderer:
         frame.offsets = sample_grid(samples, world.device)
         n = frame.width * frame.height
         self._light, self._half = (wp.empty(n, dtype=float, device=world.device) for _ in range(2))
+        self._body = wp.empty(n, dtype=int, device=world.device)
         reach = max(1, math.ceil(3.0 * blur))
         along = np.arange(-reach, reach + 1)
         weights = np.exp(-0.5 * (along / max(blur, 1e-6)) ** 2)
@@ -99,9 +100,12 @@ class MapRenderer:
         f, device = self._frame, self._world.device
         f.pose, f.instant = pose, instant
         n = f.width * f.height
-        launch(
-            world_view.render_map, n, [self._world.params, f], [self._light], device=device, smallest=SMALLEST_LAUNCH
-        )
+        inputs = [self._world.params, f]
+        launch(world_view.render_map, n, inputs, [self._light, self._body], device=device, smallest=SMALLEST_LAUNCH)
+        if len(f.offsets) > 1:
+            inputs += [self._light, self._body]
+            launch(world_view.refine_map, n, inputs, [self._half], device=device, smallest=SMALLEST_LAUNCH)
+            self._light, self._half = self._half, self._light
         for across, source, target in ((0, self._light, self._half), (1, self._half, self._light)):
             inputs = [source, self._weights, f.width, f.height, across]
             launch(world_view.blur_lines, n, inputs, [target], device=device)
