@@ -10,6 +10,7 @@ counted.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import math
 import time
@@ -18,8 +19,6 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from pyvista.examples import mapfile
-
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.engine import DeviceBlock, Engine
@@ -71,12 +70,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--quick", action="store_true", help="a tenth of the simulated time")
+    parser.add_argument("--picture", type=Path, help="for the picture at infinity; by default PyVista's map")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     on_cpu = wp.get_device(args.device).is_cpu
     seconds = (0.1 if on_cpu else 1.0) * (0.1 if args.quick else 1.0)
-    rows = [measure("picture at infinity", Scene.from_picture(mapfile), seconds, args.device)]
+    picture = args.picture or Path(importlib.import_module("pyvista.examples").mapfile)
+    rows = [measure("picture at infinity", Scene.from_picture(picture), seconds, args.device)]
+    print(json.dumps(rows[0]), flush=True)
     cases = [("room", "still", "maps", None), ("desk", "handheld", "maps", None), ("room", "handheld", "maps", None)]
     if not on_cpu:
         cases += [("room", "handheld", "rays", 1), ("room", "handheld", "rays", 4), ("street", "handheld", "rays", 1),
