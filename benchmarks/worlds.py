@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.engine import DeviceBlock, Engine
@@ -37,7 +38,7 @@ LATENCY_S = 1e-4
 def reprojection(scene: WorldScene, block: DeviceBlock) -> np.ndarray:
     """Return distances [px] of some events."""
     assert block.seen is not None
-    places = block.seen.place[::SOME].astype(np.float64)
+    places = block.seen.place.numpy()[::SOME].astype(np.float64)
     bare = block.arrays.points.numpy()[::SOME]
     t = block.arrays.t.numpy()[::SOME] * 1e-6 - LATENCY_S
     known = np.isfinite(places[:, 0])

@@ -260,14 +260,14 @@ def test_points_of_events_project_to_their_places_without_the_prism(seeing: str)
     _, _, blocks = counts(simulation)
     far = []
     for block in blocks:
-        places = block.seen.place.astype(np.float64)
+        places = block.truth().place.astype(np.float64)
         bare = block.arrays.points.numpy()
         some = np.flatnonzero(np.isfinite(places[:, 0]))[::17]
         for k in some:
             # at the time of its crossing, which the stamp follows by the latency
             t = float(block.arrays.t.numpy()[k]) * 1e-6 - 1e-4
             far.append(np.linalg.norm(project(places[k : k + 1], t, path)[0] - bare[k]))
-        assert set(np.unique(block.seen.instance)) <= set(range(len(world.instances) + 1))
+        assert set(np.unique(block.truth().instance)) <= set(range(len(world.instances) + 1))
     assert len(far) > 60
     assert np.quantile(far, 0.95) < 0.05  # [px]; the latency of single events differs from its mean
 

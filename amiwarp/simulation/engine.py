@@ -24,7 +24,7 @@ from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.map_ring import WorldMapRing
 from amiwarp.simulation.worlds.sight import SeenSurfaces, WorldSight, interval_limit_us, largest_speed
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world_scene import Seeing, WorldScene
 
 if TYPE_CHECKING:
     from amiwarp.simulation.sensor import SensorModel
@@ -79,7 +79,8 @@ class DeviceBlock:
         points, cause = self.arrays.points.numpy(), self.arrays.cause.numpy()
         if self.seen is None:
             return EventTruth(points, cause)
-        return EventTruth(points, cause, self.seen.instance, self.seen.depth, self.seen.place)
+        seen = self.seen
+        return EventTruth(points, cause, seen.instance.numpy(), seen.depth.numpy(), seen.place.numpy())
 
 
 class Engine:
@@ -98,7 +99,7 @@ class Engine:
             speed = largest_speed(world, simulation, scene)
             self._step = step_us(simulation, world_speed=speed, longest=interval_limit_us(scene))
             self._sight = WorldSight(simulation, scene, world)
-            if not scene.uses_rays(on_cpu=self._device.is_cpu):
+            if scene.seeing is not Seeing.RAYS:
                 self._maps = WorldMapRing(simulation, scene, world, seen_bearings(simulation))
         else:
             self._step = step_us(simulation)

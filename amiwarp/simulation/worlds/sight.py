@@ -45,14 +45,14 @@ def aperture(scene: WorldScene) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class SeenSurfaces:
-    """What each event saw: of the surface that its pixel saw through the prism when it crossed its threshold."""
+    """What each event saw, on the device: the surface that its pixel saw through the prism at its crossing."""
 
-    instance: NDArray[np.uint16]
-    """Instance number, shape (n,): 0 is the sky, i + 1 is ``World.instances[i]``."""
-    depth: NDArray[np.float32]
-    """Depth along the camera's axis [m], shape (n,); infinite for the sky."""
-    place: NDArray[np.float32]
-    """Place in the world [m], shape (n, 3); NaN for the sky."""
+    instance: Any
+    """Instance number, uint16, shape (n,): 0 is the sky, i + 1 is ``World.instances[i]``."""
+    depth: Any
+    """Depth along the camera's axis [m], float32, shape (n,); infinite for the sky."""
+    place: Any
+    """Point in the world [m], vec3, shape (n,); NaN for the sky."""
 
 
 def largest_speed(world: DeviceWorld, simulation: Simulation, scene: WorldScene) -> float:
@@ -102,7 +102,7 @@ class WorldSight:
             setattr(out, name, wp.empty(n, dtype=dtype, device=device))
         inputs = [self._world.params, view, steps, self._view.poses, block.x, block.y, block.ticks]
         launch(world_view.find_event_truth, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
-        return SeenSurfaces(out.instance.numpy(), out.depth.numpy(), out.place.numpy())
+        return SeenSurfaces(out.instance, out.depth, out.place)
 
 
 def interval_limit_us(scene: WorldScene) -> float:

@@ -13,8 +13,6 @@ from amiwarp.validation import choice, instance, one_of, real
 class Seeing(enum.StrEnum):
     """How the pixels see a world."""
 
-    AUTO = "auto"
-    """Maps on a CPU, rays on CUDA."""
     MAPS = "maps"
     """Pictures of the world without the prism, rendered whenever it has moved by half a pixel, and blended between."""
     RAYS = "rays"
@@ -35,7 +33,7 @@ class WorldScene:
     """The camera's pose over time."""
     blur: float = 0.5
     """Standard deviation of the optical blur, the pixel's aperture included [px]; a single ray a pixel has none."""
-    seeing: Seeing = Seeing.AUTO
+    seeing: Seeing = Seeing.MAPS
     """How the pixels see the world."""
     samples: int | None = None
     """Rays a texel (maps) or a pixel (rays): 1, 4, 9 or 16; None for 4."""
@@ -50,18 +48,3 @@ class WorldScene:
         object.__setattr__(self, "motion_px", real(self.motion_px, "motion_px", 0.01, 2.0, " px"))
         if self.samples is not None:
             one_of(str(self.samples), [str(n) for n in SAMPLES], "samples")
-
-    def uses_rays(self, *, on_cpu: bool) -> bool:
-        """Return whether rays are cast for every step on a device.
-
-        Parameters
-        ----------
-        on_cpu : bool
-            Whether the device is a CPU.
-
-        Returns
-        -------
-        bool
-            True for rays, False for maps.
-        """
-        return self.seeing is Seeing.RAYS or (self.seeing is Seeing.AUTO and not on_cpu)
