@@ -101,7 +101,7 @@ def test_regroup_by_duration_cuts_on_the_grid_of_the_first_event(t, edges, durat
 
 @pytest.mark.parametrize("options", [{"count": 0}, {"duration_us": 0}, {"count": 1, "duration_us": 1}])
 def test_regroup_refuses(options):
-    with pytest.raises(AmiwarpError, match="blocks"):
+    with pytest.raises(AmiwarpError, match="block"):
         list(regroup([make([1])], **options))
 
 
