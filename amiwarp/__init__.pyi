@@ -90,6 +90,7 @@ from .simulation.translator import PictureStack as PictureStack
 from .simulation.translator import VideoFile as VideoFile
 from .simulation.translator import translate as translate
 from .simulation.worlds.frame_truth import TruthRenderer as TruthRenderer
+from .simulation.worlds.named.catalogue import named_world as named_world
 from .simulation.worlds.scene import Body as Body
 from .simulation.worlds.scene import Lamp as Lamp
 from .simulation.worlds.scene import Material as Material
@@ -98,6 +99,7 @@ from .simulation.worlds.scene import Sky as Sky
 from .simulation.worlds.scene import Sun as Sun
 from .simulation.worlds.scene import World as World
 from .simulation.worlds.trajectory import Trajectory as Trajectory
+from .simulation.worlds.world_files import load_world as load_world
 from .simulation.worlds.world_scene import Seeing as Seeing
 from .simulation.worlds.world_scene import WorldScene as WorldScene
 from .viewer.app import view as view
