@@ -17,10 +17,11 @@ import numpy as np
 import warp as wp
 from matplotlib import colormaps
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
+from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import Simulation
@@ -28,17 +29,16 @@ from amiwarp.simulation.worlds.named import named_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
 CAMERA, PRISM = Camera.from_fov(320, 240, math.radians(60.0)), Prism(math.radians(1.0))
-SPACING_S = 1.0 / 12.0 / 6.0
-"""Time between frames [s]: a sixth of a turn at 720 rpm."""
-WINDOW_S = 0.003
+SPACING_S = 1.0 / 60.0
+"""Time between frames [s]: a fifth of a turn at 720 rpm."""
+WINDOW_S = 0.002
 """Time over which a frame collects events [s]."""
-FRAMES, FRAMES_PER_S = 36, 10
+FRAMES, FRAMES_PER_S = 30, 10
 WIDTH, HEIGHT, GAP, TOP, BOTTOM = 240, 180, 6, 22, 26
 """Size of a panel, space between panels, above and below them [px]."""
 SHADES, GREYS = 48, 8
 """Colours of depth, and greys from white to black."""
 TITLES = ("without the prism", "through the prism", "through the prism, by depth")
-ON, OFF = (213, 94, 0), (0, 114, 178)
 WHITE, BLACK, OF_SKY = 0, GREYS - 1, 3
 """Indices of colours in the palette: greys, then OFF, ON, and the shades of depth."""
 
@@ -67,8 +67,9 @@ class DepthScale:
 def palette() -> list[int]:
     """Return the colours of the films: red, green and blue of each, 0 to 255."""
     greys = [(round(255 - 255 * k / (GREYS - 1)),) * 3 for k in range(GREYS)]
+    polarities = [ImageColor.getrgb(colour) for colour in (OFF_COLOUR, ON_COLOUR)]
     shades = np.rint(255 * colormaps["viridis_r"](np.linspace(0.0, 1.0, SHADES))[:, :3]).astype(int).tolist()
-    return [int(value) for colour in (*greys, OFF, ON, *shades) for value in colour]
+    return [int(value) for colour in (*greys, *polarities, *shades) for value in colour]
 
 
 def simulate(name: str, device: str) -> list[tuple[Events, EventTruth]]:
@@ -132,7 +133,13 @@ def draw(runs: list[tuple[Events, EventTruth]]) -> list[Image.Image]:
             window = slice(*np.searchsorted(each.t, (begin, begin + WINDOW_S * 1e6)).tolist())
             left = GAP + k * (WIDTH + GAP)
             image[TOP : TOP + HEIGHT, left : left + WIDTH] = panel(each, colour, window)
-        write_text(image, f"{begin * 1e-3:.0f} ms", GAP + WIDTH, TOP + HEIGHT + 7, anchor="ra")
+        write_text(
+            image,
+            f"at {begin * 1e-3:.0f} ms, {WINDOW_S * 1e3:g} ms of events",
+            GAP + WIDTH,
+            TOP + HEIGHT + 7,
+            anchor="ra",
+        )
         frame = Image.fromarray(image).convert("P")
         frame.putpalette(colours)
         frames.append(frame)
