@@ -107,7 +107,7 @@ simulation = amiwarp.Simulation(
     amiwarp.Prism(math.radians(1.0)),
     duration_s=0.06,
 )
-instant_us = 30_000
+instant_us = 45_000
 recordings = {
     "without the prism": simulation.without_prism().run(),
     "through the prism": simulation.run(truth_times_us=[instant_us]),
@@ -124,7 +124,7 @@ plt.show()
 
 # %%
 # The camera moves to the right. Without the prism, horizontal edges cause hardly
-# any events. Through the prism, edges of every orientation do.
+# any events. Over a turn of the prism, edges of every orientation do.
 #
 # What each event saw
 # -------------------
