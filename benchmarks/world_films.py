@@ -1,8 +1,8 @@
 """Draw films of events in named worlds: without the prism, through it, and coloured by the depth of what each saw.
 
-    python -m benchmarks.world_films [room ball street] [--device cuda:0] [--out docs/images]
+    python -m benchmarks.world_films [room ball street] [--frames 30] [--motion-px 0.5] [--device cuda:0]
 
-A film shows FRAMES moments, SPACING_S apart, and at each the events of WINDOW_S. It plays more slowly than the
+A film shows moments that are SPACING_S apart, and at each the events of WINDOW_S. It plays more slowly than the
 simulated time passes. Depth comes from the ground truth of the events.
 """
 
@@ -33,7 +33,7 @@ SPACING_S = 1.0 / 60.0
 """Time between frames [s]: a fifth of a turn at 720 rpm."""
 WINDOW_S = 0.002
 """Time over which a frame collects events [s]."""
-FRAMES, FRAMES_PER_S = 30, 10
+FRAMES_PER_S = 10
 WIDTH, HEIGHT, GAP, TOP, BOTTOM = 240, 180, 6, 22, 26
 """Size of a panel, space between panels, above and below them [px]."""
 SHADES, GREYS = 48, 8
@@ -72,11 +72,11 @@ def palette() -> list[int]:
     return [int(value) for colour in (*greys, *polarities, *shades) for value in colour]
 
 
-def simulate(name: str, device: str) -> list[tuple[Events, EventTruth]]:
+def simulate(name: str, frames: int, motion_px: float, device: str) -> list[tuple[Events, EventTruth]]:
     """Return events and ground truth without the prism and through it."""
-    seconds = FRAMES * SPACING_S
+    seconds = frames * SPACING_S
     world, trajectory = named_world(name, "handheld", duration_s=seconds)
-    simulation = Simulation(WorldScene(world, trajectory), CAMERA, PRISM, seconds, device=device)
+    simulation = Simulation(WorldScene(world, trajectory, motion_px=motion_px), CAMERA, PRISM, seconds, device=device)
     runs = []
     for each in (simulation.without_prism(), simulation):
         events, truth = zip(*each.blocks_with_truth(), strict=True)
@@ -117,7 +117,7 @@ def background(scale: DepthScale) -> NDArray[np.uint8]:
     return image
 
 
-def draw(runs: list[tuple[Events, EventTruth]]) -> list[Image.Image]:
+def draw(runs: list[tuple[Events, EventTruth]], count: int) -> list[Image.Image]:
     """Return the frames of a film."""
     (bare, _), (events, truth) = runs
     assert truth.depth is not None
@@ -126,7 +126,7 @@ def draw(runs: list[tuple[Events, EventTruth]]) -> list[Image.Image]:
     layers.append((events, scale.colours(truth.depth)))
     still, colours = background(scale), palette()
     frames = []
-    for number in range(FRAMES):
+    for number in range(count):
         begin = number * SPACING_S * 1e6 + 1000.0
         image = still.copy()
         for k, (each, colour) in enumerate(layers):
@@ -149,12 +149,14 @@ def draw(runs: list[tuple[Events, EventTruth]]) -> list[Image.Image]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("worlds", nargs="*", default=["room", "ball", "street"])
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--motion-px", type=float, default=0.5, help="largest motion between two maps [px]")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     for name in args.worlds:
-        first, *others = draw(simulate(name, args.device))
+        first, *others = draw(simulate(name, args.frames, args.motion_px, args.device), args.frames)
         path = args.out / f"world_{name}.gif"
         first.save(path, save_all=True, append_images=others, duration=1000 // FRAMES_PER_S, loop=0, optimize=False,
                    disposal=1)  # fmt: skip
