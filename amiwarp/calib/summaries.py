@@ -83,7 +83,7 @@ class PhotometricSummary:
     pairs: int
     """Number of pairs of events used."""
     off_over_on: float
-    """Ratio of the OFF threshold to the ON threshold: solved for if it was free, else counted."""
+    """Ratio of the OFF to the ON threshold: estimated if it was free, else taken from the numbers of events."""
     leak: float = 0.0
     """Drift of a pixel's reference level [thresholds/s]: solved for if it was free, else 0."""
     held: tuple[str, ...] = ()
@@ -99,7 +99,7 @@ class ModelCandidate:
     numbers: str
     """Number of the model's parameters, and which are given."""
     predicted_px: float
-    """Distance of the model's best fit from the exact model, over the events [px rms]."""
+    """Predicted error: rms distance [px] at the events between the exact model and this model fitted to it."""
     sharpness: float
     """Sharpness on held-out turns."""
     loss: float

@@ -219,7 +219,10 @@ def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) 
     if dtype.kind not in kinds or dtype.fields is not None:
         raise AmiwarpError(f"dataset '{name}' is {dtype}; see docs/reference/recording-format.md")
     if row_bytes(dataset) > CHUNK_BYTES or (dataset.chunks or dataset.shape)[1:] != dataset.shape[1:]:
-        raise AmiwarpError(f"dataset '{name}' has rows of over {CHUNK_BYTES >> 20} MiB, or chunks of partial rows")
+        raise AmiwarpError(
+            f"dataset '{name}' has rows of over {CHUNK_BYTES >> 20} MiB, or chunks of partial rows; "
+            "rewrite the file with chunks of whole rows"
+        )
     creation = dataset.id.get_create_plist()
     filters = [creation.get_filter(at) for at in range(creation.get_nfilters())]
     places: list[tuple[int, int]] | None = None

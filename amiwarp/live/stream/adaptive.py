@@ -188,7 +188,7 @@ class SpeedController:
         first = self._t_us is None
         if not start_us < end_us or (self._t_us is not None and start_us < self._t_us):
             given = f"window {start_us} .. {end_us} us after one that ended at {self._t_us} us"
-            raise AmiwarpError(f"adaptive speed: {given}; give windows in order of time")
+            raise AmiwarpError(f"adaptive speed: {given}; pass the windows of events in order of time")
         seconds = (end_us - (start_us if self._t_us is None else self._t_us)) * 1e-6
         self._t_us = end_us
         new = 1.0 if first else 1.0 - math.exp(-seconds / MEMORY_S)

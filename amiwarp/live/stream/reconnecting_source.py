@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 LATE_US = 10_000
 """Largest step backwards of the event time when a sender returns [us]: events within it are sorted."""
 CLOCK_US = 2_000_000
-"""Difference between the camera's and the host's duration of a gap above which a message warns the user [us]."""
+"""After a reconnection, the length of the gap by the camera's clock is compared with that by the host's clock. A larger
+difference than this warns the user [us]."""
 
 
 SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")

@@ -83,7 +83,7 @@ class Timed:
     """Times of a task, and the kept result of its first timed run."""
 
     task: Task
-    """Task."""
+    """The compensation or calibration that was timed."""
     times: tuple[float, ...]
     """Times of the repeats [s]."""
     result: Any
