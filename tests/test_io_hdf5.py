@@ -309,7 +309,8 @@ def alive(pid: int) -> bool:
 
 
 SCRIPT = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits an ignored SIGINT
 from amiwarp.io import open_recording, reading_process
 reading_process.CPU_SECONDS = 1
 source = open_recording(sys.argv[1]).events
