@@ -35,12 +35,13 @@ from amiwarp.kernels.launch import launch
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.device_camera import camera_params
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import save
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.scenery import MapRing, place_scene, step_us
-from amiwarp.simulation.simulator import Scene, Simulation
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.demo import earth
 from amiwarp.studies.machine_info import machine, versions
 

@@ -32,7 +32,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, EllipseModel
+from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate

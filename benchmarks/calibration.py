@@ -52,7 +52,9 @@ from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.3
@@ -274,7 +276,7 @@ def run_shares(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    from amiwarp.simulation.translator import open_pictures
+    from amiwarp.simulation.sequences import open_pictures
 
     for clip in sorted(p for p in args.folder.iterdir() if p.suffix in (".npy", ".mp4")):
         frames = open_pictures(clip, fps=240.0 if "240fps" in clip.name else 25.0 if clip.suffix == ".npy" else None)

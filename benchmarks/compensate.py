@@ -60,7 +60,8 @@ MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside
 
 def half_a_second() -> Events:
     from amiwarp.simulation.motion import EncoderModel
-    from amiwarp.simulation.simulator import Scene, Simulation
+    from amiwarp.simulation.scene import Scene
+    from amiwarp.simulation.simulator import Simulation
 
     scene = Scene.from_picture(blocks_picture())
     simulation = Simulation(scene, CAMERA, PRISM, REPEATED_US * 1e-6, encoder_model=EncoderModel.ideal())

@@ -18,7 +18,8 @@ from amiwarp.imaging.metrics import PictureQuality, model_error, picture_quality
 from amiwarp.imaging.tile_votes import TileVotes
 from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
 from amiwarp.optics.models import MODELS, Model
-from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.reconstruction.result import Picture
 from benchmarks import peers, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Peer

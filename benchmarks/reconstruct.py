@@ -45,12 +45,14 @@ from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction, reconstruct
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.scenery import place_scene
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 
 CAMERA = Camera.from_fov(346, 260, math.radians(60.0))
 PRISM, PHASE = Prism(math.radians(1.0)), 1.0

@@ -22,9 +22,10 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, apex_from_deflection
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import SensorModel, Simulation
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.prism import Prism, apex_from_deflection
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.demo import Demo, simulation
 from benchmarks import compensate
 from benchmarks.libraries import Missing

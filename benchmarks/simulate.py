@@ -22,12 +22,13 @@ import numpy as np
 import warp as wp
 
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import EncoderModel
+from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.scenery import step_us
-from amiwarp.simulation.simulator import Scene, Simulation
+from amiwarp.simulation.simulator import Simulation
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55
 

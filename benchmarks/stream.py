@@ -41,7 +41,9 @@ from amiwarp.live.stream.packets import Packet
 from amiwarp.live.stream.session import Session
 from amiwarp.live.stream.status import IMAGE_US, SessionStatus
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import CircleModel, ExactModel, Model
+from amiwarp.optics.circle_models import CircleModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import Model
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.machine_info import machine

@@ -31,7 +31,8 @@ from PIL import Image
 from amiwarp.calib import Calibration
 from amiwarp.cli.info import describe
 from amiwarp.cli.inputs import read_camera
-from amiwarp.events.events import Events, check_events
+from amiwarp.events.checks import check_events
+from amiwarp.events.events import Events
 from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
 from amiwarp.io.text import read_calib
@@ -39,7 +40,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.translator import open_pictures
+from amiwarp.simulation.sequences import open_pictures
 
 MEMORY_KIB = 3 << 19
 """Largest memory that a check may take, 1.5 GiB [KiB]."""

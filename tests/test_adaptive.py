@@ -11,10 +11,11 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.live.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, SpeedController, prism_path
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.simulator import Scene, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.stability.scenes import SceneKind, draw
 
 WINDOW_US = 33_000

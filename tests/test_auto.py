@@ -23,7 +23,9 @@ from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, CircleModel, ExactModel
+from amiwarp.optics.circle_models import CircleModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate

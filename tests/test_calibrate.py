@@ -25,10 +25,13 @@ from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.io import open_recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, predicted_error, wrap_angle
+from amiwarp.optics.displacement import wrap_angle
+from amiwarp.optics.model_error import predicted_error
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.simulator import SensorModel, simulate
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import simulate
 
 calibrate = functools.partial(calib.calibrate, stages=("sharpness",))
 

@@ -27,8 +27,10 @@ from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import RadialTangential
-from amiwarp.optics.models import MODELS, ExactModel, predicted_error
+from amiwarp.optics.model_error import predicted_error
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.plotting import figures
 from amiwarp.progress import silent

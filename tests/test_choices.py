@@ -30,11 +30,14 @@ from amiwarp.io.formats import Format, open_recording
 from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.queues import PacketQueue
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, CircleModel, ExactModel, RadialCircleModel
+from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism, apex_from_deflection, deflection_from_apex
 from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, tones
-from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.reconstruction.result import Picture
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.cloud_scene import Look
 

@@ -27,8 +27,10 @@ from amiwarp.io.chunks import CHUNK
 from amiwarp.kernels.encoder_angle import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.circle_models import CircleModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import Fisheye, RadialTangential
-from amiwarp.optics.models import MODELS, CircleModel, ExactModel
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide
 
 

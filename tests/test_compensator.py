@@ -16,8 +16,9 @@ from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import RadialTangential
-from amiwarp.optics.models import MODELS, ExactModel
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 
 WIDTH, HEIGHT = 64, 48

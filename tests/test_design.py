@@ -15,18 +15,21 @@ from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner
 
+from amiwarp.calib.selection.smaller_models import QUANTISATION_PX
 from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import RadialTangential
-from amiwarp.optics.models import ExactModel, apex_from_deflection
-from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.design import Design, Limits, Timing, design
-from amiwarp.studies.design.choice import ACROSS, LEAST_SWING, QUANTISATION_PX
+from amiwarp.studies.design.choice import ACROSS, LEAST_SWING
 from amiwarp.studies.design.drawing import chart
 from amiwarp.studies.design.event_volume import TILE, filled, measure, tiles
 from amiwarp.studies.design.orbit_size import QUARTER_SWING, orbit_of

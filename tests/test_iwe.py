@@ -13,7 +13,8 @@ from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import upload_events
 from amiwarp.imaging.warped_image import FIRST_BATCH, CanvasShape, Image, Votes, iwe
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, ExactModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 
 

@@ -17,7 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.json_files import MOST_BYTES, read_json
 from amiwarp.optics.camera import Camera
-from amiwarp.simulation.translator import open_pictures
+from amiwarp.simulation.sequences import open_pictures
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "calibration": Calibration.load,

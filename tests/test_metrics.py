@@ -8,7 +8,7 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import contrast, edge_blur, entropy, find_edges, model_error, picture_quality
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 
 

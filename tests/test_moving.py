@@ -30,7 +30,9 @@ from amiwarp.optics.prism import FlatSide
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation, simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 KNOWN = PhotometricSettings(sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))

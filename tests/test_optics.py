@@ -11,20 +11,14 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.displacement import wrap_angle
+from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import Fisheye, RadialTangential
-from amiwarp.optics.models import (
-    MODELS,
-    CircleModel,
-    EllipseModel,
-    ExactModel,
-    Model,
-    RadialCircleModel,
-    apex_from_deflection,
-    deflection_from_apex,
-    predicted_error,
-    wrap_angle,
-)
-from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.optics.model_error import predicted_error
+from amiwarp.optics.models import MODELS, Model
+from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, deflection_from_apex
 
 ATOL = 1e-3  # px, the documented limit; docs/explanation/optics.md has the measured values
 SIDES = list(FlatSide)

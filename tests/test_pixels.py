@@ -27,7 +27,9 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
-from amiwarp.simulation.simulator import Scene, SensorModel, simulate
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 SIZE = (200, 150)

@@ -14,16 +14,21 @@ from hypothesis import strategies as st
 
 from amiwarp.calib import Settings
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import TIME_LIMIT, check_events
 from amiwarp.events.encoder import LARGEST_ANGLE, Encoder
-from amiwarp.events.events import TIME_LIMIT, Events, MemoryEvents, check_events
+from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL, Camera
+from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import Fisheye, RadialTangential
-from amiwarp.optics.models import CircleModel, EllipseModel, ExactModel, RadialCircleModel
 from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 
 CAMERA = Camera.from_fov(4, 3, 1.0)
 TABLE = np.zeros((3, 4, 2), np.float32)

@@ -25,14 +25,17 @@ from amiwarp.io import open_recording, save_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, save_video, tones
 from amiwarp.reconstruction.known import dilated, without_small_holes
-from amiwarp.reconstruction.picture import Picture, Reconstruction, reconstruct
+from amiwarp.reconstruction.picture import Reconstruction, reconstruct
+from amiwarp.reconstruction.result import Picture
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 PRISM, PHASE = Prism(math.radians(1.2)), 2.0

@@ -18,7 +18,7 @@ from amiwarp.io import Format, open_recording, read_encoder_csv
 from amiwarp.io.regular_file import check_regular
 from amiwarp.io.text import read_calib
 from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.translator import open_pictures
+from amiwarp.simulation.sequences import open_pictures
 
 
 def fifo(path: Path) -> Path:

@@ -18,7 +18,9 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation, simulate
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)

@@ -37,7 +37,7 @@ from amiwarp.live.stream.session import Session
 from amiwarp.live.stream.source_opening import open_source
 from amiwarp.live.stream.status import SessionStatus
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))

@@ -18,13 +18,15 @@ from amiwarp.events.recording import Recording
 from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import launch as launching
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import RadialTangential
-from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
+from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.scenery import step_us
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, simulate
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation, simulate
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)

@@ -14,7 +14,9 @@ from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 

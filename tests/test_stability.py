@@ -12,7 +12,7 @@ from amiwarp.calib import calibrate
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
 from amiwarp.studies.stability.cells import Cell, Store, best_fit
 from amiwarp.studies.stability.run import conditions

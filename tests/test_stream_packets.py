@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.live.stream.event_sorter import EventSorter
@@ -20,7 +21,6 @@ from amiwarp.live.stream.packets import (
     HELLO,
     MAGIC,
     MOST,
-    Compensated,
     EncoderSamples,
     End,
     Hello,

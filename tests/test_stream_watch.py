@@ -34,7 +34,8 @@ from amiwarp.live.stream.sources import FileSource
 from amiwarp.live.stream.speed_control import WINDOW_US, SpeedKeeper
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import SensorModel, simulate
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import simulate
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
 BIAS_DEG = 3.5

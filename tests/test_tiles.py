@@ -14,8 +14,10 @@ from amiwarp.imaging.tile_votes import TileVotes
 from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.circle_models import CircleModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import RadialTangential
-from amiwarp.optics.models import CircleModel, ExactModel, Model
+from amiwarp.optics.models import Model
 from amiwarp.optics.prism import Prism
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")

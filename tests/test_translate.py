@@ -12,11 +12,12 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.simulator import SensorModel
-from amiwarp.simulation.translator import open_pictures, translate, translation
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.sequences import open_pictures
+from amiwarp.simulation.translator import translate, translation
 
 CLEAR = Prism(0.0, 1.5)  # no deflection
 WEDGE = Prism(math.radians(2.0), 1.55)

@@ -11,7 +11,7 @@ from amiwarp.events.events import Events
 from amiwarp.imaging.device_events import LARGEST_WEIGHT, TURNS, upload_events
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 
 

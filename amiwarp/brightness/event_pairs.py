@@ -16,7 +16,7 @@ from amiwarp.kernels import pairs as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
 from amiwarp.kernels.photometric import BLOCK, HELD, Pairs
-from amiwarp.optics.models import model_camera
+from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -29,7 +29,7 @@ from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
 from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.device_camera import pinhole_params
-from amiwarp.optics.models import model_camera
+from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,8 +15,9 @@ import numpy as np
 
 from amiwarp.calib.nlopt_solver import best_of
 from amiwarp.calib.preparation import prepare
-from amiwarp.calib.result import Calibration, StageSummary
+from amiwarp.calib.result import Calibration
 from amiwarp.calib.sharpness.search import STAGES, Settings
+from amiwarp.calib.summaries import StageSummary
 from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness
 

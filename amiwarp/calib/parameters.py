@@ -16,7 +16,10 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.models import MODELS, CircleModel, EllipseModel, ExactModel, RadialCircleModel
+from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.validation import instance, one_of, real, shown, vector
 

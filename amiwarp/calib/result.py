@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib.parameters import MOTION, UNITS, build_model, rotation_from_values, size_name
-from amiwarp.calib.summaries import FreedParameter, ModelCandidate, ModelChoice, PhotometricSummary, StageSummary
+from amiwarp.calib.summaries import ModelChoice, PhotometricSummary, StageSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.imaging.choices import Sharpness
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.optics.models import Model
-
-__all__ = ["Calibration", "FreedParameter", "ModelCandidate", "ModelChoice", "PhotometricSummary", "StageSummary",
-           "camera_from_json", "camera_to_json", "constant_speed", "cost_surface"]  # fmt: skip
 
 FORMAT = "amiwarp-calibration"
 VERSION = 1

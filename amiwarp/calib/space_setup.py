@@ -18,7 +18,7 @@ from amiwarp.calib.parameters import (
     size_name,
 )
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import deflection_from_apex
+from amiwarp.optics.prism import deflection_from_apex
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

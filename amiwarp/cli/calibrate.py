@@ -22,7 +22,7 @@ from amiwarp.io.atomic_output import check_output
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
     from amiwarp.calib.photometric.stage import PhotometricSettings
-    from amiwarp.calib.result import ModelChoice
+    from amiwarp.calib.summaries import ModelChoice
     from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"

@@ -141,7 +141,8 @@ def run(
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.simulation.simulator import Scene, SensorModel
+    from amiwarp.simulation.scene import Scene
+    from amiwarp.simulation.sensor import SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import design
     from amiwarp.studies.design.drawing import draw

@@ -20,7 +20,8 @@ from amiwarp.progress import Progress
 from amiwarp.reconstruction.choices import CONTRAST, Fill, Tone
 
 if TYPE_CHECKING:
-    from amiwarp.reconstruction.picture import Picture, Reconstruction
+    from amiwarp.reconstruction.picture import Reconstruction
+    from amiwarp.reconstruction.result import Picture
 
 EXAMPLE = "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1"
 

@@ -16,7 +16,7 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import SensorModel
+    from amiwarp.simulation.sensor import SensorModel
 
 _CAMERA, _PRISM, _SENSOR, _ENCODER = "Camera", "Prism", "Sensor", "Encoder"
 
@@ -168,7 +168,7 @@ class SensorOptions:
 
     def build(self) -> SensorModel:
         """Return the sensor model."""
-        from amiwarp.simulation.simulator import SensorModel
+        from amiwarp.simulation.sensor import SensorModel
 
         if self.ideal and self.sensor is not None:
             raise AmiwarpError("--ideal and --sensor both describe the sensor; give one of them")

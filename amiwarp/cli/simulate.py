@@ -20,7 +20,8 @@ from amiwarp.io import open_recording
 from amiwarp.simulation.motion import CameraMotion
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import Scene, Simulation
+    from amiwarp.simulation.scene import Scene
+    from amiwarp.simulation.simulator import Simulation
     from amiwarp.simulation.worlds.world_scene import WorldScene
 
 EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
@@ -107,7 +108,7 @@ def _scene(
     picture: Path | None, world: WorldOptions, scene: SceneOptions, duration: float, seed: int
 ) -> Scene | WorldScene:
     """Return the picture or the world."""
-    from amiwarp.simulation.simulator import Scene
+    from amiwarp.simulation.scene import Scene
 
     if picture is not None:
         return Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px)

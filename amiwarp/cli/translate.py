@@ -40,7 +40,8 @@ def run(
 
     The camera has the size of the pictures unless --size or --camera gives another one.
     """
-    from amiwarp.simulation.translator import open_pictures, translation
+    from amiwarp.simulation.sequences import open_pictures
+    from amiwarp.simulation.translator import translation
 
     device = choose_device(common.device)
     pictures = open_pictures(source, fps=fps)

@@ -16,8 +16,9 @@ import warp as wp
 
 from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import encoder_params
-from amiwarp.events.events import Events, check_sensor
+from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native_reader import NativeEvents

@@ -12,7 +12,8 @@ import warp as wp
 
 from amiwarp.compensation.batches import BatchInFlight, BatchPipeline, StagedBatch
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, check_sensor
+from amiwarp.events.checks import check_sensor
+from amiwarp.events.events import Events
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import TIME_LIMIT, as_times
+from amiwarp.events.checks import TIME_LIMIT, as_times
 from amiwarp.events.unwrapping import unwrap_angles, unwrap_counts
 from amiwarp.validation import array, instance, real, whole
 

@@ -15,14 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import TIME_LIMIT, as_coordinate, as_polarity, as_times, check_events, check_sensor
+from amiwarp.events.checks import as_coordinate, as_polarity, as_times, check_events
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import instance, whole
-
-__all__ = [
-    "DEFAULT_BLOCK", "TIME_LIMIT", "EventSource", "Events", "MemoryEvents", "as_times", "check_events", "check_sensor",
-    "regroup",
-]  # fmt: skip
 
 DEFAULT_BLOCK = 1 << 20
 """Default number of events per block."""

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import azimuths, encoder_params
-from amiwarp.events.events import check_sensor
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.votes import (
     BLOCK,

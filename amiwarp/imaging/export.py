@@ -202,6 +202,3 @@ class IweFiles:
         for new in self._unfinished:
             new.commit()
             self.written.append(new.path)
-
-
-__all__ = ["IweFiles", "Layers", "save_png", "to_picture", "tone"]

@@ -14,7 +14,8 @@ from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import sharpness
 from amiwarp.imaging.warped_image import iwe
-from amiwarp.optics.models import ExactModel, ModelError, predicted_error
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.model_error import ModelError, predicted_error
 from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:

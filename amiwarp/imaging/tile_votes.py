@@ -13,8 +13,10 @@ from amiwarp.kernels.camera import CameraRotationParams
 from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams
 from amiwarp.kernels.tiles import AT_ONCE, THREADS, read_tiles, vote_tiles
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.device_camera import pinhole_params
-from amiwarp.optics.models import CircleModel, ExactModel, RadialCircleModel, model_camera
+from amiwarp.optics.displacement import model_camera
+from amiwarp.optics.exact_model import ExactModel
 
 if TYPE_CHECKING:
     from amiwarp.imaging.device_events import DeviceEvents

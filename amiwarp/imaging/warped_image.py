@@ -29,7 +29,7 @@ from amiwarp.kernels.votes import (
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.device_camera import pinhole_params
-from amiwarp.optics.models import model_camera
+from amiwarp.optics.displacement import model_camera
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:

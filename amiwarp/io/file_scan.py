@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, regroup
+from amiwarp.events.checks import as_times
+from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
 

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import as_times, check_events
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, as_times, check_events
+from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.atomic_output import allocate, check_output, put_in_place
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order

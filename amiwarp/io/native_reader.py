@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import as_times, check_events
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import DEFAULT_BLOCK, Events, as_times, check_events, regroup
+from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.camera_attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order

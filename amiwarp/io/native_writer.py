@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import check_events
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, check_events
+from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io.atomic_output import NewFile

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import as_times
+from amiwarp.events.checks import as_times
 from amiwarp.events.recording import Truth
 from amiwarp.events.truth import MAPS, EventValues, FrameTruth, Poses, WorldLabels, rotation_of
 from amiwarp.io.camera_attributes import attribute

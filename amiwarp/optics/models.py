@@ -6,17 +6,8 @@ The formulas are derived in ``docs/explanation/optics.md``.
 from __future__ import annotations
 
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.displacement import model_camera, wrap_angle
 from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel, axis_rotation
-from amiwarp.optics.model_error import ModelError, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, deflection_from_apex
-
-__all__ = [
-    "MODELS", "CircleModel", "EllipseModel", "ExactModel", "FlatSide", "Model", "ModelError", "Prism",
-    "RadialCircleModel", "apex_from_deflection", "axis_rotation", "deflection_from_apex", "model_camera",
-    "predicted_error", "wrap_angle",
-]  # fmt: skip
+from amiwarp.optics.exact_model import ExactModel
 
 Model = CircleModel | RadialCircleModel | EllipseModel | ExactModel
 MODELS: dict[str, type[Model]] = {

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events
     from amiwarp.events.recording import Recording
     from amiwarp.imaging.metrics import PictureQuality
-    from amiwarp.reconstruction.picture import Picture
+    from amiwarp.reconstruction.result import Picture
 
 EVENTS = 2_000_000
 """Largest number of events in an image of a figure; more are thinned evenly."""

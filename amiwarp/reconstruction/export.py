@@ -18,7 +18,7 @@ from amiwarp.validation import choice
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.reconstruction.picture import Picture
+    from amiwarp.reconstruction.result import Picture
 
 DARK, BRIGHT = 0.5, 99.5
 """Percentiles of the known pixels that are shown black and white."""
@@ -156,6 +156,3 @@ def padded_to_even(value: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Repeat the last row and column where needed for an even size, which the codec requires."""
     rows, columns = value.shape[:2]
     return np.pad(value, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (value.ndim - 2)), mode="edge")
-
-
-__all__ = ["Tone", "check_path", "limits", "save_film", "save_mask", "save_picture", "save_video", "tones"]

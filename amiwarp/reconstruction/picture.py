@@ -390,6 +390,3 @@ def reconstruct(
         recording, calibration, model=model, encoder=encoder, camera_rotation=camera_rotation, fill=fill, device=device
     )
     return work.window(*work.span(start_us, length_us, turns))
-
-
-__all__ = ["Picture", "Reconstruction", "reconstruct"]

@@ -17,7 +17,8 @@ from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import event_keys, photoreceptor, prism_view, readout, world_events
 from amiwarp.kernels import launch as launching
 from amiwarp.optics.device_camera import camera_params
-from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
+from amiwarp.optics.displacement import wrap_angle
+from amiwarp.optics.exact_model import ExactModel, axis_rotation
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.readout import Readout
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us

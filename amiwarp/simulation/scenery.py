@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.device_camera import camera_params
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.simulation.pictures import Placement, log_map, place_picture
 from amiwarp.simulation.scene import Scene
 

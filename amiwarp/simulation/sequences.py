@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import TIME_LIMIT
+from amiwarp.events.checks import TIME_LIMIT
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.io.regular_file import check_regular
 from amiwarp.simulation.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear

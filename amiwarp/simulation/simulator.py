@@ -21,7 +21,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.scene import Frames, Scene, Still
+from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.worlds.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.worlds.world_scene import WorldScene
@@ -384,6 +384,3 @@ def simulate(
         seed=seed,
         device=device,
     ).run(truth_hz=truth_hz, progress=progress)
-
-
-__all__ = ["Frames", "Scene", "SensorModel", "Simulation", "Still", "simulate"]

@@ -12,7 +12,7 @@ from amiwarp.progress import Progress
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.sequences import PictureFolder, Pictures, PictureStack, VideoFile, open_pictures
+from amiwarp.simulation.sequences import Pictures, open_pictures
 from amiwarp.simulation.simulator import Simulation
 
 if TYPE_CHECKING:
@@ -104,6 +104,3 @@ def translate(
     (32, 24)
     """
     return translation(source, prism, **settings).run(progress=progress)
-
-
-__all__ = ["PictureFolder", "PictureStack", "Pictures", "VideoFile", "open_pictures", "translate", "translation"]

@@ -26,15 +26,18 @@ from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import Reconstructed, draw_demo
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.export import save_picture
-from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.reconstruction.result import Picture
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.recording import Recording
-    from amiwarp.optics.models import ExactModel
+    from amiwarp.optics.exact_model import ExactModel
 
 APEX, PHASE = math.radians(1.0), math.radians(126.0)
 """True apex angle and phase [rad]."""

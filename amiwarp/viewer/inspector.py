@@ -19,7 +19,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import DeviceEvents, upload_events
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import apex_from_deflection
+from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.imager import LoadedWindow, WindowImager
 from amiwarp.viewer.timeline import Span, event_rate, read_span
 

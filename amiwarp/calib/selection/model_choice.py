@@ -25,7 +25,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
-from amiwarp.optics.models import MODELS, predicted_error
+from amiwarp.optics.model_error import predicted_error
+from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, Sear
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION, UNITS, check_names
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.progress_share import stage_share
-from amiwarp.calib.result import StageSummary
 from amiwarp.calib.sharpness.curvature import finite_differences
 from amiwarp.calib.sharpness.objective import Objective
+from amiwarp.calib.summaries import StageSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.models import MODELS

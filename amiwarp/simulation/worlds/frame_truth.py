@@ -15,7 +15,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import FrameTruth
 from amiwarp.kernels import prism_view, world_events
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.models import ExactModel, wrap_angle
+from amiwarp.optics.displacement import wrap_angle
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import SMALLEST_LAUNCH, SurfaceView, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.sight import WorldSight

@@ -17,7 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.device_events import TURNS
 from amiwarp.io.atomic_output import check_output, make_folder, write_text
 from amiwarp.progress import Progress, part, silent
-from amiwarp.simulation.simulator import SensorModel
+from amiwarp.simulation.sensor import SensorModel
 from amiwarp.studies.chart import calibration, compensation
 from amiwarp.studies.chart.drawing import draw
 from amiwarp.studies.chart.rows import Row, beaten_by, fastest_within, fronts, most_accurate_within

@@ -25,7 +25,8 @@ from amiwarp.imaging.device_events import TURNS, upload_events
 from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.atomic_output import scratch_folder
-from amiwarp.optics.models import MODELS, Model, wrap_angle
+from amiwarp.optics.displacement import wrap_angle
+from amiwarp.optics.models import MODELS, Model
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import Row, Task, measure
 from amiwarp.studies.chart.truth import KnownRecording, exact_image, exact_places, raw_places, rms

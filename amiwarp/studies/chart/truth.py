@@ -13,7 +13,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
-from amiwarp.optics.models import axis_rotation
+from amiwarp.optics.exact_model import axis_rotation
 from amiwarp.optics.prism import FlatSide
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events
     from amiwarp.optics.camera import Camera
-    from amiwarp.optics.models import ExactModel
+    from amiwarp.optics.exact_model import ExactModel
 
 MOST_EVENTS = 20_000_000
 """Largest number of events, taken from the beginning of the recording, because they are held in memory."""

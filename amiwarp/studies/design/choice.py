@@ -13,7 +13,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.design.event_volume import Volume, filled, measure
 from amiwarp.studies.design.orbit_size import Orbit, orbit_of
 

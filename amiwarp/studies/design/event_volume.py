@@ -16,8 +16,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.scenery import place_scene, seen_bearings
-from amiwarp.simulation.simulator import Scene, Simulation
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.design.orbit_size import Orbit, orbit_radii
 
 if TYPE_CHECKING:

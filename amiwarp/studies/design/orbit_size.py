@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS, CircleModel, EllipseModel, ExactModel, RadialCircleModel, predicted_error
+from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.model_error import predicted_error
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:

@@ -26,7 +26,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error
 from amiwarp.io.atomic_output import write_text
-from amiwarp.optics.models import ExactModel, predicted_error
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.model_error import predicted_error
 from amiwarp.studies.machine_info import machine
 from amiwarp.studies.stability.conditions import Condition, SimulatedSample, make
 

@@ -21,7 +21,9 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.simulator import Scene, SensorModel, Simulation, Still
+from amiwarp.simulation.scene import Scene, Still
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.stability.scenes import Lamp, PassingObject, SceneKind, draw
 
 TEXELS = 2.0
