@@ -10,7 +10,6 @@ counted.
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import math
 import time
@@ -20,65 +19,93 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from amiwarp.events.events import Events
+from amiwarp.events.truth import EventTruth
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.engine import DeviceBlock, Engine
+from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.named import named_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))
+WIDE = math.radians(72.0)
+"""Field of view of the picture at infinity [rad]: that of the camera, and of the prism's deflection around it."""
 SOME = 101
 """One event in this many is checked."""
 LATENCY_S = 1e-4
 """Mean latency of the simulated sensor [s]; single latencies scatter by 30 us."""
 
 
-def reprojection(scene: WorldScene, block: DeviceBlock) -> np.ndarray:
+def reprojection(scene: WorldScene, events: Events, truth: EventTruth) -> np.ndarray:
     """Return distances [px] of some events."""
-    assert block.seen is not None
-    places = block.seen.place.numpy()[::SOME].astype(np.float64)
-    bare = block.arrays.points.numpy()[::SOME]
-    t = block.arrays.t.numpy()[::SOME] * 1e-6 - LATENCY_S
+    assert truth.place is not None
+    assert truth.points is not None
+    places = truth.place[::SOME].astype(np.float64)
+    t = events.t[::SOME] * 1e-6 - LATENCY_S
     known = np.isfinite(places[:, 0])
     rotation, position = scene.trajectory.poses(t[known])
     local = np.einsum("nij,ni->nj", rotation, places[known] - position)
     x = CAMERA.fx * local[:, 0] / local[:, 2] + CAMERA.cx
     y = CAMERA.fy * local[:, 1] / local[:, 2] + CAMERA.cy
-    return np.asarray(np.hypot(x - bare[known, 0], y - bare[known, 1]))
+    return np.asarray(np.hypot(x - truth.points[::SOME][known, 0], y - truth.points[::SOME][known, 1]))
+
+
+def timed(scene: Any, seconds: float, device: str, errors: list[np.ndarray] | None) -> tuple[float, float, int, Engine]:
+    """Simulate; return wall and processor time without the first map [s], the events, and the engine.
+
+    With ``errors``, the ground truth of each event is found too, and its reprojection errors are appended untimed.
+    """
+    engine = Engine(Simulation(scene, CAMERA, PRISM, seconds, device=device))
+    if engine._maps is not None:
+        engine._maps.cover(0, 0)
+    wp.synchronize_device(device)
+    wall, processor, count = 0.0, 0.0, 0
+    began, began_processor = time.perf_counter(), time.process_time()
+    for block in engine.run():
+        count += block.count
+        truth = None if errors is None else block.truth()
+        wp.synchronize_device(device)
+        wall, processor = wall + time.perf_counter() - began, processor + time.process_time() - began_processor
+        if truth is not None and errors is not None and isinstance(scene, WorldScene):
+            errors.append(reprojection(scene, block.events(), truth))
+        began, began_processor = time.perf_counter(), time.process_time()
+    return wall, processor, count, engine
 
 
 def measure(name: str, scene: Any, seconds: float, device: str) -> dict[str, Any]:
-    """Simulate twice; return the second run's row."""
-    for duration in (0.01, seconds):
-        engine = Engine(Simulation(scene, CAMERA, PRISM, duration, device=device))
-        began, events, blocks = time.perf_counter(), 0, []
-        for block in engine.run():
-            events += block.count
-            blocks.append(block)
-        wp.synchronize_device(device)
-        took = time.perf_counter() - began
-    error = None
-    if isinstance(scene, WorldScene):
-        error = float(np.quantile(np.concatenate([reprojection(scene, block) for block in blocks]), 0.95))
-    return {"scene": name, "device": device, "simulated_s": seconds, "events": events, "s_per_s": took / seconds,
-            "mev_per_s": events / took * 1e-6, "maps": getattr(engine._maps, "rendered", None),
-            "error_px_95": error}  # fmt: skip
+    """Simulate without and with the ground truth of events; return the row."""
+    timed(scene, 0.01, device, [])  # compiles
+    wall, processor, events, _ = timed(scene, seconds, device, None)
+    errors: list[np.ndarray] = []
+    wall_truth, processor_truth, _, engine = timed(scene, seconds, device, errors)
+    return {"scene": name, "device": device, "simulated_s": seconds, "events": events, "s_per_s": wall / seconds,
+            "cpu_s_per_s": processor / seconds, "mev_per_s": events / wall * 1e-6,
+            "s_per_s_with_truth": wall_truth / seconds, "cpu_s_per_s_with_truth": processor_truth / seconds,
+            "maps": getattr(engine._maps, "rendered", None),
+            "error_px_95": float(np.quantile(np.concatenate(errors), 0.95)) if errors else None}  # fmt: skip
+
+
+def as_picture(name: str) -> Scene:
+    """Return the first view of a world as a picture at infinity, of twice the resolution."""
+    world, path = named_world(name, "still")
+    wide = Camera.from_fov(1600, 1200, WIDE)
+    truth = TruthRenderer(Simulation(WorldScene(world, path, samples=4, blur=0.5), wide, Prism(0.0), 0.01)).at(0)
+    return Scene.from_picture(truth.intensity, fov=WIDE)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--quick", action="store_true", help="a tenth of the simulated time")
-    parser.add_argument("--picture", type=Path, help="for the picture at infinity; by default PyVista's map")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     on_cpu = wp.get_device(args.device).is_cpu
     seconds = (0.1 if on_cpu else 1.0) * (0.1 if args.quick else 1.0)
-    picture = args.picture or Path(importlib.import_module("pyvista.examples").mapfile)
-    rows = [measure("picture at infinity", Scene.from_picture(picture), seconds, args.device)]
+    rows = [measure("room, still, as a picture at infinity", as_picture("room"), seconds, args.device)]
     print(json.dumps(rows[0]), flush=True)
     cases = [("room", "still", "maps", None), ("desk", "handheld", "maps", None), ("room", "handheld", "maps", None)]
     if not on_cpu:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import world_view
+from amiwarp.kernels import world_maps
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.worlds.device_world import DeviceWorld
@@ -108,12 +108,14 @@ def rendered(world: World, trajectory: Trajectory, width: int = 320, height: int
     """Log intensity that a camera sees at the start."""
     device = DeviceWorld(world, "cpu")
     focal = width / 2.0 / math.tan(FOV / 2.0)
-    frame = world_view.MapFrame()
+    frame = world_maps.MapFrame()
     frame.width, frame.height, frame.pitch_x, frame.pitch_y, frame.cone = width, height, focal, focal, 1.0 / focal
     frame.left, frame.top = -width / 2.0 / focal, -height / 2.0 / focal
     out = wp.empty(width * height, dtype=wp.vec4, device="cpu")
+    faces = wp.empty(width * height, dtype=int, device="cpu")
     rotation, position = trajectory.poses([0.0])
-    MapRenderer(device, frame, blur=0.5, dark=DARK, samples=4).render(device_pose(rotation[0], position[0]), 0, out, 0)
+    pose = device_pose(rotation[0], position[0])
+    MapRenderer(device, frame, blur=0.5, dark=DARK, samples=4).render(pose, out, faces, 0)
     return np.asarray(out.numpy()[:, 0].reshape(height, width))
 
 

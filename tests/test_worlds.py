@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -18,6 +19,7 @@ from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.frame_truth import TruthRenderer
+from amiwarp.simulation.worlds.map_ring import WorldMapRing
 from amiwarp.simulation.worlds.renderer import pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Mesh, Sky, Sun, World
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
@@ -200,13 +202,15 @@ def test_flow_through_the_prism_is_what_finite_differences_say() -> None:
     assert np.linalg.norm(flow, axis=1).mean() > 30.0
 
 
-def counts(simulation: Simulation) -> tuple[NDArray[np.float64], Engine, list[Any]]:
-    """Events of each pixel, and the blocks."""
-    engine = Engine(simulation)
+def counts(
+    simulation: Simulation, chunk_us: int | None = None
+) -> tuple[NDArray[np.float64], Engine, list[tuple[Any, Any]]]:
+    """Events of each pixel, the engine, and the events and ground truth of each block."""
+    engine = Engine(simulation, chunk_us)
     image = np.zeros((simulation.camera.height, simulation.camera.width))
-    blocks = list(engine.run())
-    for block in blocks:
-        np.add.at(image, (block.arrays.y.numpy(), block.arrays.x.numpy()), 1.0)
+    blocks = [(block.events(), block.truth()) for block in engine.run()]
+    for events, _ in blocks:
+        np.add.at(image, (events.y, events.x), 1.0)
     return image, engine, blocks
 
 
@@ -257,19 +261,62 @@ def test_a_plane_far_away_is_the_picture_at_infinity() -> None:
 def test_points_of_events_project_to_their_places_without_the_prism(seeing: str) -> None:
     world, path = random_world(2), moving_camera()
     simulation = Simulation(WorldScene(world, path, seeing=seeing), CAMERA, Prism(math.radians(1.0)), 0.1)
-    _, _, blocks = counts(simulation)
+    _, _, blocks = counts(simulation, chunk_us=40_000)
+    assert len(blocks) == 3
     far = []
-    for block in blocks:
-        places = block.truth().place.astype(np.float64)
-        bare = block.arrays.points.numpy()
-        some = np.flatnonzero(np.isfinite(places[:, 0]))[::17]
-        for k in some:
+    for events, truth in blocks:
+        places = truth.place.astype(np.float64)
+        for k in np.flatnonzero(np.isfinite(places[:, 0]))[::17]:
             # at the time of its crossing, which the stamp follows by the latency
-            t = float(block.arrays.t.numpy()[k]) * 1e-6 - 1e-4
-            far.append(np.linalg.norm(project(places[k : k + 1], t, path)[0] - bare[k]))
-        assert set(np.unique(block.truth().instance)) <= set(range(len(world.instances) + 1))
+            t = float(events.t[k]) * 1e-6 - 1e-4
+            far.append(np.linalg.norm(project(places[k : k + 1], t, path)[0] - truth.points[k]))
+        assert set(np.unique(truth.instance)) <= set(range(len(world.instances) + 1))
     assert len(far) > 60
     assert np.quantile(far, 0.95) < 0.05  # [px]; the latency of single events differs from its mean
+
+
+def test_maps_know_the_surfaces_that_rays_find() -> None:
+    """The maps' faces shorten the search for the surface of an event; the answer is that of the whole mesh."""
+    world, path = random_world(2), moving_camera()
+    engine = Engine(Simulation(WorldScene(world, path, seeing="maps"), CAMERA, Prism(math.radians(1.0)), 0.1))
+    block = next(engine.run())
+    near, no_faces = block.truth(), wp.empty(0, dtype=int, device="cpu")
+    assert block.look is not None
+    anywhere = block.look.func(*block.look.args[:-1], no_faces)  # type: ignore[attr-defined]
+    assert block.count > 1000
+    assert (near.instance == anywhere.instance.numpy()).mean() > 0.999
+    close = np.isclose(near.depth, anywhere.depth.numpy(), rtol=1e-4, atol=1e-3)  # infinities are equal
+    assert close.mean() > 0.99
+
+
+def fast_ball(speed: float) -> World:
+    """A box that flies across a world at rest [m/s], in the shadow of a lamp."""
+    flight = Trajectory([0.0, 1.0], [np.zeros(3), [speed, 0.0, 0.0]], [Rotation.identity().as_quat()] * 2)
+    ball = Body("ball", box((-1.0, -2.0, 0.3), (0.4, 0.4, 0.4)), Material(0.9, smooth_texture(50)), flight)
+    world = random_world(5, moving=0)
+    return World("ball", (*world.bodies, ball), lamps=(Lamp((0.0, -4.0, 3.0), 9.0, shadows=True),))
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_maps_between_whole_maps_are_whole_maps(moves: bool) -> None:
+    path = moving_camera() if moves else Trajectory.still((0.0, -6.0, 0.5), look_at=(0.0, 0.0, 0.0))
+    engine = Engine(Simulation(WorldScene(fast_ball(10.0), path, blur=1.0), CAMERA, Prism(0.01), 0.1))
+    ring = engine._maps
+    assert isinstance(ring, WorldMapRing)
+    times, slots = ring.cover(0, 60_000)
+    assert len(times) > 4 * ring.rendered  # far fewer whole maps than maps
+    texels, shape = ring.placement.width * ring.placement.height, (ring.placement.height, ring.placement.width)
+    kept = ring.maps.numpy()[:, 0].copy()
+    for time, slot in list(zip(times, slots, strict=True))[1:-1:4]:
+        whole = ring._render(time * 1e-6, ring._held[0].orientation)
+        expected = ring.maps.numpy()[whole.slot * texels :][:texels, 0].reshape(shape)
+        given = kept[slot * texels :][:texels].reshape(shape)
+        if not moves:
+            np.testing.assert_allclose(given, expected, rtol=0.0, atol=1e-5)
+        # a camera that moves gives parallax of up to 0.5 px between whole maps, which edges feel
+        assert np.sqrt(np.mean((given - expected) ** 2)) < 0.03
+        before = kept[slots[0] * texels :][:texels].reshape(shape)
+        assert np.sqrt(np.mean((before - expected) ** 2)) > 0.02 or time < 5000.0  # the ball has moved on
 
 
 def test_shadow_and_sky() -> None:
@@ -294,7 +341,7 @@ def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
     _, engine, blocks = counts(
         Simulation(WorldScene(world, path, seeing="maps"), CAMERA, Prism(0.0), 0.1, sensor=SensorModel.ideal())
     )
-    on = np.concatenate([block.arrays.t.numpy()[block.arrays.p.numpy() == 1] for block in blocks])
+    on = np.concatenate([events.t[events.p == 1] for events, _ in blocks])
     phase = np.exp(2j * np.pi * 100.0 * on * 1e-6).mean()
     assert abs(phase) > 0.6  # ON events come while the light rises
     assert engine._step <= 1e6 / 1600

@@ -1,17 +1,18 @@
-"""Device side of worlds: rays that meet meshes, and the light that comes back along them."""
+"""Rays in a world: the nearest surface along a ray, and the luminance that the ray sees."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(1.0e6)  # [m]
-LIFT = wp.constant(1.0e-4)  # a shadow ray starts so far above its surface, relative to the distance, plus one tenth [m]
+LIFT = wp.constant(1.0e-4)  # height above its surface at which a shadow ray starts, as a share of the distance + 0.1 m
+EDGE = wp.constant(1.0e-5)  # width of a face's border that still belongs to the face, in barycentric coordinates
 PI = wp.constant(3.14159265358979)
 
 
 @wp.struct
 class Pose:
-    """From a body's or camera's frame to the world's."""
+    """Pose of a body or a camera: maps coordinates in its own frame to the world's frame."""
 
     rotation: wp.mat33
     position: wp.vec3
@@ -19,12 +20,13 @@ class Pose:
 
 @wp.struct
 class Mover:
-    """A body that moves: its mesh, in its own frame."""
+    """Mesh of a moving body, in the body's frame."""
 
     mesh: wp.uint64
-    first_face: int  # of its faces among those of the world
-    centre: wp.vec3  # of a sphere around it
-    radius: float
+    first_face: int  # number of its first face among the faces of the world
+    radius: float  # radius of its bounding sphere [m]
+    lower: wp.vec3  # corners of its bounding box, in the body's frame [m]
+    upper: wp.vec3
 
 
 @wp.struct
@@ -42,53 +44,69 @@ class Surface:
 
 @wp.struct
 class Lamp:
+    """Position of a lamp, and whether bodies cast shadows in its light."""
+
     position: wp.vec3
     shadows: int
 
 
 @wp.struct
 class World:
-    still: wp.uint64  # mesh of all bodies that rest; 0 for none
+    """Geometry, materials and light of a world. The faces of bodies at rest come first, then those of each mover."""
+
+    still: wp.uint64  # mesh of all bodies at rest; 0 for none
     movers: wp.array(dtype=Mover)
-    poses: wp.array2d(dtype=Pose)  # instant, mover
-    body: wp.array(dtype=int)  # of each face
-    uv: wp.array(dtype=wp.vec2)  # of each face's three corners
-    shade: wp.array(dtype=float)  # factor of the reflectance at each face's three corners
+    first_mover: int  # number of the first moving body among all bodies
+    poses: wp.array2d(dtype=Pose)  # pose of each mover at each instant; axes: instant, mover
+    centres: wp.array2d(dtype=wp.vec3)  # centre of each mover's bounding sphere in the world's frame; instant, mover
+    body: wp.array(dtype=int)  # number of the body of each face
+    corners: wp.array(dtype=wp.vec3)  # the three corners of each face, in the frame of its mesh [m]
+    uv: wp.array(dtype=wp.vec2)  # texture coordinates at the three corners of each face
+    shade: wp.array(dtype=float)  # factor of the reflectance at the three corners of each face
     density: wp.array(dtype=float)  # texels per metre on each face
     surfaces: wp.array(dtype=Surface)
     texels: wp.array(dtype=float)
     ambient: float
-    sun: wp.vec3  # towards it
+    sun: wp.vec3  # unit vector towards the sun
     sun_light: float
     sun_shadows: int
     lamps: wp.array(dtype=Lamp)
-    lamp_light: wp.array2d(dtype=float)  # instant, lamp
+    lamp_light: wp.array2d(dtype=float)  # intensity of each lamp at each instant; axes: instant, lamp
     sky: float
-    panorama: int  # first texel; -1 for none
+    panorama: int  # first texel of the panorama; -1 for none
     panorama_width: int
     panorama_height: int
 
 
 @wp.struct
 class Hit:
-    """What a ray meets first."""
+    """Nearest surface along a ray."""
 
     distance: float  # [m]; FAR for the sky
     face: int  # -1 for the sky
     u: float  # barycentric weights of the face's first two corners
     v: float
-    mover: int  # -1 for a body that rests
-    normal: wp.vec3  # in the world's frame, towards the ray's origin
+    mover: int  # number of the moving body; -1 for a body at rest
+    normal: wp.vec3  # unit normal in the world's frame, on the side of the ray's origin
+
+
+@wp.func
+def body_of(world: World, face: int) -> int:
+    """Return the body of a face; -1 for the sky."""
+    if face < 0:
+        return -1
+    return world.body[face]
 
 
 @wp.func
 def facing(normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """Return the normal or its opposite, whichever points against the direction."""
     return wp.where(wp.dot(normal, direction) > 0.0, -normal, normal)
 
 
 @wp.func
 def meets_sphere(origin: wp.vec3, direction: wp.vec3, centre: wp.vec3, radius: float) -> bool:
-    """Whether a ray with a direction of length one comes within ``radius`` of ``centre``."""
+    """Return whether a ray along a unit vector passes through a sphere."""
     to = centre - origin
     along = wp.dot(to, direction)
     aside = wp.dot(to, to) - along * along
@@ -97,7 +115,7 @@ def meets_sphere(origin: wp.vec3, direction: wp.vec3, centre: wp.vec3, radius: f
 
 @wp.func
 def nearer(hit: Hit, q: wp.MeshQueryRay, first_face: int, mover: int, direction: wp.vec3) -> Hit:
-    """The hit, or that of a query which met something nearer; ``direction`` is in the frame of the mesh."""
+    """Return the surface that a query found, or ``hit`` if it found none; ``direction`` is in the mesh's frame."""
     if q.result:
         hit.distance = q.t
         hit.face = first_face + q.face
@@ -110,7 +128,7 @@ def nearer(hit: Hit, q: wp.MeshQueryRay, first_face: int, mover: int, direction:
 
 @wp.func
 def cast(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: float) -> Hit:
-    """Nearest surface within ``far`` [m] along a direction of length one."""
+    """Return the nearest surface within ``far`` [m] along a unit vector."""
     hit = Hit()
     hit.distance = far
     hit.face = -1
@@ -119,10 +137,10 @@ def cast(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: f
         hit = nearer(hit, wp.mesh_query_ray(world.still, origin, direction, far), 0, -1, direction)
     for m in range(world.movers.shape[0]):
         mover = world.movers[m]
-        pose = world.poses[instant, m]
-        o = wp.transpose(pose.rotation) * (origin - pose.position)
-        d = wp.transpose(pose.rotation) * direction
-        if meets_sphere(o, d, mover.centre, mover.radius):
+        if meets_sphere(origin, direction, world.centres[instant, m], mover.radius):
+            pose = world.poses[instant, m]
+            o = wp.transpose(pose.rotation) * (origin - pose.position)
+            d = wp.transpose(pose.rotation) * direction
             hit = nearer(hit, wp.mesh_query_ray(mover.mesh, o, d, hit.distance), mover.first_face, m, d)
     if hit.mover >= 0:
         hit.normal = world.poses[instant, hit.mover].rotation * hit.normal
@@ -131,17 +149,16 @@ def cast(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: f
 
 @wp.func
 def blocked(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: float) -> bool:
-    """Whether anything lies within ``far`` [m] along a direction of length one."""
+    """Return whether any surface lies within ``far`` [m] along a unit vector."""
     if world.still != wp.uint64(0):
         if wp.mesh_query_ray_anyhit(world.still, origin, direction, far):
             return True
     for m in range(world.movers.shape[0]):
         mover = world.movers[m]
-        pose = world.poses[instant, m]
-        o = wp.transpose(pose.rotation) * (origin - pose.position)
-        d = wp.transpose(pose.rotation) * direction
-        if meets_sphere(o, d, mover.centre, mover.radius):
-            if wp.mesh_query_ray_anyhit(mover.mesh, o, d, far):
+        if meets_sphere(origin, direction, world.centres[instant, m], mover.radius):
+            pose = world.poses[instant, m]
+            o = wp.transpose(pose.rotation) * (origin - pose.position)
+            if wp.mesh_query_ray_anyhit(mover.mesh, o, wp.transpose(pose.rotation) * direction, far):
                 return True
     return False
 
@@ -151,7 +168,7 @@ def blocked(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far
 
 @wp.func
 def texel(world: World, first: int, width: int, height: int, col: int, row: int) -> float:
-    """One texel of a texture that repeats."""
+    """Return a texel of a repeated texture."""
     c = col % width
     r = row % height
     return world.texels[first + wp.where(r < 0, r + height, r) * width + wp.where(c < 0, c + width, c)]
@@ -159,7 +176,7 @@ def texel(world: World, first: int, width: int, height: int, col: int, row: int)
 
 @wp.func
 def bilinear(world: World, first: int, width: int, height: int, x: float, y: float) -> float:
-    """Look-up at texel coordinates, whose whole numbers are texel centres."""
+    """Interpolate a texture at texel coordinates; whole numbers are texel centres."""
     col = int(wp.floor(x))
     row = int(wp.floor(y))
     fx = x - float(col)
@@ -173,7 +190,7 @@ def bilinear(world: World, first: int, width: int, height: int, x: float, y: flo
 
 @wp.func
 def level_at(world: World, s: Surface, uv: wp.vec2, level: int) -> float:
-    """Look-up in one level of a pyramid."""
+    """Interpolate one level of a texture pyramid."""
     first = int(s.texel)
     width = int(s.width)
     height = int(s.height)
@@ -188,7 +205,7 @@ def level_at(world: World, s: Surface, uv: wp.vec2, level: int) -> float:
 
 @wp.func
 def textured(world: World, s: Surface, uv: wp.vec2, footprint: float) -> float:
-    """Factor of the reflectance, averaged over ``footprint`` texels."""
+    """Return the texture's factor of the reflectance, averaged over ``footprint`` texels."""
     depth = wp.clamp(wp.log2(wp.max(footprint, 1.0)), 0.0, float(s.levels - 1))
     level = int(depth)
     value = level_at(world, s, uv, level)
@@ -199,7 +216,7 @@ def textured(world: World, s: Surface, uv: wp.vec2, footprint: float) -> float:
 
 @wp.func
 def reflectance(world: World, hit: Hit, direction: wp.vec3, cone: float) -> float:
-    """Reflectance where a ray of angular width ``cone`` [rad] meets a face."""
+    """Return the reflectance where a ray of angular width ``cone`` [rad] meets a face."""
     k = 3 * hit.face
     w = 1.0 - hit.u - hit.v
     s = world.surfaces[world.body[hit.face]]
@@ -216,7 +233,7 @@ def reflectance(world: World, hit: Hit, direction: wp.vec3, cone: float) -> floa
 
 @wp.func
 def sky(world: World, direction: wp.vec3) -> float:
-    """Luminance of the sky."""
+    """Return the luminance of the sky in a direction."""
     if world.panorama < 0:
         return world.sky
     width = world.panorama_width
@@ -229,7 +246,7 @@ def sky(world: World, direction: wp.vec3) -> float:
 
 @wp.func
 def lamp_light(world: World, instant: int, k: int, place: wp.vec3, normal: wp.vec3) -> float:
-    """Luminance that a lamp gives a white surface."""
+    """Return the luminance that a lamp adds to a white surface."""
     lamp = world.lamps[k]
     to = lamp.position - place
     distance = wp.length(to)
@@ -244,7 +261,7 @@ def lamp_light(world: World, instant: int, k: int, place: wp.vec3, normal: wp.ve
 
 @wp.func
 def light_at(world: World, instant: int, place: wp.vec3, normal: wp.vec3) -> float:
-    """Luminance of a white surface."""
+    """Return the luminance of a white surface."""
     light = float(world.ambient)
     toward = wp.dot(normal, world.sun)
     if world.sun_light > 0.0 and toward > 0.0:
@@ -259,16 +276,59 @@ def light_at(world: World, instant: int, place: wp.vec3, normal: wp.vec3) -> flo
 
 
 @wp.func
-def shade(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, hit: Hit, cone: float) -> float:
-    """Return the luminance of what a ray of angular width ``cone`` [rad] hit."""
+def illumination(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, hit: Hit) -> float:
+    """Return the luminance of a white surface where a ray hits, or that of the sky if it hits nothing."""
     if hit.face < 0:
         return sky(world, direction)
     place = origin + hit.distance * direction + LIFT * (hit.distance + 0.1) * hit.normal
-    s = world.surfaces[world.body[hit.face]]
-    return s.emission + reflectance(world, hit, direction, cone) * light_at(world, instant, place, hit.normal)
+    return light_at(world, instant, place, hit.normal)
+
+
+@wp.func
+def luminance(world: World, direction: wp.vec3, hit: Hit, cone: float, white: float) -> float:
+    """Return the luminance of a hit whose :func:`illumination` is ``white``; ``cone``: angular width [rad]."""
+    if hit.face < 0:
+        return white
+    return world.surfaces[world.body[hit.face]].emission + reflectance(world, hit, direction, cone) * white
 
 
 @wp.func
 def radiance(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, cone: float) -> float:
-    """Return the luminance along a ray of angular width ``cone`` [rad]; its direction has length one."""
-    return shade(world, instant, origin, direction, cast(world, instant, origin, direction, FAR), cone)
+    """Return the luminance along a unit vector, averaged over the angular width ``cone`` [rad]."""
+    hit = cast(world, instant, origin, direction, FAR)
+    return luminance(world, direction, hit, cone, illumination(world, instant, origin, direction, hit))
+
+
+# -- single faces: cheaper than the whole mesh if the face is known
+
+
+@wp.func
+def meet_triangle(o: wp.vec3, d: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
+    """Return the distance from ``o`` along ``d`` to the triangle with the corners 0, ``u`` and ``v``, or FAR."""
+    p = wp.cross(d, v)
+    q = wp.cross(o, u)
+    det = wp.dot(u, p)
+    if det == 0.0:
+        return FAR
+    a = wp.dot(o, p) / det
+    b = wp.dot(d, q) / det
+    distance = wp.dot(v, q) / det
+    if a < -EDGE or b < -EDGE or a + b > 1.0 + EDGE or distance <= 0.0:
+        return FAR
+    return distance
+
+
+@wp.func
+def meet_face(world: World, instant: int, face: int, origin: wp.vec3, direction: wp.vec3) -> float:
+    """Return the distance [m] at which a ray along a unit vector meets a face; FAR if it does not (Cramer's rule)."""
+    o = origin
+    d = direction
+    m = world.body[face] - world.first_mover
+    if m >= 0:
+        pose = world.poses[instant, m]
+        o = wp.transpose(pose.rotation) * (origin - pose.position)
+        d = wp.transpose(pose.rotation) * direction
+    a = world.corners[3 * face]
+    u = world.corners[3 * face + 1] - a
+    v = world.corners[3 * face + 2] - a
+    return meet_triangle(o - a, d, u, v)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -24,7 +25,8 @@ from amiwarp.simulation.readout import Readout
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.map_ring import WorldMapRing
-from amiwarp.simulation.worlds.sight import SeenSurfaces, WorldSight, interval_limit_us, largest_speed
+from amiwarp.simulation.worlds.motion import flicker_interval_s
+from amiwarp.simulation.worlds.sight import WorldSight, image_speed
 from amiwarp.simulation.worlds.world_scene import Seeing, WorldScene
 
 if TYPE_CHECKING:
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
 
 FRAMES_PER_CHUNK = 8
 """Largest number of pictures per chunk."""
+
+MAPS_PER_CHUNK = 32
+"""Approximate largest number of a world's maps per chunk."""
 
 CHUNK_US = {True: 100_000, False: 500_000}
 """Span of a chunk [us] on a CPU (True) and on CUDA (False), for up to 640x480 pixels; shorter for more pixels."""
@@ -61,27 +66,30 @@ class DeviceBlock:
     """The kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     count: int
     """Number of events."""
-    seen: SeenSurfaces | None = None
-    """What the events saw of a world."""
+    look: Callable[[], Any] | None = None
+    """Finds the surfaces that the events saw in a world; valid until the engine goes on."""
 
-    def to_host(self) -> tuple[Events, NDArray[np.float32]]:
-        """Return the events, and their scene points without the prism, shape (n, 2)."""
+    def events(self) -> Events:
+        """Return the events in host memory."""
         if not self.count:
-            return Events.empty(), np.empty((0, 2), np.float32)
+            return Events.empty()
         b = self.arrays
-        return Events(b.x.numpy(), b.y.numpy(), b.t.numpy(), b.p.numpy()), b.points.numpy()
+        return Events(b.x.numpy(), b.y.numpy(), b.t.numpy(), b.p.numpy())
+
+    def points(self) -> NDArray[np.float32]:
+        """Return the scene point of each event: its pixel without the prism [px], shape (n, 2)."""
+        return self.arrays.points.numpy() if self.count else np.empty((0, 2), np.float32)
 
     def truth(self) -> EventTruth:
-        """Return the ground truth of the events."""
+        """Return the ground truth of the events. In a world, call it before the engine goes on."""
+        cause = self.arrays.cause.numpy() if self.count else np.empty(0, np.uint8)
+        if self.look is None:
+            return EventTruth(self.points(), cause)
         if not self.count:
             surfaces = (np.empty(0, np.uint16), np.empty(0, np.float32), np.empty((0, 3), np.float32))
-            points, cause = np.empty((0, 2), np.float32), np.empty(0, np.uint8)
-            return EventTruth(points, cause) if self.seen is None else EventTruth(points, cause, *surfaces)
-        points, cause = self.arrays.points.numpy(), self.arrays.cause.numpy()
-        if self.seen is None:
-            return EventTruth(points, cause)
-        seen = self.seen
-        return EventTruth(points, cause, seen.instance.numpy(), seen.depth.numpy(), seen.place.numpy())
+            return EventTruth(self.points(), cause, *surfaces)
+        seen = self.look()
+        return EventTruth(self.points(), cause, seen.instance.numpy(), seen.depth.numpy(), seen.place.numpy())
 
 
 class Engine:
@@ -95,17 +103,21 @@ class Engine:
         scene = simulation.scene
         self._sight: WorldSight | None = None
         self._maps: MapRing | WorldMapRing | None = None
+        longest_chunk = math.inf
         if isinstance(scene, WorldScene):
             world = DeviceWorld(scene.world, self._device)
-            speed = largest_speed(world, simulation, scene)
-            self._step = step_us(simulation, world_speed=speed, longest=interval_limit_us(scene))
+            speed, flicker = image_speed(world, simulation, scene), flicker_interval_s(scene.world)
+            self._step = step_us(simulation, world_speed=speed.total, longest=1e6 * flicker)
+            longest_chunk = 1e6 * MAPS_PER_CHUNK * min(flicker, scene.motion_px / max(speed.in_maps, 1e-9))
             self._sight = WorldSight(simulation, scene, world)
             if scene.seeing is not Seeing.RAYS:
                 self._maps = WorldMapRing(simulation, scene, world, seen_bearings(simulation))
         else:
             self._step = step_us(simulation)
             self._maps = MapRing(simulation, place_scene(simulation))
-        self._chunk_steps = self._steps_per_chunk(chunk_us)
+            if scene.frames.interval_us is not None:
+                longest_chunk = FRAMES_PER_CHUNK * scene.frames.interval_us
+        self._chunk_steps = self._steps_per_chunk(chunk_us, longest_chunk)
         self._margin = int(kernels.LARGEST_LAG) // (int(kernels.TICKS) * self._step) + 2
         self._axis = axis_rotation(*simulation.motion.tilt)
         self._sensor = sensor_params(simulation.sensor, self._step)
@@ -125,14 +137,10 @@ class Engine:
         self._carry = self._nothing
         self.now_us = 0
 
-    def _steps_per_chunk(self, chunk_us: int | None) -> int:
-        """Return the number of steps per chunk."""
-        longest = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
-        scene = self._simulation.scene
-        interval = None if isinstance(scene, WorldScene) else scene.frames.interval_us
-        if interval is not None:
-            longest = min(longest, int(FRAMES_PER_CHUNK * interval))
-        return max(1, longest // self._step)
+    def _steps_per_chunk(self, chunk_us: int | None, longest: float) -> int:
+        """Return the number of steps per chunk; ``longest``: upper bound of its span [us]."""
+        span = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
+        return max(1, int(min(span, longest)) // self._step)
 
     def prepare(self) -> None:
         """Read the first pictures and load the kernels. Otherwise, this happens in the first chunk."""
@@ -261,7 +269,12 @@ class Engine:
         launching.launch(event_keys.unpack, n, inputs, [block], device=self._device)
         if stamps is not None:
             block.t = stamps
-        return DeviceBlock(block, n, None if self._sight is None else self._sight.look(self._view, steps, block, n))
+        if self._sight is None:
+            return DeviceBlock(block, n)
+        faces = (
+            self._maps.faces if isinstance(self._maps, WorldMapRing) else wp.empty(0, dtype=int, device=self._device)
+        )
+        return DeviceBlock(block, n, partial(self._sight.look, self._view, steps, block, n, faces))
 
 
 class KeyBuffer:

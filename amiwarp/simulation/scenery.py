@@ -15,6 +15,7 @@ from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.optics.exact_model import ExactModel
+from amiwarp.simulation.map_slots import MapSlots
 from amiwarp.simulation.pictures import Placement, log_map, place_picture
 from amiwarp.simulation.scene import Scene
 
@@ -164,8 +165,12 @@ class MapRing:
         self._device = simulation.device
         self._texels = placement.width * placement.height
         self._held: list[tuple[int, int]] = []  # time [us], slot
-        self._free: list[int] = []
-        self.maps: wp.array = wp.empty(0, dtype=wp.vec4, device=self._device)
+        self._slots = MapSlots(self._texels, wp.vec4, device=self._device)
+
+    @property
+    def maps(self) -> wp.array:
+        """Bilinear pieces of log intensity of all maps, slot by slot."""
+        return self._slots.arrays[0]
 
     def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         """Return times [us] and slots of the maps around ``start`` .. ``stop``, at least one."""
@@ -174,29 +179,19 @@ class MapRing:
             if following is None:
                 break
             if len(self._held) > 1 and self._held[1][0] <= start:
-                self._free.append(self._held.pop(0)[1])
-            slot = self._slot()
+                self._slots.give_back(self._held.pop(0)[1])
+            slot = self._slots.take()
             pieces = bilinear_pieces(log_map(following[1], self.placement, self._blur)).reshape(-1, 4)
             wp.copy(self.maps, wp.array(pieces, dtype=wp.vec4, device=self._device), dest_offset=slot * self._texels)
             self._held.append((following[0], slot))
         while len(self._held) > 1 and self._held[1][0] <= start:
-            self._free.append(self._held.pop(0)[1])
+            self._slots.give_back(self._held.pop(0)[1])
         times, slots = zip(*self._held, strict=True)
         return np.array(times, np.float64), np.array(slots, np.int32)
 
     def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return matrices (n, 3, 3) from the camera's frame to the pictures' at times [us]; None at rest."""
         return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
-
-    def _slot(self) -> int:
-        """Return a free slot; double their number if there is none."""
-        if not self._free:
-            slots = len(self.maps) // self._texels
-            grown = wp.empty((2 * slots or 1) * self._texels, dtype=wp.vec4, device=self._device)
-            wp.copy(grown, self.maps, count=len(self.maps))
-            self._free.extend(range(slots, 2 * slots or 1))
-            self.maps = grown
-        return self._free.pop()
 
 
 def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
-from amiwarp.simulation.engine import Engine
+from amiwarp.simulation.engine import DeviceBlock, Engine
 from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
@@ -167,10 +167,8 @@ class Simulation:
             Events, and the scene point of each event: its pixel without the prism [px], shape ``(n, 2)``, NaN if its
             ray misses the image plane.
         """
-        for events, truth, _ in self._run_engine(chunk_us, progress):
-            points = truth.points
-            assert points is not None
-            yield events, points
+        for block, _ in self._run_engine(chunk_us, progress):
+            yield block.events(), block.points()
 
     def blocks_with_truth(
         self, *, chunk_us: int | None = None, progress: Progress | None = None
@@ -189,14 +187,14 @@ class Simulation:
         tuple
             Events, and their ground truth: points and causes; in a world also instances, depths and places.
         """
-        for events, truth, _ in self._run_engine(chunk_us, progress):
-            yield events, truth
+        for block, _ in self._run_engine(chunk_us, progress):
+            yield block.events(), block.truth()
 
-    def _run_engine(self, chunk_us: int | None, progress: Progress | None) -> Iterator[tuple[Events, EventTruth, int]]:
-        """Yield events, their ground truth, and the end of their time span [us]."""
+    def _run_engine(self, chunk_us: int | None, progress: Progress | None) -> Iterator[tuple[DeviceBlock, int]]:
+        """Yield the blocks of successive time spans, each with the end of its span [us]."""
         engine = Engine(self, chunk_us)
         for block in engine.run():
-            yield block.to_host()[0], block.truth(), engine.now_us
+            yield block, engine.now_us
             if progress is not None:
                 progress("simulating", min(1.0, engine.now_us / self.duration_us))
 
@@ -238,9 +236,9 @@ class Simulation:
         """
         recorded = RecordedTruth(self, chosen_instants(self.duration_us, truth_hz, truth_times_us))
         blocks: list[Events] = []
-        for events, truth, now_us in self._run_engine(None, progress):
-            blocks.append(events)
-            recorded.keep(truth, now_us)
+        for block, now_us in self._run_engine(None, progress):
+            blocks.append(block.events())
+            recorded.keep(block.truth(), now_us)
         return Recording(
             MemoryEvents(Events.concatenate(blocks), self.camera.width, self.camera.height),
             self.camera,
@@ -294,8 +292,8 @@ class Simulation:
             metadata=self.metadata(),
             overwrite=overwrite,
         ) as writer:
-            for events, truth, now_us in self._run_engine(None, progress):
-                writer.append(events, truth=truth)
+            for block, now_us in self._run_engine(None, progress):
+                writer.append(block.events(), truth=block.truth())
                 for frame in recorded.frames_before(now_us):
                     writer.append_frame(frame)
                 poses = recorded.poses_before(now_us)

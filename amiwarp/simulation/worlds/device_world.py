@@ -1,4 +1,4 @@
-"""A world on a device: its meshes, textures and lights, and the poses of what moves at given instants."""
+"""A world on a device: meshes, textures, lights, and the poses of moving bodies at given instants."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from amiwarp.kernels import world as kernels
 from amiwarp.simulation.worlds.scene import Body, Material, World
 
 LARGEST_PYRAMID = 14
-"""Levels of a texture pyramid, at most."""
+"""Largest number of levels of a texture pyramid."""
 
 
 class DeviceWorld:
     """Meshes, materials and light of a world on a device.
 
-    The bodies that rest are one mesh; each body that moves has its own, and a pose for each instant.
+    All bodies at rest form one mesh. Each moving body has its own mesh, and a pose at each instant.
     """
 
     def __init__(self, world: World, device: Any) -> None:
@@ -28,13 +28,12 @@ class DeviceWorld:
         self.movers = world.moving
         names = {body.name for body in self.movers}
         still = [body for body in world.bodies if body.name not in names]
-        bodies = [*still, *self.movers]
-        """The order of bodies on the device."""
+        bodies = [*still, *self.movers]  # the order of bodies on the device
         texels = _Texels()
         numbers = {label: k + 1 for k, label in enumerate(world.instances)}
         surfaces = [_surface(body, numbers[body.instance or body.name], texels) for body in bodies]
         p = self.params = kernels.World()
-        p.panorama, p.sky = -1, world.sky.luminance
+        p.panorama, p.sky, p.first_mover = -1, world.sky.luminance, len(still)
         if world.sky.panorama is not None:
             p.panorama = texels.add(world.sky.panorama, 1)
             p.panorama_height, p.panorama_width = world.sky.panorama.shape
@@ -57,10 +56,12 @@ class DeviceWorld:
         return mesh
 
     def _upload_faces(self, bodies: Sequence[Body], surfaces: Sequence[Any]) -> None:
-        """What belongs to each face: its body, and at its corners the place on the texture and the shade."""
-        number, uv, shade, density = [], [], [], []
+        """Upload the body and the corners of each face, with their texture coordinates and reflectance factors."""
+        number, corners, uv, shade, density = [], [], [], [], []
         for k, body in enumerate(bodies):
             mesh, faces = body.mesh, np.asarray(body.mesh.faces)
+            vertices = np.asarray(mesh.vertices) if body in self.movers else _resting(body)
+            corners.append(vertices[faces.ravel()])
             number.append(np.full(len(faces), k, np.int32))
             place = np.zeros((len(np.asarray(mesh.vertices)), 2)) if mesh.uv is None else np.asarray(mesh.uv)
             light = np.ones(len(place)) if mesh.light is None else np.asarray(mesh.light)
@@ -69,6 +70,7 @@ class DeviceWorld:
             density.append(_density(mesh, place, surfaces[k]))
         p = self.params
         p.body = wp.array(np.concatenate(number), dtype=int, device=self.device)
+        p.corners = wp.array(np.concatenate(corners).astype(np.float32), dtype=wp.vec3, device=self.device)
         p.uv = wp.array(np.concatenate(uv).astype(np.float32), dtype=wp.vec2, device=self.device)
         p.shade = wp.array(np.concatenate(shade).astype(np.float32), dtype=float, device=self.device)
         p.density = wp.array(np.concatenate(density).astype(np.float32), dtype=float, device=self.device)
@@ -89,23 +91,26 @@ class DeviceWorld:
     def _upload_movers(self, first: int) -> None:
         movers = []
         for body in self.movers:
-            vertices = np.asarray(body.mesh.vertices)
-            centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
             mover = kernels.Mover()
+            vertices = np.asarray(body.mesh.vertices)
             mover.mesh, mover.first_face = self._mesh([vertices], [body]).id, first
-            mover.centre = wp.vec3(*centre.tolist())
-            mover.radius = float(np.linalg.norm(vertices - centre, axis=1).max()) * 1.001
+            mover.lower, mover.upper = (wp.vec3(*v.tolist()) for v in (vertices.min(axis=0), vertices.max(axis=0)))
+            mover.radius = body.mesh.bounding_sphere[1] * 1.001
             first += len(np.asarray(body.mesh.faces))
             movers.append(mover)
         self.params.movers = wp.array(movers, dtype=kernels.Mover, device=self.device)
 
     def set_instants(self, t: NDArray[np.float64]) -> None:
-        """Put the moving bodies and the flickering lamps where they are at times [s], shape ``(n,)``, one row each."""
+        """Set the poses of moving bodies and the light of flickering lamps at ``n`` instants, given by times [s]."""
         poses: NDArray[Any] = np.zeros((len(t), len(self.movers)), cast("Any", kernels.Pose).numpy_dtype())
+        centres = np.zeros((len(t), len(self.movers), 3), np.float32)
         for k, body in enumerate(self.movers):
             assert body.trajectory is not None
-            poses["rotation"][:, k], poses["position"][:, k] = body.trajectory.poses(t)
+            rotation, position = body.trajectory.poses(t)
+            poses["rotation"][:, k], poses["position"][:, k] = rotation, position
+            centres[:, k] = rotation @ body.mesh.bounding_sphere[0] + position
         self.params.poses = wp.array(poses, dtype=kernels.Pose, device=self.device)
+        self.params.centres = wp.array(centres, dtype=wp.vec3, device=self.device)
         lights = [lamp.intensity * (1.0 + lamp.flicker_depth * np.sin(2.0 * math.pi * lamp.flicker_hz * t))
                   for lamp in self.world.lamps]  # fmt: skip
         table = np.stack(lights, axis=1) if lights else np.zeros((len(t), 0))
@@ -113,7 +118,7 @@ class DeviceWorld:
 
 
 class _Texels:
-    """Texture pyramids, one after the other."""
+    """Texture pyramids, concatenated."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.float32]] = [np.zeros(1, np.float32)]
@@ -121,7 +126,7 @@ class _Texels:
         self._known: dict[int, int] = {}
 
     def add(self, texture: NDArray[np.float32], levels: int) -> int:
-        """Append a texture and its halved copies; return the number of its first texel."""
+        """Append a texture and its halved copies; return the index of its first texel."""
         if id(texture) in self._known:
             return self._known[id(texture)]
         first = self._known[id(texture)] = self._count
@@ -137,12 +142,12 @@ class _Texels:
 
 
 def _halved(texture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a texture at half the size, rounded down, each texel a mean."""
-    for axis in (0, 1):
-        if texture.shape[axis] > 1:
-            even = texture.shape[axis] // 2 * 2
-            cut = np.take(texture, range(even), axis=axis)
-            texture = (np.take(cut, range(0, even, 2), axis=axis) + np.take(cut, range(1, even, 2), axis=axis)) / 2.0
+    """Return a texture at half the size, rounded down; each texel is the mean of those that it replaces."""
+    rows, columns = (size // 2 * 2 for size in texture.shape)
+    if rows:
+        texture = (texture[0:rows:2] + texture[1:rows:2]) / np.float32(2.0)
+    if columns:
+        texture = (texture[:, 0:columns:2] + texture[:, 1:columns:2]) / np.float32(2.0)
     return texture
 
 
@@ -163,7 +168,7 @@ def _surface(body: Body, number: int, texels: _Texels) -> Any:
 
 
 def _resting(body: Body) -> NDArray[np.float64]:
-    """Vertices of a body that rests, in the world's frame."""
+    """Return the vertices of a body at rest, in the world's frame."""
     vertices = np.asarray(body.mesh.vertices)
     if body.trajectory is None:
         return vertices
@@ -172,7 +177,7 @@ def _resting(body: Body) -> NDArray[np.float64]:
 
 
 def _density(mesh: Any, place: NDArray[np.float64], surface: Any) -> NDArray[np.float64]:
-    """Texels per metre on each face."""
+    """Return the texels per metre on each face."""
     faces = np.asarray(mesh.faces)
     if surface.texel < 0:
         return np.zeros(len(faces))

@@ -1,4 +1,4 @@
-"""How fast the image of a world moves: the length of steps, and the times of maps."""
+"""Speed of a world's image. It determines the length of steps and the times of maps."""
 
 from __future__ import annotations
 
@@ -15,37 +15,38 @@ from amiwarp.simulation.worlds.scene import Body
 from amiwarp.simulation.worlds.trajectory import Trajectory
 
 PROBE = 48
-"""Columns of the grid of rays that finds how near the world is."""
+"""Columns of the grid of rays that measures distances in the world."""
 NEAREST_M = 0.02
-"""Bodies nearer than this count as this near [m]: nothing can follow what goes through the camera."""
+"""Smallest distance [m] for which speeds are computed; closer surfaces count as this close."""
 MOMENT_S = 1e-3
-"""Over which speeds are taken [s]."""
+"""Time over which speeds are difference quotients [s]."""
 FLICKER_SAMPLES = 16
-"""Steps, or maps, in a period of a flickering lamp."""
+"""Smallest number of steps, and of maps, in a period of a flickering lamp."""
 SAFETY = 1.2
-"""Factor of a speed that a coarse grid finds."""
+"""Factor of the speed measured on a coarse grid, which can miss the fastest pixel."""
 
 
 def body_speed(body: Body, trajectory: Trajectory, focal: float, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a bound of a moving body's speed in the image at times [s], shape ``(n,)`` [px/s]."""
+    """Return an upper bound of a moving body's speed in the image [px/s] at times [s], shape ``(n,)``."""
     assert body.trajectory is not None
-    vertices = np.asarray(body.mesh.vertices)
-    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
-    places, turns = [], []
-    for at in (t, t + MOMENT_S):
-        rotation, position = body.trajectory.poses(at)
-        places.append(np.einsum("nij,j->ni", rotation, centre) + position - trajectory.poses(at)[1])
-        turns.append(rotation)
-    speed = np.linalg.norm(places[1] - places[0], axis=1) / MOMENT_S
-    cosine = (np.einsum("nij,nij->n", turns[0], turns[1]) - 1.0) / 2.0
-    rate = np.arccos(np.clip(cosine, -1.0, 1.0)) / MOMENT_S
-    distance = np.maximum(np.linalg.norm(places[0], axis=1) - radius, NEAREST_M)
-    return np.asarray(focal * (speed + rate * radius) / distance)
+    centre, radius = body.mesh.bounding_sphere
+    rotation, position = body.trajectory.poses(t)
+    rotation_after, position_after = body.trajectory.poses(t + MOMENT_S)
+    place = rotation @ centre + position - trajectory.poses(t)[1]
+    place_after = rotation_after @ centre + position_after - trajectory.poses(t + MOMENT_S)[1]
+    speed = np.linalg.norm(place_after - place, axis=1) / MOMENT_S
+    distance = np.maximum(np.linalg.norm(place, axis=1) - radius, NEAREST_M)
+    return np.asarray(focal * (speed + turn_rate(rotation, rotation_after) * radius) / distance)
+
+
+def turn_rate(rotation: NDArray[np.float64], rotation_after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angular speed [rad/s] between rotations (n, 3, 3) that are :data:`MOMENT_S` apart."""
+    cosine = (np.einsum("nij,nij->n", rotation, rotation_after) - 1.0) / 2.0
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)) / MOMENT_S)
 
 
 def parallax_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: float, instant: int) -> float:
-    """Return the largest speed in the image [px/s] that the camera's change of place gives the resting world."""
+    """Return the largest speed in the image [px/s] that the camera's translation gives to bodies at rest."""
     before, after = (trajectory.poses([at]) for at in (t, t + MOMENT_S))
     velocity = (after[1][0] - before[1][0]) / MOMENT_S
     if not velocity.any():
@@ -65,17 +66,21 @@ def parallax_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t
     return float(SAFETY * max(camera.fx, camera.fy) * (across / distance).max())
 
 
-def turn_speed(camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a bound of the speed in the image that the camera's rotation gives, at times [s], ``(n,)`` [px/s]."""
-    first, second = (trajectory.poses(at)[0] for at in (t, t + MOMENT_S))
-    cosine = (np.einsum("nij,nij->n", first, second) - 1.0) / 2.0
-    rate = np.arccos(np.clip(cosine, -1.0, 1.0)) / MOMENT_S
+def movers_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[Any]:
+    """Return an upper bound of the speed of all moving bodies in the image [px/s] at times [s], shape ``(n,)``."""
+    speeds = [body_speed(body, trajectory, max(camera.fx, camera.fy), t) for body in world.movers]
+    return np.max([np.zeros(len(t)), *speeds], axis=0)
+
+
+def rotation_speed(camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an upper bound of the image speed [px/s] by the camera's rotation, at times [s], shape ``(n,)``."""
+    rate = turn_rate(*(trajectory.poses(at)[0] for at in (t, t + MOMENT_S)))
     corner = math.hypot(max(camera.cx, camera.width - 1 - camera.cx), max(camera.cy, camera.height - 1 - camera.cy))
     focal = max(camera.fx, camera.fy)
     return np.asarray(rate * focal * (1.0 + (corner / focal) ** 2))
 
 
 def flicker_interval_s(world: Any) -> float:
-    """Return the longest time between two looks at flickering lamps [s]; infinite without any."""
+    """Return the longest time between two renderings of flickering lamps [s]; infinite without such lamps."""
     rates = [lamp.flicker_hz for lamp in world.lamps if lamp.flicker_hz and lamp.flicker_depth]
     return 1.0 / (FLICKER_SAMPLES * max(rates)) if rates else math.inf

@@ -1,4 +1,4 @@
-"""Views of a world: luminance, depth, normals and instances, without the prism."""
+"""Rendering of a world without the prism: surfaces that rays meet, and maps of log intensity."""
 
 from __future__ import annotations
 
@@ -9,33 +9,37 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
+from amiwarp.imaging.sharpness_costs import gaussian
 from amiwarp.kernels import world as kernels
-from amiwarp.kernels import world_view
+from amiwarp.kernels import world_maps, world_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 
 SMALLEST_LAUNCH = 1 << 10
-"""Rays that are worth a thread on a CPU."""
+"""Smallest number of rays per thread on a CPU."""
 ROTATED_GRID = [(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375)]
-"""Places of four samples from a pixel's centre [px]: fixed, so that sampling fires no events."""
+"""Positions of four samples relative to the pixel's centre [px]. They are fixed, because random ones fire events."""
+TILE = int(world_maps.TILE)
+"""Side of a tile of a map [texels]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """What rays meet."""
+    """Surfaces that rays meet."""
 
     depth: NDArray[np.float32]
-    """Depth along the camera's axis [m], shape (n,); infinite for the sky."""
+    """Distance along the camera's axis [m], shape (n,); infinite for the sky."""
     normal: NDArray[np.float32]
-    """Unit normals in the world's frame, towards the camera, shape (n, 3); zero for the sky."""
+    """Unit normals in the world's frame, on the camera's side, shape (n, 3); zero for the sky."""
     instance: NDArray[np.int32]
     """Instance numbers, shape (n,): 0 is the sky, i + 1 is ``World.instances[i]``."""
     mover: NDArray[np.int32]
-    """Number of the moving body, as in ``World.moving``, shape (n,); -1 for what rests."""
+    """Index in ``World.moving``, shape (n,); -1 for bodies at rest and the sky."""
     place: NDArray[np.float32]
-    """Place in the world [m], shape (n, 3)."""
+    """Points in the world's frame [m], shape (n, 3)."""
 
 
 def device_pose(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Any:
@@ -53,7 +57,7 @@ def surfaces_at(
     position: NDArray[np.float64],
     instant: int = 0,
 ) -> SurfaceView:
-    """Return what rays meet.
+    """Return the surfaces that rays meet.
 
     ``rays``: in the camera's frame, shape (n, 3); ``instant``: a row of :meth:`DeviceWorld.set_instants`.
     """
@@ -74,40 +78,85 @@ def pixel_rays(camera: Camera) -> NDArray[np.float64]:
 
 
 def sample_grid(samples: int, device: Any) -> wp.array:
-    """Return the places of a pixel's samples from its centre [px]."""
+    """Return the positions of a pixel's samples relative to its centre [px]."""
     centres = (np.arange(math.isqrt(samples)) + 0.5) / math.isqrt(samples) - 0.5
     places = ROTATED_GRID if samples == 4 else [(x, y) for y in centres for x in centres]
     return wp.array(np.array(places, np.float32), dtype=wp.vec2, device=device)
 
 
 class MapRenderer:
-    """Renders maps of a world on a plane at distance 1 before the camera, as bilinear pieces of log intensity."""
+    """Renderer of maps: planes at distance 1 from the camera, as bilinear pieces of log intensity.
+
+    The maps are parts of two long arrays, one of pieces and one of the face that each texel sees.
+    """
 
     def __init__(self, world: DeviceWorld, frame: Any, *, blur: float, dark: float, samples: int) -> None:
-        """``frame``: a :class:`amiwarp.kernels.world_view.MapFrame` without a pose; ``blur``: sigma [texels]."""
+        """``frame``: a :class:`amiwarp.kernels.world_maps.MapFrame` without a pose; ``blur``: sigma [texels]."""
         self._world, self._frame, self._dark = world, frame, dark
         frame.offsets = sample_grid(samples, world.device)
         n = frame.width * frame.height
-        self._light, self._half = (wp.empty(n, dtype=float, device=world.device) for _ in range(2))
-        self._body = wp.empty(n, dtype=int, device=world.device)
-        reach = max(1, math.ceil(3.0 * blur))
-        along = np.arange(-reach, reach + 1)
-        weights = np.exp(-0.5 * (along / max(blur, 1e-6)) ** 2)
-        self._weights = wp.array((weights / weights.sum()).astype(np.float32), dtype=float, device=world.device)
+        self._smooth, self._half = (wp.empty(n, dtype=float, device=world.device) for _ in range(2))
+        self._hits = world_maps.FirstHits()
+        self._hits.light, self._hits.white = (wp.empty(n, dtype=float, device=world.device) for _ in range(2))
+        self._hits.normal = wp.empty(n, dtype=wp.vec3, device=world.device)
+        half = gaussian(blur)
+        self._weights = wp.array(np.concatenate([half[:0:-1], half]), dtype=float, device=world.device)
+        self._grid = (-(-frame.height // TILE), -(-frame.width // TILE))
+        self._reach = -(-len(half) // TILE)  # the blur, and the next texel that a bilinear piece needs [tiles]
+        self._all = self._numbers(np.ones(self._grid, bool))
 
-    def render(self, pose: Any, instant: int, out: wp.array, first: int) -> None:
-        """Render one map into ``out`` from place ``first`` on."""
+    def render(self, pose: Any, maps: wp.array, faces: wp.array, first: int) -> None:
+        """Render a map into the arrays of all maps, from index ``first`` on, at the world's first instant."""
+        self._frame.pose, self._frame.instant, self._frame.first = pose, 0, first
+        self._cast(self._all, faces)
+        self._blur(self._all, self._all, maps)
+
+    def render_between(
+        self, pose: Any, maps: wp.array, faces: wp.array, first: int, ends: tuple[int, int], weight: float
+    ) -> None:
+        """Render a map between two others, which begin at ``ends``, by interpolation where no body moves.
+
+        The world's first three instants are those of this map and of the other two; ``weight``: that of the second.
+        """
+        frame, world = self._frame, self._world
+        n = frame.width * frame.height
+        launch(world_maps.interpolate_maps, n, [maps, faces, *ends, weight, first], [], device=world.device)
+        frame.pose, frame.instant, frame.first = pose, 0, ends[0]
+        marks = wp.empty(self._grid[0] * self._grid[1], dtype=wp.uint8, device=world.device)
+        inputs = [world.params, frame, faces, 3]
+        launch(world_maps.mark_tiles, len(marks), inputs, [marks], device=world.device, smallest=SMALLEST_LAUNCH)
+        neighbours = np.ones((3, 3), bool)
+        changed = binary_dilation(marks.numpy().reshape(self._grid), neighbours)
+        if not changed.any():
+            return
+        frame.first = first
+        written = binary_dilation(changed, neighbours, iterations=self._reach)
+        cast = binary_dilation(written, neighbours, iterations=self._reach)
+        self._cast(self._numbers(cast), faces)
+        self._blur(self._numbers(cast), self._numbers(written), maps)
+
+    def _numbers(self, tiles: NDArray[np.bool_]) -> wp.array:
+        """Return the numbers of tiles on the device."""
+        return wp.array(np.flatnonzero(tiles).astype(np.int32), dtype=int, device=self._world.device)
+
+    def _cast(self, tiles: wp.array, faces: wp.array) -> None:
+        """Compute the luminance of tiles."""
         f, device = self._frame, self._world.device
-        f.pose, f.instant = pose, instant
-        n = f.width * f.height
-        inputs = [self._world.params, f]
-        launch(world_view.render_map, n, inputs, [self._light, self._body], device=device, smallest=SMALLEST_LAUNCH)
-        if len(f.offsets) > 1:
-            inputs += [self._light, self._body]
-            launch(world_view.refine_map, n, inputs, [self._half], device=device, smallest=SMALLEST_LAUNCH)
-            self._light, self._half = self._half, self._light
-        for across, source, target in ((0, self._light, self._half), (1, self._half, self._light)):
-            inputs = [source, self._weights, f.width, f.height, across]
-            launch(world_view.blur_lines, n, inputs, [target], device=device)
-        inputs = [self._light, f.width, f.height, self._dark, first]
-        launch(world_view.log_pieces, n, inputs, [out], device=device)
+        f.tiles = tiles
+        inputs, n = [self._world.params, f], len(tiles) * TILE * TILE
+        launch(world_maps.render_map, n, inputs, [faces, self._hits], device=device, smallest=SMALLEST_LAUNCH)
+        if len(f.offsets) == 1:
+            wp.copy(self._smooth, self._hits.light)
+            return
+        inputs += [faces, self._hits]
+        launch(world_maps.smooth_edges, n, inputs, [self._smooth], device=device, smallest=SMALLEST_LAUNCH)
+
+    def _blur(self, tiles: wp.array, written: wp.array, maps: wp.array) -> None:
+        """Blur the luminance of ``tiles``, and write the log intensities of ``written``."""
+        f, device = self._frame, self._world.device
+        for across, source, target in ((0, self._smooth, self._half), (1, self._half, self._smooth)):
+            inputs = [f, source, self._weights, across]
+            launch(world_maps.blur_lines, len(tiles) * TILE * TILE, inputs, [target], device=device)
+        f.tiles = written
+        inputs = [f, self._smooth, self._dark]
+        launch(world_maps.log_pieces, len(written) * TILE * TILE, inputs, [maps], device=device)

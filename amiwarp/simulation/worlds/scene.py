@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,13 @@ class Mesh:
                 if values.shape != shape or not np.isfinite(values).all():
                     raise AmiwarpError(f"mesh's {name} has shape {values.shape}; give finite numbers, {shape}")
                 object.__setattr__(self, name, values)
+
+    @cached_property
+    def bounding_sphere(self) -> tuple[NDArray[np.float64], float]:
+        """Centre [m], shape ``(3,)``, and radius [m] of a sphere that contains all vertices."""
+        vertices = np.asarray(self.vertices)
+        centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+        return centre, float(np.linalg.norm(vertices - centre, axis=1).max())
 
 
 @dataclass(frozen=True, eq=False)
