@@ -1,5 +1,6 @@
 """Ground truth of simulated worlds: in memory, in the native file, in other data sets' files, on the command line."""
 
+import itertools
 import json
 import re
 import signal
@@ -508,6 +509,19 @@ def test_no_prism_and_the_same_seed(named: Path) -> None:
     np.testing.assert_array_equal(back.events.slice(0, 10**6).t, same.events.slice(0, 10**6).t)
 
 
+def test_how_pixels_see_the_world(named: Path) -> None:
+    camera, prism = amiwarp.Camera.from_fov(*SIZE, np.radians(60.0)), amiwarp.Prism(np.radians(1.0))
+    times = []
+    for option, given in (("--seeing", {"seeing": "rays"}), ("--motion-px", {"motion_px": 0.1}), ("--seed", {})):
+        (value,) = given.values() or (5,)
+        ok("simulate", "w.h5", "--world", "room", "--force", "--seed", "5", option, str(value), *SHORT)
+        scene = amiwarp.WorldScene(*stub_world(5, "room"), **given)
+        same = amiwarp.Simulation(scene, camera, prism, DURATION_S, seed=5).run()
+        times.append(amiwarp.open_recording("w.h5").events.slice(0, 10**6).t)
+        np.testing.assert_array_equal(times[-1], same.events.slice(0, 10**6).t)
+    assert not any(np.array_equal(a, b) for a, b in itertools.combinations(times, 2))
+
+
 def test_world_files_and_files_of_poses(named: Path) -> None:
     stub_world()[1].save_tum("way.txt")
     ok("simulate", "w.h5", "--world", "mine.toml", "--trajectory", "way.txt", *SHORT)
@@ -520,6 +534,10 @@ def test_world_files_and_files_of_poses(named: Path) -> None:
         (("--world", "room", "--rotate-deg-s", "0,5,0"), "--rotate-deg-s"),
         (("--world", "room", "--preview", "seen.jpg"), "ends in .png"),
         (("--picture", "none.jpg", "--trajectory", "still"), "--trajectory applies to a world"),
+        (("--picture", "none.jpg", "--seeing", "maps"), "--seeing applies to a world; give --world, or leave it out"),
+        (("--picture", "none.jpg", "--motion-px", "1"), "--motion-px applies to a world"),
+        (("--world", "room", "--motion-px", "3"), "motion_px = 3.0"),
+        (("--world", "room", "--motion-px", "1", "--seeing", "rays"), "--motion-px applies to maps"),
     ):
         result = run("simulate", "bad.h5", *args, *SHORT)
         assert (result.exit_code, message in result.stderr) == (1, True), result.stderr
