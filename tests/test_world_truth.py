@@ -479,14 +479,15 @@ def test_simulate_a_named_world(named: Path) -> None:
     assert data["events"] > 500
     about = ok("info", "w.h5")["world"]
     assert about["name"] == "room"
-    assert (about["instances"], about["categories"]) == (2, ["building", "thing"])
+    assert (about["instances"], about["categories"]) == (["wall", "ñ square"], ["building", "thing"])
     assert about["per_event"] == ["cause", "instance", "depth", "place"]
     assert list(about["causes"]) == ["signal", "shot_noise", "leak", "hot_pixel"]
     assert sum(about["causes"].values()) == data["events"]
     assert (about["instants"], about["poses"]) == (3, 41)
     assert (about["moving_bodies"], about["joints"]) == (["ñ square"], ["hand"])
-    text = run("info", "w.h5").stdout
-    for line in ("signal", "room: 2 instances of the classes building, thing", "3 with depth", "41 of the camera"):
+    text = re.sub(" +", " ", run("info", "w.h5").stdout)
+    for line in ("signal", "room: 2 instances of the classes building, thing", "instances wall, ñ square",
+                 "3 with depth", "41 of the camera, 1 moving bodies, 1 joints", "joints hand"):  # fmt: skip
         assert line in text
     picture = np.asarray(Image.open("seen.png").convert("RGB"))
     assert picture.shape[1] > 1000
@@ -497,6 +498,17 @@ def test_info_of_a_recording_without_truth_of_a_world(named: Path) -> None:
     source = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([0, 1], [0, 0], [0, 1], [1, 1]), 4, 4)
     amiwarp.save_recording("old.h5", amiwarp.Recording(source, truth=amiwarp.Truth({"apex": 0.01})))
     assert ok("info", "old.h5")["world"] is None
+
+
+def test_info_of_many_instances_names_the_first(named: Path) -> None:
+    source = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([0, 1], [0, 0], [0, 1], [1, 1]), 4, 4)
+    names = tuple(f"box {k}" for k in range(20))
+    labels = amiwarp.WorldLabels("boxes", names, ("",) * 20)
+    amiwarp.save_recording("many.h5", amiwarp.Recording(source, truth=amiwarp.Truth(labels=labels)))
+    assert ok("info", "many.h5")["world"]["instances"] == list(names)
+    text = run("info", "many.h5").stdout
+    assert "box 14, box 15 and 4 more" in text
+    assert "box 16" not in text
 
 
 def test_no_prism_and_the_same_seed(named: Path) -> None:
