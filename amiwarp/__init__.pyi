@@ -89,6 +89,7 @@ from .simulation.sequences import VideoFile as VideoFile
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate
 from .simulation.translator import translate as translate
+from .simulation.worlds.choices import Seeing as Seeing
 from .simulation.worlds.frame_truth import TruthRenderer as TruthRenderer
 from .simulation.worlds.named.catalogue import named_world as named_world
 from .simulation.worlds.scene import Body as Body
@@ -100,6 +101,5 @@ from .simulation.worlds.scene import Sun as Sun
 from .simulation.worlds.scene import World as World
 from .simulation.worlds.trajectory import Trajectory as Trajectory
 from .simulation.worlds.world_files import load_world as load_world
-from .simulation.worlds.world_scene import Seeing as Seeing
 from .simulation.worlds.world_scene import WorldScene as WorldScene
 from .viewer.app import view as view

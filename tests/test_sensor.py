@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -321,6 +322,13 @@ def test_presets_make_events(name: str) -> None:
     assert len(events) > 10_000
     assert sensor.cutoff_hz
     assert sensor.bus_rate_mev_s
+
+
+def test_half_of_the_dvxplorer_s_pixels_respond_at_13_percent_and_nearly_all_at_27_5_percent() -> None:
+    sensor = SensorModel.preset("dvxplorer")
+    thresholds = NormalDist(sensor.contrast_on, sensor.mismatch * sensor.contrast_on)
+    assert thresholds.cdf(math.log(1.13)) == pytest.approx(0.5)
+    assert thresholds.cdf(math.log(1.275)) == pytest.approx(0.999, abs=2e-5)
 
 
 def test_an_unknown_preset_names_the_known_ones() -> None:

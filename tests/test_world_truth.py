@@ -1,5 +1,6 @@
 """Ground truth of simulated worlds: in memory, in the native file, in other data sets' files, on the command line."""
 
+import itertools
 import json
 import re
 import signal
@@ -478,14 +479,15 @@ def test_simulate_a_named_world(named: Path) -> None:
     assert data["events"] > 500
     about = ok("info", "w.h5")["world"]
     assert about["name"] == "room"
-    assert (about["instances"], about["categories"]) == (2, ["building", "thing"])
+    assert (about["instances"], about["categories"]) == (["wall", "ñ square"], ["building", "thing"])
     assert about["per_event"] == ["cause", "instance", "depth", "place"]
     assert list(about["causes"]) == ["signal", "shot_noise", "leak", "hot_pixel"]
     assert sum(about["causes"].values()) == data["events"]
     assert (about["instants"], about["poses"]) == (3, 41)
     assert (about["moving_bodies"], about["joints"]) == (["ñ square"], ["hand"])
-    text = run("info", "w.h5").stdout
-    for line in ("signal", "room: 2 instances of the classes building, thing", "3 with depth", "41 of the camera"):
+    text = re.sub(" +", " ", run("info", "w.h5").stdout)
+    for line in ("signal", "room: 2 instances of the classes building, thing", "instances wall, ñ square",
+                 "3 with depth", "41 of the camera, 1 moving bodies, 1 joints", "joints hand"):  # fmt: skip
         assert line in text
     picture = np.asarray(Image.open("seen.png").convert("RGB"))
     assert picture.shape[1] > 1000
@@ -498,6 +500,17 @@ def test_info_of_a_recording_without_truth_of_a_world(named: Path) -> None:
     assert ok("info", "old.h5")["world"] is None
 
 
+def test_info_of_many_instances_names_the_first(named: Path) -> None:
+    source = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([0, 1], [0, 0], [0, 1], [1, 1]), 4, 4)
+    names = tuple(f"box {k}" for k in range(20))
+    labels = amiwarp.WorldLabels("boxes", names, ("",) * 20)
+    amiwarp.save_recording("many.h5", amiwarp.Recording(source, truth=amiwarp.Truth(labels=labels)))
+    assert ok("info", "many.h5")["world"]["instances"] == list(names)
+    text = run("info", "many.h5").stdout
+    assert "box 14, box 15 and 4 more" in text
+    assert "box 16" not in text
+
+
 def test_no_prism_and_the_same_seed(named: Path) -> None:
     ok("simulate", "plain.h5", "--world", "room", "--no-prism", "--seed", "5", *SHORT)
     back = amiwarp.open_recording("plain.h5")
@@ -506,6 +519,19 @@ def test_no_prism_and_the_same_seed(named: Path) -> None:
     camera, prism = amiwarp.Camera.from_fov(*SIZE, np.radians(60.0)), amiwarp.Prism(np.radians(1.0))
     same = amiwarp.Simulation(scene, camera, prism, DURATION_S, seed=5).without_prism().run()
     np.testing.assert_array_equal(back.events.slice(0, 10**6).t, same.events.slice(0, 10**6).t)
+
+
+def test_how_pixels_see_the_world(named: Path) -> None:
+    camera, prism = amiwarp.Camera.from_fov(*SIZE, np.radians(60.0)), amiwarp.Prism(np.radians(1.0))
+    times = []
+    for option, given in (("--seeing", {"seeing": "rays"}), ("--motion-px", {"motion_px": 0.1}), ("--seed", {})):
+        (value,) = given.values() or (5,)
+        ok("simulate", "w.h5", "--world", "room", "--force", "--seed", "5", option, str(value), *SHORT)
+        scene = amiwarp.WorldScene(*stub_world(5, "room"), **given)
+        same = amiwarp.Simulation(scene, camera, prism, DURATION_S, seed=5).run()
+        times.append(amiwarp.open_recording("w.h5").events.slice(0, 10**6).t)
+        np.testing.assert_array_equal(times[-1], same.events.slice(0, 10**6).t)
+    assert not any(np.array_equal(a, b) for a, b in itertools.combinations(times, 2))
 
 
 def test_world_files_and_files_of_poses(named: Path) -> None:
@@ -520,6 +546,10 @@ def test_world_files_and_files_of_poses(named: Path) -> None:
         (("--world", "room", "--rotate-deg-s", "0,5,0"), "--rotate-deg-s"),
         (("--world", "room", "--preview", "seen.jpg"), "ends in .png"),
         (("--picture", "none.jpg", "--trajectory", "still"), "--trajectory applies to a world"),
+        (("--picture", "none.jpg", "--seeing", "maps"), "--seeing applies to a world; give --world, or leave it out"),
+        (("--picture", "none.jpg", "--motion-px", "1"), "--motion-px applies to a world"),
+        (("--world", "room", "--motion-px", "3"), "motion_px = 3.0"),
+        (("--world", "room", "--motion-px", "1", "--seeing", "rays"), "--motion-px applies to maps"),
     ):
         result = run("simulate", "bad.h5", *args, *SHORT)
         assert (result.exit_code, message in result.stderr) == (1, True), result.stderr

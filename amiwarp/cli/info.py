@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording, Truth
 
 EXAMPLE = "amiwarp info recording.h5"
+MOST_NAMES = 16
+"""Number of instances, bodies and joints that are named; ``--json`` names all."""
 
 
 def run(file: Annotated[Path, typer.Argument(help="Recording in any supported format.")], *, common: Common) -> None:
@@ -126,7 +128,7 @@ def _world(truth: Truth, count: int) -> dict[str, Any] | None:
     labels = truth.labels
     return {
         "name": None if labels is None else labels.name,
-        "instances": None if labels is None else len(labels.instances),
+        "instances": None if labels is None else list(labels.instances),
         "categories": None if labels is None else sorted({name for name in labels.categories if name}),
         "per_event": stored,
         "causes": _causes(truth, count),
@@ -156,7 +158,8 @@ def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("causes", ", ".join(shares) or "no events"))
     if d["name"] is not None:
         categories = f" of the classes {', '.join(d['categories'])}" if d["categories"] else ""
-        rows.append(("world", f"{d['name']}: {d['instances']} instances{categories}"))
+        rows.append(("world", f"{d['name']}: {len(d['instances'])} instances{categories}"))
+        rows.append(("instances", _list(d["instances"])))
     surfaces = [name for name in d["per_event"] if name != "cause"]
     if surfaces:
         rows.append(("per event", ", ".join(surfaces)))
@@ -165,7 +168,14 @@ def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     if d["poses"]:
         moving = [f"{len(d[name])} {name.replace('_', ' ')}" for name in ("moving_bodies", "joints") if d[name]]
         rows.append(("poses", f"{d['poses']:,} of the camera" + (f", {', '.join(moving)}" if moving else "")))
+        rows += [(name.replace("_", " "), _list(d[name])) for name in ("moving_bodies", "joints") if d[name]]
     return rows
+
+
+def _list(names: list[str]) -> str:
+    """Return the first :data:`MOST_NAMES` names, and the number of further ones."""
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(names[:MOST_NAMES]) + more
 
 
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:

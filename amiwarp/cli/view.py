@@ -42,9 +42,13 @@ class ScreenshotOptions:
         OUTPUT,
     ] = None
     view: Annotated[View, typer.Option(help="Viewpoint of the picture.", rich_help_panel=_PICTURE)] = View.FREE
-    colour: Annotated[Colour, typer.Option(help="Quantity shown by colour.", rich_help_panel=_PICTURE)] = (
-        Colour.POLARITY
-    )
+    colour: Annotated[
+        Colour,
+        typer.Option(
+            help="Quantity shown by colour. Cause, instance and depth need the ground truth of a simulation.",
+            rich_help_panel=_PICTURE,
+        ),
+    ] = Colour.POLARITY
     axis: Annotated[
         Axis | None,
         typer.Option(

@@ -10,6 +10,7 @@ import typer
 
 from amiwarp.cli.options import OUTPUT
 from amiwarp.errors import AmiwarpError
+from amiwarp.simulation.worlds.choices import Seeing
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
@@ -55,6 +56,21 @@ class WorldOptions:
             rich_help_panel=_WORLD,
         ),
     ] = False
+    seeing: Annotated[
+        Seeing | None,
+        typer.Option(
+            help="How pixels see the world: maps (pictures of the world, blended between) or rays (through the prism "
+            "into the world, exact, and slow on a CPU). Default: maps.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    motion_px: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest motion between two maps, 0.01 to 2 (px). Smaller is more accurate and slower. Default: 0.5.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
     truth_hz: Annotated[
         float | None,
         typer.Option(
@@ -75,12 +91,15 @@ class WorldOptions:
     ] = None
 
     def check(self) -> None:
-        """Raise :class:`AmiwarpError` for options that describe a world if none is given."""
-        given = {"--trajectory": self.trajectory, "--truth-hz": self.truth_hz, "--preview": self.preview}
+        """Raise :class:`AmiwarpError` for options that do not apply."""
+        given = {"--trajectory": self.trajectory, "--seeing": self.seeing, "--motion-px": self.motion_px,
+                 "--truth-hz": self.truth_hz, "--preview": self.preview}  # fmt: skip
         if self.world is None:
             for name, value in given.items():
                 if value is not None:
                     raise AmiwarpError(f"{name} applies to a world; give --world, or leave it out")
+        if self.motion_px is not None and self.seeing is Seeing.RAYS:
+            raise AmiwarpError("--motion-px applies to maps; give --seeing maps, or leave it out")
         if self.preview is not None and self.preview.suffix.lower() != ".png":
             raise AmiwarpError(f"{self.preview}: a preview is a PNG file; give a name that ends in .png")
 
@@ -89,7 +108,8 @@ class WorldOptions:
         from amiwarp.simulation.worlds.world_scene import WorldScene
 
         world, trajectory = self._load(duration_s, seed)
-        return WorldScene(world, trajectory, blur=blur)
+        given = {name: value for name in ("seeing", "motion_px") if (value := getattr(self, name)) is not None}
+        return WorldScene(world, trajectory, blur=blur, **given)
 
     def _load(self, duration_s: float, seed: int) -> tuple[World, Trajectory]:
         from amiwarp.simulation.worlds.trajectory import Trajectory

@@ -23,11 +23,12 @@ from amiwarp.optics.exact_model import ExactModel, axis_rotation
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.readout import Readout
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
+from amiwarp.simulation.worlds.choices import Seeing
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.map_ring import WorldMapRing
 from amiwarp.simulation.worlds.motion import flicker_interval_s
 from amiwarp.simulation.worlds.sight import WorldSight, image_speed
-from amiwarp.simulation.worlds.world_scene import Seeing, WorldScene
+from amiwarp.simulation.worlds.world_scene import WorldScene
 
 if TYPE_CHECKING:
     from amiwarp.simulation.sensor import SensorModel

@@ -117,10 +117,7 @@ class SensorModel:
 
     @classmethod
     def preset(cls, name: str) -> SensorModel:
-        """Return the model of a known event camera.
-
-        Published values are those of data sheets and papers, at the manufacturer's biases in good light. Everything
-        that they do not state is an estimate.
+        """Return the model of a known event camera at the manufacturer's biases in good light.
 
         Parameters
         ----------
@@ -139,23 +136,42 @@ class SensorModel:
 
         Notes
         -----
-        Data sheets state the contrast threshold C as a relative change of light: the model uses ln(1 + C).
+        Contrast thresholds C are published as relative changes of light, (maximum - minimum) / minimum (Prophesee,
+        "Event-based vision sensor characteristics"). The model uses ln(1 + C) for both polarities.
 
-        ``dvxplorer`` (iniVation DVXplorer, 640x480). Published by iniVation (docs.inivation.com, DVXplorer): threshold
-        27.5 % (at which 99.9 % of the pixels respond; 13 % for half of them), of which the model takes 20 % in the
-        middle; latency below 1 ms; time resolution 200 us; 165 million events/s. The time resolution is modelled as
-        a scan of the rows; the chip scans columns. Estimated: bandwidth, mean latency, queue, mismatch, noise.
+        ``dvxplorer``: iniVation DVXplorer, 640x480, 9 um pixels. Its data are those of the manufacturer
+        (docs.inivation.com, DVXplorer):
 
-        ``davis346`` (iniVation DAVIS346, 346x260). Published in G. Gallego et al., "Event-based Vision: A Survey",
-        IEEE TPAMI 2022, table 1: threshold 14.3 % ON and 22.5 % OFF, latency 20 us, 12 million events/s. The bandwidth
-        of 300 Hz, the refractory period of 500 us, and shot noise that is four times stronger in the dark are v2e's.
-        Estimated: jitter, queue, mismatch, leak and shot noise.
+        - thresholds 13 %: at this contrast half of the pixels respond
+        - mismatch 0.32: 99.9 % of the pixels respond at 27.5 %, which is 3.09 standard deviations of ln(1 + C) away
+        - latency 200 us: published as "below 1 ms"; the number is a typical value, no source
+        - row_us 0.4: a scan of 480 rows takes the published time resolution of 200 us; the chip scans columns
+        - bus rate: 165 million events/s
+        - cutoff_hz 1000, refractory_us 200, jitter, queue, leak and shot noise: typical values, no source
 
-        ``gen4`` (Prophesee Gen4 and Sony IMX636, 1280x720). Published by T. Finateu et al., "A 1280x720
-        Back-Illuminated Stacked Temporal Contrast Event-Based Vision Sensor with 4.86 um Pixels, 1.066 GEPS Readout",
-        ISSCC 2020, and in the survey's table 1: threshold 11 %, latency 20 to 150 us, 1066 million events/s. IMX636's
-        data sheet: latency below 100 us at 1000 lux. Estimated: bandwidth, latency, queue, mismatch, noise; the
-        default biases have a higher threshold than the smallest, and the model takes 25 %.
+        ``davis346``: iniVation DAVIS346, 346x260, 18.5 um pixels.
+
+        - thresholds 14.3 % ON and 22.5 % OFF, at which half of the pixels respond: G. Gallego et al., "Event-based
+          Vision: A Survey", IEEE TPAMI 2022, table 1
+        - latency 20 us, the smallest; bus rate 12 million events/s: data sheet (inivation.com, DAVIS346.pdf)
+        - mismatch 0.15, refractory_us 500 and cutoff_hz 300: defaults of v2e (standard deviation 0.03 of thresholds of
+          0.2); the standard deviation of 2.1 % contrast that P. Lichtsteiner et al. measured on an earlier chip (IEEE
+          JSSC 43(2), 2008) is 0.16 of the ON threshold
+        - leak_hz 0.1: v2e's parameters for a noisy sensor
+        - jitter, queue, shot noise: typical values, no source
+
+        ``gen4``: Prophesee Gen4 and Sony IMX636, 1280x720, 4.86 um pixels.
+
+        - thresholds 25 %, nominal: data of the camera EVK4 (Prophesee); the smallest threshold is lower
+        - latency 100 us: published as "below 100 us at 1000 lux" (Prophesee, EVK4); its manual states 220 us as
+          typical at 25 % contrast
+        - bus rate 1066 million events/s: T. Finateu et al., "A 1280x720 Back-Illuminated Stacked Temporal Contrast
+          Event-Based Vision Sensor with 4.86 um Pixels, 1.066 GEPS Readout", ISSCC 2020; cameras with USB
+          transmit less
+        - cutoff_hz 2000, refractory_us 100, mismatch, jitter, queue, leak and shot noise: typical values, no source
+
+        In all three, shot noise is four times as strong in the dark, and the jitter of the leak and the spread of the
+        noise rates are 0.1, as in v2e. Hot pixels have the default: typical values, no source.
 
         Examples
         --------
@@ -173,13 +189,13 @@ def _real_or_none(value: float | None, what: str, least: float, limit: float) ->
 
 _PRESETS: dict[str, dict[str, float]] = {
     "dvxplorer": {
-        "contrast_on": math.log(1.20), "contrast_off": math.log(1.20), "mismatch": 0.06, "refractory_us": 200.0,
+        "contrast_on": math.log(1.13), "contrast_off": math.log(1.13), "mismatch": 0.32, "refractory_us": 200.0,
         "latency_us": 200.0, "latency_jitter_us": 50.0, "leak_hz": 0.05, "shot_noise_hz": 0.5, "shot_noise_dark": 4.0,
         "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 1000.0, "row_us": 0.4,
         "bus_rate_mev_s": 165.0, "bus_queue": 16384.0,
     },
     "davis346": {
-        "contrast_on": math.log(1.143), "contrast_off": math.log(1.225), "mismatch": 0.1, "refractory_us": 500.0,
+        "contrast_on": math.log(1.143), "contrast_off": math.log(1.225), "mismatch": 0.15, "refractory_us": 500.0,
         "latency_us": 20.0, "latency_jitter_us": 10.0, "leak_hz": 0.1, "shot_noise_hz": 1.0, "shot_noise_dark": 4.0,
         "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 300.0, "bus_rate_mev_s": 12.0,
         "bus_queue": 4096.0,

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import webbrowser
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -174,8 +174,7 @@ def save_screenshot(
 
     check_output(path)
     look = look or Look()
-    scene = Scene(size)
-    scene.show(inspector.show(), look)
-    scene.look_from(view, look)
-    scene.save(path)
-    scene.close()
+    with closing(Scene(size)) as scene:
+        scene.show(inspector.show(), look)
+        scene.look_from(view, look)
+        scene.save(path)

@@ -13,6 +13,12 @@ class Colour(enum.StrEnum):
     """Number of events in the point's pixel; the scale ends at the 99th percentile."""
     RESIDUAL = "residual"
     """Distance from the centre of the neighbouring events, up to 2 px; for an edge, the distance from its crest."""
+    CAUSE = "cause"
+    """Cause of the event, from the ground truth of a simulation."""
+    INSTANCE = "instance"
+    """Instance of a simulated world that the event saw, from the ground truth."""
+    DEPTH = "depth"
+    """Depth of what the event saw in a simulated world [m], from the ground truth; the scale is logarithmic."""
 
 
 class Axis(enum.StrEnum):

@@ -18,6 +18,8 @@ from amiwarp.imaging.export import save_png
 from amiwarp.validation import choice
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.colouring import colours_of, third_axis
+from amiwarp.viewer.legend import legend_actors, rows_in, strip_share
+from amiwarp.viewer.truth_colours import Legend, legend_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -124,13 +126,16 @@ class Scene:
         check_display()
         import pyvista
 
-        self.plotter = pyvista.Plotter(off_screen=True, shape=(1, 2), border=False, window_size=list(size))
+        self.plotter = pyvista.Plotter(off_screen=True, shape=(1, 3), border=False, window_size=list(size))
         self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
-        self.plotter.link_views()
+        self.plotter.link_views((0, 1))
+        self.plotter.renderers[2].InteractiveOff()
+        self._divide(0.0, overlaid=False)
         self.view = View.FREE
         self._clouds: list[Any] = []
         self._marks: list[tuple[int, Any]] = []
         self._frame: list[tuple[int, Any]] = []
+        self._explained: tuple[Legend, str] | None = None
         self._framed: tuple[Any, ...] | None = None
         self.box = Box(0, 0, 1, 1, 1.0)
         self._points: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)] * 2
@@ -147,6 +152,7 @@ class Scene:
             valid = np.isfinite(points).all(axis=1)
             self._cloud(k, points[valid], colours[valid], look)
         self._draw_frame(look)
+        self._draw_legend(legend_of(shown.truth, look.colour, rows_in(self.plotter.window_size[1])), look)
         if replace(before, depth=depth) != self.box:  # the region has changed
             self.look_from(self.view, look)
 
@@ -165,14 +171,14 @@ class Scene:
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - middle
         wide, tall, near = (np.abs(corners @ right), np.abs(corners @ up), corners @ away)
         width, height = self.plotter.window_size
-        aspect = width / height * (1.0 if look.overlaid else 0.5)
+        aspect = width / height * (1.0 - self._strip) * (1.0 if look.overlaid else 0.5)
         half = math.tan(math.radians(VIEW_ANGLE / 2.0))
         camera = self.plotter.renderers[0].camera
         camera.parallel_projection, camera.view_angle = view is not View.FREE, VIEW_ANGLE
         camera.parallel_scale = float(np.maximum(tall, wide / aspect).max())
         away = away * float((near + np.maximum(tall, wide / aspect) / half).max())
         camera.position, camera.focal_point, camera.up = tuple(middle + away), tuple(middle), tuple(up)
-        for renderer in self.plotter.renderers:
+        for renderer in self._views:
             renderer.camera = camera
             renderer.reset_camera_clipping_range()
 
@@ -195,7 +201,7 @@ class Scene:
 
         x and y are shares of the picture's width and height from its top left.
         """
-        side = int(x >= 0.5 and not self._overlaid)
+        side = int(x >= self.plotter.renderers[1].GetViewport()[0] and not self._overlaid)
         renderer, points = self.plotter.renderers[side], self._points[side]
         width, height = self.plotter.window_size
         matrix = renderer.camera.GetCompositeProjectionTransformMatrix(renderer.GetTiledAspectRatio(), -1.0, 1.0)
@@ -231,6 +237,11 @@ class Scene:
         self.plotter.close()
 
     @property
+    def _views(self) -> list[Any]:
+        """Renderers of the two clouds."""
+        return list(self.plotter.renderers)[:2]
+
+    @property
     def _overlaid(self) -> bool:
         return bool(self.plotter.renderers[0].GetViewport()[2] > 0.9)
 
@@ -257,14 +268,13 @@ class Scene:
             return
         self._framed = wanted
         background, ink = BACKGROUND_AND_INK[look.dark]
-        left, right = self.plotter.renderers
+        left, right = self._views
         if look.overlaid != self._overlaid:
-            left.SetViewport(0.0, 0.0, *((1.0, 1.0) if look.overlaid else (0.5, 1.0)))
-            right.SetDraw(not look.overlaid)
+            self._divide(self._strip, overlaid=look.overlaid)
             home, cloud = (left, right)[not look.overlaid], self._clouds[1]
             (right if look.overlaid else left).RemoveActor(cloud)
             home.AddActor(cloud)
-        for renderer in (left, right):
+        for renderer in self.plotter.renderers:
             renderer.set_background(background)
         for k, actor in self._frame:
             self.plotter.renderers[k].remove_actor(actor, render=False)
@@ -272,6 +282,33 @@ class Scene:
         titles = ("as recorded and compensated",) if look.overlaid else ("as recorded", "compensated")
         for k, title in enumerate(titles):
             self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
+
+    def _draw_legend(self, legend: Legend, look: Look) -> None:
+        """Draw the legend in a strip on the left, if it has changed. The clouds shrink to make room."""
+        ink, home, camera = BACKGROUND_AND_INK[look.dark][1], self.plotter.renderers[2], self._views[0].camera
+        strip = strip_share(legend, self.plotter.window_size[0])
+        if strip != self._strip:
+            grows = (1.0 - self._strip) / (1.0 - strip)
+            self._divide(strip, overlaid=look.overlaid)
+            camera.Dolly(1.0 / grows)
+            camera.parallel_scale *= grows
+            self._views[0].reset_camera_clipping_range()
+        if self._explained == (legend, ink):
+            return
+        self._explained = legend, ink
+        home.clear_actors()
+        for actor in legend_actors(legend, ink, font()):
+            home.add_actor(actor, render=False, pickable=False, reset_camera=False)
+
+    def _divide(self, strip: float, *, overlaid: bool) -> None:
+        """Divide the picture into the legend's strip, given as a share of the width, and one or two clouds."""
+        self._strip, (left, right, legend) = strip, self.plotter.renderers
+        middle = (1.0 + strip) / 2.0
+        legend.SetViewport(0.0, 0.0, strip, 1.0)
+        left.SetViewport(strip, 0.0, 1.0 if overlaid else middle, 1.0)
+        right.SetViewport(middle, 0.0, 1.0, 1.0)
+        legend.SetDraw(strip > 0.0)
+        right.SetDraw(not overlaid)
 
     def _axes(self, k: int, look: Look, ink: str, title: str) -> list[Any]:
         import pyvista

@@ -9,6 +9,8 @@ import numpy as np
 
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.viewer.choices import Axis, Colour
+from amiwarp.viewer.drawn_truth import STORES
+from amiwarp.viewer.truth_colours import truth_colours
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,6 +39,8 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
     if look.colour is Colour.POLARITY:
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
+    if look.colour in STORES:
+        return truth_colours(shown.truth, look.colour)
     value, name = _measure(shown, look.colour, after=after)
     table = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
     if name == "twilight":  # its ends are white and its middle is black: keep both apart from the background

@@ -12,6 +12,7 @@ from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import DeviceEvents
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.viewer.drawn_truth import DrawnTruth
 from amiwarp.viewer.timeline import Span
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ class LoadedWindow:
     """Window, with all events that were read."""
     drawn: Events
     """Selected events that are drawn as points."""
+    truth: DrawnTruth
+    """Ground truth of the drawn events."""
     xy: NDArray[np.float32]
     """Pixels of the drawn events, shape ``(n, 2)``."""
     theta: NDArray[np.float64]

@@ -20,6 +20,7 @@ from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import DeviceEvents, upload_events
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import apex_from_deflection
+from amiwarp.viewer.drawn_truth import DrawnTruth
 from amiwarp.viewer.imager import LoadedWindow, WindowImager
 from amiwarp.viewer.timeline import Span, event_rate, read_span
 
@@ -94,6 +95,8 @@ class DisplayedWindow:
     """Number of events in the images."""
     events: Events
     """Events that are drawn as points."""
+    truth: DrawnTruth
+    """Ground truth of these events."""
     before: NDArray[np.float32]
     """Pixels of these events as recorded, shape ``(n, 2)``."""
     after: NDArray[np.float32]
@@ -280,8 +283,8 @@ class Inspector:
         after = np.asarray(self.model.compensate_points(w.xy, theta.astype(np.float32)), np.float32)
         region = self.selection.region or (0, 0, *self.recording.events.size)
         return DisplayedWindow(
-            w.span, region, w.on_device.count, w.drawn, w.xy, after, np.mod(theta, math.tau), w.image, image,
-            w.sharpness, sharpness,
+            w.span, region, w.on_device.count, w.drawn, w.truth, w.xy, after, np.mod(theta, math.tau), w.image,
+            image, w.sharpness, sharpness,
         )  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -336,19 +339,21 @@ class Inspector:
         return build_model(knobs.model, self.camera, self.prism, self._values(knobs))
 
     def _prepare(self, span: Span) -> LoadedWindow:
-        selected = self._selected(span.events)
+        kept = np.flatnonzero(self._selected(span.events))
+        selected = span.events if len(kept) == len(span.events) else span.events[kept]
         if not len(selected):
             what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
             raise AmiwarpError(f"{what} from {(span.start_us - self.recording.events.t_first) * 1e-3:.3f} ms on for "
                                f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
         encoder, n = self.encoder, len(selected)
-        drawn = selected[np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)]
+        thin = np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)
+        drawn, truth = selected[thin], DrawnTruth(self.recording.truth, span, kept[thin])
         curve_events = selected[:: max(1, -(-n // CURVE_EVENTS))]
         on_device = self._upload(selected, self.knobs)
         no_prism = self._model(replace(self.knobs, model="exact", apex=0.0))
         image, sharpness = self._imager.measure(no_prism, on_device, 0.0)
         return LoadedWindow(
-            span, drawn, np.stack([drawn.x, drawn.y], axis=1).astype(np.float32), encoder.angle_at(drawn.t),
+            span, drawn, truth, np.stack([drawn.x, drawn.y], axis=1).astype(np.float32), encoder.angle_at(drawn.t),
             encoder.speed_at(drawn.t) * 1e-6, on_device, curve_events, self._upload(curve_events, self.knobs), image,
             sharpness,
         )  # fmt: skip
@@ -361,7 +366,8 @@ class Inspector:
         encoder = self.recording.encoder
         return upload_events(events, encoder, self.device, slope=encoder.speed_at(events.t) * 1e-6)
 
-    def _selected(self, events: Events) -> Events:
+    def _selected(self, events: Events) -> NDArray[np.bool_]:
+        """Return whether each event meets the selection, shape ``(n,)``."""
         s, keep = self.selection, np.ones(len(events), np.bool_)
         if self.recording.encoder is not None:
             first, last = self.recording.encoder.coverage
@@ -373,4 +379,4 @@ class Inspector:
             keep &= (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
         if s.hide_hot:
             keep &= ~self.hot[events.y, events.x]
-        return events if keep.all() else events[keep]
+        return keep

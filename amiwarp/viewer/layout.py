@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.choices import Axis, View
 
 if TYPE_CHECKING:
     from amiwarp.viewer.panel import Panel
@@ -210,14 +210,16 @@ def _calibration(panel: Panel, html: Any, v: Any) -> None:
 def _look(html: Any, v: Any) -> None:
     html.H4("points")
     with html.Div(classes="row"):
-        for name, label, items in (("colour", "colour", Colour), ("axis", "third axis", Axis)):
-            v.VSelect(v_model=(name,), items=(str([each.value for each in items]),), label=label, density="compact",
-                      hide_details=True, style="max-width: 140px", id=name)  # fmt: skip
+        axes = str([each.value for each in Axis])
+        for name, label, items in (("colour", "colour", "colours"), ("axis", "third axis", axes)):
+            v.VSelect(v_model=(name,), items=(items,), label=label, density="compact", hide_details=True,
+                      style="max-width: 140px", id=name)  # fmt: skip
     for name, label, most, step in (("point_size", "size", 8, 0.5), ("opacity", "opacity", 1, 0.05)):
         with html.Div(style="display: grid; grid-template-columns: 84px 1fr; align-items: center"):
             html.Span(label, classes="small")
             v.VSlider(v_model=(name,), min=step, max=most, step=step, hide_details=True, density="compact")
     v.VCheckbox(v_model=("orbit_shown",), label="show the model's orbit", density="compact", hide_details=True)
+    html.Div("ground truth: {{ truth }}", v_if="truth", classes="small", id="truth")
 
 
 def _export(panel: Panel, html: Any, v: Any) -> None:

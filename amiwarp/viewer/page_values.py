@@ -11,6 +11,7 @@ import numpy as np
 
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
 from amiwarp.viewer.layout import NAMES, SPEEDS
 from amiwarp.viewer.message_filter import Check, flag, list_of, number, one_of, text
 
@@ -45,7 +46,8 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "playing": False, "speed": 0.1, "polarity": "both", "hide_hot": False, "region_x": [0, source.size[0]],
         "region_y": [0, source.size[1]], "colour": Colour.POLARITY.value, "point_size": 2.0, "opacity": 1.0,
         "axis": (Axis.ANGLE if has_turns else Axis.TIME).value, "dark": False, "overlaid": False,
-        "view": View.FREE.value,
+        "view": View.FREE.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
+        "truth": truth_text(recording.truth),
         "knob": "apex", "has_encoder": inspector.has_encoder, "orbit_shown": True, "help_shown": False, "out": "",
         "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "events": "", "sharpness": "",
         "before": "", "after": "", "picture": "", "picture_note": "", "curve": "", "curve_mark": 0.0, "curve_text": "",
@@ -64,11 +66,11 @@ def source_state(inspector: Inspector) -> dict[str, Any]:
 
 
 def event_text(shown: DisplayedWindow, k: int) -> str:
-    """Return the description of point ``k``: pixel, time, angle, polarity and compensated position."""
-    e, (x, y) = shown.events, shown.after[k]
+    """Return the description of point ``k``: pixel, time, angle, polarity, compensated position and ground truth."""
+    e, (x, y), truth = shown.events, shown.after[k], shown.truth.text(k)
     return (
         f"x {e.x[k]}, y {e.y[k]} px; t {e.t[k]} µs; θ {math.degrees(shown.theta[k]):.2f}°; "
-        f"{'ON' if e.p[k] else 'OFF'}; compensated {x:.2f}, {y:.2f} px"
+        f"{'ON' if e.p[k] else 'OFF'}; compensated {x:.2f}, {y:.2f} px{truth and f'; {truth}'}"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.events import EventSource
+    from amiwarp.events.truth import EventValues
 
 RUNS = 64
 """Number of evenly spaced runs of events that are read from a window with too many events."""
@@ -37,6 +38,12 @@ class Span:
     """Number of events in the window, including those that are not read."""
     events: Events
     """All events of the window, or evenly spaced runs of them."""
+    runs: tuple[slice, ...]
+    """Indices of these events in the recording."""
+
+    def rows(self, values: EventValues) -> NDArray[Any]:
+        """Return the rows of ``values`` for :attr:`events`; ``values`` has one row per event of the recording."""
+        return np.concatenate([values[run] for run in self.runs])
 
 
 def read_span(source: EventSource, start_us: int, length_us: int, *, most_events: int) -> Span:
@@ -47,9 +54,10 @@ def read_span(source: EventSource, start_us: int, length_us: int, *, most_events
     first, stop = (source.find(t) for t in (start_us, start_us + length_us))
     count = stop - first
     if count <= most_events:
-        return Span(start_us, length_us, count, source.slice(first, stop))
+        return Span(start_us, length_us, count, source.slice(first, stop), (slice(first, stop),))
     starts, length = (first + np.arange(RUNS) * count // RUNS).tolist(), most_events // RUNS
-    return Span(start_us, length_us, count, Events.concatenate(list(_runs(source, starts, length))))
+    runs = tuple(slice(k, k + length) for k in starts)
+    return Span(start_us, length_us, count, Events.concatenate(list(_runs(source, starts, length))), runs)
 
 
 def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from amiwarp.kernels import world as kernels
 from amiwarp.simulation.worlds.scene import Body, Material, World
 
+CUDA_TREE = "cubql"
+"""Kind of the tree of faces on a GPU: rays take 0.5 to 0.65 of the time of Warp's default there, but more on a CPU."""
 LARGEST_PYRAMID = 14
 """Largest number of levels of a texture pyramid."""
 
@@ -51,7 +53,7 @@ class DeviceWorld:
         faces = [np.asarray(body.mesh.faces) + start for body, start in zip(bodies, starts, strict=False)]
         points = wp.array(np.concatenate(vertices).astype(np.float32), dtype=wp.vec3, device=self.device)
         indices = wp.array(np.concatenate(faces).ravel().astype(np.int32), dtype=int, device=self.device)
-        mesh = wp.Mesh(points, indices)
+        mesh = wp.Mesh(points, indices, bvh_constructor=None if self.device.is_cpu else CUDA_TREE)
         self._meshes.append(mesh)
         return mesh
 

@@ -206,7 +206,9 @@ def _placement(bearings: NDArray[np.float64], focal: float, margin: float) -> Pl
     x, y, z = bearings.T
     if not len(bearings) or z.min() < SMALLEST_COSINE:
         limit = 2.0 * math.degrees(math.acos(SMALLEST_COSINE))
-        raise AmiwarpError(f"the camera sees more than the {limit:.0f} deg that a map covers; give seeing='rays'")
+        raise AmiwarpError(
+            f"the camera sees more than the {limit:.0f} deg that a map covers; give seeing='rays' (--seeing rays)"
+        )
     low_x, high_x = float((x / z).min()) - margin, float((x / z).max()) + margin
     low_y, high_y = float((y / z).min()) - margin, float((y / z).max()) + margin
     pitch = TEXELS_PER_PIXEL * focal

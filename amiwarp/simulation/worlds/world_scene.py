@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass
 
+from amiwarp.simulation.worlds.choices import Seeing
 from amiwarp.simulation.worlds.scene import World
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import choice, instance, one_of, real
-
-
-class Seeing(enum.StrEnum):
-    """How the pixels see a world."""
-
-    MAPS = "maps"
-    """Pictures of the world without the prism, rendered whenever it has moved by half a pixel, and blended between."""
-    RAYS = "rays"
-    """Rays through the prism into the world, for every pixel and step: exact, and slow on a CPU."""
-
 
 SAMPLES = (1, 4, 9, 16)
 """Numbers of rays a pixel, or a texel, that can be chosen."""
