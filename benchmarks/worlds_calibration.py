@@ -1,0 +1,92 @@
+"""Calibrate simulated worlds, with a camera at rest, in a hand, and in fast motion.
+
+    python -m benchmarks.worlds_calibration [--device cuda:0] [--size 320 240] [--out FILE.json]
+
+The error is the rms distance [px] between the displacement of the calibrated model and that of the true prism, over
+the image and a turn. A camera that translates gives parallax, which no model of calibration has. Its largest speed in
+the image is given next to the error, as a share of the mean speed that the prism gives the image.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.calib.calibration import calibrate
+from amiwarp.calib.sharpness.search import Settings
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import Prism
+from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.motion import movers_speed, parallax_speed
+from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, named_world
+from amiwarp.simulation.worlds.world_scene import WorldScene
+
+SECONDS, APEX, RPM = 0.4, math.radians(1.0), 720.0
+NOMINAL = 1.1
+"""Nominal over true apex angle, so that the search range is not centred on the truth."""
+
+
+def image_speeds(scene: WorldScene, camera: Camera, device: str) -> tuple[float, float]:
+    """Return the largest speeds that the camera's translation and moving bodies give the image [px/s]."""
+    world, t = DeviceWorld(scene.world, device), np.linspace(0.0, SECONDS, 9)
+    world.set_instants(t)
+    parallax = max(parallax_speed(world, camera, scene.trajectory, float(at), k) for k, at in enumerate(t))
+    return parallax, float(movers_speed(world, camera, scene.trajectory, t).max())
+
+
+def row(name: str, trajectory: str, size: tuple[int, int], device: str) -> dict[str, Any]:
+    """Simulate and calibrate one recording."""
+    camera, prism = Camera.from_fov(*size, math.radians(60.0)), Prism(APEX)
+    world, path = named_world(name, trajectory, duration_s=SECONDS)
+    scene = WorldScene(world, path)
+    began = time.perf_counter()
+    simulation = Simulation(scene, camera, prism, SECONDS, nominal_prism=Prism(NOMINAL * APEX), device=device)
+    recording = simulation.run()
+    simulated = time.perf_counter() - began
+    parallax, movers = image_speeds(scene, camera, device)
+    prism_speed = camera.fx * (prism.index - 1.0) * APEX * RPM / 60.0 * 2.0 * math.pi
+    found = {"world": name, "trajectory": trajectory, "events": len(recording.events), "simulated_in_s": simulated,
+             "parallax_px_s": parallax, "movers_px_s": movers, "parallax_share": parallax / prism_speed}  # fmt: skip
+    assert recording.camera is not None
+    assert recording.truth is not None
+    try:
+        c = calibrate(recording, Settings(), device=device)
+    except AmiwarpError as error:
+        return found | {"refused": str(error)}
+    truth = truth_model(recording.camera, recording.truth, prism.flat_side)
+    error = model_error(c.model, truth)
+    return found | {"model": c.model_name, "error_px": error.rms, "largest_px": error.worst, "seconds": c.seconds,
+                    "warnings": list(c.warnings)}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--size", type=int, nargs=2, default=(320, 240))
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS))
+    parser.add_argument("--trajectories", nargs="+", default=list(TRAJECTORIES), choices=list(TRAJECTORIES))
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    rows = []
+    for trajectory in args.trajectories:
+        for name in args.worlds:
+            rows.append(row(name, trajectory, tuple(args.size), args.device))
+            print(json.dumps(rows[-1]), flush=True)
+    if args.out is not None:
+        report = {"machine": str(wp.get_device(args.device).name), "size": list(args.size), "rows": rows}
+        args.out.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
