@@ -106,9 +106,11 @@ def edge_blur(
     AmiwarpError
         If the IWE has no edges, or no event is near an edge.
 
-    Notes ----- Edges are the ridges of the IWE of ``sharp_xy`` (Steger, PAMI 1998). An event belongs to an edge if it
-    is within 3 px. Each event is weighted by the probability that it is not part of the uniform background, which
-    consists of noise and neighbouring texture.
+    Notes
+    -----
+    Edges are the ridges of the IWE of ``sharp_xy`` (Steger, PAMI 1998). An event belongs to an edge if it is within
+    3 px. Each event is weighted by the probability that it is not part of the uniform background, which consists of
+    noise and neighbouring texture.
 
     Examples
     --------

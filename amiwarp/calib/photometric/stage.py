@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from amiwarp.progress import Progress
 
 LARGEST_ROTATION_MOVE_PX = 4.0
-"""Largest distance from the sharpness optimum in the parameters of the camera's rotation [px]."""
+"""Largest distance from the sharpness optimum that is searched in the parameters of the camera's rotation [px]."""
 RESTARTS = 3
-"""Largest number of new searches from a nearby point with a lower cost than the result."""
+"""Largest number of further searches, each from a point near the previous result that has a lower cost."""
 FIRST_STEP_PX = 0.2
 """First step of an NLopt algorithm's first run [px]."""
 POLISH_STEP_PX = 0.05
-"""First step of its second run [px]."""
+"""First step of an NLopt algorithm's second run, which starts at the result of the first [px]."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,15 @@ class PhotometricSettings:
     evaluations: int = 80
     """Largest number of evaluations in each of the two runs of an NLopt algorithm."""
     tolerance_px: float = 0.002
-    """The search ends when its steps move events by less than this [px]."""
+    """Length below which the search's steps end it, as displacement of events [px]."""
     steps: int = 20
-    """Number of conjugate-gradient steps per evaluation; each evaluation starts from the last map."""
+    """Number of conjugate-gradient steps that solve the brightness map in each evaluation, starting from the previous
+    map."""
     density: float = 1.0
-    """Nodes of the map per pixel along each axis."""
+    """Nodes of the brightness map per pixel along each axis."""
     sensor: SensorTiming = field(default_factory=SensorTiming)
-    """Known latency and refractory period. Unknown parts of them become part of the phase."""
+    """Known latency and refractory period of the sensor. If they are unknown, the calibrated phase contains their
+    effect."""
 
     def check(self) -> None:
         """Check the settings.
@@ -90,7 +92,7 @@ class PhotometricSettings:
 def refine(
     recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
 ) -> tuple[PhotometricSummary, StageSummary]:
-    """Run the stage from the answer of the sharpness stage and return its result.
+    """Run the photometric stage from the answer of the sharpness stage, and return its result.
 
     ``linear`` names the free ones of ``off_ratio`` and ``leak``. Raises :class:`AmiwarpError` for too few pairs.
     """
