@@ -2,9 +2,6 @@
 
 The grid is refined about the values that the hardware gives: the nominal prism and the mounted phase. The paper states
 neither the grid nor η. As in the paper, the result is not checked and has no uncertainty.
-
-The grid is refined about the values that the hardware gives: the nominal prism and the mounted phase. The paper states
-neither the grid nor η. As in the paper there are no checks of the answer and no uncertainty.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
 """Presets: JSON files of settings for ``calibrate`` or ``compensate`` that ``amiwarp chart`` chose for a budget."""
-"""
 
 from __future__ import annotations
 

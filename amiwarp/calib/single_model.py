@@ -2,9 +2,6 @@
 
 If no brightness map explains the events, three causes are tried in turn: hot or flickering pixels, a rotating camera,
 and a wrong scale of the encoder.
-
-If no brightness map explains the events, three causes are tried in turn: hot or flickering pixels, a rotating camera,
-and a wrong scale of the encoder.
 """
 
 from __future__ import annotations
@@ -33,8 +30,6 @@ LEAST_BAD_SHARE = 0.01
 """Share of the events on hot or flickering pixels above which these pixels are masked."""
 LEAST_SHARPNESS_KEPT = 0.7
 """Smallest share of the gain in sharpness that the parameters of the photometric stage must keep.
-
-The true parameters keep 0.93 to 0.99 of the gain, 0.8 with many hot pixels (measured).
 
 The true parameters keep 0.93 to 0.99 of the gain, 0.8 with many hot pixels (measured).
 """

@@ -1,8 +1,6 @@
 """Acceptance of the photometric stage's optimum.
 
-Each limit prevents failures that were measured in ``docs/explanation/stability.md``.
-
-Each limit was set by failures that it prevents, see ``docs/explanation/stability.md``.
+Each limit was set by failures that it prevents; ``docs/explanation/stability.md`` describes them.
 """
 
 LARGEST_MOVE_PX = 1.5
@@ -14,9 +12,6 @@ PERTURBATION_PX, LEAST_COST_RISE = 0.3, 0.01
 
 Without such a rise there is no distinct optimum, or a brightness map of few events fits any orbit. The cost is relative
 to that without a brightness map.
-
-Without such a rise there is no optimum, or a map of few events fits any orbit. The cost is relative to that without a
-map.
 """
 LARGEST_NEXT_STEP_PX = 0.06
 """Largest Gauss-Newton step that may remain when the search ends [px]. The step is about 0.01 px if the search

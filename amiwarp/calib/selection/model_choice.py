@@ -220,8 +220,6 @@ def express(trial: Trial, fitted: FittedCandidate, settings: Settings, device: A
     """Express the exact model's calibration in the parameters of a smaller model, with uncertainty.
 
     The deflection replaces the apex. The sharpness is measured like that of the exact model.
-
-    The sharpness is measured like that of the exact model.
     """
     exact, name, values = trial.exact, fitted.candidate.model, fitted.values
     if name in ("exact", "ellipse"):

@@ -2,8 +2,6 @@
 
 The module also estimates the blur that remains even with the exact model: by encoder noise, clock resolution and
 latency jitter.
-
-Also the blur that remains even with the exact model: by encoder noise, clock resolution and latency jitter.
 """
 
 from __future__ import annotations

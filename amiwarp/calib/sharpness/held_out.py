@@ -123,8 +123,6 @@ class Quadratic:
         """Return the step to the sharpest point [px]: 0 along flat directions, at most :data:`LONGEST_STEP_PX` long.
 
         ``gradient`` [1/px] replaces the approximation's own gradient, for another model with about the same Hessian.
-
-        ``gradient`` replaces the own one, for another model with about the same Hessian.
         """
         values, vectors = np.linalg.eigh(-self.hessian)
         along = vectors.T @ (self.slopes.mean(axis=1) if gradient is None else gradient)

@@ -88,8 +88,6 @@ class Objective:
         """Return the model to evaluate: the exact model instead of the ellipse, which is its first harmonic.
 
         Both have the same optimum, but the ellipse would need new tables at every point.
-
-        The exact model stands in for it, because the ellipse would need new tables at every point.
         """
         kind = "exact" if self.space.model == "ellipse" else self.space.model
         return build_model(kind, self.space.camera, self.space.prism, values)
