@@ -1,4 +1,4 @@
-"""Checks of a recording and of calibrated parameters. Each check raises an error that gives the reason and the remedy."""
+"""Checks of a recording and of calibrated parameters. A failed check raises an error with the reason and the remedy."""
 
 from __future__ import annotations
 

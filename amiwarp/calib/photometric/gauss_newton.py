@@ -1,4 +1,4 @@
-"""Gauss-Newton search for parameters with the brightness map eliminated (variable projection), and their uncertainty."""
+"""Gauss-Newton search for parameters with the brightness map eliminated (variable projection), with uncertainty."""
 
 from __future__ import annotations
 
