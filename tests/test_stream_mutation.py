@@ -61,7 +61,7 @@ def test_a_size_is_a_whole_number_in_range(value: str) -> None:
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity", "9" * 5000])
 def test_what_is_no_json_is_refused(value: str) -> None:
-    with pytest.raises(AmiwarpError, match="its hello is not JSON"):
+    with pytest.raises(AmiwarpError, match="its hello message is not JSON"):
         hello(f'{{"width":{value},"height":48}}')
 
 

@@ -63,7 +63,7 @@ class PacketCopier:
     """Copies many packets by several threads, see :mod:`amiwarp.kernels.packet_copy`. One copy at a time."""
 
     def __init__(self, find_pointers: FindPointers | None = None) -> None:
-        """Set the function that finds the arrays' memory (:mod:`amiwarp.compensation.pointers`); default: the fastest."""
+        """Set the function that finds the arrays' memory, see :mod:`amiwarp.compensation.pointers`."""
         self._find_pointers = find_pointers or fastest()
         self._allocate(64)
 

@@ -161,7 +161,7 @@ class Compensator:
             return
         if t.item(0) < self._t_last:
             raise AmiwarpError(
-                f"a packet starts at {t[0]} us, the previous packet ended at {self._t_last} us; sort the packets by time"
+                f"a packet starts at {t[0]} us, the previous one ended at {self._t_last} us; sort the packets by time"
             )
         parts = [events]
         if t.size > self.batch:
