@@ -48,9 +48,8 @@ class PinnedPool:
         if not free and len(self._arrays[dtype]) >= POOL_SIZE:
             view = np.empty(n, dtype)
             return wp.array(view, dtype=wp.dtype_from_numpy(dtype), device="cpu", copy=False), view
-        number = (
-            heapq.heappop(free) if free else self._allocate(dtype)
-        )  # the lowest number, so that few arrays are in use
+        # the lowest number, so that few arrays are in use
+        number = heapq.heappop(free) if free else self._allocate(dtype)
         array = self._arrays[dtype][number]
         # Not a slice: NumPy makes a slice of a slice refer to the base, and the pool would miss that it is in use.
         view = np.frombuffer(memoryview(array.numpy()), dtype, n)

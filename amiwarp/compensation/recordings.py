@@ -281,5 +281,5 @@ def check_size(fitted: Calibration | Model, size: tuple[int, int], name: str, *,
     width, height = fitted.camera.width, fitted.camera.height
     if size != (width, height):
         raise AmiwarpError(
-            f"{name}: is {size[0]}x{size[1]} px, the {what} is for {width}x{height} px; calibrate this camera"
+            f"{name}: its sensor is {size[0]}x{size[1]}, the {what} is for {width}x{height}; calibrate this camera"
         )

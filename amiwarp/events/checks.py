@@ -21,7 +21,7 @@ The difference and the sum of any two times then fit int64.
 """
 
 SENSOR_DTYPE = np.dtype(np.uint16)
-"""Type of pixel coordinates from a sensor. Compensated events have float32 coordinates."""
+"""Data type of pixel coordinates from a sensor. Compensated events have float32 coordinates instead."""
 
 
 def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
@@ -33,7 +33,7 @@ def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
         with np.errstate(over="ignore"):
             short = array.astype(np.float32, copy=False)
         if np.isinf(short).any():
-            raise AmiwarpError(f"events' {name} holds a coordinate that float32 cannot hold; drop that event")
+            raise AmiwarpError(f"events' {name} holds a coordinate that is too large for float32; drop that event")
         return short
     if array.dtype == np.uint16:
         return array
@@ -64,7 +64,7 @@ def as_times(values: ArrayLike) -> NDArray[np.int64]:
 
 
 def check_sensor(events: Events) -> None:
-    """Raise :class:`AmiwarpError` for compensated events, whose coordinates are not uint16."""
+    """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
     if events.x.dtype != SENSOR_DTYPE:
         raise AmiwarpError(
             f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"

@@ -21,9 +21,9 @@ from amiwarp.validation import array, instance, real, whole
 TWO_PI = 2.0 * math.pi
 """One turn [rad]."""
 MOST_SAMPLES = 1 << 28
-"""Largest number of samples of :meth:`Encoder.constant_speed`: three days at one sample per millisecond."""
+"""Largest number of samples that :meth:`Encoder.constant_speed` makes: three days at one sample per millisecond."""
 LARGEST_ANGLE = 1e10
-"""Largest magnitude of an angle [rad]: 1.6e9 turns. Up to it float64 resolves 2e-6 rad."""
+"""Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class Encoder:
     clock_offset_us: float = 0.0
     """Encoder time minus event time [us]."""
     index_t: NDArray[np.int64] | None = None
-    """Times of the index pulses on the encoder's clock [us], shape ``(k,)``, or None."""
+    """Times of the index pulses on the encoder's clock [us], shape ``(k,)``; None if the encoder has none."""
 
     def __post_init__(self) -> None:
         for name in ("t", "angle"):
@@ -64,7 +64,7 @@ class Encoder:
         late = self.t[1:] <= self.t[:-1]
         if late.any():
             at = int(np.argmax(late)) + 1
-            raise AmiwarpError(f"encoder sample {at} (t = {self.t[at]} us) is not later than the one before; sort them")
+            raise AmiwarpError(f"encoder sample {at} ({self.t[at]} us) is not later than the one before; sort by time")
         if not (self.t[0] > -TIME_LIMIT and self.t[-1] < TIME_LIMIT):
             span = f"{self.t[0]} .. {self.t[-1]} us"
             raise AmiwarpError(f"encoder samples span {span}, beyond {TIME_LIMIT} us from 0; they are damaged")
@@ -242,7 +242,7 @@ class Encoder:
         """
         index_t = np.atleast_1d(as_times(index_t_us))
         if not index_t.size:
-            raise AmiwarpError("no index pulse given; leave index_t_us out if there is none")
+            raise AmiwarpError("index_t_us contains no pulse; leave index_t_us out if the encoder has no index pulse")
         self._check_index(index_t)
         at_pulse = np.interp(index_t - self.t[0], self.t - self.t[0], self.angle)
         # The circular mean chooses where to cut the circle. The median around it is robust to spurious pulses.
@@ -251,7 +251,7 @@ class Encoder:
         return dataclasses.replace(self, angle=self.angle - zero, index_t=index_t)
 
     def slip(self) -> NDArray[np.float64]:
-        """Return the angle error at each index pulse.
+        """Return the angle error at each index pulse: the distance of the angle from a multiple of 2 pi.
 
         Returns
         -------
@@ -373,7 +373,7 @@ class Encoder:
         return float((self.angle[-1] - self.angle[0]) / TWO_PI * 60e6 / float(self.t[-1] - self.t[0]))
 
     def _near(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the encoder times of ``t``, and the times and angles of the samples around them.
+        """Return the encoder times for event times ``t``, and the times and angles of the samples around them.
 
         All times are relative to the first of these samples. Only samples near ``t`` are used, so the cost does not
         depend on the recording's length.
@@ -383,7 +383,7 @@ class Encoder:
         if not self.covers(low, high):
             first, last = self.coverage
             raise AmiwarpError(
-                f"events at {low} .. {high} us lie outside the encoder's {first} .. {last} us; drop them"
+                f"events at {low} .. {high} us lie outside the encoder's {first} .. {last} us; drop these events"
             )
         start = int(np.searchsorted(self.t, math.floor(low + self.clock_offset_us))) - 1
         start = min(max(start, 0), self.t.size - 2)

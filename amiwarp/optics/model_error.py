@@ -1,4 +1,4 @@
-"""Distance between two models over the image and one turn."""
+"""Distance between two optical models over the image and one turn of the prism."""
 
 from __future__ import annotations
 

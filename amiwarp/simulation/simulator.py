@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Everything that determines a simulated recording.
+    """Description of a simulated recording: all that determines its events.
 
     Equal values give equal events, bit for bit, on one kind of device.
 
@@ -50,23 +50,23 @@ class Simulation:
     """
 
     scene: Scene | WorldScene
-    """The scene: pictures at infinity, or a world."""
+    """Scene in front of the camera: pictures at infinity, or a world."""
     camera: Camera
-    """The camera, of at most 4194304 pixels."""
+    """Camera intrinsics, of at most 4194304 pixels."""
     prism: Prism
-    """The true prism."""
+    """Prism in front of the camera, with its true parameters."""
     duration_s: float
-    """Duration [s]."""
+    """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
     """Motion of the prism."""
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
     """Rotation of the camera."""
     sensor: SensorModel = field(default_factory=SensorModel)
-    """Pixels of the sensor."""
+    """Model of the sensor's pixels and readout."""
     encoder_model: EncoderModel | None = field(default_factory=EncoderModel)
     """Errors of the encoder; None for a camera without a prism, whose recording has neither encoder nor prism."""
     nominal_prism: Prism | None = None
-    """The prism stored with the recording; None for the true one."""
+    """Nominal prism that is stored with the recording; None for the true prism."""
     seed: int = 0
     """Seed of all random numbers."""
     device: str = "cpu"
@@ -89,7 +89,7 @@ class Simulation:
 
     @property
     def duration_us(self) -> int:
-        """Duration, rounded [us]."""
+        """Duration of the recording, rounded [us]."""
         return round(self.duration_s * 1e6)
 
     def without_prism(self) -> Simulation:
@@ -103,7 +103,7 @@ class Simulation:
         return replace(self, prism=replace(self.prism, apex=0.0), nominal_prism=None, encoder_model=None)
 
     def encoder(self) -> Encoder | None:
-        """Sample the encoder.
+        """Sample the prism's encoder.
 
         Returns
         -------
@@ -124,7 +124,7 @@ class Simulation:
         """
         constant = self.camera_motion.constant and not (
             isinstance(self.scene, WorldScene) and self.scene.trajectory.moves
-        )  # a trajectory has no constant angular velocity
+        )  # a camera that follows a trajectory has no constant angular velocity
         rates = np.asarray(self.camera_motion.rates) if constant else np.full(3, np.nan)
         omega = dict(zip(("omega_x", "omega_y", "omega_z"), rates.ravel()[-3:].tolist(), strict=True))
         clock = {} if self.encoder_model is None else {"clock_offset_us": self.encoder_model.clock_offset_us}
@@ -140,7 +140,7 @@ class Simulation:
         }
 
     def metadata(self) -> dict[str, MetadataValue]:
-        """Describe how the recording was made.
+        """Return the metadata that the recording stores about its simulation.
 
         Returns
         -------
@@ -253,7 +253,7 @@ class Simulation:
 
     @property
     def _stored_prism(self) -> Prism | None:
-        """The nominal prism of the recording, or None for a plain event camera."""
+        """Nominal prism to store with the recording, or None for a plain event camera."""
         return None if self.encoder_model is None else self.nominal_prism or self.prism
 
     def write(

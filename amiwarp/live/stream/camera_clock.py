@@ -40,12 +40,9 @@ class CameraClock:
     """Relates the clocks of controller and camera by pulses that both recorded."""
 
     def __init__(self) -> None:
-        self._sync: deque[tuple[int, int]] = deque(
-            maxlen=MOST_UNPAIRED
-        )  # controller's time and host's time of each sync pulse
-        self._trigger: deque[tuple[int, int]] = deque(
-            maxlen=MOST_UNPAIRED
-        )  # camera's time and host's time of each trigger
+        # of each sync pulse the controller's and the host's time, of each trigger the camera's and the host's time
+        self._sync: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)
+        self._trigger: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)
         self._pairs: deque[tuple[int, int]] = deque(maxlen=MOST_PAIRS)
         self._delays: deque[int] = deque(maxlen=MOST_DELAYS)
         self._map: ClockMap | None = None
@@ -82,7 +79,7 @@ class CameraClock:
             self._match()
 
     def packet(self, t_last: int, host_us: int) -> None:
-        """Store the delay of a packet whose last event has camera time ``t_last``, and that came at ``host_us`` [us]."""
+        """Store the delay of a packet: its last event has camera time ``t_last``; it arrived at ``host_us`` [us]."""
         self._delays.append(host_us - t_last)
 
     def clock(self, host: ClockMap | None) -> ClockMap | None:

@@ -64,12 +64,8 @@ class IntervalFigures:
     """Event rate, latency, and coverage by encoder samples, all since the last report."""
 
     def __init__(self, began_us: int) -> None:
-        self._reported = (
-            began_us,
-            0,
-            0,
-            0,
-        )  # at the last report: time [us]; numbers of events received, compensated, without a measured angle
+        # at the last report: time [us]; numbers of events received, compensated, without a measured angle
+        self._reported = (began_us, 0, 0, 0)
         self._latencies: list[int] = []
 
     def add(self, packet: Compensated, now_us: int, status: SessionStatus) -> None:
