@@ -196,6 +196,7 @@ class CameraMotion:
 
 def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> None:
     """Raise :class:`AmiwarpError` for a table of wrong shape, with values out of range or unsorted times."""
+    if table.ndim != 2 or table.shape[1] != columns or len(table) < 2:
         raise AmiwarpError(f"{what} has shape {table.shape}; give one value, or at least 2 rows of {columns} numbers")
     if not (np.abs(table) <= LARGEST_SPEED).all():  # NaN fails
         worst = table[~(np.abs(table) <= LARGEST_SPEED)][0]
