@@ -109,7 +109,7 @@ def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
         for start in range(0, len(events), 50_000):
             which = slice(start, start + 50_000)
             writer.append(events[which], inside=inside[which], extrapolated=extrapolated[which])
-        with pytest.raises(AmiwarpError, match=r"a\.h5: compensated events come with inside"):
+        with pytest.raises(AmiwarpError, match=r"a\.h5: compensated events need the flags inside"):
             writer.append(events)
     source = open_recording(tmp_path / "a.h5").events
     assert_equal(read(tmp_path / "a.h5"), events)
@@ -299,7 +299,7 @@ def test_what_is_refused_does_not_end_the_recording(tmp_path, append, message):
 def test_writer_refuses_its_path_and_options(tmp_path):
     with pytest.raises(AmiwarpError, match="does not exist"), live(tmp_path / "no" / "a.h5"):
         pass
-    with pytest.raises(AmiwarpError, match="give both one size"):
+    with pytest.raises(AmiwarpError, match="give both the same size"):
         LiveWriter(tmp_path / "a.h5", width=10, height=10, camera=CAMERA)
     with pytest.raises(AmiwarpError, match=r"a\.h5: making the file"), live(tmp_path / "a.h5", metadata={"n": "a\0b"}):
         pass

@@ -14,7 +14,7 @@ KINDS = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
-"""Names of the file types that are refused, for messages."""
+"""Names of the file types that are refused, used in messages."""
 
 
 def check_regular(path: Path) -> None:
