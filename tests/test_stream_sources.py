@@ -207,7 +207,7 @@ def test_a_wrong_stream_is_an_error_after_all_before_it(tail, message):
 
 
 def test_a_stream_begins_with_a_hello(monkeypatch):
-    for data, message in ((encode_end(), "begins without a hello"), (b"", "ended without"), (b"AMI", "ended within")):
+    for data, message in ((encode_end(), "begins without a hello message"), (b"", "ended without"), (b"AMI", "ended within")):
         with pytest.raises(AmiwarpError, match=f"the pipe: {message}"):
             pipe(data)
     monkeypatch.setattr(sources, "HELLO_S", 0.06)
@@ -480,7 +480,7 @@ def test_a_camera_without_its_library(monkeypatch):
     for name, remedy in (("dv_processing", r"amiwarp\[dv\]"), ("metavision_core.event_io", "install OpenEB")):
         monkeypatch.setitem(sys.modules, name, None)
         spec = "dv" if name.startswith("dv") else "prophesee:0004"
-        with pytest.raises(AmiwarpError, match=f"^{spec}: needs {name.partition('.')[0]} .*{remedy}"):
+        with pytest.raises(AmiwarpError, match=f"^{spec}: needs the library {name.partition('.')[0]} .*{remedy}"):
             open_source(spec)
 
 

@@ -28,7 +28,7 @@ def machine(device: str) -> str:
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Return the versions of amiwarp, of Python, and of those ``packages`` that are installed."""
+    """Return the versions of amiwarp, of Python, and of those ``packages`` that are installed, by name."""
     out = {"amiwarp": __version__, "python": platform.python_version()}
     for name in packages:
         try:

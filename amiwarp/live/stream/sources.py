@@ -177,9 +177,7 @@ class StreamSource:
             if isinstance(message, Hello):
                 return message
             if message is not None:
-                raise AmiwarpError(
-                    f"{self.name}: the stream begins without a hello message; see docs/reference/stream-format.md"
-                )
+                raise AmiwarpError(f"{self.name}: begins without a hello message; see docs/reference/stream-format.md")
         raise Unreachable(f"{self.name}: {self.problem or 'sent no hello'}; see docs/reference/stream-format.md")
 
     def _next(self, timeout_s: float) -> Message | None:
