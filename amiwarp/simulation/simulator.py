@@ -124,7 +124,7 @@ class Simulation:
         """
         constant = self.camera_motion.constant and not (
             isinstance(self.scene, WorldScene) and self.scene.trajectory.moves
-        )  # a camera that follows a trajectory has no constant angular velocity
+        )  # a trajectory has no constant angular velocity
         rates = np.asarray(self.camera_motion.rates) if constant else np.full(3, np.nan)
         omega = dict(zip(("omega_x", "omega_y", "omega_z"), rates.ravel()[-3:].tolist(), strict=True))
         clock = {} if self.encoder_model is None else {"clock_offset_us": self.encoder_model.clock_offset_us}
