@@ -46,7 +46,7 @@ class Pairs:
 
 @wp.struct
 class Atlas:
-    """Tiles of the map.
+    """Tiles of the brightness map.
 
     ``origin`` (x, y, x, …) is the pixel of each tile's first node. Nodes are ``1 / density`` px apart.
     """
@@ -73,19 +73,19 @@ class Geometry:
 
 @wp.func
 def fractions_of(g: Geometry, k: int, i: int) -> wp.vec2:
-    """Return the fractions (x, y) of the first (k = 0) or second event."""
+    """Return the fractions (x, y) between map nodes of the first (k = 0) or second event of pair ``i``."""
     return wp.vec2(load_float(g.part, 2 * k * g.stride + i), load_float(g.part, (2 * k + 1) * g.stride + i))
 
 
 @wp.func
 def fraction(node: wp.vec2) -> wp.vec2:
-    """Return the fractional part of node coordinates."""
+    """Return the fractional part of each node coordinate."""
     return wp.vec2(node[0] - wp.floor(node[0]), node[1] - wp.floor(node[1]))
 
 
 @wp.func
 def bilinear(f: wp.vec2) -> wp.vec4:
-    """Return the weights of the nodes: upper left, upper right, lower left, lower right."""
+    """Return the bilinear weights of four nodes: upper left, upper right, lower left, lower right."""
     return wp.vec4((1.0 - f[0]) * (1.0 - f[1]), f[0] * (1.0 - f[1]), (1.0 - f[0]) * f[1], f[0] * f[1])
 
 
@@ -144,7 +144,7 @@ def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g:
 
 @wp.func
 def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int, value: float):
-    """Add to the sums of the leak and the OFF threshold."""
+    """Add a value to the sums of the leak and the OFF threshold."""
     extra = sums.shape[0] - EXTRA
     if atlas.with_leak > 0.0:
         add_fixed(sums, extra, value * (pairs.time[pairs.stride + i] - pairs.time[i]))

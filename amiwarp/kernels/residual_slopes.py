@@ -1,4 +1,4 @@
-"""Quantities computed from residuals: their derivatives by the parameters, costs, and sums of products."""
+"""Quantities computed from the residuals of event pairs: derivatives by the parameters, costs, and sums of products."""
 
 import warp as wp
 
