@@ -65,7 +65,7 @@ BANDS: dict[str, dict[str, float]] = {"adaptive": {}, "adaptive, 99 %": {"low": 
 SPARE_S = 0.05
 """Time simulated after the measurement, because the last window extends past its end [s]."""
 MOTOR_S = 0.1
-"""Time constant of the motor [s]."""
+"""Time constant of the simulated motor's speed [s]."""
 CONTRAST, NEAR, LEAST = 0.75, 1.0, 2
 """Smallest change of log intensity within 3 × 3 px at an edge, and distance [px] and number of events that make an edge
 visible."""
@@ -233,7 +233,7 @@ def summary(name: str, windows: list[Window], start_s: float, end_s: float) -> R
 
 
 def judge(row: Row, usual: Row) -> None:
-    """Set ``ok`` of a row.
+    """Set the field ``ok`` of a measured row.
 
     It is true if there are fewer events than at the usual speed, and the same share of visible edges within the error,
     or at least 99 %.

@@ -65,7 +65,7 @@ class Case:
     model: str = "plane circle"
     """Optical model that the method compensates."""
     vote: Vote = Vote.BILINEAR
-    """How an event votes for pixels."""
+    """How an event's vote is shared among pixels."""
     scenes: tuple[str, ...] = EVENT_SCENES
     """Scenes on which the case runs."""
     devices: tuple[str, ...] = ("cpu", "cuda")
@@ -75,7 +75,7 @@ class Case:
     unit: str = "ev"
     """Unit of the job's ``work``; empty if the time itself is reported."""
     most_repeats: int = 1_000
-    """Largest number of passes."""
+    """Largest number of timed passes of the method."""
 
 
 def image_bars(model: str, vote: Vote) -> dict[str, float]:
@@ -142,7 +142,7 @@ class Aim:
     of: str
     """Name of the case to which the target applies."""
     bars: dict[str, float]
-    """Target value for each scene."""
+    """Target value of each scene, by name of the scene."""
     unit: str
     """Unit of the target, which also determines whether it is a minimum or a maximum.
 

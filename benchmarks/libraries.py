@@ -40,7 +40,7 @@ class PeerEvents:
     angle: NDArray[np.float32]
     """Direction of each displacement, within one turn [rad]."""
     radius: float
-    """Radius of the circle [px]."""
+    """Radius of the circle on which events are displaced [px]."""
     width: int
     """Width of the image [px]."""
     height: int
@@ -76,7 +76,7 @@ class Peer:
     with_margin: Callable[[], Any]
     """Function that returns the image of the latest pass, including the margin."""
     events: PeerEvents
-    """Events that are voted."""
+    """Events that the implementation votes into the image."""
 
     def image(self) -> NDArray[np.floating[Any]]:
         """Return the image of the latest pass without the margin, shape ``(height, width)``."""

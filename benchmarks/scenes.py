@@ -185,7 +185,7 @@ class FileScene:
     """Recording in a temporary folder that is deleted together with the scene."""
 
     source: Path
-    """Path of the recording."""
+    """Path of the recording's file or folder."""
     n: int
     """Number of events."""
     missing: tuple[str, ...]

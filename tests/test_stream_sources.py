@@ -207,7 +207,7 @@ def test_a_wrong_stream_is_an_error_after_all_before_it(tail, message):
 
 
 def test_a_stream_begins_with_a_hello(monkeypatch):
-    for data, message in ((encode_end(), "begins without a hello message"), (b"", "ended without"), (b"AMI", "ended within")):
+    for data, message in ((encode_end(), "begins without a hello"), (b"", "ended without"), (b"AMI", "ended within")):
         with pytest.raises(AmiwarpError, match=f"the pipe: {message}"):
             pipe(data)
     monkeypatch.setattr(sources, "HELLO_S", 0.06)

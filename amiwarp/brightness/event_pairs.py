@@ -155,7 +155,7 @@ class EventTable:
     """Events of one or more time spans on a device, sorted by pixel."""
 
     def __init__(self, spans: Sequence[Events], tile_of: Any, device: Any) -> None:
-        """Copy the events to the device.
+        """Copy the events of the time spans to the device, without sorting them.
 
         Only pixels with ``tile_of`` >= 0 are used: shape (height, width), NumPy or on the device.
         """

@@ -36,8 +36,7 @@ class Residuals:
         self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
 
     def mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> float:
-        """Return the mean Cauchy cost, log(1 + (r / ``scale``)²), of the residuals r of all pairs, or of held-out
-        pairs.
+        """Return the mean Cauchy cost, log(1 + (r / ``scale``)²), of the residuals r of all pairs or the held-out ones.
 
         ``held``: whether only held-out pairs count. ``missing``: residual of pairs off the map; NaN excludes these
         pairs.

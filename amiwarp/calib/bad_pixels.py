@@ -77,7 +77,7 @@ class BadPixelSummary:
     flickering: int
     """Number of pixels that see a flickering lamp."""
     lamps_hz: tuple[float, ...]
-    """Flicker frequencies, the strongest first [Hz]."""
+    """Frequencies of flickering lamps, the strongest lamp first [Hz]."""
     share: float
     """Share of all events that lie on bad pixels, 0 to 1."""
 
@@ -107,7 +107,7 @@ def stretch(source: EventSource, encoder: Encoder) -> Events:
 def strange_pixels(
     events: Events, encoder: Encoder, size: tuple[int, int]
 ) -> tuple[NDArray[np.bool_], BadPixelSummary]:
-    """Find hot and flickering pixels.
+    """Find hot pixels and pixels that see a flickering lamp.
 
     Hot pixels are found by their event rate and, from two turns on, by events that do not repeat from turn to turn. The
     second test fails while the camera rotates fast.
@@ -153,7 +153,7 @@ class MaskedEventSource:
     """Event source that drops the events of masked pixels on reading. ``len`` still counts them."""
 
     source: EventSource
-    """The source to read from."""
+    """Event source whose events are read and masked."""
     mask: NDArray[np.bool_]
     """Mask of bad pixels: True for pixels whose events are dropped, shape ``(height, width)``."""
 

@@ -47,7 +47,7 @@ class NoSharpOptimumError(AmiwarpError):
 
 
 def check_events(count: int, name: str) -> None:
-    """Check the number of events."""
+    """Raise :class:`AmiwarpError` if a recording has too few events for a calibration."""
     if count < FEWEST_EVENTS:
         raise AmiwarpError(f"{name}: {count} events are too few to calibrate; record at least {FEWEST_EVENTS}")
 

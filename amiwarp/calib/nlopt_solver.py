@@ -58,15 +58,15 @@ class SearchStage:
     score: float
     """Score at the best point; higher is better."""
     evaluations: int
-    """Number of evaluations of the score."""
+    """Number of evaluations of the score in the run."""
     seconds: float
-    """Run time [s]."""
+    """Run time of the search [s]."""
     ended: str
     """Reason why the search ended, in words."""
     points: NDArray[np.float64] = field(repr=False)
     """All evaluated points in order [px], shape ``(evaluations, n)``."""
     scores: NDArray[np.float64] = field(repr=False)
-    """Score of each point, shape ``(evaluations,)``."""
+    """Score of each evaluated point, shape ``(evaluations,)``."""
 
 
 def best_of(
@@ -209,7 +209,7 @@ def _optimiser(
     step: float,
     inner: str,
 ) -> Any:
-    """Return a configured NLopt optimiser."""
+    """Return an NLopt optimiser with bounds, budget and tolerances set."""
     import nlopt
 
     n = len(low)

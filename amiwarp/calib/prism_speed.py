@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 CELL = 8
 """Side of the cells in which events are counted [px]."""
 BIN_US = 1000
-"""Length of the time bins [us]."""
+"""Length of the time bins in which events are counted [us]."""
 LONGEST_US = 3_000_000
 """Longest duration from the start of the recording that is analysed [us]."""
 FASTEST_BINS = 5

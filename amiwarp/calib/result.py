@@ -76,11 +76,11 @@ class Calibration:
     uncertainty: Mapping[str, float]
     """Standard deviations of the free parameters by name, in the units of ``parameters``."""
     free: tuple[str, ...]
-    """Names of the free parameters."""
+    """Names of the parameters that the calibration determined."""
     sharpness_name: str
     """Name of the sharpness measure, a value of :class:`amiwarp.Sharpness`."""
     sharpness_before: float
-    """Sharpness of the events as recorded."""
+    """Sharpness of the events before compensation."""
     sharpness_after: float
     """Sharpness of the events after compensation by this calibration."""
     stages: tuple[StageSummary, ...]
@@ -88,7 +88,7 @@ class Calibration:
     events: int
     """Number of events that the last sharpness search used."""
     seconds: float
-    """Total run time, reading included [s]."""
+    """Total run time of the calibration, reading included [s]."""
     warnings: tuple[str, ...] = ()
     """Warnings for the user, one sentence each."""
     zero_us: int | None = None
@@ -102,7 +102,7 @@ class Calibration:
 
     @property
     def model(self) -> Model:
-        """Calibrated model."""
+        """Optical model with the calibrated parameters."""
         return build_model(self.model_name, self.camera, self.prism, self.parameters)
 
     @property
@@ -194,7 +194,7 @@ class Calibration:
         return out
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the JSON file.
+        """Write the calibration to a JSON file.
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:
-        """Read a file that :meth:`save` wrote.
+        """Read a calibration from a JSON file that :meth:`save` wrote.
 
         Parameters
         ----------

@@ -16,13 +16,13 @@ class StageSummary:
     """Summary of one stage of the search, as the calibration file stores it."""
 
     name: str
-    """Stage: ``global``, ``local``, ``photometric`` or ``grid``."""
+    """Name of the stage: ``global``, ``local``, ``photometric`` or ``grid``."""
     algorithm: str
     """Name of the search algorithm, such as ``GN_DIRECT_L`` or ``gauss-newton``."""
     evaluations: int
     """Number of evaluations of the sharpness or of the photometric score."""
     seconds: float
-    """Run time [s]."""
+    """Run time of the stage [s]."""
     sharpness: float
     """Score of the best parameters of the stage. Scores of different stages are not comparable, because their images
     differ."""
@@ -96,7 +96,7 @@ class ModelCandidate:
     """One model that the automatic choice considered, and the evidence for and against it."""
 
     model: str
-    """Name of the model."""
+    """Name of the candidate model."""
     numbers: str
     """Number of the model's free parameters, and the parameters that must be known."""
     predicted_px: float
@@ -114,7 +114,7 @@ class ModelCandidate:
     cost_ns: float
     """Measured time for one event's angle, displacement and vote [ns]."""
     chosen: bool
-    """Whether this model was chosen."""
+    """Whether the automatic choice selected this model."""
     verdict: str
     """Reason why the model was chosen or not, in words."""
 

@@ -85,7 +85,7 @@ class LimitOptions:
     ] = None
 
     def build(self) -> Limits:
-        """Return the limits of the study."""
+        """Return the limits that the options set for the study."""
         from amiwarp.studies.design import Limits
 
         most = None if self.bandwidth_mev_s is None else self.bandwidth_mev_s * 1e6

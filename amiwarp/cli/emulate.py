@@ -78,7 +78,7 @@ class ControllerOptions:
     ] = None
 
     def build(self, rotor: Rotor, seed: int) -> Controller:
-        """Return the controller of ``rotor``."""
+        """Return an emulated controller, with the options' settings, that drives ``rotor``."""
         return Controller(
             rotor,
             counts_per_turn=self.counts_per_turn,

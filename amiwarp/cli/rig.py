@@ -167,7 +167,7 @@ class SensorOptions:
     )
 
     def build(self) -> SensorModel:
-        """Return the sensor model."""
+        """Return the sensor model that the options describe."""
         from amiwarp.simulation.sensor import SensorModel
 
         if self.ideal and self.sensor is not None:
@@ -198,7 +198,7 @@ class EncoderModelOptions:
     )
 
     def build(self) -> EncoderModel:
-        """Return the encoder model."""
+        """Return the encoder model that the options describe."""
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
         if self.counts_per_turn == 0:
             given["counts_per_turn"] = None

@@ -29,7 +29,7 @@ EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
 SEEDS, QUICK_SEEDS = 20, 1
 """Number of recordings per value of an axis, by default and with ``--quick``."""
 QUICK_MINUTES = 9.0
-"""Time limit of ``--quick`` [min]."""
+"""Time limit of a run with ``--quick`` [min]."""
 
 
 def run(

@@ -104,7 +104,7 @@ class StatusLine:
         self._console = Console(stderr=True, highlight=False)
         self._live = Live(console=self._console, refresh_per_second=5, transient=True)
         self.messages: deque[str] = deque(maxlen=1000)
-        """The most recent messages."""
+        """Most recent messages that were printed."""
 
     def __enter__(self) -> StatusLine:
         if self._console.is_terminal:

@@ -43,7 +43,7 @@ PIECE = 2 * CHUNK
 
 @dataclass(frozen=True, slots=True)
 class CompensationSummary:
-    """Result of a compensation.
+    """Summary of the compensation of a recording.
 
     Examples
     --------
@@ -56,11 +56,11 @@ class CompensationSummary:
     outside: int
     """Number of events outside the image or without coordinates (NaN). They are kept and marked."""
     seconds: float
-    """Duration, including reading and writing [s]."""
+    """Duration of the compensation, including reading and writing [s]."""
 
     @property
     def mev_per_s(self) -> float:
-        """Million events per second."""
+        """Speed of the compensation [million events/s]."""
         return self.events / max(self.seconds, 1e-9) / 1e6
 
 
@@ -112,7 +112,7 @@ def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
 
 
 def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = "cpu") -> NDArray[np.float32]:
-    """Compensate events.
+    """Compensate events in memory: return their positions without the prism.
 
     Parameters
     ----------

@@ -129,7 +129,7 @@ class Compensator:
         self._least_returned = LEAST_RETURNED if self._device.is_cuda else math.inf
         self._queue: deque[QueuedPacket] = deque()
         self.waiting = 0
-        """Number of events in the queue."""
+        """Number of events in the queue, which wait for encoder samples."""
         self.waiting_bytes = 0
         """Memory of the packets in the queue [bytes], as computed by :func:`held_bytes`."""
         self._staged: StagedBatch | None = None

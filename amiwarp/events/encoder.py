@@ -88,7 +88,7 @@ class Encoder:
 
     @classmethod
     def from_angles(cls, t_us: ArrayLike, angle: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
-        """Create an encoder from angles.
+        """Create an encoder from samples of the prism angle.
 
         Parameters
         ----------
@@ -124,7 +124,7 @@ class Encoder:
         index_t_us: ArrayLike | None = None,
         clock_offset_us: float = 0.0,
     ) -> Encoder:
-        """Create an encoder from counts.
+        """Create an encoder from encoder counts.
 
         The counter may keep counting, restart each turn, or wrap at its width.
 
@@ -352,7 +352,7 @@ class Encoder:
         return float(self.t[-1] - self.t[0]) / (self.t.size - 1)
 
     def gaps(self, max_interval_us: float) -> list[tuple[int, int]]:
-        """Return the gaps between samples.
+        """Return the gaps: intervals between samples that are too long.
 
         Parameters
         ----------

@@ -44,7 +44,7 @@ class Events:
     y: NDArray[Any]
     """Row [px], shape ``(n,)``, of the type of ``x``."""
     t: NDArray[np.int64]
-    """Time [us], shape ``(n,)``."""
+    """Time of each event [us], shape ``(n,)``."""
     p: NDArray[np.uint8]
     """Polarity, shape ``(n,)``: 1 is ON, 0 is OFF."""
 
@@ -101,7 +101,7 @@ class Events:
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Events]) -> Events:
-        """Join blocks in the given order.
+        """Join blocks of events in the given order.
 
         Parameters
         ----------

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 MetadataValue: TypeAlias = str | int | float | bool
-"""A value of a recording's metadata."""
+"""Type of a value in a recording's metadata."""
 
 
 class PointStore(Protocol):
@@ -29,7 +29,7 @@ class PointStore(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Ground truth of a synthetic recording.
+    """Ground truth of a simulated recording.
 
     Examples
     --------

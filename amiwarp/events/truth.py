@@ -96,7 +96,7 @@ class EventTruth:
 
 @dataclass(frozen=True, slots=True)
 class WorldLabels:
-    """Names in a simulated world.
+    """Names of the instances in a simulated world, and their classes.
 
     Examples
     --------
@@ -106,7 +106,7 @@ class WorldLabels:
     """
 
     name: str
-    """Name of the world."""
+    """Name of the simulated world."""
     instances: tuple[str, ...]
     """Labels of the instances. The label at index i has the instance number i + 1; number 0 is the sky."""
     categories: tuple[str, ...]
@@ -261,4 +261,4 @@ class PoseStore(Protocol):
         """Return the number of times for which there are poses."""
 
     def __getitem__(self, which: slice, /) -> Poses:
-        """Return the poses of a slice."""
+        """Return the poses at the times in a slice."""

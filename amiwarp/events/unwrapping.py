@@ -74,7 +74,7 @@ class _Steps:
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """Each step minus its prediction."""
+        """Difference of each step from its prediction, in the samples' unit."""
         return np.asarray(self.step - self.expected)
 
     @property
@@ -90,7 +90,7 @@ class _Samples:
     t: NDArray[np.int64]
     """Times of the samples [us], shape ``(m,)``."""
     value: NDArray[np.float64]
-    """Counts, or angles [rad], shape ``(m,)``."""
+    """Values of the samples: counts, or angles [rad], shape ``(m,)``."""
     turn: float
     """One turn in the unit of ``value``."""
     rounding: float
@@ -104,7 +104,7 @@ class _Samples:
 
     @property
     def interval(self) -> NDArray[np.float64]:
-        """Times between samples [us]."""
+        """Times between neighbouring samples [us], shape ``(m - 1,)``."""
         return np.diff(self.t).astype(np.float64)
 
     @property

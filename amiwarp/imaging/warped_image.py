@@ -59,13 +59,13 @@ class CanvasShape:
     """Shape of a vote image: the sensor's image, extended by ``pad`` px on each side, then scaled."""
 
     width: int
-    """Sensor width [px]."""
+    """Width of the sensor [px]."""
     height: int
-    """Sensor height [px]."""
+    """Height of the sensor [px]."""
     pad: int = 0
     """Border on each side of the sensor's image that keeps displaced events inside the canvas [sensor px]."""
     scale: float = 1.0
-    """Canvas pixels per sensor pixel."""
+    """Canvas pixels per sensor pixel, along each axis."""
     per_polarity: bool = False
     """Whether OFF and ON events get separate layers, in this order."""
     vote: Vote = Vote.BILINEAR
@@ -186,7 +186,7 @@ class Votes:
         self._read: tuple[Image, Any] | None = None
 
     def clear(self) -> None:
-        """Discard all votes."""
+        """Discard all votes, so that the image is empty."""
         self._discard_batches()
         self._words.zero_()
         if self._any_total:
@@ -221,7 +221,7 @@ class Votes:
             self._vote_exactly(vote_events, inputs, events.count)
 
     def add_points(self, x: Any, y: Any, layer: Any, count: int | None = None) -> None:
-        """Vote points without moving them.
+        """Vote points at their coordinates, without compensation.
 
         ``x``, ``y``: Warp arrays of float [px]. ``layer``: Warp array of uint8, the index of each point's layer.
         ``count``: number of points to vote; None for all.

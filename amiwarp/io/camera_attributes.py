@@ -39,7 +39,7 @@ def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[A
 
 
 def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[float]]:
-    """Return the attributes of a camera."""
+    """Return a camera as attributes of an HDF5 group, by name."""
     attributes: dict[str, int | float | str | list[float]] = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
     attributes["distortion_model"] = "none"
     for name, kind in DISTORTIONS.items():

@@ -25,7 +25,7 @@ GAP_INTERVALS = 5
 
 @dataclass(frozen=True, slots=True)
 class ConversionSummary:
-    """Summary of a conversion.
+    """Summary of the conversion of a recording.
 
     Examples
     --------
@@ -37,15 +37,15 @@ class ConversionSummary:
     """
 
     events: int
-    """Number of events written."""
+    """Number of events that were written."""
     t_first: int | None
     """Time of the first event [us], or None without events."""
     t_last: int | None
     """Time of the last event [us], or None without events."""
     width: int
-    """Sensor width [px]."""
+    """Width of the sensor [px]."""
     height: int
-    """Sensor height [px]."""
+    """Height of the sensor [px]."""
     repairs: dict[str, int]
     """Number of repairs and other findings while reading, by name of the finding."""
     encoder_covers: bool | None

@@ -47,9 +47,9 @@ class PassCounts:
     count: int = 0
     """Number of events that were kept."""
     t_first: int = 0
-    """Time of the first event [us]."""
+    """Time of the first event so far [us]."""
     t_last: int = 0
-    """Time of the latest event [us]."""
+    """Time of the latest event so far [us]."""
     x_max: int = 0
     """Largest column of an event so far [px]."""
     y_max: int = 0

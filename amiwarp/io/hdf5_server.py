@@ -81,7 +81,7 @@ CACHE_BYTES = 1 << 22
 """HDF5's cache of decoded chunks per dataset [bytes]. Chunks of other writers may exceed the default of 1 MB."""
 
 ATTRIBUTE_BYTES = 1 << 16
-"""Largest attribute that is read [bytes]."""
+"""Size of the largest attribute that is read [bytes]."""
 
 ATTEMPTS = 24
 """Number of attempts to read a block that is being written. The pauses double from 1 ns; their sum is 17 ms."""
@@ -116,7 +116,7 @@ def open_file(path: str) -> Reply:
 
 
 def read(name: str, start: int, stop: int) -> Reply:
-    """Return a part of a dataset."""
+    """Return the rows ``start`` to ``stop`` (excluded) of a dataset."""
     dataset = kept("columns")[name]
     return None, [np.atleast_1d(dataset[()] if dataset.ndim == 0 else dataset[start:stop])]
 

@@ -273,7 +273,7 @@ class RecordingWriter:
             self._open_truth().append_frame(frame)
 
     def append_poses(self, poses: Poses) -> None:
-        """Append true poses.
+        """Append true poses of camera, bodies and joints.
 
         Parameters
         ----------

@@ -48,7 +48,7 @@ class Input:
 
 @wp.func
 def last_input(level: float) -> Input:
-    """Return the input for a level."""
+    """Return the photoreceptor's input at a level, with the exponential computed."""
     result = Input()
     result.level = level
     result.light = wp.exp(level)

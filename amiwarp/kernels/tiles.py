@@ -57,7 +57,7 @@ class TileEvents:
 
 @wp.struct
 class UnpackedEvent:
-    """One event, unpacked from :class:`TileEvents`."""
+    """Event that was unpacked from :class:`TileEvents`."""
 
     x: float  # on the sensor [px]
     y: float
@@ -271,7 +271,7 @@ def cast_event(
 
 @wp.func
 def unpack(packed: int, chunk: Chunk, canvas: Canvas, layout: Layout, i: int) -> UnpackedEvent:
-    """Unpack event ``i``."""
+    """Unpack event ``i`` of the packed events of a tile."""
     e = UnpackedEvent()
     e.x = float(chunk.x + (packed & 31))
     e.y = float(chunk.y + ((packed >> 5) & 31))

@@ -199,7 +199,7 @@ def vote_blocks(
 
 @wp.kernel
 def vote_events(model: Any, camera: Any, events: EventArrays, canvas: Canvas, start: int, cells: Cells):
-    """Vote one event per thread, exactly."""
+    """Vote one event per thread, with a check of every addition for overflow."""
     i = start + wp.tid()
     _inside, cell, word = event_vote(model, camera, events, canvas, i)
     add_vote_atomically(cells, cell, canvas.columns, repeat_vote(events, i, word))
@@ -301,7 +301,7 @@ def vote_points(
     start: int,
     cells: Cells,
 ):
-    """Vote one point per thread, exactly."""
+    """Vote one point per thread, with a check of every addition for overflow."""
     i = start + wp.tid()
     layer = int(layers[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, x[i], y[i], layer)

@@ -49,17 +49,17 @@ class Camera:
     """
 
     width: int
-    """Image width [px]."""
+    """Width of the image [px]."""
     height: int
-    """Image height [px]."""
+    """Height of the image [px]."""
     fx: float
     """Focal length along x [px]."""
     fy: float
     """Focal length along y [px]."""
     cx: float
-    """Principal point, x [px]."""
+    """Coordinate x of the principal point [px]."""
     cy: float
-    """Principal point, y [px]."""
+    """Coordinate y of the principal point [px]."""
     distortion: Distortion | None = None
     """Lens distortion, or None for a pinhole camera."""
 

@@ -29,7 +29,7 @@ class FlatSide(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Prism:
-    """A wedge prism in air.
+    """Wedge prism in air, given by its apex angle, refractive index and flat side.
 
     Raises
     ------

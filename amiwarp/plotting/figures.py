@@ -126,7 +126,7 @@ def _polar(size: float, phase: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Reconstructed:
-    """Reconstructed picture with its ground truth."""
+    """Picture reconstructed from events, together with its ground truth."""
 
     picture: Picture
     """Picture that was reconstructed from events."""
@@ -189,11 +189,11 @@ class Grid:
     """Axes of the demo's figure by name, laid out by the image's aspect ratio so that nothing overlaps."""
 
     figure: Any
-    """Matplotlib's figure."""
+    """Matplotlib figure to which the axes belong."""
     axes: dict[str, Any]
     """Axes of the figure, by name."""
     height: float
-    """Height of the figure [inch]."""
+    """Height of the whole figure [inch]."""
 
     @classmethod
     def make(cls, columns: int, rows: int) -> Grid:

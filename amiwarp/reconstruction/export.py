@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 DARK, BRIGHT = 0.5, 99.5
 """Percentiles of intensity over the known pixels that are shown black and white."""
 GAMMA = 2.2
-"""Display gamma."""
+"""Gamma with which pictures are displayed."""
 LIMITS_UPDATE = 0.1
 """Weight of a new frame in the running average of a video's black and white levels. A small weight prevents flicker."""
 STILL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")

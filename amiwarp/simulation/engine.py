@@ -62,7 +62,7 @@ class DeviceBlock:
     arrays: Any
     """Columns of the events: the kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     count: int
-    """Number of events."""
+    """Number of events in the block."""
     seen: SeenSurfaces | None = None
     """Surfaces of a world that the events' pixels saw; None for pictures."""
 
@@ -326,7 +326,7 @@ class KeyBuffer:
         return keys
 
     def _launch(self, kernel: Any, inputs: list[Any]) -> None:
-        """Launch the kernel for all pixels."""
+        """Launch the kernel that simulates the pixels, for all pixels."""
 
         def run(start: int, stop: int) -> None:
             wp.launch(kernel, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)

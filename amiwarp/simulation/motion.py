@@ -19,7 +19,7 @@ ROTATION_INTERVAL = 1e-3
 LARGEST_SPEED = 1e9
 """Largest accepted speed of a prism [turns/min] and of a camera's rotation [rad/s]; higher values are mistakes."""
 LONGEST_S = 86400.0
-"""Longest simulation [s]."""
+"""Longest duration of a simulation [s]."""
 LARGEST_OFFSET_US = 1e7
 """Largest clock offset of a simulated encoder [us]. The encoder is sampled for this much longer before and after the
 events."""
@@ -42,7 +42,7 @@ class PrismMotion:
     Or a table of rows (time [s], speed), interpolated linearly and constant outside, shape (n, 2).
     """
     phase: float = 0.0
-    """Azimuth at angle 0, θ_b [rad]."""
+    """Azimuth of the prism's tilt at encoder angle 0, θ_b [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
     """Tilt of the axis of rotation about the camera's x and y axes [rad], as in :class:`amiwarp.ExactModel`."""
 
@@ -60,7 +60,7 @@ class PrismMotion:
         phase: float = 0.0,
         tilt: tuple[float, float] = (0.0, 0.0),
     ) -> PrismMotion:
-        """Sample the speed from a function.
+        """Create a motion by sampling a function of time that gives the speed.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class PrismMotion:
 
     @property
     def largest_speed(self) -> float:
-        """Largest magnitude of the speed [rad/s]."""
+        """Largest magnitude of the prism's speed [rad/s]."""
         return float(np.abs(self._table()[:, 1]).max())
 
 
@@ -207,7 +207,7 @@ def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> Non
 
 @dataclass(frozen=True, slots=True)
 class EncoderModel:
-    """Errors of a simulated encoder.
+    """Errors that a simulated encoder makes.
 
     Raises :class:`AmiwarpError` for values out of range.
 
@@ -225,7 +225,7 @@ class EncoderModel:
     jitter_us: float = 1.0
     """Standard deviation of the time stamp of an encoder sample [us]."""
     clock_offset_us: float = 0.0
-    """Encoder clock minus camera clock [us]."""
+    """Offset of the encoder's clock: encoder time minus event time [us]."""
     dropouts_hz: float = 0.0
     """Mean number of drop-outs per second [Hz]."""
     dropout_us: float = 5000.0

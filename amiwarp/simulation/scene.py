@@ -41,7 +41,7 @@ class Still:
     """Single picture that never changes."""
 
     light: NDArray[np.float32]
-    """Linear luminance, shape (height, width)."""
+    """Linear luminance of the picture, shape (height, width); white is 1."""
 
     @property
     def size(self) -> tuple[int, int]:

@@ -33,7 +33,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", "
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class PictureFolder:
-    """Picture files with times.
+    """Folder of picture files with a time for each picture.
 
     Examples
     --------
@@ -45,7 +45,7 @@ class PictureFolder:
     """
 
     files: tuple[Path, ...]
-    """Picture files, all of one size."""
+    """Paths of the picture files, which are all of one size."""
     times_us: NDArray[np.int64]
     """Time of each picture [us], shape (n,), starting at 0 and increasing."""
     size: tuple[int, int]
@@ -158,7 +158,7 @@ class VideoFile:
     """
 
     path: Path
-    """Path of the video."""
+    """Path of the video file."""
     size: tuple[int, int]
     """Width and height of a frame [px]."""
     fps: float

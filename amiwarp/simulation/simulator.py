@@ -58,9 +58,9 @@ class Simulation:
     duration_s: float
     """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism."""
+    """Motion of the prism: speed, phase and tilt."""
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
-    """Rotation of the camera."""
+    """Rotation of the camera; by default none."""
     sensor: SensorModel = field(default_factory=SensorModel)
     """Model of the sensor's pixels and readout."""
     encoder_model: EncoderModel | None = field(default_factory=EncoderModel)
@@ -68,9 +68,9 @@ class Simulation:
     nominal_prism: Prism | None = None
     """Nominal prism that is stored with the recording; None for the true prism."""
     seed: int = 0
-    """Seed of all random numbers."""
+    """Seed of all random numbers of the simulation."""
     device: str = "cpu"
-    """Device to compute on."""
+    """Device that computes, such as ``cpu`` or ``cuda:0``."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
@@ -115,7 +115,7 @@ class Simulation:
         return self.encoder_model.sample(self.motion, self.duration_us, self.seed)
 
     def truth_parameters(self) -> dict[str, float]:
-        """Return the true parameter values.
+        """Return the true values of the parameters of prism, encoder, camera motion and sensor.
 
         Returns
         -------

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.exact_model import ExactModel
 
 APEX, PHASE = math.radians(1.0), math.radians(126.0)
-"""True apex angle and phase [rad]."""
+"""True apex angle and true phase of the simulated prism [rad]."""
 NOMINAL_APEX = math.radians(1.2)
 """Nominal apex angle of the recording [rad]. It differs from the truth, so that no search box is centred on the truth.
 """
@@ -55,7 +55,7 @@ class Demo:
     """Settings of the demo."""
 
     out: Path
-    """Folder for the results."""
+    """Folder to which the demo's files are written."""
     picture: Path | None = None
     """Picture file that the scene shows; None for the map of the earth that comes with PyVista."""
     width: int = 640

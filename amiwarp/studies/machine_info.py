@@ -15,7 +15,7 @@ from amiwarp.kernels.cpu_threads import cpu_threads
 
 
 def processor() -> str:
-    """Return the name of the CPU."""
+    """Return the name of this machine's CPU."""
     info = Path("/proc/cpuinfo")
     found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
     return (found.group(1) if found else platform.processor() or platform.machine()).strip()

@@ -52,7 +52,7 @@ class Look:
     axis: Axis = Axis.ANGLE
     """Quantity along the third axis: prism angle or time."""
     point_size: float = 2.0
-    """Diameter of the points [px]."""
+    """Diameter of the points in the picture [px]."""
     opacity: float = 1.0
     """Opacity of the points, 0 to 1."""
     dark: bool = False
@@ -78,7 +78,7 @@ class Box:
 
     @property
     def width(self) -> int:
-        """Width of the region [px]."""
+        """Width of the shown region of the image [px]."""
         return self.right - self.left
 
     @property

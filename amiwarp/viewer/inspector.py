@@ -50,7 +50,7 @@ class Knobs:
     model: str = "exact"
     """Name of the optical model."""
     apex: float = 0.0
-    """Apex angle [rad]."""
+    """Apex angle of the prism [rad]."""
     phase: float = 0.0
     """Phase θ_b of the prism [rad]."""
     clock_offset: float = 0.0
@@ -91,9 +91,9 @@ class DisplayedWindow:
     region: tuple[int, int, int, int]
     """Part of the image that is shown: left, top, right and bottom [px]; right and bottom are exclusive."""
     selected: int
-    """Number of events in the images."""
+    """Number of selected events, which are all in the images."""
     events: Events
-    """Events that are drawn as points."""
+    """Selected events that are drawn as points."""
     before: NDArray[np.float32]
     """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
     after: NDArray[np.float32]
@@ -105,9 +105,9 @@ class DisplayedWindow:
     image_after: NDArray[np.float32]
     """Image of the compensated events [events per pixel], shape ``(height, width)``."""
     sharpness_before: float
-    """Sharpness of ``image_before``."""
+    """Sharpness of ``image_before``, the image before compensation."""
     sharpness_after: float
-    """Sharpness of ``image_after``."""
+    """Sharpness of ``image_after``, the image after compensation."""
 
 
 class Inspector:
@@ -190,7 +190,7 @@ class Inspector:
 
     @property
     def model(self) -> Model:
-        """Optical model with the current parameters."""
+        """Optical model with the parameters that are set on the page."""
         return self._model(self.knobs)
 
     @cached_property

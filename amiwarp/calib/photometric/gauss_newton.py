@@ -53,7 +53,7 @@ class Slopes:
         return Slopes(self.hessian[np.ix_(which, which)], self.gradient[which], self.parts[which])
 
     def step(self) -> Vector:
-        """Return the Gauss-Newton step [px]."""
+        """Return the change of the parameters by a Gauss-Newton step [px]."""
         ridge = 1e-6 * float(np.trace(self.hessian)) * np.eye(len(self.hessian))
         return np.asarray(-np.linalg.solve(self.hessian + ridge, self.gradient))
 

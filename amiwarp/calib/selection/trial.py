@@ -53,7 +53,7 @@ class Trial:
     """Calibrated exact model, with the two halves of the events on which models are fitted and compared."""
 
     exact: Calibration
-    """Calibration of the exact model."""
+    """Calibration of the exact model, with which smaller models are compared."""
     calibration_events: CalibrationEvents
     """All events of the trial with their encoder."""
     sample: Places

@@ -44,7 +44,7 @@ class CalibrationEvents:
         return self._uploaded[str(device), middle_us]
 
     def every(self, step: int) -> CalibrationEvents:
-        """Return every ``step``-th event."""
+        """Return every ``step``-th event, with the same encoder."""
         return self if step == 1 else self._cut(slice(0, None, step))
 
     def central(self, share: float) -> CalibrationEvents:

@@ -26,7 +26,7 @@ class EncoderFault(enum.StrEnum):
     SLIP = "slip"
     """The index pulse and the count disagree: counts were lost, or the encoder disc moved."""
     MISSED_INDEX = "missed index"
-    """No index pulse for :data:`MISSED_INDEX_TURNS`."""
+    """No index pulse came within :data:`MISSED_INDEX_TURNS` turns after the last one."""
     REVERSED = "reversed"
     """The prism changed its direction of rotation."""
 

@@ -62,9 +62,9 @@ class ClockMap:
     drift: float
     """Relative difference between the rates of the clocks: 1e-6 is one microsecond per second."""
     offset_std_us: float
-    """Standard deviation of the offset [us]."""
+    """Standard deviation of the offset at :attr:`at_us` [us]."""
     drift_std: float
-    """Standard deviation of the drift."""
+    """Standard deviation of the relative rate difference."""
     pairs: int
     """Number of pairs used by the fit, outliers excluded."""
 

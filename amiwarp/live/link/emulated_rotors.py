@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 MOST_SEGMENTS = 1024
 """Largest number of motor segments in memory. The oldest segment then also describes all earlier times."""
 RPM = math.tau / 60.0
-"""One turn per minute in rad/s."""
+"""Factor from turns per minute to rad/s."""
 
 
 class Rotor(Protocol):
@@ -43,11 +43,11 @@ class _Segment:
     start: float
     """Time at which the segment starts [s]."""
     angle: float
-    """Prism angle at the start [rad]."""
+    """Prism angle at the start of the segment [rad]."""
     speed: float
-    """Speed at the start [rad/s]."""
+    """Speed of the prism at the start of the segment [rad/s]."""
     target: float
-    """Target speed at the start [rad/s]."""
+    """Target speed at the start of the segment [rad/s]."""
     slope: float
     """Rate of change of the target speed [rad/s²]."""
 

@@ -71,7 +71,7 @@ class EmulatedFault:
     """Fault of the emulated controller (a name in :data:`LASTING_FAULTS` or :data:`INSTANT_FAULTS`) at a given time."""
 
     name: str
-    """Name of the fault."""
+    """Name of the fault, from :data:`LASTING_FAULTS` or :data:`INSTANT_FAULTS`."""
     start_s: float
     """Emulation time at which it begins [s]."""
     duration_s: float = 0.0

@@ -42,11 +42,11 @@ class Follower:
     def __init__(self, name: str, counts_per_turn: int | None = None) -> None:
         self.name = name
         self.status: ControllerStatus | None = None
-        """Latest status of the controller."""
+        """Latest status that the controller sent; None before the first."""
         self.trips: deque[tuple[int, int, int]] = deque(maxlen=TRIPS)
         """Round trips of pings: time sent (host), answered (controller), received (host) [us]."""
         self.updates = UpdateQueue()
-        """Updates that wait to be fetched."""
+        """Updates that wait to be fetched by the user of the link."""
         self._given_per_turn = counts_per_turn
         self._per_turn: int | None = None
         self._connection, self._epoch = Connection(0), Epoch(None)

@@ -74,7 +74,7 @@ class Link:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open."""
+        """Whether the serial port is open."""
         return self._port is not None
 
     @property

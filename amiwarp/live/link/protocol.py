@@ -50,7 +50,7 @@ class Index:
     t_us: int
     """Time of the pulse on the controller's clock [us], modulo 2**32."""
     count: int
-    """Encoder count at the pulse."""
+    """Encoder count at the index pulse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class Answer:
     KIND: ClassVar[int] = 0x06
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<HB")
     sequence: int
-    """Sequence number of the command."""
+    """Sequence number of the command that is answered."""
     refused: int
     """Reason for a refusal, as an index into :data:`REFUSALS`; 0 if the command was accepted."""
 
@@ -116,14 +116,14 @@ class SetSpeed:
     KIND: ClassVar[int] = 0x81
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<ff")
     rpm: float
-    """Target speed [turns/min], negative backwards."""
+    """Target speed of the motor [turns/min], negative backwards."""
     ramp: float
     """Rate of change of the speed [rpm/s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Command to stop the motor."""
+    """Command to stop the prism's motor."""
 
     KIND: ClassVar[int] = 0x82
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<")
@@ -157,7 +157,7 @@ _PLAIN: dict[int, type[Plain]] = {
 
 
 def encode(message: Message, sequence: int) -> bytes:
-    """Encode a message as a frame.
+    """Encode a message as the bytes of a frame.
 
     Raises ValueError for numbers outside a field's range, or for other than 1 to :data:`MOST_SAMPLES` samples.
     """

@@ -66,7 +66,7 @@ FOLLOW_S, LIMITED_S = 0.2, 1.5
 SPEED_TOLERANCE = 0.01
 """Relative difference from the sufficient speed below which the speed is not changed further."""
 NEAR_LIMIT, BELOW_LIMIT = 0.9, 0.8
-"""Shares of the largest event rate.
+"""Shares of the largest event rate at which its limitation of the prism speed ends, and below which the speed may rise.
 
 Once the event rate exceeds the largest rate, the speed is lowered until the event rate falls to the first share. The
 speed may rise only while the event rate is below the second share.

@@ -71,9 +71,9 @@ class Packet:
 
 
 NO_TIMES = np.zeros(0, np.int64)
-"""Empty array of times."""
+"""Empty array of times, for packets without triggers or encoder samples."""
 NO_ANGLES = np.zeros(0)
-"""Empty array of angles."""
+"""Empty array of angles, for packets without encoder samples."""
 
 
 def make_packet(
@@ -239,7 +239,7 @@ class PacketDecoder:
         return message
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Yield the messages that ``data`` completes."""
+        """Decode the bytes ``data``, and yield the messages that they complete."""
         start = 0
         while start < len(data):
             free_buffer = self.free_buffer()

@@ -27,9 +27,9 @@ class SessionStatus:
     seconds: float = 0.0
     """Duration of the session [s]."""
     events: int = 0
-    """Number of events received."""
+    """Number of events received so far."""
     done: int = 0
-    """Number of events compensated."""
+    """Number of events compensated so far."""
     outside: int = 0
     """Number of events displaced out of the image."""
     guessed: int = 0
@@ -69,7 +69,7 @@ class IntervalFigures:
         self._latencies: list[int] = []
 
     def add(self, packet: Compensated, now_us: int, status: SessionStatus) -> None:
-        """Count a compensated packet."""
+        """Count a compensated packet in the figures of the interval."""
         flags = packet.flags
         status.done += len(flags)
         if flags.any():

@@ -62,9 +62,9 @@ class ErrorSample:
     step: int
     """Interval of the sampled events: every ``step``-th event of the recording."""
     xy: NDArray[np.float64]
-    """Recorded positions [px], shape ``(n, 2)``."""
+    """Recorded positions of the sampled events [px], shape ``(n, 2)``."""
     theta: NDArray[np.float64]
-    """Prism angles [rad], shape ``(n,)``."""
+    """Prism angles of the sampled events [rad], shape ``(n,)``."""
     exact: NDArray[np.float64]
     """Exact compensated positions [px], shape ``(n, 2)``."""
 

@@ -36,7 +36,7 @@ COLOURS = {
     "default": BLACK, "model": ORANGE, "algorithms": BLUE, "events": GREEN, "folding": PINK, "pairs": SKY_BLUE,
     "events and pairs": VERMILION,
 }  # fmt: skip
-"""Colour of each family of settings."""
+"""Colour of each family of settings in the charts."""
 WORDS = {"ellipse": "ellipse (table)", "exact": "exact (closed form)", "default": "all settings default",
          "other libraries": "other libraries (circle)"}  # fmt: skip
 """Legend text of the families whose text differs from the name."""
@@ -102,7 +102,7 @@ class ChartPanel:
         ax.set_xlabel("time of a calibration [ms]" if self.timed else "speed [million events/s]", fontsize=LETTERS)
 
     def _point(self, row: Row) -> None:
-        """Draw the point of a row."""
+        """Draw the point of a measured setting."""
         colour, mark = COLOURS[row.family], MARKS[row.mark]
         size = 5.0 if row.settings.get("angles", TURNS) < TURNS else 12.0 if mark == "*" else 8.5
         lines = row.mark in HOLLOW or mark in THIN

@@ -42,11 +42,11 @@ class Row:
     events: int
     """Number of events of the recording, whichever share of them the setting uses."""
     seconds: float
-    """Median time of the repeats [s]."""
+    """Median time of the repeated runs [s]."""
     spread: float
     """Difference of longest and shortest repeat, relative to the median."""
     repeats: int
-    """Number of repeats."""
+    """Number of repeated runs."""
     error_px: float
     """Error of the result [px rms]."""
     image_error: float | None = None
@@ -64,7 +64,7 @@ class Row:
 
     @property
     def cost(self) -> float:
-        """Time per event [s]."""
+        """Run time per event [s]."""
         return self.seconds / self.events
 
 
@@ -89,7 +89,7 @@ class Timed:
     task: Task
     """The compensation or calibration that was timed."""
     times: tuple[float, ...]
-    """Times of the repeats [s]."""
+    """Times of the repeated runs [s]."""
     result: Any
     """Part of the first timed run's result that was kept."""
 

@@ -37,7 +37,7 @@ class KnownRecording:
     """Recording in memory with its ground truth."""
 
     recording: Recording
-    """Recording in memory."""
+    """Recording, which is held in memory."""
     events: Events
     """Events of the recording."""
     camera: Camera

@@ -42,7 +42,7 @@ class Timing:
     """Error of an event's time relative to the encoder's clock [us]; 58 us results from a readout in scans of 200 us.
     """
     encoder: float = math.radians(0.1)
-    """Error of the encoder's angle [rad]."""
+    """Standard deviation of the encoder's angle [rad]."""
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.clock_us <= 1e6 and 0.0 <= self.encoder <= math.pi):

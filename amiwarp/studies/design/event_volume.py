@@ -40,7 +40,7 @@ class Volume:
     """
 
     apexes: NDArray[np.float64]
-    """Simulated apex angles [rad], shape ``(n,)``."""
+    """Apex angles that were simulated [rad], shape ``(n,)``."""
     rpms: NDArray[np.float64]
     """Simulated speeds, one or two [turns/min], shape ``(m,)``."""
     yields: NDArray[np.float64]
@@ -56,7 +56,7 @@ class Volume:
     noise_hz: float
     """Noise rate of each pixel [events/s]."""
     simulated: int
-    """Number of simulated pixels."""
+    """Number of pixels that were simulated, summed over the tiles."""
 
     def events_per_s(self, orbit: Orbit, rpm: float) -> float:
         """Return the event rate of the whole image [events/s]."""

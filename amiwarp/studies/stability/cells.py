@@ -150,9 +150,9 @@ class Stored:
     """Known results of the calibration methods for one cell."""
 
     cell: Cell
-    """Condition and seed of the results."""
+    """Cell (condition and seed) to which the results belong."""
     events: int = 0
-    """Number of events of the recording."""
+    """Number of events of the cell's recording."""
     results: dict[str, Result] = field(default_factory=dict)
     """Results by :func:`identity` of the method."""
 

@@ -71,7 +71,7 @@ class Condition:
     mismatch: float = 0.03
     """Relative standard deviation of the contrast thresholds between pixels."""
     latency_us: float = 100.0
-    """Latency of the sensor [us]."""
+    """Latency of the sensor's pixels [us]."""
     refractory_us: float = 100.0
     """Refractory period of the pixels [us]."""
     readout_us: float = 0.0
@@ -81,13 +81,13 @@ class Condition:
     bus_rate_mev_s: float = 0.0
     """Largest rate of events on the sensor's bus [million events/s]; 0 for unlimited."""
     counts_per_turn: int = 8192
-    """Encoder counts per turn."""
+    """Resolution of the encoder [counts/turn]."""
     jitter_deg: float = 0.0
     """Standard deviation of the angle of an encoder sample [deg]."""
     clock_offset_us: float = 0.0
-    """Offset of the encoder's clock [us]."""
+    """Offset between the clocks of encoder and camera [us]."""
     dropouts_hz: float = 0.0
-    """Rate of encoder drop-outs [1/s]."""
+    """Rate of drop-outs, in which encoder samples are lost [1/s]."""
     slip_deg: float = 0.0
     """Angle that the encoder loses per second [deg], in two steps per turn."""
     backwards: bool = False
@@ -157,7 +157,7 @@ class SimulatedSample:
     """Simulated recording of the study, and the parameters that its hardware states."""
 
     recording: Recording
-    """Recording with ground truth."""
+    """Simulated recording with its ground truth."""
     hardware: dict[str, float]
     """Approximate phase that the hardware states [rad]."""
 

@@ -64,7 +64,7 @@ def _save_pdf(figures: Sequence[Any], path: Path) -> None:
 
 
 def _figure(width: float, height: float) -> Any:
-    """Return an empty figure."""
+    """Return an empty Matplotlib figure of a width and height [inch]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

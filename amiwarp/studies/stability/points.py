@@ -46,7 +46,7 @@ class Rate:
         return f"{percent(self.share)} ({percent(low)} to {percent(high)}; {self.count:,} of {self.total:,})"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the rate as JSON data."""
+        """Return count, total, share and confidence interval as JSON data."""
         low, high = self.interval
         share = round(self.share, 5) if self.total else None
         return {"count": self.count, "total": self.total, "share": share, "low": round(low, 5), "high": round(high, 5)}

@@ -34,7 +34,7 @@ class WorseThanPaper:
     """Value of an axis at which the default method succeeds less often than the paper's method."""
 
     axis: Axis
-    """Axis of the study."""
+    """Axis of the study that the value belongs to."""
     value: Any
     """Value of the condition field that the axis varies."""
     default: Rate
@@ -277,7 +277,7 @@ def summary(atlas: Atlas) -> list[tuple[str, ...]]:
 
 
 def _grid(headings: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
-    """Return a Markdown table."""
+    """Return headings and rows as a Markdown table."""
     if not rows:
         return "None."
     lines = [headings, ["---"] * len(headings), *rows]

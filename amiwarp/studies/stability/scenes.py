@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 DARK, BRIGHT = 0.2, 1.0
-"""Range of the scenes' luminance."""
+"""Smallest and largest luminance of the scenes, relative to white."""
 LAMP_HZ = 100.0
 """Frequency of the flickering lamp [Hz]."""
 FRAME_US = 1000
@@ -133,7 +133,7 @@ class Lamp(_ChangingStill):
     duration_us: int
     """Duration for which pictures are given [us]."""
     depth: float = 0.7
-    """Relative decrease of the square's luminance."""
+    """Relative decrease of the square's luminance when the lamp is dark."""
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """Yield the time [us] and the picture with the square."""
