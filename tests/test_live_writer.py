@@ -274,7 +274,7 @@ def test_the_file_that_was_there_is_replaced_at_the_end(tmp_path):
         (lambda w: w.append(make(5)[::-1]), "event 11 .* earlier"),
         (lambda w: w.append(make(5, start=1000)), "event 10 .* earlier than the one before"),
         (lambda w: w.append(Events.from_arrays([320], [0], [9_000_000], [0])), "event 10 .* outside the 320x240 frame"),
-        (lambda w: w.append(make(5), inside=np.ones(5)), "give events from a sensor without flags"),
+        (lambda w: w.append(make(5), inside=np.ones(5)), "events from a sensor take no flags"),
         (lambda w: w.append(make(1, start=2**61)), "timestamp is damaged"),
         (lambda w: w.append_encoder([7, 6], [0.0, 0.0]), "encoder samples 7 .. 6 us do not follow"),
         (lambda w: w.append_encoder([5, 6], [0.0, 0.0]), "encoder samples 5 .. 6 us do not follow 5 us"),

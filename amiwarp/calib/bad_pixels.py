@@ -36,7 +36,7 @@ BLOCKS = 4
 """Number of groups of successive turns in which unrepeated events are counted separately before the counts are added.
 More groups reduce the noise of the count, but cost time."""
 NEIGHBOURS = 2
-"""Half width of the square neighbourhood to whose event counts that of a pixel is compared [px]."""
+"""Half width of the square of neighbouring pixels with whose event counts a pixel's event count is compared [px]."""
 LEAST_LOW = 19
 """Smallest number of the 24 neighbours that must have far fewer events than a pixel before it counts as hot. Pixels of
 corners and thin lines have fewer such neighbours."""
@@ -47,14 +47,16 @@ BIN_US = 1000
 LONGEST_US = 1_000_000
 """Longest duration, around the middle of the events, that is searched for flicker [us]."""
 SLOWEST_HZ = 40.0
-"""Lowest detected flicker frequency [Hz]. Slower changes cannot be distinguished from those of the scene."""
+"""Lowest detected flicker frequency [Hz]. Slower changes of the light cannot be distinguished from motion of the scene.
+"""
 LAMP_CYCLES = 6
 """Smallest number of cycles of a lamp during the events from which its frequency can be determined."""
 LEAST_SHARE = 0.3
 """Smallest share of a cell's or a pixel's events that must oscillate with the lamp for it to count as flickering.
 Texture alone reaches 0.2."""
 LEAST_RATIO = 4.0
-"""Smallest ratio of a lamp's power to that of nearby frequencies (see :data:`NEAR_TURNS`). Texture alone reaches 3."""
+"""Smallest ratio of a lamp's power to the power of nearby frequencies (see :data:`NEAR_TURNS`). Texture alone reaches
+3."""
 NEAR_TURNS = 2.6
 """Distance of the frequencies to which a lamp's power is compared, in multiples of the prism's rotation frequency. The
 range then contains harmonics of the prism's rotation."""
@@ -144,7 +146,7 @@ def strange_pixels(
 
 
 def without_pixels(events: Events, mask: NDArray[np.bool_]) -> Events:
-    """Return the events outside the masked pixels; ``mask`` is True for masked ones, shape (height, width)."""
+    """Return the events outside the masked pixels; ``mask`` is True for masked pixels, shape (height, width)."""
     return events[~mask[events.y, events.x]] if mask.any() else events
 
 
@@ -173,7 +175,7 @@ class MaskedEventSource:
         return self.source.size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Return those of the source's events ``start <= index < stop`` that lie outside the mask."""
+        """Return the events with ``start <= index < stop`` of the source that lie outside the mask."""
         return without_pixels(self.source.slice(start, stop), self.mask)
 
     def find(self, t: int) -> int:

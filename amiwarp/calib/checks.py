@@ -53,7 +53,7 @@ def check_events(count: int, name: str) -> None:
 
 
 def check_unmasked_events(count: int, mask: NDArray[np.bool_], name: str) -> None:
-    """Check the number of events outside the bad pixels; ``mask`` is True for bad ones."""
+    """Raise :class:`AmiwarpError` if too few events lie outside the bad pixels; ``mask`` is True for bad pixels."""
     if count < FEWEST_EVENTS:
         pixels = int(np.count_nonzero(mask))
         raise AmiwarpError(

@@ -81,7 +81,7 @@ class ParameterSpace:
     model: str
     """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
-    """Nominal camera. If the focal length is free, its value replaces that of the camera."""
+    """Nominal camera. If the focal length is free, its value replaces the camera's focal length."""
     prism: Prism
     """Nominal prism. It gives the flat side, and the index if that is not free."""
     names: tuple[str, ...]
@@ -91,7 +91,7 @@ class ParameterSpace:
     high: Mapping[str, float]
     """Upper bound of each free parameter, in its unit."""
     start: Mapping[str, float]
-    """Values of all parameters of the model, free ones at their start, in their units."""
+    """Values of all parameters of the model, in their units. The search starts at the values of the free parameters."""
     pixels: Mapping[str, float]
     """Displacement of events per unit of each free parameter [px rms]."""
     middle_us: int
@@ -316,7 +316,7 @@ def size_name(model: str) -> str:
 
 
 def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraRotation:
-    """Return the camera rotation that the parameter values describe; a missing rate counts as 0."""
+    """Return the camera rotation that the parameter values describe; a missing rate is taken as 0."""
     x, y, z = (values.get(n, 0.0) for n in RATES)
     a, b, c = (values.get(n, 0.0) for n in CHANGES)
     return CameraRotation((x, y, z), (a, b, c), middle_us)

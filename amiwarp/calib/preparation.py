@@ -83,7 +83,7 @@ def linear_unknowns(settings: Settings) -> tuple[str, ...]:
 
 
 def zero_time(recording: Recording, space: ParameterSpace) -> int | None:
-    """Return the time at which the prism angle counts as 0 [us] if no encoder gives it; None if one does."""
+    """Return the time at which the prism angle is defined as 0 [us] if there is no encoder; None if there is one."""
     return _middle(recording) if recording.encoder is None and space.sized else None
 
 

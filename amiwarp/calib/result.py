@@ -67,7 +67,7 @@ class Calibration:
     model_name: str
     """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
-    """Nominal camera. If ``parameters`` contain a focal length, it replaces that of the camera."""
+    """Nominal camera. If ``parameters`` contain a focal length, it replaces the camera's focal length."""
     prism: Prism
     """Nominal prism. It gives the flat side, and the index if that was not free."""
     parameters: Mapping[str, float]

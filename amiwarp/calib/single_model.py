@@ -86,8 +86,6 @@ def _without_bad_pixels(
 
     Return the masked recording and the better of both calibrations. Raises :class:`AmiwarpError` if most pixels
     flicker.
-
-    Return the masked recording and the better of both answers. Raises :class:`AmiwarpError` if most pixels flicker.
     """
     source, encoder = recording.events, recording.encoder
     assert encoder is not None
@@ -249,7 +247,7 @@ def _calibrate_once(recording: Recording, settings: Settings, device: Any, progr
 def _photometric_stage(
     recording: Recording, search: Search, result: Calibration, progress: Progress | None
 ) -> Calibration:
-    """Return the result of the photometric stage, or that of the sharpness stage with a warning that says why."""
+    """Return the photometric stage's result, or the sharpness stage's result with a warning that says why."""
     try:
         found, summary = refine(recording, search, linear_unknowns(search.settings), progress=progress)
     except AmiwarpError as error:

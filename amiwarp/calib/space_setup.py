@@ -108,7 +108,7 @@ def make_space(
 
 
 def _ordered_names(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the free parameters' names in the order of the vector; raise for unknown or conflicting ones."""
+    """Return the free parameters' names in the search vector's order; raise for unknown or conflicting names."""
     size = size_name(model)
     wanted = {size if n in ("apex", "deflection") else n for n in free if n != "motion"}
     wanted |= set(RATES if "motion" in free else ())

@@ -148,7 +148,7 @@ class ModelChoice:
     timing_px: float
     """Estimated blur from encoder noise, clock resolution and latency jitter [px rms]."""
     agreed: bool
-    """Whether prediction and held-out turns agree on the chosen model and on all smaller ones."""
+    """Whether the predicted errors and the held-out turns agree on the chosen model and on all smaller models."""
     exact: Mapping[str, float]
     """Parameters of the exact model, to which the smaller models were fitted: values by name, in their units."""
     exact_uncertainty: Mapping[str, float]

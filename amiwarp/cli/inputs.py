@@ -170,7 +170,7 @@ def _suffix(text: str, unit: str) -> str:
 
 
 def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
-    """Convert values separated by commas. Raises :class:`AmiwarpError` unless there are ``count``."""
+    """Convert ``count`` values separated by commas. Raises :class:`AmiwarpError` for another number of values."""
     try:
         values = tuple(float(word) for word in text.split(","))
     except ValueError:

@@ -99,7 +99,7 @@ class PacketCopier:
         return CopyInProgress(self._run(len(parts), THREADS if n > PIECE else 0), self._found[: len(parts)], sources)
 
     def _run(self, rows: int, threads: int) -> list[Future[None]]:
-        """Copy the calling thread's share of the packets, while the other threads start to copy theirs."""
+        """Copy the calling thread's share of the packets, while background threads start to copy their shares."""
         ours = rows // CALLER_SHARE if threads else rows
         edges = [0, *(ours + (rows - ours) * k // max(threads, 1) for k in range(threads + 1))]
 

@@ -54,8 +54,8 @@ class Compensated:
     """
 
     events: Events
-    """Events with coordinates without the prism, float32 [px]; NaN for events without coordinates. Times and polarities
-    are those of the input."""
+    """Compensated events: coordinates without the prism, float32 [px], NaN if there are none. Times and polarities are
+    unchanged."""
     flags: NDArray[np.uint8]
     """Sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED` and :data:`NO_ANGLE` for each event, shape ``(n,)``."""
     arrived_us: int = 0
@@ -277,7 +277,7 @@ class Compensator:
         return Compensated(Events(x, y, in_flight.t, in_flight.p), flags, in_flight.arrived_us)
 
     def _set_encoder(self, first: int, last: int, last_known: int) -> None:
-        """Copy the encoder's samples over a span of event times [us] to the device, unless they are there already."""
+        """Copy the encoder's samples over a span of event times [us] to the device, unless it has them already."""
         if self._covered is None or first < self._covered[0] or last > self._covered[1]:
             until = max(last, min(last_known, last + AHEAD_US))
             self._pipeline.set_encoder(self.encoder.over(first, until), first, until)

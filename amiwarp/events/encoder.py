@@ -208,7 +208,7 @@ class Encoder:
         return cls(elapsed + t_first, elapsed.astype(np.float64) * (direction * rpm * TWO_PI / 60e6))
 
     def with_clock_offset(self, clock_offset_us: float) -> Encoder:
-        """Return the same samples with another clock offset.
+        """Return an encoder with the same samples and another clock offset.
 
         Parameters
         ----------
@@ -223,7 +223,7 @@ class Encoder:
         return dataclasses.replace(self, clock_offset_us=clock_offset_us)
 
     def with_index(self, index_t_us: ArrayLike) -> Encoder:
-        """Return the same samples with the angle zero at the index pulses.
+        """Return an encoder with the same samples whose angle is zero at the index pulses.
 
         Parameters
         ----------

@@ -43,7 +43,7 @@ class EncoderStream:
     SPEED_WINDOW_US = 50_000
     """Duration before the last sample whose mean speed extrapolates the angles after it [us]."""
     GAP_US = 20_000
-    """Longest time between two samples that is not a gap [us]. Angles in a gap count as estimates."""
+    """Longest time between two samples that is not a gap [us]. Angles in a gap are regarded as estimates."""
     MAX_GAPS = 64
     """Number of latest gaps that are remembered."""
 
@@ -81,7 +81,7 @@ class EncoderStream:
         self._restarted = len(self) > 0
 
     def append(self, t_us: ArrayLike, angle: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Append samples. Samples that are not later than the one before are dropped.
+        """Append samples. Samples that are not later than the sample before them are dropped.
 
         Parameters
         ----------

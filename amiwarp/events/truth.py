@@ -137,7 +137,7 @@ class FrameTruth:
     flow: NDArray[np.float32]
     """Optical flow without the prism [px/s], shape ``(height, width, 2)``; NaN where a point leaves the image plane."""
     flow_with_prism: NDArray[np.float32]
-    """Optical flow of what the pixel sees through the turning prism [px/s], shape ``(height, width, 2)``."""
+    """Optical flow of the scene that the pixel sees through the turning prism [px/s], shape ``(height, width, 2)``."""
     intensity: NDArray[np.float32]
     """Linear luminance without the prism, shape ``(height, width)``."""
     intensity_with_prism: NDArray[np.float32]

@@ -98,7 +98,7 @@ class _Samples:
     noun: str
     """Name of the values in error messages: count or angle."""
     unit: float
-    """Factor from the unit of ``value`` to that of error messages."""
+    """Factor from the unit of ``value`` to the unit in error messages."""
     remedy: str
     """Remedy for the user in error messages."""
 

@@ -71,7 +71,7 @@ def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool)
 
 @contextlib.contextmanager
 def own_folder(path: Path) -> Iterator[None]:
-    """Allow the replacement of existing files in a folder that holds only files of the same job."""
+    """Allow this command to replace existing files in a folder that only holds the command's own results."""
     folder = path.resolve()
     _permissions.folders.append(folder)
     try:
@@ -107,7 +107,7 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
 
 
 def _may_replace(target: Path, overwrite: bool) -> bool:
-    """Return whether an existing file may be replaced: all files, or files in a folder of the same job."""
+    """Return whether an existing file may be replaced: any file, or a file in a folder of the command's own results."""
     return overwrite or _permissions.overwrite or target.parent in _permissions.folders
 
 
@@ -249,7 +249,7 @@ def _is_alive(pid: int) -> bool:
 
 @atexit.register
 def _discard_unfinished() -> None:
-    """Remove the unfinished files of this process, but not those of a process that it was forked from."""
+    """Remove the unfinished files of this process, but not files of the process that it was forked from."""
     for part in list(_unfinished):
         if f"-{os.getpid()}-" in part.name:
             _remove(part)

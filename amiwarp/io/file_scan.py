@@ -91,8 +91,8 @@ class FileEvents:
         self._packets = packets
         self._size = size
         self.size_is_known = size is not None
-        """Whether the file stores the sensor size. Otherwise the size is that of the smallest known sensor that
-        contains all events."""
+        """Whether the file stores the sensor size. Otherwise the smallest known sensor that contains all events is
+        assumed."""
         self._kept: list[Events] | None = []
         self._counts = PassCounts()
         for block in self._pass(self._counts):
@@ -104,7 +104,7 @@ class FileEvents:
         register_reader(self, self.path)
 
     def _check_counts(self) -> None:
-        """Raise :class:`AmiwarpError` if the file has no events, or too many faulty ones."""
+        """Raise :class:`AmiwarpError` if the file has no events, or too many faulty events."""
         counts = self._counts
         for bad, what in ((counts.outside, f"lie outside the frame {self._size}"), (counts.late, "are out of order")):
             if bad * 100 > counts.count + counts.outside:

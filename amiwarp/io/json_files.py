@@ -86,7 +86,7 @@ def _finite(digits: str) -> float:
 
 
 def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a JSON object after checking that it has all ``needed`` fields and otherwise only ``optional`` ones.
+    """Return a JSON object after checking that it has all ``needed`` fields and no others except ``optional`` fields.
 
     ``where`` names the object for messages; it is empty for the whole file. Raises :class:`AmiwarpError`, which names
     the field.

@@ -161,7 +161,7 @@ class LiveWriter:
             error.add_note(f"{self.path}: holds the {len(self)} events before the error")
 
     def append(self, events: Events, *, inside: ArrayLike | None = None, extrapolated: ArrayLike | None = None) -> None:
-        """Append events. Compensated ones need the flags ``inside`` and may have ``extrapolated``, shape ``(n,)``."""
+        """Append events. Compensated events need the flags ``inside`` and may have ``extrapolated``, shape ``(n,)``."""
         self._check_open("append")
         with errors_name(self.path, lambda: f"after {len(self)} events"):
             columns = self._as_columns(events, inside, extrapolated)

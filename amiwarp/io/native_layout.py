@@ -36,7 +36,7 @@ index would be huge."""
 
 
 def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
-    """Raise :class:`AmiwarpError` for an impossible sensor size, or one that differs from the camera's."""
+    """Raise :class:`AmiwarpError` for an impossible sensor size, or a size that differs from the camera's."""
     check_size(width, height, path)
     if camera is not None and (camera.width, camera.height) != (width, height):
         given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
@@ -65,7 +65,7 @@ def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) 
 
 
 def chunks_of(columns: Columns) -> Iterator[NDArray[Any]]:
-    """Yield all chunks of the first column, then those of the next."""
+    """Yield all chunks of the first column, then all chunks of the next columns."""
     for column in columns.values():
         for at in range(0, len(column), CHUNK):
             yield column[at : at + CHUNK]
@@ -99,7 +99,7 @@ def write_header(
     prism: NominalPrism | None,
     metadata: Mapping[str, MetadataValue],
 ) -> None:
-    """Write what is known before the first event arrives: format, size, camera, prism and metadata."""
+    """Write the parts of a file that are known before the first event: format, size, camera, prism and metadata."""
     file.attrs["format"] = FORMAT
     file.attrs["format_version"] = FORMAT_VERSION
     file.attrs["width"], file.attrs["height"] = size

@@ -106,7 +106,7 @@ def begin(function: str, *arguments: Any) -> Reply:
 
 
 def advance() -> Reply:
-    """Return the counts and the next packets of the started generator, joined. At the end there are no arrays."""
+    """Return the counts and the next packets of the started generator, joined; no arrays at the end."""
     found: list[tuple[NDArray[Any], ...]] = []
     for packet in _next_packets(kept("packets")):
         found.append(packet)

@@ -324,7 +324,7 @@ def mirrored(i: int, n: int) -> int:
 
 @wp.kernel
 def mark_hot(count: wp.array2d(dtype=int), tile: int, start: int, tile_of: wp.array(dtype=int)):
-    """Set the tile to -1 for hot pixels, and to ``tile`` for the others.
+    """Exclude hot pixels by setting their tile to -1; the other pixels get the tile ``tile``.
 
     A pixel is hot if it fires far more than at least 19 of the 25 pixels of the 5 x 5 around it.
     """

@@ -91,7 +91,7 @@ def bilinear(f: wp.vec2) -> wp.vec4:
 
 @wp.func
 def brightness_at(image: wp.array(dtype=float), g: Geometry, columns: int, k: int, i: int) -> float:
-    """Return the brightness at the first (k = 0) or second event; for a pair off the map that of node 0."""
+    """Return the brightness at the first (k = 0) or second event of a pair, or at node 0 for a pair off the map."""
     cell = wp.max(load_int(g.cell, k * g.stride + i), 0)
     fx = load_float(g.part, 2 * k * g.stride + i)
     fy = load_float(g.part, (2 * k + 1) * g.stride + i)

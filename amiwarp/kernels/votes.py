@@ -64,7 +64,7 @@ class Canvas:
 
 @wp.struct
 class Cells:
-    """Words of the vote cells of one image, then the trash words, and the totals of what overflowed the words."""
+    """Words of the vote cells of one image, then the trash words, and the totals to which overflows are added."""
 
     words: wp.array(dtype=wp.uint64)
     totals: wp.array(dtype=wp.int64)

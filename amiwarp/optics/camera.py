@@ -26,7 +26,7 @@ CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 
 Rows = TypeVar("Rows")
 """Type of the rows of vectors given to a camera: NumPy array (n, 2) or (n, 3), or Warp array of vec2 or vec3. Results
-are of the same kind."""
+have the same type."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ class CameraRotation:
     """Reference time of the rotation [us], usually the middle of the time window."""
 
     def about(self, middle_us: int) -> CameraRotation:
-        """Return the same motion with another reference time.
+        """Return the same rotation, expressed about another reference time.
 
         Parameters
         ----------

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Points = TypeVar("Points")
-"""Type of points given to a model: NumPy array (n, 2), or Warp array of vec2 of shape (n,). Results are of the same
-kind."""
+"""Type of points given to a model: NumPy array (n, 2), or Warp array of vec2 of shape (n,). Results have the same type.
+"""
 
 
 class HasParams(Protocol):

@@ -93,7 +93,7 @@ class Simulation:
         return round(self.duration_s * 1e6)
 
     def without_prism(self) -> Simulation:
-        """Return the same simulation of a plain event camera: the prism is taken out.
+        """Return this simulation with the prism taken out, which makes it that of a plain event camera.
 
         Returns
         -------

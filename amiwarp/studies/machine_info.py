@@ -22,7 +22,7 @@ def processor() -> str:
 
 
 def machine(device: str) -> str:
-    """Return the name of the GPU, or that of the CPU with the number of cores that this process may use."""
+    """Return the name of the GPU; for ``cpu`` the name of the CPU, with the number of cores that may be used."""
     there = wp.get_device(device)
     return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
 

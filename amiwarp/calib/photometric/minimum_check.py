@@ -1,4 +1,4 @@
-"""Check that the photometric stage's answer is a minimum: orbits a little larger, smaller or rotated must cost more."""
+"""Check that the photometric stage's result is a minimum: slightly larger, smaller or rotated orbits must cost more."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def cost_around_optimum(cost: Cost, best: NDArray[np.float64], final: float) -> 
 
 
 def size_and_phase_directions(space: ParameterSpace, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return unit vectors of the search space along the prism's size and phase, for those of the two that are free."""
+    """Return unit vectors of the search space along the prism's size and phase, if these are free."""
     if space.cartesian:
         x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)
         rest = np.zeros(len(best) - 2)

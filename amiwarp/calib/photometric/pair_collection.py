@@ -76,7 +76,7 @@ class _PairCollector:
 
 
 def turn_length(recording: Recording, encoder: Encoder) -> float:
-    """Return the duration of a turn of the prism [us], or that of the recording if it is shorter."""
+    """Return the duration of a turn of the prism [us]; the duration of the recording if it is shorter."""
     whole = float(recording.events.t_last - recording.events.t_first + 1)
     return min(60e6 / max(abs(encoder.rpm), 1e-6), whole)
 

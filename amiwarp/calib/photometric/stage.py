@@ -92,7 +92,7 @@ class PhotometricSettings:
 def refine(
     recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
 ) -> tuple[PhotometricSummary, StageSummary]:
-    """Run the photometric stage from the answer of the sharpness stage, and return its result.
+    """Run the photometric stage, which starts at the result of the sharpness stage, and return its result.
 
     ``linear`` names the free ones of ``off_ratio`` and ``leak``. Raises :class:`AmiwarpError` for too few pairs.
     """
@@ -130,7 +130,7 @@ def refine(
 
 
 def search_box(space: ParameterSpace, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of the box about the answer ``v`` of the sharpness stage in which this stage searches."""
+    """Return the corners of the box about the sharpness stage's result ``v`` in which this stage searches."""
 
     def largest_move(name: str) -> float:
         if name in DEGENERATE_WITH_APEX:
@@ -145,7 +145,7 @@ def search_box(space: ParameterSpace, v: NDArray[np.float64]) -> tuple[NDArray[n
 def _search_with_restarts(
     cost: Cost, v: NDArray[np.float64], left: float, settings: PhotometricSettings, report: Callable[[float], None]
 ) -> tuple[SearchStage, PhotometricSummary]:
-    """Search from the answer of the sharpness stage, and again from any point near the result with a lower cost.
+    """Search from the sharpness stage's result, and again from any point near the new result with a lower cost.
 
     If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost.
     """
@@ -168,7 +168,7 @@ def _search(
     settings: PhotometricSettings,
     report: Callable[[float], None],
 ) -> SearchStage:
-    """Run one search from ``start``, in the box about the answer ``v`` of the sharpness stage."""
+    """Run one search from ``start``, in the box about the sharpness stage's result ``v``."""
     low, high = search_box(cost.space, v)
 
     def report_steps(done: int, budget: int) -> None:
@@ -196,7 +196,10 @@ def _search(
 
 
 def join_runs(first: SearchStage, second: SearchStage) -> SearchStage:
-    """Return two runs as one. The answer is that of the second run, whose map was better converged."""
+    """Return two successive runs as one.
+
+    The result is that of the second run, whose brightness map was better converged.
+    """
     return replace(
         second,
         evaluations=first.evaluations + second.evaluations,

@@ -46,7 +46,7 @@ def calibrate_auto(
     progress: Progress | None = None,
     budget_px: float | None = None,
 ) -> Calibration:
-    """Calibrate the exact model, then express the answer by the smallest model that keeps the error budget.
+    """Calibrate the exact model, then express its result by the smallest model that keeps the error budget.
 
     ``budget_px`` is the largest tolerated model error where the scene has events [px rms]; None: a tenth of the blur
     by quantisation and timing. Raises :class:`AmiwarpError` if the recording cannot determine the exact model.
@@ -240,7 +240,7 @@ def express(trial: Trial, fitted: FittedCandidate, settings: Settings, device: A
 def _sharpness(
     trial: Trial, space: ParameterSpace, values: Mapping[str, float], settings: Settings, device: Any
 ) -> float:
-    """Return the sharpness of all events, on a canvas like that of the search so that both are comparable."""
+    """Return the sharpness of all events, on a canvas as large as the search's, so that both values are comparable."""
     like = trial.space_of("exact", trial.exact)
     largest = settings.bounds.get("apex", (0.0, 2.0 * trial.exact.prism.apex))[1]
     camera, kind = space.camera, settings.sharpness

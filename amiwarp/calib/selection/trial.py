@@ -170,7 +170,7 @@ def make_trial(
 
 
 def sharpness_answer(exact: Calibration) -> Calibration:
-    """Return the calibration with the sharpness stage's parameters: the photometric ones are less sharp."""
+    """Return the calibration with the sharpness stage's parameters, which are sharper than the photometric stage's."""
     p = exact.photometric
     if p is None or not p.accepted:
         return exact

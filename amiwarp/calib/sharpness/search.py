@@ -272,7 +272,7 @@ class Search:
 
 
 def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
-    """Return the best points of a stage, at most ``most``, each at least ``apart`` px away from all better ones."""
+    """Return at most ``most`` best points of a stage, each at least ``apart`` px away from all better points."""
     chosen: list[NDArray[np.float64]] = []
     for k in np.argsort(-stage.scores, kind="stable"):
         if all(np.linalg.norm(stage.points[k] - other) >= apart for other in chosen):

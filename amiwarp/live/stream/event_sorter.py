@@ -49,7 +49,7 @@ class EventSorter:
         return self._release(Events.empty(), self._newest_us)
 
     def _release(self, events: Events, until: int) -> Events:
-        """Return the events up to the time ``until`` [us], and hold the others back."""
+        """Return the events up to the time ``until`` [us], and hold back the later events."""
         joined = events if self._held is None else Events.concatenate([self._held, events])
         joined = joined[np.argsort(joined.t, kind="stable")]
         late = int(np.searchsorted(joined.t, self._last_out_us))

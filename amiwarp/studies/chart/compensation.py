@@ -175,7 +175,8 @@ class LibraryTask:
 
 
 Libraries: TypeAlias = Callable[["ErrorSample", "Uploads", str], tuple[list[LibraryTask], list[str]]]
-"""Function that returns tasks of other libraries for a sample, its uploads and a device, and notes on missing ones."""
+"""Function that returns tasks of other libraries for a sample, its uploads and a device, and notes on libraries that
+are not installed."""
 
 
 def rows(

@@ -84,7 +84,7 @@ class KnownRecording:
 
 
 def exact_places(model: ExactModel, xy: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the compensated positions of events [px], in float64; NaN if there are none.
+    """Return the compensated positions of events [px], in float64; NaN for events without a position.
 
     ``xy`` (n, 2) [px] are the recorded positions, ``theta`` (n,) [rad] the prism angles. The closed form is that of
     ``docs/explanation/optics.md``. Lens distortion is computed in float32, within 3e-4 px.

@@ -158,7 +158,10 @@ class Design:
 
     @cached_property
     def chosen(self) -> Choice | None:
-        """Choice with the fewest events that keeps all limits; ties go to the smaller error. None if there is none."""
+        """Choice with the fewest events that keeps all limits; None if there is none.
+
+        Of choices with equal numbers of events, it is the choice with the smallest error.
+        """
         return min((c for c in self.choices if not c.misses), key=lambda c: (c.events_per_s, c.error_px), default=None)
 
     def at(self, apex: float, rpm: float) -> Choice:

@@ -279,7 +279,7 @@ def windowed(events: Events, width: int, height: int, count: int) -> Events:
 
 
 def scanned(events: Events, interval_us: float) -> Events:
-    """Return events as read out in scans: time stamps are those of the end of the scan, rows in order."""
+    """Return events as read out in scans: each gets the time stamp of the end of its scan; rows are in order."""
     t = (np.ceil(events.t / interval_us) * interval_us).astype(np.int64)
     order = np.lexsort((events.x, events.y, t))
     return Events(events.x[order], events.y[order], t[order], events.p[order])
