@@ -111,7 +111,7 @@ def wrong_scale(
     )
     return AmiwarpError(
         f"{name}: {what} every {turns:.4f} turns of the encoder, not every turn; {evidence} its scale is off by a "
-        f"factor of {turns:.4f}: read its log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
+        f"factor of {turns:.4f}: read the encoder log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
     )
 
 

@@ -65,7 +65,8 @@ def run(
         raise AmiwarpError("'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it")
     if rpm is not None and not abs(rpm) <= limit_rpm:
         raise AmiwarpError(
-            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if the prism bears it"
+            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if prism and mount "
+            "withstand it"
         )
     with Link(port) as link:
         messages: list[str] = []

@@ -67,7 +67,7 @@ class Encoder:
             raise AmiwarpError(f"encoder sample {at} ({self.t[at]} us) is not later than the one before; sort by time")
         if not (self.t[0] > -TIME_LIMIT and self.t[-1] < TIME_LIMIT):
             span = f"{self.t[0]} .. {self.t[-1]} us"
-            raise AmiwarpError(f"encoder samples span {span}, beyond {TIME_LIMIT} us from 0; they are damaged")
+            raise AmiwarpError(f"encoder samples span {span}, beyond {TIME_LIMIT} us from 0; times are damaged")
         good = np.abs(self.angle) <= LARGEST_ANGLE  # NaN fails
         if not good.all():
             at = int(np.argmin(good))
@@ -80,7 +80,7 @@ class Encoder:
 
     def _check_index(self, index_t: NDArray[np.int64]) -> None:
         if instance(index_t, np.ndarray, "encoder index_t").ndim != 1 or index_t.dtype != np.int64:
-            raise AmiwarpError(f"encoder index_t is {index_t.dtype} of shape {index_t.shape}; expected int64, (k,)")
+            raise AmiwarpError(f"encoder index_t is {index_t.dtype} of shape {index_t.shape}; expected int64 (k,)")
         inside = (index_t >= self.t[0]) & (index_t <= self.t[-1])
         if not inside.all():
             bad = index_t[int(np.argmin(inside))]

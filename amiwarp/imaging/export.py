@@ -96,7 +96,7 @@ class IweFiles:
         """
         for path in paths:
             if path.suffix.lower() not in (".png", ".npy"):
-                raise AmiwarpError(f"{path}: images of events are written as .png or .npy; give such an ending")
+                raise AmiwarpError(f"{path}: images of events are written as .png or .npy; give one of these suffixes")
         self.written: list[Path] = []
         self._layers = layers = choice(Layers, layers, "layers")
         width, height = source.size

@@ -77,7 +77,7 @@ def _check_header(path: Path, header: bytes) -> int:
         start = root + text + struct.unpack_from("<I", header, root + text)[0]
         (length,) = struct.unpack_from("<I", header, start)
         if min(fields, text) <= 0 or start + 4 + length > len(header):
-            raise ValueError("its text lies outside it")
+            raise ValueError("its text lies outside the header")
         ElementTree.fromstring(header[start + 4 : start + 4 + length].decode("utf-8"))
         return int(struct.unpack_from("<q", header, root + position)[0]) if position else 0
     except (struct.error, ValueError, ElementTree.ParseError) as error:

@@ -256,7 +256,9 @@ def _plain_length(dataset: Any, name: str, path: str) -> int:
     compact = dataset.id.get_create_plist().get_layout() == h5py.h5d.COMPACT
     inside = compact or (offset is not None and offset + declared <= os.path.getsize(path))
     if count and (stored < declared or not inside):
-        raise AmiwarpError(f"dataset '{name}' declares {count} elements, which the file does not hold; it is damaged")
+        raise AmiwarpError(
+            f"dataset '{name}' declares {count} elements, which the file does not hold; copy the file again"
+        )
     return count
 
 
@@ -271,7 +273,8 @@ def _chunked_length(dataset: Any, name: str, chunks: list[Any], unfinished: bool
         return min(count, held * size)
     if held != -(-count // size) or len(chunks) != held:
         raise AmiwarpError(
-            f"dataset '{name}' declares {count} elements, the file holds {len(chunks)} chunks of {size}; it is damaged"
+            f"dataset '{name}' declares {count} elements, the file holds {len(chunks)} chunks of {size}; copy the "
+            "file again"
         )
     return count
 

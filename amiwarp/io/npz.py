@@ -60,7 +60,9 @@ def _array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], tup
         if dtype.kind not in "iub":
             raise AmiwarpError(f"array {name} is {dtype}; expected integers (t in microseconds), no pickled objects")
         if math.prod(shape) * dtype.itemsize != about.file_size - stream.tell():
-            raise AmiwarpError(f"array {name} declares shape {shape}, which the archive does not hold; it is damaged")
+            raise AmiwarpError(
+                f"array {name} declares shape {shape}, which the archive does not hold; copy the file again"
+            )
         yield stream, shape, dtype
 
 

@@ -33,4 +33,4 @@ def check_regular(path: Path) -> None:
         what = getattr(error, "strerror", None) or error
         raise AmiwarpError(f"{path}: cannot be opened: {what}; give another file") from error
     if kind != stat.S_IFREG:
-        raise AmiwarpError(f"{path}: is {KINDS.get(kind, 'not a regular file')}; give a file")
+        raise AmiwarpError(f"{path}: is {KINDS.get(kind, 'not a regular file')}; give a regular file")

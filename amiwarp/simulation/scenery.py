@@ -171,9 +171,9 @@ class MapRing:
         self.maps: wp.array = wp.empty(0, dtype=wp.vec4, device=self._device)
 
     def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Return the times [us] and the slots on the device of the maps around ``start`` ..
+        """Return the times [us] and the slots on the device of the maps around ``start`` .. ``stop`` [us].
 
-        ``stop`` [us], at least one map.
+        There is at least one map.
         """
         while not self._held or self._held[-1][0] < stop:
             following = next(self._frames, None)

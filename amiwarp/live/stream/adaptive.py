@@ -184,7 +184,7 @@ class SpeedController:
             raise AmiwarpError(f"adaptive speed: {given}; give 0 < low < high < 1")
         for name in ("ramp_rpm_s", "most_mev_s"):
             if not getattr(self, name) > 0.0:
-                raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give more than 0")
+                raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give a number above 0")
         self._unseen, self._speeds = np.zeros(SPEEDS), np.geomspace(self.least_rpm, self.most_rpm, SPEEDS)
 
     def update(self, start_us: int, end_us: int, coverage: Coverage, rate_mev_s: float) -> float | None:

@@ -100,7 +100,7 @@ def _refuse(constant: str) -> NoReturn:
 
 def _raise_wrong(where: str, name: str, value: Any, expected: str) -> NoReturn:
     if value is None:
-        raise AmiwarpError(f"{where} has no attribute '{name}'; add it: {expected}")
+        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute: {expected}")
     raise AmiwarpError(f"{where} attribute '{name}' is {_shown(value)}; expected {expected}")
 
 

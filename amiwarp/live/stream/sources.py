@@ -209,16 +209,16 @@ class StreamSource:
             raise AmiwarpError(f"{self.name}: sends compensated events; give the stream of a sensor")
         if len(message.t) and not (message.t.min() >= -LARGEST_US and message.t.max() <= LARGEST_US):
             what = f"times of {message.t.min()} .. {message.t.max()} us, not in +-{LARGEST_US}"
-            raise AmiwarpError(f"{self.name}: {what}; correct its sender")
+            raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
         if isinstance(message, Triggers):
             return make_packet(now, triggers=message.t)
         if isinstance(message, EncoderSamples):
             if not (np.abs(message.angle) <= LARGEST_RAD).all():
                 what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
-                raise AmiwarpError(f"{self.name}: {what}; correct its sender")
+                raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
             return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
         width, height = self.size
         if len(message) and (message.x.max() >= width or message.y.max() >= height or message.p.max() > 1):
             what = f"an event outside the {width}x{height} frame, or with a polarity that is neither 0 nor 1"
-            raise AmiwarpError(f"{self.name}: {what}; correct its sender")
+            raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
         return make_packet(now, message)

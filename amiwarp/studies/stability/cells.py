@@ -254,7 +254,7 @@ class Store:
             results = {name: Result.from_json(r) for name, r in data["results"].items()}
             return Stored(cell, data["events"], results)
         except (ValueError, KeyError, TypeError) as error:
-            raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to run the cell again") from error
+            raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
 
     def save(self, known: Stored) -> None:
         """Write all known results of a cell."""

@@ -305,5 +305,5 @@ def _cell(path: Path) -> Cell | None:
     except TypeError:
         return None  # the file was written by a version with other fields
     except (OSError, ValueError, KeyError) as error:
-        raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to run the cell again") from error
+        raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
     return cell if cell.name == path.stem else None
