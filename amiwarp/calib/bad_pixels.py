@@ -239,7 +239,10 @@ def unrepeated_counts(
 
 
 def harmonics() -> NDArray[np.float64]:
-    """Return low harmonics of the angle at the bin centres, each with mean square 1, shape (harmonics, BINS)."""
+    """Return a constant, cosines and sines of the angle at the bin centres, shape (harmonics, BINS).
+
+    Each has the mean square 1.
+    """
     phase = np.outer(np.arange(1, HARMONICS + 1), (np.arange(BINS) + 0.5) * (TWO_PI / BINS))
     return np.concatenate([np.ones((1, BINS)), math.sqrt(2.0) * np.cos(phase), math.sqrt(2.0) * np.sin(phase)])
 

@@ -169,7 +169,7 @@ def _in_words(gain: float) -> str:
 def check_texture(
     best: NDArray[np.float64], opposite: NDArray[np.float64], still: NDArray[np.float64], name: str
 ) -> None:
-    """Check that the optimum is sharper than chance.
+    """Check that the image is sharper at the optimum than by chance, and than without compensation.
 
     Each array holds the sharpness of disjoint parts of the events: at the optimum, with half a turn added to the phase,
     and without motion compensation.

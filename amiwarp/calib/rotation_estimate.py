@@ -34,7 +34,10 @@ ROLLS = tuple(range(-60, 61, 12))
 
 
 def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> tuple[float, float, float]:
-    """Return the camera's mean angular velocity [rad/s] from about two turns of ``events``; zeros from less."""
+    """Return the camera's mean angular velocity [rad/s] from about two turns of events.
+
+    The result is zero for less than 1.25 turns.
+    """
     from scipy.ndimage import map_coordinates
     from scipy.optimize import minimize
     from scipy.spatial.transform import Rotation

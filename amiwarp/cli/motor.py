@@ -21,7 +21,7 @@ LIMIT_RPM = 3000.0
 WAIT_S = 2.5
 """Longest wait for the controller's status, which is sent once a second, and for its clock [s]."""
 STEP_S = 0.02
-"""Interval between two readings of the link [s]."""
+"""Interval between two readings of the data that the controller has sent [s]."""
 
 
 class Action(enum.StrEnum):

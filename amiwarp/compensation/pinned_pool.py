@@ -22,7 +22,7 @@ PooledArray: TypeAlias = tuple[Any, NDArray[Any]]
 
 
 class PinnedPool:
-    """Pool of page-locked host arrays. An array is reused once its view, and all views of that, are gone."""
+    """Pool of page-locked host arrays. An array is reused once its user has dropped all views of it."""
 
     def __init__(self, size: int, *, pinned: bool = True) -> None:
         """Make a pool of arrays with at most ``size`` values. ``pinned``: page-lock the memory, which requires CUDA."""

@@ -108,8 +108,6 @@ def check_events(
     if after_t is not None and events.t[0] < after_t:
         fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
     if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # the times are sorted here
-        fail(
-            np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; the time is damaged"
-        )
+        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; drop this event")
     if int(events.p.max()) > 1:
         fail(events.p > 1, "has a polarity that is neither 0 nor 1")

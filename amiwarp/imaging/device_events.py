@@ -59,7 +59,7 @@ class DeviceEvents:
     """
 
     def drift(self, value: float) -> None:
-        """Set the prism angles to those at the value ``value`` of the drifting parameter."""
+        """Set the prism angles for the value ``value`` of the drifting parameter."""
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:

@@ -123,7 +123,7 @@ class Image:
         self.pixels = wp.zeros(f.first + layers * f.layer + f.stride, dtype=float, device=device)
 
     def _view(self, flat: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the pixels of a flat array without its border, shape (layers, rows, columns)."""
+        """Return the pixels in a flat array without the border around them, shape (layers, rows, columns)."""
         layers, rows, columns = self.shape
         end = self.frame.first + layers * self.frame.layer
         stacked = flat[self.frame.first : end].reshape(layers, -1, self.frame.stride)

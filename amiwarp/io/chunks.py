@@ -120,7 +120,7 @@ def _moment(sums: NDArray[np.uint32]) -> int:
 
 
 def _fold_carries(total: int) -> int:
-    """Return a sum modulo 65535 as end-around carry gives it: a multiple of 65535 is 65535, except 0."""
+    """Return a sum modulo 65535 as end-around carries give it: 65535 for every multiple of 65535 except 0."""
     return (total - 1) % 65535 + 1 if total else 0
 
 

@@ -20,7 +20,7 @@ CPU_WIDTH = 4096  # unknowns per CPU thread
 
 @wp.struct
 class Unknowns:
-    """Vectors of the conjugate-gradient method, each as long as the part of the image that is solved for."""
+    """Vectors of the conjugate-gradient method, with one element per unknown that is solved for."""
 
     diagonal: wp.array(dtype=float)  # of the operator, prior included
     residual: wp.array(dtype=float)  # r, of the normal equations
@@ -150,7 +150,7 @@ def next_ratio(dots: Dots, thread: int) -> float:
 
 @wp.kernel
 def update_search_direction(width: int, start: int, u: Unknowns, dots: Dots):
-    """Compute the search direction p = z + b p, where z = r / diagonal."""
+    """Compute the search direction p = z + b p, where z = r / diagonal and b is :func:`next_ratio`."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
     for i in range(thread * width, wp.min((thread + 1) * width, u.residual.shape[0])):
@@ -160,7 +160,7 @@ def update_search_direction(width: int, start: int, u: Unknowns, dots: Dots):
 
 @wp.kernel
 def update_search_direction_with(z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots: Dots):
-    """Compute the search direction p = z + b p for a given z."""
+    """Compute the search direction p = z + b p for a given z, where b is :func:`next_ratio`."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
     for i in range(thread * width, wp.min((thread + 1) * width, z.shape[0])):

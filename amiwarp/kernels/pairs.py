@@ -108,7 +108,7 @@ def mark_ends(s: Sorted, start: int, flag: wp.array(dtype=int)):
 
 @wp.kernel
 def mark_spans(s: Sorted, edges: wp.array(dtype=wp.int64), start: int, fired: wp.array(dtype=wp.uint8)):
-    """Mark the pixels that fire in each span between two edges."""
+    """Mark the pixels that fire in each time span between two successive ``edges`` [us]."""
     i = start + wp.tid()
     t = s.t[i]
     spans = edges.shape[0] - 1

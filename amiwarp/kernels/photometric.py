@@ -177,7 +177,7 @@ def apply_normal(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W A vector, one pair per thread."""
+    """Compute sums += Aᵀ W A vector for equations A with weights W, one pair of events per thread."""
     i = start + wp.tid()
     if geometry.cell[i] < 0:
         return
@@ -200,7 +200,7 @@ def apply_normal_blocks(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W A vector, one block of pairs per thread. For CPUs."""
+    """Compute sums += Aᵀ W A vector for equations A with weights W, one block of pairs per thread. For CPUs."""
     first = (start + wp.tid()) * BLOCK
     values = wp.zeros(shape=(64,), dtype=float)
     for k in range(BLOCK):
@@ -219,7 +219,7 @@ def apply_transpose(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W residual."""
+    """Compute sums += Aᵀ W residual for equations A with weights W."""
     i = start + wp.tid()
     transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
 
@@ -233,7 +233,7 @@ def subtract(
     start: int,
     residual: wp.array(dtype=float),
 ):
-    """Compute residual -= A vector; 0 for a pair off the map."""
+    """Compute residual -= A vector for equations A; the residual is 0 for a pair off the map."""
     i = start + wp.tid()
     if i < pairs.count:
         rest = residual[i] - difference(vector, atlas, pairs, geometry, i)

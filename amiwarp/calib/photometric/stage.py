@@ -42,7 +42,7 @@ RESTARTS = 3
 FIRST_STEP_PX = 0.2
 """First step of an NLopt algorithm's first run [px]."""
 POLISH_STEP_PX = 0.05
-"""First step of an NLopt algorithm's second run, which starts at the result of the first [px]."""
+"""First step of an NLopt algorithm's second run, which starts at the result of the first run [px]."""
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ class Objective:
         return self._meter.results()
 
     def values(self, values: Mapping[str, float]) -> float:
-        """Return the sharpness at parameter values."""
+        """Return the sharpness of the image of warped events at parameter values, in their units."""
         return self._measure(values)[0]
 
     def __call__(self, v: NDArray[np.float64]) -> float:

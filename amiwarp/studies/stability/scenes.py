@@ -107,7 +107,7 @@ class _ChangingStill:
     """Still picture that changes with time (base class)."""
 
     light: NDArray[np.float32]
-    """Linear luminance of the still, shape ``(height, width)``."""
+    """Linear luminance of the still picture, shape ``(height, width)``."""
 
     @property
     def size(self) -> tuple[int, int]:
