@@ -30,13 +30,13 @@ from amiwarp.simulation.worlds.world_scene import WorldScene
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))
 SOME = 101
-"""Interval of the events whose error is measured: every 101st event."""
+"""One event in this many is checked."""
 LATENCY_S = 1e-4
-"""Mean latency of the simulated sensor [s]; the latency of single events scatters by 30 us."""
+"""Mean latency of the simulated sensor [s]; single latencies scatter by 30 us."""
 
 
 def reprojection(scene: WorldScene, block: DeviceBlock) -> np.ndarray:
-    """Return the reprojection errors of every :data:`SOME`-th event [px]."""
+    """Return distances [px] of some events."""
     assert block.seen is not None
     places = block.seen.place.numpy()[::SOME].astype(np.float64)
     bare = block.arrays.points.numpy()[::SOME]
@@ -50,7 +50,7 @@ def reprojection(scene: WorldScene, block: DeviceBlock) -> np.ndarray:
 
 
 def measure(name: str, scene: Any, seconds: float, device: str) -> dict[str, Any]:
-    """Simulate twice; return speed and error of the second run."""
+    """Simulate twice; return the second run's row."""
     for duration in (0.01, seconds):
         engine = Engine(Simulation(scene, CAMERA, PRISM, duration, device=device))
         began, events, blocks = time.perf_counter(), 0, []
