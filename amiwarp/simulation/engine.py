@@ -62,12 +62,12 @@ class DeviceBlock:
     arrays: Any
     """Columns of the events: the kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     count: int
-    """Number of events in the block."""
+    """Number of events."""
     seen: SeenSurfaces | None = None
-    """Surfaces of a world that the events' pixels saw; None for pictures."""
+    """What the events saw of a world."""
 
     def to_host(self) -> tuple[Events, NDArray[np.float32]]:
-        """Copy the events to the host; return them and their scene points without the prism [px], shape (n, 2)."""
+        """Return the events, and their scene points without the prism, shape (n, 2)."""
         if not self.count:
             return Events.empty(), np.empty((0, 2), np.float32)
         b = self.arrays
@@ -131,7 +131,7 @@ class Engine:
         self.now_us = 0
 
     def _steps_per_chunk(self, chunk_us: int | None) -> int:
-        """Return the number of time steps per chunk."""
+        """Return the number of steps per chunk."""
         longest = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
         scene = self._simulation.scene
         interval = None if isinstance(scene, WorldScene) else scene.frames.interval_us

@@ -166,7 +166,7 @@ class MapRing:
         self._frames = scene.frames.read()
         self._device = simulation.device
         self._texels = placement.width * placement.height
-        self._held: list[tuple[int, int]] = []  # time [us] and slot of each map on the device
+        self._held: list[tuple[int, int]] = []  # time [us], slot
         self._free: list[int] = []
         self.maps: wp.array = wp.empty(0, dtype=wp.vec4, device=self._device)
 
@@ -195,7 +195,7 @@ class MapRing:
         return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
 
     def _slot(self) -> int:
-        """Return a free slot for a map; double the number of slots if none is free."""
+        """Return a free slot; double their number if there is none."""
         if not self._free:
             slots = len(self.maps) // self._texels
             grown = wp.empty((2 * slots or 1) * self._texels, dtype=wp.vec4, device=self._device)
