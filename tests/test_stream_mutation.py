@@ -54,7 +54,7 @@ def test_a_whole_hello_is_understood() -> None:
 def test_a_size_is_a_whole_number_in_range(value: str) -> None:
     for text in (f'{{"width":{value},"height":48}}', f'{{"width":64,"height":{value}}}'):
         with pytest.raises(
-            AmiwarpError, match=r"tcp:there: packet at byte 0: its hello .*expected .*1 \.\. 65536|add it"
+            AmiwarpError, match=r"tcp:there: packet at byte 0: its hello .*expected .*1 \.\. 65536|add this attribute"
         ):
             hello(text)
 
