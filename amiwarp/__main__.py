@@ -9,7 +9,7 @@ import sys
 from amiwarp.cli import INTERRUPTED, STOPPED, fail
 
 ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""Signals that end a command in the same way as Ctrl-C."""
+"""Signals that end a command in the same way as Ctrl-C does."""
 
 
 def main() -> None:
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def _main() -> None:
-    """Load the command line, which takes some time, and run it."""
+    """Load the command line, which takes some time, and run the command."""
     try:
         for number in ENDING:
             if signal.getsignal(number) is signal.SIG_DFL:  # a signal that nohup ignores stays ignored
@@ -39,7 +39,7 @@ def _main() -> None:
         from amiwarp.cli import app
 
         app.main()
-    except KeyboardInterrupt:  # during loading, or before or after a command
+    except KeyboardInterrupt:  # Ctrl-C during loading, or before or after a command
         fail(INTERRUPTED, STOPPED)
 
 

@@ -1,4 +1,4 @@
-"""The exception for bad input. Its message says what was given, what was expected and what to do."""
+"""Exception for bad input, whose message says what was given, what was expected and what to do."""
 
 
 class AmiwarpError(ValueError):
@@ -14,7 +14,7 @@ class AmiwarpError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        """Keep the message in printable form, because it may quote a damaged or malicious file."""
+        """Store the message in printable form, because it may quote a damaged or malicious file."""
         super().__init__(printable(message))
 
 

@@ -1,4 +1,4 @@
-"""Type of the progress callback of long tasks."""
+"""Type of the callback by which long tasks report their progress."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ Progress: TypeAlias = Callable[[str, float], None]
 
 
 def part(progress: Progress, start: float, end: float) -> Progress:
-    """Return the callback for a part of a task that covers the fractions ``start`` to ``end`` of the whole."""
+    """Return the callback for a part of a task, which covers the fractions ``start`` to ``end`` of the whole."""
     return lambda what, share: progress(what, start + (end - start) * share)
 
 
 def silent(what: str, share: float) -> None:
-    """Ignore the progress: the callback for callers that do not report it."""
+    """Ignore the progress: callback for callers that do not report progress."""

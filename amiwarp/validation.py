@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 Choice = TypeVar("Choice", bound=enum.StrEnum)
-"""An enumeration of names."""
+"""Type variable: an enumeration whose members have names."""
 
 Kind = TypeVar("Kind")
-"""Any class."""
+"""Type variable: any class."""
 
 UNUSABLE = (TypeError, ValueError, OverflowError, RecursionError)
-"""Exceptions of Python and NumPy for values of unexpected types."""
+"""Exceptions that Python and NumPy raise for values of unexpected types."""
 
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = _short.maxlong = 80
@@ -40,12 +40,15 @@ def shown(value: object) -> str:
 
 
 def choice(kind: type[Choice], value: object, what: str) -> Choice:
-    """Return the member of ``kind`` that ``value`` is or names. Raises :class:`AmiwarpError` with the choices."""
+    """Return the member of the enumeration ``kind`` that ``value`` is or names.
+
+    Raises :class:`AmiwarpError` with the names of all members.
+    """
     return kind(one_of(value, [member.value for member in kind], what))
 
 
 def one_of(value: object, names: Iterable[str], what: str) -> str:
-    """Return ``value`` if it is one of ``names``. Raises :class:`AmiwarpError` with the names."""
+    """Return ``value`` if it is one of ``names``; else raise :class:`AmiwarpError` with the names."""
     names = list(names)
     if not isinstance(value, str) or value not in names:
         raise AmiwarpError(f"{what} is {shown(value)}; choose among {', '.join(names)}")
@@ -53,7 +56,7 @@ def one_of(value: object, names: Iterable[str], what: str) -> str:
 
 
 def instance(value: object, kind: type[Kind], what: str) -> Kind:
-    """Return ``value`` if it is an instance of ``kind``. Raises :class:`AmiwarpError`."""
+    """Return ``value`` if it is an instance of the class ``kind``; else raise :class:`AmiwarpError`."""
     if not isinstance(value, kind):
         raise AmiwarpError(f"{what} is {shown(value)}; expected a {kind.__name__}")
     return value
@@ -90,7 +93,10 @@ def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
 
 
 def vector(value: object, count: int, what: str, check: Callable[[object, str], float]) -> tuple[float, ...]:
-    """Return a sequence of ``count`` numbers, each checked by ``check``. Raises :class:`AmiwarpError`."""
+    """Return a sequence of ``count`` numbers, each checked by the function ``check``.
+
+    Raises :class:`AmiwarpError` for any other value.
+    """
     axes = value.ndim if isinstance(value, np.ndarray) else 1
     if not isinstance(value, list | tuple | np.ndarray) or axes != 1 or len(value) != count:
         raise AmiwarpError(f"{what} is {shown(value)}; expected {count} numbers")
@@ -98,7 +104,7 @@ def vector(value: object, count: int, what: str, check: Callable[[object, str], 
 
 
 def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
-    """Return an array of numbers, without a copy if ``value`` is one. Raises :class:`AmiwarpError`.
+    """Return an array of numbers, without a copy if ``value`` is such an array. Raises :class:`AmiwarpError`.
 
     ``kinds`` are the accepted kinds of types, as in NumPy's ``dtype.kind``. Add ``b`` to accept truth values.
     """
@@ -119,7 +125,7 @@ def _scalar(value: object) -> Any:
 
 
 def _range(what: str, low: float, high: float) -> str:
-    """Describe a range whose limits may be infinite."""
+    """Return the text of a range whose limits may be infinite."""
     if math.isinf(low) and math.isinf(high):
         return what
     if math.isinf(high):
@@ -128,5 +134,5 @@ def _range(what: str, low: float, high: float) -> str:
 
 
 def _plain(number: float) -> str:
-    """Format a limit of a range."""
+    """Return a limit of a range as text."""
     return str(number) if isinstance(number, int) else f"{number:.6g}"

@@ -40,7 +40,7 @@ REST_S = 0.02
 
 
 def seconds_of(job: Job, device: str) -> float:
-    """Return the duration of one pass [s]; the device is idle before and after it."""
+    """Return the duration of one pass [s]. The device is idle before and after the pass."""
     if job.seconds is not None:
         return next(job.seconds)
     if device == "cpu":
@@ -65,7 +65,10 @@ def row_of(case: Case, scene: str) -> dict[str, Any]:
 
 
 def prepared(case: Case, scene: Any, device: str, row: dict[str, Any]) -> Job | None:
-    """Return the job after its first pass, or None if its library is missing; ``row`` then holds the reason."""
+    """Return the job after its first pass.
+
+    If its library is missing, return None, and the reason in ``row``.
+    """
     try:
         began = time.perf_counter()
         job = case.make(scene, device, case.model, case.vote)
@@ -80,7 +83,7 @@ def prepared(case: Case, scene: Any, device: str, row: dict[str, Any]) -> Job | 
 def measured(
     cases: list[Case], name: str, device: str, *, events: int | None, repeats: int, picture: Path | None
 ) -> list[dict[str, Any]]:
-    """Measure all cases on one scene, and return their rows."""
+    """Measure all cases on one scene, and return the results as rows."""
     rows = [row_of(case, name) for case in cases]
     try:
         scene = SCENES[name].make(events or SCENES[name].events[kind(device)], device, picture)
@@ -107,7 +110,7 @@ def measured(
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return a row as one line of text."""
+    """Return the result of one case as one line of text."""
     start = f"{row['scene']:20} {row['name']:28}"
     if "skipped" in row:
         return f"{start} skipped: {row['skipped']}"
@@ -130,7 +133,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """Return the commit of the checkout, followed by + if files have changed since."""
+    """Return the git commit of the checkout, followed by + if files have changed since."""
     try:
         git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty=+"]
         return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()

@@ -47,25 +47,28 @@ from amiwarp.studies.machine_info import machine, versions
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 PRISM, SMALL, PHASE = Prism(math.radians(1.8)), Prism(math.radians(0.9)), 1.0
-"""Two prisms, with orbits of 5.8 and 2.9 px, and their phase [rad]."""
+"""Two prisms, with orbits of 5.8 and 2.9 px, and the phase of both [rad]."""
 WINDOW_US = 33_000
 FIXED, USUAL = (180.0, 360.0, 540.0, 720.0, 1440.0), 720.0
 MOTIONS = {"still": (0.0, 1.0, 1), "slow": (15.0, 1.0, 1), "fast": (120.0, 1.0, 3), "very fast": (300.0, 0.4, 6)}
-"""Angular speed of the camera [deg/s], duration of a circle of its optical axis [s], and number of measured circles."""
+"""Camera motions by name: angular speed [deg/s], duration of a circle of the optical axis [s], and number of measured
+circles."""
 SETTLED_S, ADAPTED_S = 0.2, 1.2
-"""Start of the measured circles, for fixed and adaptive speed [s]."""
+"""Time from the start of a run to the start of the measured circles [s], for fixed and for adaptive speed."""
 CHANGING = (("still", 2.0), ("slow", 1.0), ("fast", 2.0), ("still", 2.0))
 """Sequence of motions and their durations [s]: whole circles, so that each starts where the last one ends."""
 MOST_RPM, START_RPM = 900.0, 540.0
-"""The controller's highest speed, and its initial speed, from which it settles before the measurement starts."""
+"""Highest speed that the controller may command, and its initial speed, from which it settles before the measurement
+starts [turns/min]."""
 BANDS: dict[str, dict[str, float]] = {"adaptive": {}, "adaptive, 99 %": {"low": 0.99, "high": 0.996}}
-"""Coverage that the controller aims at: its default, and a lower one of about 99 %."""
+"""Limits of the coverage that the controller aims at: its default limits, and lower ones of about 99 %."""
 SPARE_S = 0.05
 """Time simulated after the measurement, because the last window extends past its end [s]."""
 MOTOR_S = 0.1
-"""Time constant of the motor [s]."""
+"""Time constant of the simulated motor's speed [s]."""
 CONTRAST, NEAR, LEAST = 0.75, 1.0, 2
-"""Change of log intensity within 3 × 3 px of an edge; distance [px] and number of events that make it visible."""
+"""Smallest change of log intensity within 3 × 3 px at an edge, and distance [px] and number of events that make an edge
+visible."""
 MARGIN = 24
 """Border of the image that is not evaluated, because it is not in view during the whole window [px]."""
 
@@ -129,7 +132,7 @@ class Edges:
         return rows[crest], columns[crest]
 
     def seen(self, t_us: NDArray[np.int64], points: NDArray[np.float32], start_us: int, end_us: int) -> float:
-        """Return the share of edges at the window's middle with at least LEAST of its events within NEAR."""
+        """Return the share of the edges at the window's middle that have at least LEAST events within NEAR px."""
         middle = 0.5e-6 * (start_us + end_us)
         grid = np.arange(start_us, end_us, 1000)
         turned = self.orientation(np.array([middle]))[0].T @ self.orientation((grid + 500) * 1e-6)
@@ -161,7 +164,7 @@ def gaze(rates: ArrayLike, t: NDArray[np.float64], circle_s: float = 1.0) -> Cam
 
 @dataclass(frozen=True)
 class Window:
-    """Results of one window."""
+    """Results of one time window of a run."""
 
     t_s: float
     """Middle of the window [s]."""
@@ -170,13 +173,13 @@ class Window:
     seconds: float
     """Length of the window [s]."""
     rpm: float
-    """Speed of the prism [1/min]."""
+    """Speed of the prism [turns/min]."""
     events: int
-    """Number of events."""
+    """Number of events in the window."""
     share: float
-    """Share of visible edges."""
+    """Share of the scene's edges that the window's events make visible."""
     coverage: float
-    """Coverage that the controller measured."""
+    """Coverage that was estimated from the window's events."""
 
 
 def run(
@@ -230,7 +233,11 @@ def summary(name: str, windows: list[Window], start_s: float, end_s: float) -> R
 
 
 def judge(row: Row, usual: Row) -> None:
-    """Set ``ok``: fewer events than at the usual speed, and the same share within the error, or at least 99 %."""
+    """Set the field ``ok`` of a measured row.
+
+    It is true if there are fewer events than at the usual speed, and the same share of visible edges within the error,
+    or at least 99 %.
+    """
     row["within"] = 2.0 * math.hypot(row["share_error"], usual["share_error"])
     row["fewer_events"] = 1.0 - row["mev_s"] / usual["mev_s"]
     needed = usual["share"] - row["within"] if row["name"] == "adaptive" else 0.99
@@ -312,9 +319,9 @@ def draw(path: Path, results: dict[str, Any]) -> None:
 COLOURS = {"still": "#0072b2", "slow": "#009e73", "fast": "#d55e00", "very fast": "#cc79a7"}
 COURSES = {f"{USUAL:g} rpm": ("#777777", "--"), "adaptive": ("#000000", "-"), "adaptive, 99 %": ("#e69f00", "-")}
 ALL = 2e-5
-"""Share of missed edges at which zero is drawn, because the axis is logarithmic."""
+"""Share of missed edges at which zero is drawn, because the axis of the figure is logarithmic."""
 LABELS = {"still": (-26, 8), "slow": (5, -11), "fast": (10, -9), "very fast": (-9, 10)}
-"""Offsets of the speed labels from their points [pt]."""
+"""Offsets of the speed labels from their points in the figure [pt]."""
 
 
 def _against(ax: Any, motions: dict[str, list[Row]]) -> None:

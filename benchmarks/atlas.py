@@ -27,7 +27,7 @@ _started = multiprocessing.get_context("spawn").Value("i", 0)
 
 
 def quiet(counter: object) -> None:
-    """Pin each process to its own core, because the work is spread over processes rather than threads."""
+    """Silence Warp, and pin each process to its own core, because work is spread over processes, not threads."""
     wp.config.log_level = wp.LOG_ERROR
     with counter.get_lock():  # type: ignore[attr-defined]
         number = counter.value  # type: ignore[attr-defined]

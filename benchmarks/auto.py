@@ -41,9 +41,10 @@ from amiwarp.studies.machine_info import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1
-"""Nominal over true apex angle, so that no search range is centred on the truth."""
+"""Ratio of the nominal to the true apex angle. It differs from 1 so that no search range is centred on the truth."""
 NEAR = 0.05
-"""If a model's true error differs from the budget by less than this share, a pick on either side is plausible."""
+"""Relative difference of a model's true error from the budget below which choosing this model or a larger one is
+correct."""
 LEAST_RIGHT, MOST_OVER, MOST_REFUSED = 0.95, 1.1, 0.05
 TURNS_PER_S = 12.0
 
@@ -52,7 +53,10 @@ def recorded(
     picture: Path, size: tuple[int, int], fov_deg: float, apex_deg: float, seed: int, args: argparse.Namespace,
     *, index: float = 1.5168, ramp: bool = False, **changes: Any,
 ) -> Recording:  # fmt: skip
-    """Simulate a recording. The phase depends on the seed; with ``ramp``, the speed of the prism doubles."""
+    """Simulate a recording. The phase depends on the seed.
+
+    With ``ramp``, the speed of the prism doubles.
+    """
     camera = Camera.from_fov(*size, math.radians(fov_deg))
     prism = Prism(math.radians(apex_deg), index)
     seconds = args.turns / TURNS_PER_S
@@ -67,7 +71,7 @@ def recorded(
 
 
 def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
-    """Return the rms error over the events of each model, fitted to the true exact model [px]."""
+    """Return the rms error of each model, fitted to the true exact model at the events [px]."""
     assert recording.camera is not None
     assert recording.truth is not None
     assert recording.encoder is not None

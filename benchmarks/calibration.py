@@ -58,9 +58,10 @@ from amiwarp.simulation.simulator import Simulation
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.3
-"""Nominal over true apex angle, so that no search range is centred on the truth."""
+"""Ratio of the nominal to the true apex angle. It differs from 1 so that no search range is centred on the truth."""
 EVERY = 16
-"""Every 16th event of a picture's recording is kept. Calibration thins them further, to a million."""
+"""Interval of the kept events of a picture's recording: every 16th event. Calibration thins them further, to a million.
+"""
 GRID_PX = 0.75
 BLUR_EVENTS = 1_000_000
 
@@ -101,7 +102,7 @@ def pictures(folder: Path) -> list[Path]:
 
 
 def best_of_grid(search: Any, best: np.ndarray) -> dict[str, float]:
-    """Compare the optimum with the best point of a dense grid over the search range and a fine grid around it."""
+    """Compare the optimum with the best points of two dense grids: over the search range, and around the optimum."""
     low, high = search.space.bounds()
     wide = np.stack(np.meshgrid(*(np.arange(a, b, GRID_PX) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
     wide = wide[np.hypot(*wide.T) <= high[0]]
@@ -291,7 +292,7 @@ def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def some(
     args: argparse.Namespace, *, every: int = EVERY, sensor: SensorModel | None = None
 ) -> Iterator[tuple[dict[str, Any], Recording]]:
-    """Yield one recording per picture, with the three prisms in turn."""
+    """Yield one recording per picture, with each of the three prisms in turn."""
     camera = Camera.from_fov(640, 480, math.radians(60.0))
     for k, picture in enumerate(pictures(args.folder)):
         apex = APEXES_DEG[k % len(APEXES_DEG)]
@@ -301,7 +302,7 @@ def some(
 
 
 def run_algorithms(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Measure how far each global and each local search ends from the optimum of the default search."""
+    """Measure how far each global and each local search algorithm ends from the optimum of the default search."""
     for label, recording in some(args):
         search = prepare(recording, Settings(), device=args.device)[0]
         search.run()

@@ -22,7 +22,7 @@ from benchmarks.scenes import RECORDED, event_scene, file_scene, recording_scene
 
 @dataclass(frozen=True, slots=True)
 class SceneKind:
-    """Kind of input for the cases."""
+    """Kind of input on which cases are measured."""
 
     make: Callable[[int, str, Path | None], Any]
     """Function that makes the input from the number of events, the device and the picture of the scene."""
@@ -49,37 +49,37 @@ BOTH = "calibration without a guess, both stages"
 PICTURE = "picture of one turn, from given parameters"
 MOVED = "compensation of a file"
 EXACT_PX = {"plane circle": 4.0, "circle": 2.5, "radial": 0.1, "ellipse": 0.02, "exact": 0.002}
-"""Largest accepted rms error of each model [px]: slightly above its error with this camera."""
+"""Largest accepted rms error of each model's positions [px]: slightly above the model's error with this camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One method that is measured."""
+    """Method that is measured on one or more kinds of scene."""
 
     what: str
-    """Task; rows of one task share a table."""
+    """Task of the method; the results of one task share a table."""
     name: str
     """Name of the method."""
     make: Callable[[Any, str, str, Vote], Job]
-    """Function of scene, device, model and vote that prepares the data."""
+    """Function of scene, device, model and vote that prepares the data and returns the :class:`Job`."""
     model: str = "plane circle"
-    """Optical model."""
+    """Optical model that the method compensates."""
     vote: Vote = Vote.BILINEAR
-    """How an event votes for pixels."""
+    """How an event's vote is shared among pixels."""
     scenes: tuple[str, ...] = EVENT_SCENES
     """Scenes on which the case runs."""
     devices: tuple[str, ...] = ("cpu", "cuda")
     """Kinds of device on which the case runs."""
     bars: dict[str, float] = field(default_factory=dict)
-    """Largest accepted errors by name; with a larger error, or NaN, the answer is wrong."""
+    """Largest accepted error by name. With a larger error, or NaN, the result is wrong."""
     unit: str = "ev"
     """Unit of the job's ``work``; empty if the time itself is reported."""
     most_repeats: int = 1_000
-    """Largest number of passes."""
+    """Largest number of timed passes of the method."""
 
 
 def image_bars(model: str, vote: Vote) -> dict[str, float]:
-    """Return the largest accepted errors of an image.
+    """Return the largest accepted errors of an image of events.
 
     Votes in steps of 1/256 px misplace 0.2 % of the votes, less if more events meet in a pixel. A nearest vote at half
     a pixel may go to either side, so a pixel may differ by a few events.
@@ -127,24 +127,24 @@ WHOLE = (
         for model in ("circle", "exact")
     ),
 )  # fmt: skip
-"""Complete tasks, from end to end."""
+"""Cases of complete tasks, from end to end."""
 CASES = (*LADDER, *PEERS, *PREPARED_VOTES, *WHOLE)
 
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """Target: a rate, a time, a memory size, or a ratio between two cases."""
+    """Target of the benchmarks: a rate, a time, a memory size, or a ratio between two cases."""
 
     what: str
-    """Description in the table of targets."""
+    """Description of the target in the table of targets."""
     device: str
-    """Kind of device."""
+    """Kind of device for which the target holds: cpu or cuda."""
     of: str
-    """Name of the case."""
+    """Name of the case to which the target applies."""
     bars: dict[str, float]
-    """Target value for each scene."""
+    """Target value of each scene, by name of the scene."""
     unit: str
-    """Unit of the target, which also tells its direction.
+    """Unit of the target, which also determines whether it is a minimum or a maximum.
 
     Rates such as ``Gev/s`` and ``x faster`` are minima. ``s``, ``x time`` and ``MiB`` (peak memory of the process) are
     maxima.

@@ -1,4 +1,4 @@
-"""Rows of the charts for other libraries, which make the same image of warped events with the circle model."""
+"""Other libraries in the charts: tasks that make the same image of warped events with the circle model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from benchmarks import libraries
 
 
 def library_tasks(sample: ErrorSample, uploads: Uploads, device: str) -> tuple[list[LibraryTask], list[str]]:
-    """Make a task for every installed library, with the circle that fits the events best, and notes on the others."""
+    """Make a task for every installed library, with the circle that fits the events best.
+
+    Notes name the libraries that are not installed.
+    """
     known = sample.known
     camera, radius, turned = known.camera, *circle(sample)
 

@@ -53,7 +53,7 @@ APEX, PHASE, RPM, REPEATED_US = math.radians(2.0), 0.7, 720.0, 500_000
 CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, FOV), Prism(APEX, INDEX)
 BAR_PX = 1e-3
 ALONE = 20_000_000
-"""Number of events for measuring a stage without the others."""
+"""Number of events with which each stage is measured without the other stages."""
 COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
 MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside": np.uint8}
 
@@ -95,7 +95,7 @@ def make(path: Path, events: int, columns: bool) -> None:
 
 
 class Bare:
-    """Folder of plain binary columns, read and written by threads instead of HDF5."""
+    """Stand-in for HDF5: a folder of plain binary columns, read and written by threads."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -126,7 +126,7 @@ class Bare:
 
 
 class Calibrated:
-    """Stand-in for a calibration, with the attributes that compensation needs."""
+    """Stand-in for a calibration, with the attributes that the compensation needs."""
 
     def __init__(self, name: str) -> None:
         self.model_name, self.camera = name, CAMERA
@@ -143,7 +143,7 @@ def seconds(work: Callable[[], Any]) -> float:
 
 
 def truth(name: str, model: Any, xy: Any, theta: Any) -> Any:
-    """Return the positions by the float64 oracle of the tests; for the ellipse, by its own tables in float64."""
+    """Return the true positions by the float64 oracle of the tests; for the ellipse, by its own tables in float64."""
     if name == "ellipse":
         phi = (theta + PHASE)[:, None]
         at = xy[:, 1].astype(int), xy[:, 0].astype(int)
@@ -188,7 +188,7 @@ def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any]:
 
 
 def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[str, float]:
-    """Million events a second of each stage, over all cores, the others left out."""
+    """Return the speed of each stage without the other stages, over all cores [million events/s]."""
     reads = list(recording.events.pieces(PIECE))[: ALONE // PIECE]
     count = min(len(reads) * PIECE, len(recording.events))
     held = [read() for read in reads[:8]]

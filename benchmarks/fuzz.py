@@ -35,7 +35,7 @@ from amiwarp.kernels.cpu_threads import cpu_threads
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 LONGEST_S = 300.0
-"""A decoder that works longer than this on one input counts as hanging [s]."""
+"""Time after which a decoder that still works on one input is considered hanging [s]."""
 
 
 def files(count: int | None, until: float | None, seed: int, keep: Path) -> dict[str, Counter[str]]:
@@ -56,7 +56,7 @@ def files(count: int | None, until: float | None, seed: int, keep: Path) -> dict
 
 
 def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: Path) -> dict[str, Counter[str]]:
-    """Check files with these numbers in one supervised process."""
+    """Check the mutated files with these numbers in one supervised process."""
     mutation = importlib.import_module("mutation_files")
     kinds = list(mutation.KINDS)
     outcomes: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}

@@ -21,13 +21,13 @@ TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
     "simulate", "translate", "benchmarks",
 )  # fmt: skip
-"""Test files that use a device, and need neither the packages of the command line nor video."""
+"""Names of the test files that use a device and need neither the packages of the command line nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
-"""Tests to skip without hdf5plugin, which a GPU machine may lack."""
+"""Options that skip tests which need hdf5plugin, if a GPU machine lacks it."""
 
 
 def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
-    """Return the commands by name."""
+    """Return the commands to run, by name."""
     tests = [f"tests/test_{name}.py" for name in TESTS]
     module = [sys.executable, "-m"]
     calibration = [*module, "benchmarks.calibration"]

@@ -1,4 +1,4 @@
-"""The job that a case gives to the runner."""
+"""Job that a benchmark case gives to the program that times it."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One method on one scene and device, with its data prepared."""
+    """One method with its data prepared for one scene and device."""
 
     run: Callable[[], Any]
-    """One pass, which is timed. On CUDA it may return before the device is done."""
+    """Function that runs one pass, which is timed. On CUDA it may return before the device has finished."""
     errors: Callable[[], dict[str, float]]
     """Function that returns the errors of the latest pass by name; the case has limits for them."""
     work: float = 1.0
-    """Work of one pass, in the case's unit."""
+    """Amount of work in one pass, in the unit of the case."""
     also: Callable[[], dict[str, float]] = dict
-    """Function that returns further results by name."""
+    """Function that returns further results of the latest pass by name."""
     seconds: Iterator[float] | None = None
     """Durations of passes that were timed in another process [s]; ``run`` then does nothing."""
     note: str = ""
-    """How the case differs on this machine, if it does."""
+    """Text that says how the case differs on this machine; empty if it does not."""

@@ -22,36 +22,36 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BLOCK = 1 << 16
-"""Number of events whose arrays fit into a CPU's cache while NumPy and PyTorch process them array by array."""
+"""Number of events per block of NumPy and PyTorch. The arrays of a block fit into a CPU's cache."""
 
 
 class Missing(Exception):
-    """Raised if a library is not installed, or does not run on this device; the row is then skipped with this text."""
+    """Raised if a library is not installed, or does not run on this device. The row is then skipped with this text."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeerEvents:
-    """Events in the form that users of other libraries have, and the circle to compensate."""
+    """Events in the form that users of other libraries have, and the circle by which to compensate them."""
 
     x: NDArray[np.uint16]
-    """Column of each event [px]."""
+    """Column of each event on the sensor [px]."""
     y: NDArray[np.uint16]
-    """Row of each event [px]."""
+    """Row of each event on the sensor [px]."""
     angle: NDArray[np.float32]
     """Direction of each displacement, within one turn [rad]."""
     radius: float
-    """Radius of the circle [px]."""
+    """Radius of the circle on which events are displaced [px]."""
     width: int
     """Width of the image [px]."""
     height: int
     """Height of the image [px]."""
     margin: int
-    """Margin around the image that no event leaves [px]: larger than the radius plus 1."""
+    """Margin around the image that contains all compensated events [px]: larger than the radius plus 1."""
     _kept: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the image, its margin included."""
+        """Rows and columns of the image, including its margin."""
         return self.height + 2 * self.margin, self.width + 2 * self.margin
 
     def keep(self, key: Any, make: Callable[[], Any]) -> Any:
@@ -69,14 +69,14 @@ class PeerEvents:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """One library, with the events in memory."""
+    """Implementation with one library, with the events in memory."""
 
     run: Callable[[], Any]
-    """One pass, which is timed. On CUDA it may return before the device is done."""
+    """Function that runs one pass, which is timed. On CUDA it may return before the device has finished."""
     with_margin: Callable[[], Any]
     """Function that returns the image of the latest pass, including the margin."""
     events: PeerEvents
-    """Events that are voted."""
+    """Events that the implementation votes into the image."""
 
     def image(self) -> NDArray[np.floating[Any]]:
         """Return the image of the latest pass without the margin, shape ``(height, width)``."""
@@ -93,7 +93,7 @@ def library(name: str) -> Any:
 
 
 def with_numpy(events: PeerEvents, device: str, *, block: int | None = None) -> Peer:
-    """NumPy, with four calls of ``add.at`` (faster than ``bincount`` in NumPy 2) over whole arrays or blocks."""
+    """Prepare NumPy: four calls of ``add.at`` (faster than ``bincount`` in NumPy 2) over whole arrays or blocks."""
     x, y, angle, radius, margin = events.x, events.y, events.angle, np.float32(events.radius), np.float32(events.margin)
     rows, columns = events.shape
     image = np.zeros(rows * columns, np.float32)
@@ -117,7 +117,10 @@ def with_numpy(events: PeerEvents, device: str, *, block: int | None = None) -> 
 
 @cache
 def numba_kernels() -> tuple[Any, Any]:
-    """Return two kernels: sine and cosine per event, and a table of displacements. Each thread has its own image."""
+    """Return two Numba kernels: sine and cosine per event, and a table of displacements.
+
+    Each thread has its own image.
+    """
     nb = library("numba")
     one = np.float32(1.0)
 
@@ -159,7 +162,7 @@ def _numba_images(events: PeerEvents) -> tuple[Any, Any]:
 
 
 def with_numba(events: PeerEvents, device: str) -> Peer:
-    """Numba, parallel and with ``fastmath``."""
+    """Prepare Numba, parallel and with ``fastmath``."""
     kernel, _ = numba_kernels()
     images, total = _numba_images(events)
     sizes = np.float32(events.radius), np.float32(events.margin)
@@ -168,7 +171,7 @@ def with_numba(events: PeerEvents, device: str) -> Peer:
 
 
 def with_numba_table(events: PeerEvents, device: str) -> Peer:
-    """Numba, with 16-bit angles as in amiwarp and a table of displacements."""
+    """Prepare Numba, with 16-bit angles as in amiwarp and a table of displacements."""
     _, kernel = numba_kernels()
     images, total = _numba_images(events)
     angle = np.arange(65536) * (2.0 * np.pi / 65536)
@@ -179,7 +182,7 @@ def with_numba_table(events: PeerEvents, device: str) -> Peer:
 
 
 def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> Peer:
-    """PyTorch, with four calls of ``index_add_`` over whole arrays or blocks."""
+    """Prepare PyTorch: four calls of ``index_add_`` over whole arrays or blocks."""
     torch = library("torch")
     if device != "cpu" and not torch.cuda.is_available():
         raise Missing("this PyTorch has no CUDA")
@@ -208,7 +211,7 @@ def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> 
 
 
 def _cupy_events(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
-    """Return CuPy, and x, y and angle on the device."""
+    """Return the module CuPy, and x, y and angle of the events on the device."""
     cupy = library("cupy")
     if device == "cpu":
         raise Missing("CuPy runs only on CUDA")
@@ -217,7 +220,7 @@ def _cupy_events(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
 
 
 def with_cupy(events: PeerEvents, device: str) -> Peer:
-    """CuPy, with array operations and four calls of ``add.at``."""
+    """Prepare CuPy: array operations and four calls of ``add.at``."""
     cupy, (x, y, angle) = _cupy_events(events, device)
     radius, margin, (rows, columns) = np.float32(events.radius), np.float32(events.margin), events.shape
     image = cupy.zeros(rows * columns, cupy.float32)
@@ -257,7 +260,7 @@ extern "C" __global__ void votes(const unsigned short* x, const unsigned short* 
 
 
 def with_cupy_kernel(events: PeerEvents, device: str) -> Peer:
-    """CuPy's ``RawKernel`` with CUDA C++: four float atomics per event."""
+    """Prepare CuPy's ``RawKernel`` with CUDA C++: four float atomics per event."""
     cupy, (x, y, angle) = _cupy_events(events, device)
     kernel, n = cupy.RawKernel(CUDA_SOURCE, "votes"), len(x)
     image = cupy.zeros(events.shape, cupy.float32)
@@ -283,6 +286,6 @@ PEERS: dict[str, Callable[[PeerEvents, str], Peer]] = {
     "CuPy": with_cupy,
     "CuPy, CUDA C++": with_cupy_kernel,
 }
-"""Fastest implementation with each library, by name."""
+"""Fastest implementation with each library, by name of the library."""
 ON_CPU = ("NumPy", "Numba", "Numba, table")
 """Names of the implementations that run on the CPU for every device."""

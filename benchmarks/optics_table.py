@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import reference
 
 INDEX = 1.55
-GRID = 49  # rows of pixels; 36 angles
+GRID = 49  # number of rows of pixels; the number of angles is 36
 LENSES: dict[str, Distortion | None] = {
     "no lens distortion": None,
     "radial-tangential": RadialTangential(-0.368, 0.151, -3e-4, -7.6e-4),
@@ -48,7 +48,7 @@ def fitted_circle(exact: ExactModel) -> ModelError:
 
 
 def ladder_rows() -> Iterator[str]:
-    """Yield one row per field of view, deflection and side: rms/worst error of every model [px]."""
+    """Yield one table row per field of view, deflection and flat side: rms and worst error of every model [px]."""
     yield "| FOV | δ₀ | flat side | circle, on-axis δ | circle, fitted δ | radial circle | ellipse |"
     yield "|---|---|---|---|---|---|---|"
     for fov in (40, 60, 75, 90):
@@ -74,7 +74,7 @@ def lens_camera(width: int, height: int, fov: float, lens: Distortion | None) ->
 
 
 def rounding(camera: Camera, *, count: int = 20_000) -> tuple[float, float]:
-    """Return the largest deviation from the oracle and the largest round-trip error [px].
+    """Return the largest deviation from the float64 oracle and the largest round-trip error of the exact model [px].
 
     The apex angle is 4°; both orientations of the prism are included, with and without tilt.
     """
@@ -96,7 +96,7 @@ def rounding(camera: Camera, *, count: int = 20_000) -> tuple[float, float]:
 
 
 def rounding_rows() -> Iterator[str]:
-    """Yield one row per sensor and field of view: deviation / round-trip error [1e-3 px]."""
+    """Yield one table row per sensor and field of view: deviation and round-trip error [1e-3 px]."""
     yield f"| sensor | FOV | {' | '.join(LENSES)} |"
     yield "|---|---|---|---|---|"
     for width, height in ((346, 260), (640, 480), (1280, 720), (2560, 1440)):

@@ -28,9 +28,9 @@ from benchmarks.scenes import PHASE, EventScene, FileScene, RecordingScene
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 CANDIDATES = 12
-"""Number of deflections voted in one pass."""
+"""Number of deflections whose images are voted in one pass."""
 FILE_PASSES = 3
-"""Timed passes over a file, after a first one that brings it into the page cache."""
+"""Number of timed passes over a file, after a first pass that brings the file into the page cache."""
 
 
 def model_of(scene: EventScene, name: str) -> Model:
@@ -42,7 +42,10 @@ def uploaded(scene: EventScene, device: str) -> Any:
 
 
 def image(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """Clear the image, vote, and convert to a float image on the device. The events are uploaded before."""
+    """Prepare a job that clears the image, votes, and converts to a float image on the device.
+
+    The events are uploaded beforehand.
+    """
     moves, events = model_of(scene, model), uploaded(scene, device)
     canvas = CanvasShape(scene.camera.width, scene.camera.height, vote=vote)
     votes, result = Votes(canvas, device), Image(canvas, 1, device)
@@ -56,7 +59,7 @@ def image(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
 
 
 def errors(scene: EventScene, model: str, vote: Vote, result: Image) -> dict[str, float]:
-    """Return the errors of an image.
+    """Return the errors of an image of events.
 
     The compared positions come from the functions that the votes use, at the 16-bit angles of the uploaded events.
     """
@@ -66,7 +69,7 @@ def errors(scene: EventScene, model: str, vote: Vote, result: Image) -> dict[str
 
 
 def prepared(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """Clear and vote for several deflections per pass, with events sorted by image tile before.
+    """Prepare a job that votes the images of several deflections per pass, with events sorted by image tile beforehand.
 
     The work is the number of events times candidates. The last candidate has the true deflection; its image is checked.
     """
@@ -107,7 +110,7 @@ def four_atomics(
 
 
 def warp_atomics(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """Plain Warp kernel with four float atomics per event."""
+    """Prepare a plain Warp kernel with four float atomics per event."""
     events = peers.peer_events(scene)
     inputs = [
         wp.array(events.x, dtype=wp.uint16, device=device),
@@ -126,7 +129,7 @@ def warp_atomics(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
 
 
 def calibration(scene: RecordingScene, device: str, model: str, vote: Vote, *, stages: tuple[str, ...]) -> Job:
-    """Calibrate a recording with default settings and no initial guess; its events are in host memory."""
+    """Prepare a calibration of a recording in host memory, with default settings and no initial guess."""
     found: list[Calibration] = []
 
     def run() -> None:
@@ -144,7 +147,7 @@ def calibration(scene: RecordingScene, device: str, model: str, vote: Vote, *, s
 
 
 def picture(scene: RecordingScene, device: str, model: str, vote: Vote) -> Job:
-    """Reconstruct a picture of one turn in the middle of the recording, with the true parameters."""
+    """Prepare the reconstruction of a picture of one turn in the middle of the recording, with the true parameters."""
     found: list[Picture] = []
     events = scene.recording.events
 
@@ -168,7 +171,7 @@ def picture(scene: RecordingScene, device: str, model: str, vote: Vote) -> Job:
 
 
 def file(scene: FileScene, device: str, model: str, vote: Vote) -> Job:
-    """Compensate a file into a file, in a separate process so that its peak memory can be measured."""
+    """Prepare the compensation of a file into a file, in a separate process so that its peak memory can be measured."""
     command = [sys.executable, "-m", "benchmarks.compensate", "--row", str(scene.source), "--models", model]
     command += ["--device", device, "--repeats", str(FILE_PASSES + 1), *["--columns"] * bool(scene.missing)]
     ran = subprocess.run(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[1], check=True)

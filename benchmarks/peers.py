@@ -25,7 +25,7 @@ def peer_events(scene: EventScene) -> PeerEvents:
 
 
 def job(scene: EventScene, vote: Vote, peer: Peer, model: str = "plane circle") -> Job:
-    """Return the job of a library whose data is prepared."""
+    """Return the timed job of a library whose data is prepared."""
 
     def errors() -> dict[str, float]:
         return truth.iwe_errors(scene, model, vote, peer.image(), peer.events.places(scene.some))
@@ -34,5 +34,5 @@ def job(scene: EventScene, vote: Vote, peer: Peer, model: str = "plane circle") 
 
 
 def image(way: Callable[[PeerEvents, str], Peer], scene: EventScene, device: str, model: str, vote: Vote) -> Job:
-    """Return the job of one of the functions of :mod:`benchmarks.libraries`."""
+    """Prepare the timed job of one of the functions of :mod:`benchmarks.libraries`."""
     return job(scene, vote, way(peer_events(scene), device), model)

@@ -62,13 +62,14 @@ SETTINGS = (
     (0.25, 0.0, ALL), (0.25, 0.25, ALL), (0.25, 0.1, SOME), (0.25, 0.5, SOME),
     (0.1, 0.0, ONE), (0.1, 0.25, ONE), (0.5, 0.0, ONE), (0.5, 0.25, ONE),
 )  # fmt: skip
-"""Contrast threshold, share of shot noise among the events, and lengths of the windows [turns]."""
+"""Contrast threshold, share of shot noise among the events, and lengths of the windows [turns], of each measured
+setting."""
 TEXTURED = 0.05
 """Standard deviation of log intensity over 9 × 9 px above which an area counts as textured."""
 DECAY_S = 0.1
-"""Time constant of the high-pass filter [s]."""
+"""Time constant of the high-pass filter of the method ``leaky`` [s]."""
 SHOWN = 0.25
-"""Share of noise of the pictures in the figure, at a threshold of 0.25."""
+"""Share of noise among the events of the pictures in the figure, which have a threshold of 0.25."""
 PEERS = {"panning": "panning, no prism", "integration": "integrated events", "leaky": "high-pass filter"}
 """Other methods and their titles in the figure, for windows of one turn."""
 METHODS = ("amiwarp", *PEERS)
@@ -108,7 +109,7 @@ def scene_fov(through: Simulation) -> float:
 
 
 def panning(through: Simulation, fov: float) -> tuple[Recording, CameraRotation]:
-    """Simulate the same scene at the same scale with a rotating camera without prism; return also the rotation."""
+    """Simulate the same scene with a rotating camera without prism; return also the camera's rotation."""
     rate = speed() / CAMERA.fx / math.sqrt(2.0)
     turn = CameraRotation((rate, rate, 0.0))
     still = replace(
@@ -153,7 +154,7 @@ def integrate(recording: Recording, model: ExactModel, length_us: int, *, decay_
 
 
 def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, dict[str, float]]:
-    """Return the quality in textured areas and in the whole image; SSIM after fitting gain and offset."""
+    """Return the quality of a picture in textured areas and in the whole image; SSIM after fitting gain and offset."""
     spread = ndimage.uniform_filter(truth**2, 9) - ndimage.uniform_filter(truth, 9) ** 2
     out = {}
     for area, where in (("textured", spread > TEXTURED**2), ("all", np.ones(truth.shape, np.bool_))):
@@ -170,7 +171,7 @@ def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, di
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """One simulated scene, seen through the prism and by a rotating camera without prism."""
+    """Simulated scene, seen through the prism and by a rotating camera without prism."""
 
     through: Simulation
     fov: float
@@ -219,7 +220,10 @@ class Seen:
 
 
 def rows(picture: Path, device: str, shown: dict[str, dict[str, NDArray[np.float32]]]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of all windows of a picture; add reconstructions with noise :data:`SHOWN` to ``shown``."""
+    """Yield the results of all windows of a picture as rows.
+
+    Reconstructions with noise :data:`SHOWN` are added to ``shown``.
+    """
     for contrast, share, windows in SETTINGS:
         seen = Seen.make(picture, contrast, share, windows, device)
         rate = len(seen.recording.events) / seen.through.duration_s
@@ -333,14 +337,14 @@ def table(found: list[dict[str, Any]], contrast: float, methods: tuple[str, ...]
 
 
 def ordered(line: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-    """Return the columns of the figure: selected windows, then the other methods."""
+    """Return the pictures of one row of the figure: selected windows, then the other methods."""
     last = list(PEERS.values())
     kept = [name for name in line if name not in (*last, "0.5 turn", "2 turns")]
     return {name: line[name] for name in (*kept, *last)}
 
 
 def merge(path: Path, picture: str, found: list[dict[str, Any]], device: str) -> None:
-    """Write a picture's rows into the file; they replace older rows of this picture."""
+    """Write the results of a picture into the file, where they replace older results of this picture."""
     old = json.loads(path.read_text())["rows"] if path.exists() else []
     kept = [row for row in old if row["picture"] != picture] + found
     machine = {"device": device, "machine": platform.processor(), "python": platform.python_version()}

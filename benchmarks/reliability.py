@@ -35,7 +35,7 @@ from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import NewFile, remove_abandoned
 
 LIMIT_S = 180.0
-"""A command that still runs this long after a signal counts as hanging [s]."""
+"""Time after a signal at which a command that still runs is considered hanging [s]."""
 
 START_S = 0.3
 """Time in which Python starts and imports its own modules [s]; a signal before then is handled by Python itself."""
@@ -83,14 +83,14 @@ COMMANDS = {
         ("atlas.csv", "atlas.json", "atlas.pdf", "axis_apex.png", "overview.png", "summary.md", CELLS),
     ),
 }
-"""Each command line, and the files it writes. IN is the folder of inputs; OUT is empty before."""
+"""Command lines by name, each with the files that it writes. IN is the folder of inputs; OUT is empty at the start."""
 
 LIVE = ("record", "live")
-"""Commands that keep the events received so far: their file is valid, but may be shorter."""
+"""Commands that keep the events received until they are killed: their file is valid, but may be shorter."""
 
 
 def prepare(folder: Path) -> Path:
-    """Make the inputs once: a recording of 3 million events, a small simulated one, a calibration and a picture."""
+    """Make the input files once: a recording of 3 million events, a small one, a calibration and a picture."""
     from PIL import Image
 
     inputs = folder / "in"
@@ -240,7 +240,7 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
         if place.is_dir():
             NewFile(place / "next").discard()
     wrong += [f"{f.name} outlived the next run" for f in left if f.exists()]
-    # -number: the signal arrived while Python was starting or exiting
+    # exit status -number: the signal arrived while Python was starting or exiting
     if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number, -signal.SIGINT}):
         wrong.append(f"exit status {code}")
     ended = "finished" if set(expected) <= there else "cut short" if there - unfinished else "nothing"

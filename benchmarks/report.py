@@ -25,14 +25,14 @@ FILES = {kind: ROOT / "benchmarks" / "results" / f"speed_{kind}.json" for kind i
 BEGIN, END = "<!-- speed: from here on by python -m benchmarks.report -->", "<!-- speed: to here -->"
 IMAGES = (IMAGE, PREPARED)
 RATES = {IMAGE: "Mev/s", PREPARED: "Mvotes/s", MOVED: "Mev/s"}
-"""Unit of the rate that is shown instead of the time."""
+"""Unit of the rate that tables show instead of the time, by task."""
 ERRORS = {
     "model_px": "model error [px]",
     "decorrelation": "1 − correlation",
     "places_px": "worst place [px]",
 }
 ALSO = {"psnr_db": "PSNR [dB]", "peak_mib": "peak memory [MiB]"}
-"""Titles of further results of complete tasks."""
+"""Titles of the columns with further results of complete tasks."""
 SCALES = {"Gev/s": 1e9, "Mev/s": 1e6, "Gvotes/s": 1e9}
 
 Row = dict[str, Any]
@@ -47,14 +47,14 @@ def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
 
 
 def speed(value: float) -> str:
-    """Return a number with three significant digits."""
+    """Return a number with three significant digits as text."""
     if value < 100:
         return f"{value:.3g}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.1f}"
     return f"{value:,.0f}"
 
 
 def head(row: Row) -> list[str]:
-    """Return the heading of the table that the row belongs to."""
+    """Return the heading of the table to which the result belongs."""
     start = ["method", RATES.get(row["what"], "ms"), "quartiles"]
     if row["what"] in IMAGES:
         return [*start, "rms / worst pixel [events]", "misplaced", "px from exact"]
@@ -62,7 +62,7 @@ def head(row: Row) -> list[str]:
 
 
 def row_cells(row: Row) -> list[str]:
-    """Return the cells of a row: name, speed and its quartiles, then the errors."""
+    """Return the table cells of a result: name, speed and its quartiles, then the errors."""
     if "skipped" in row:
         return [row["name"], row["skipped"]]
     low, high = row["quartiles_s"]
@@ -95,7 +95,7 @@ def measured(rows: list[Row]) -> Iterator[str]:
 
 
 def section(results: Results) -> Iterator[str]:
-    """Yield all tables of one machine."""
+    """Yield all tables of one machine's results."""
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     yield f"### {results['machine']}"
     yield ""
@@ -111,7 +111,10 @@ def section(results: Results) -> Iterator[str]:
 
 
 def value_of(aim: Aim, row: Row, compared_with: Row | None = None) -> float:
-    """Return the result in the target's unit. A comparison is the median over pairs of consecutive passes."""
+    """Return the result of a case in the target's unit.
+
+    A comparison with another case is the median over pairs of consecutive passes.
+    """
     if aim.unit == "MiB":
         return float(row["also"]["peak_mib"])
     if compared_with is None:
@@ -123,7 +126,10 @@ def value_of(aim: Aim, row: Row, compared_with: Row | None = None) -> float:
 
 
 def aim_cells(aim: Aim, results: Results) -> list[str]:
-    """Return one line of the table of targets; empty if the target is for another device, or a case was not run."""
+    """Return one line of the table of targets.
+
+    It is empty if the target is for another device, or a case was not run.
+    """
     if results["device"].partition(":")[0] != aim.device:
         return []
     rows = {(row["scene"], row["name"]): row for row in results["rows"]}

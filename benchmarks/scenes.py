@@ -41,25 +41,28 @@ MARGIN = 24
 CHUNK = 1 << 19
 """Number of events that one thread processes at a time."""
 SAMPLE = 100_000
-"""Largest number of events whose positions are compared."""
+"""Largest number of events whose compensated positions are compared with the truth."""
 WIDTH, HEIGHT = 640, 480
 RECORDED = 10_000_000
 """Number of events of a recording of full size and length; shorter recordings keep the rate per pixel."""
 SHORTEST_S = 0.25
-"""Shortest recording [s]; for fewer events, the image becomes smaller."""
+"""Duration of the shortest recording [s]; for fewer events, the image becomes smaller instead."""
 OFF_OVER_ON = 1.0 / 0.95
-"""OFF threshold over ON threshold."""
+"""Ratio of the OFF to the ON threshold of the simulated sensor."""
 PROBES, PROBE_S, DAMPED = 4, 0.1, 0.6
 """Number and length [s] of the probes that find the contrast threshold for the wanted number of events, and the
-exponent of each correction: the number falls with a power of the threshold between -1 and -2."""
+exponent of each correction.
+
+The number of events falls with a power of the threshold between -1 and -2.
+"""
 FILTERS = ("hdf5plugin", "numcodecs")
-"""Libraries without which the files are plain binary columns."""
+"""Libraries that HDF5 files need. Without them, the benchmark's files are plain binary columns."""
 threads = ThreadPoolExecutor(cpu_threads())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EventScene:
-    """Events with their prism angles. Derived data is kept, so that the methods share it."""
+    """Events with their prism angles. Data derived from them are kept, so that all methods share them."""
 
     name: str
     camera: Camera
@@ -85,11 +88,11 @@ class EventScene:
 
     @property
     def some(self) -> slice:
-        """Evenly spaced events whose positions are compared."""
+        """Indices of evenly spaced events whose positions are compared with the truth."""
         return slice(None, None, -(-len(self) // SAMPLE))
 
     def sample(self) -> tuple[Array, Array]:
-        """Return the pixels, shape ``(m, 2)``, and the angles [rad], shape ``(m,)``, of these events."""
+        """Return the pixels, shape ``(m, 2)``, and the angles [rad], shape ``(m,)``, of the events in :attr:`some`."""
         xy = np.stack([self.events.x[self.some], self.events.y[self.some]], axis=1).astype(np.float64)
         return xy, self.theta[self.some]
 
@@ -130,7 +133,7 @@ def event_scene(name: str, n: int, *, points: int = 0, width: int = WIDTH, heigh
 
 @dataclass(frozen=True, eq=False)
 class RecordingScene:
-    """Simulated recording, and its simulation."""
+    """Simulated recording together with its simulation."""
 
     made: Simulation
     recording: Recording
@@ -179,10 +182,10 @@ def sensor(contrast: float) -> SensorModel:
 
 @dataclass(frozen=True, eq=False)
 class FileScene:
-    """Recording in a temporary folder that is deleted with the scene."""
+    """Recording in a temporary folder that is deleted together with the scene."""
 
     source: Path
-    """Path of the recording."""
+    """Path of the recording's file or folder."""
     n: int
     """Number of events."""
     missing: tuple[str, ...]

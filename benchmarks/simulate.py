@@ -44,7 +44,7 @@ def blocks_picture() -> np.ndarray:
 
 
 def time_run(simulation: Simulation, to_host: bool) -> tuple[float, int, float]:
-    """Return the duration of the run [s], the number of events, and the duration of the setup [s]."""
+    """Run a simulation; return its duration [s], its number of events, and the duration of its preparation [s]."""
     start = time.perf_counter()
     engine = Engine(simulation)
     engine.prepare()

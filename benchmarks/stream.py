@@ -57,11 +57,11 @@ MOST_MS, LATENCY_MEV_S, MOST_ERROR_PX, MOST_GROWTH_MIB = 5.0, 10.0, 0.01, 16.0
 HOUR_S, HOUR_MEV_S = 3600.0, 0.5
 REPEATS = 9
 CHECKED = 50
-"""Number of packets whose positions are compared, spread over the run."""
+"""Number of packets whose compensated positions are compared, spread over the run."""
 
 
 def random_pool(n: int) -> Events:
-    """Return events at random pixels: the worst case for caches."""
+    """Return events at random pixels, which are the worst case for caches."""
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, CAMERA.width, n).astype(np.uint16), rng.integers(0, CAMERA.height, n).astype(np.uint16)
     return Events(x, y, np.arange(n), rng.integers(0, 2, n).astype(np.uint8))
@@ -102,7 +102,7 @@ def copied(events: Events) -> Events:
 
 
 class Check:
-    """Keeps some compensated packets, and compares them after the timed run."""
+    """Keeps some of the compensated packets, and compares their positions after the timed run."""
 
     def __init__(self, packets: int) -> None:
         self._chosen = deque(np.unique(np.linspace(0, packets - 1, CHECKED).astype(int)).tolist())
@@ -133,7 +133,8 @@ def rate(device: str, pool: Events, model: Model, together: int) -> dict[str, An
     kind = "cuda" if "cuda" in device else "cpu"
     target, packets = TARGET_MEV_S[kind], 20_000 if kind == "cuda" else 2000
     stream = Stream(pool, target)
-    ahead = [stream.packet(k) for k in range(packets)]  # a sensor's driver would make these
+    # packets are made before the run, because a sensor's driver would make them
+    ahead = [stream.packet(k) for k in range(packets)]
     passes = [one_pass(device, pool, model, ahead, together, target) for _ in range(REPEATS + 1)][1:]
     mev_s = [found["mev_s"] for found in passes]
     quartiles = np.percentile(mev_s, [25, 50, 75]).tolist()
@@ -176,7 +177,8 @@ def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> d
     began, put, sampled = monotonic_us() + 10_000, 0, 0
     while check.count < packets:
         now = monotonic_us() - began
-        while put < packets and now >= (put + 1) * stream.span_us:  # the time of its last event has passed
+        # a packet exists once the time of its last event has passed
+        while put < packets and now >= (put + 1) * stream.span_us:
             compensator.put(ahead[put], round((put + 1) * stream.span_us))
             put += 1
         if now >= sampled * 1000 + 1200:
@@ -196,7 +198,7 @@ def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> d
 
 
 class Hour:
-    """Source of an hour of stream, with encoder samples."""
+    """Source of an hour of stream (for memory use), with encoder samples."""
 
     camera, prism, name, size, has_encoder = CAMERA, PRISM, "an hour", (CAMERA.width, CAMERA.height), True
 

@@ -54,7 +54,10 @@ def _ellipses(scene: EventScene) -> Array:
 
 
 def votes(xy: Array, width: int, height: int) -> dict[Vote, Array]:
-    """Return images with both kinds of vote [events per pixel]; parts of a vote outside the image are dropped."""
+    """Return images with both kinds of vote (nearest, bilinear) [events per pixel].
+
+    Parts of a vote outside the image are dropped.
+    """
     columns, rows = width + 2 * MARGIN, height + 2 * MARGIN
     inner = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
     u, v = (xy + MARGIN).T
@@ -74,7 +77,7 @@ def votes(xy: Array, width: int, height: int) -> dict[Vote, Array]:
 
 
 def images(scene: EventScene, model: str) -> dict[Vote, Array]:
-    """Return the true images of all events."""
+    """Return the true images of all events, one for each kind of vote."""
     camera, e = scene.camera, scene.events
 
     def part(start: int, stop: int) -> dict[Vote, Array]:

@@ -37,7 +37,8 @@ from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.page_values import jpeg
 
 SIZE, WIDTH, HEIGHT = (1048, 514), 640, 480
-"""Size of the clouds' picture in a window of 1366 x 768 [px], and size of the sensor [px]."""
+"""Width and height of the clouds' picture in a browser window of 1366 x 768 [px], and width and height of the sensor
+[px]."""
 REPEATS = 20
 LEAST_FPS, MOST_CPU_MS, MOST_CUDA_MS, MOST_S, MOST_GIB = 10.0, 150.0, 50.0, 3.0, 1.0
 OPENED = """
@@ -75,7 +76,10 @@ def recorded(events: Events) -> Recording:
 
 
 def orbiting(device: str) -> dict[str, Any]:
-    """Measure frames per second for 200,000 points in two clouds: the camera moves, and the picture is read back."""
+    """Measure the frames per second for 200,000 points in two clouds while the view rotates.
+
+    The camera moves, and each picture is read back.
+    """
     inspector, scene = Inspector(recorded(made(1_000_000, 0.2)), device=device), Scene(SIZE)
     inspector.open(0, 200_000)
     shown = inspector.show()
@@ -91,7 +95,7 @@ def orbiting(device: str) -> dict[str, Any]:
 
 
 def knob(device: str, *, drawn: bool) -> dict[str, Any]:
-    """Measure the time from a new parameter value to drawn clouds, encoded images and sharpness, for 1 M events."""
+    """Measure the time from a new parameter value to drawn clouds, encoded images and sharpness (1 M events)."""
     inspector, scene = Inspector(recorded(made(1_000_000, 0.2)), device=device), Scene(SIZE) if drawn else None
     inspector.open(0, 200_000)
     inspector.show()
@@ -119,7 +123,10 @@ def knob(device: str, *, drawn: bool) -> dict[str, Any]:
 
 
 def opening(device: str, n: int) -> dict[str, Any]:
-    """Measure the time from the start of a process to its first picture and event rate; median of three runs."""
+    """Measure the time from the start of a process to its first picture and event rate.
+
+    The result is the median of three runs.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.h5"
         block, seconds = 5_000_000, 0.5

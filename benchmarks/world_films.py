@@ -1,9 +1,9 @@
-"""Draw films of events in named worlds: without the prism, through it, and coloured by the depth of what each saw.
+"""Draw films of events in named worlds, in three panels: without the prism, through it, and coloured by depth.
 
     python -m benchmarks.world_films [room ball street] [--frames 30] [--motion-px 0.5] [--device cuda:0]
 
 A film shows moments that are SPACING_S apart, and at each the events of WINDOW_S. It plays more slowly than the
-simulated time passes. Depth comes from the ground truth of the events.
+simulated time passes. Depth is the distance of the surface that an event saw, from the ground truth.
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ CAMERA, PRISM = Camera.from_fov(320, 240, math.radians(60.0)), Prism(math.radian
 SPACING_S = 1.0 / 60.0
 """Time between frames [s]: a fifth of a turn at 720 rpm."""
 WINDOW_S = 0.002
-"""Time over which a frame collects events [s]."""
+"""Time over which a frame of the film collects events [s]."""
 FRAMES_PER_S = 10
 WIDTH, HEIGHT, GAP, TOP, BOTTOM = 240, 180, 6, 22, 26
-"""Size of a panel, space between panels, above and below them [px]."""
+"""Width and height of a panel, space between panels, space above and space below the panels [px]."""
 SHADES, GREYS = 48, 8
-"""Colours of depth, and greys from white to black."""
+"""Number of colours of depth, and number of greys from white to black, in the palette."""
 TITLES = ("without the prism", "through the prism", "through the prism, by depth")
 WHITE, BLACK, OF_SKY = 0, GREYS - 1, 3
-"""Indices of colours in the palette: greys, then OFF, ON, and the shades of depth."""
+"""Indices of white, black and the grey of the sky in the palette: greys, then OFF, ON, and the colours of depth."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthScale:
-    """Logarithmic scale of depth [m]."""
+    """Logarithmic scale that converts depth [m] to colours."""
 
     low: float
     high: float
 
     @classmethod
     def of_events(cls, depth: NDArray[np.float32]) -> DepthScale:
-        """Return a scale for nearly all events."""
+        """Return a scale from the 2nd to the 98th percentile of the depths of events [m]."""
         low, high = np.percentile(depth[np.isfinite(depth)], (2.0, 98.0))
         return cls(float(low), max(float(high), 1.2 * float(low)))
 
     def colours(self, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Return indices of the palette. The sky is grey."""
+        """Return the palette index of each depth. The sky is grey."""
         seen = np.isfinite(depth)
         share = np.log(np.where(seen, depth, self.low) / self.low) / math.log(self.high / self.low)
         shade = GREYS + 2 + np.clip(share * SHADES, 0, SHADES - 1).astype(int)
@@ -73,7 +73,7 @@ def palette() -> list[int]:
 
 
 def simulate(name: str, frames: int, motion_px: float, device: str) -> list[tuple[Events, EventTruth]]:
-    """Return events and ground truth without the prism and through it."""
+    """Simulate a world; return its events and ground truth without the prism and through it."""
     seconds = frames * SPACING_S
     world, trajectory = named_world(name, "handheld", duration_s=seconds)
     simulation = Simulation(WorldScene(world, trajectory, motion_px=motion_px), CAMERA, PRISM, seconds, device=device)

@@ -291,7 +291,7 @@ def test_unknown_camera(recording: Recording) -> None:
         ({"model": "sphere"}, "sphere"),
         ({"global_algorithm": "GN_X"}, "GN_X"),
         ({"local_algorithm": "GN_DIRECT"}, "GN_DIRECT"),
-        ({"bounds": {"apex": (0.05, 0.01)}}, "lower first"),
+        ({"bounds": {"apex": (0.05, 0.01)}}, "lower bound first"),
         ({"events": 0}, "events"),
     ],
 )

@@ -306,7 +306,7 @@ def test_bad_packets_are_refused_and_nothing_is_put() -> None:
     events = random_events(100)
     compensator = Compensator(MODEL, streamed())
     compensator.put(events[50:], 0)
-    with pytest.raises(AmiwarpError, match="sort it first"):
+    with pytest.raises(AmiwarpError, match="sort the packets by time"):
         compensator.put(events[:50], 0)
     with pytest.raises(AmiwarpError, match="already compensated"):
         compensator.put(Events(events.x.astype(np.float32), events.y.astype(np.float32), events.t, events.p), 0)

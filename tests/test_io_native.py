@@ -222,7 +222,7 @@ def test_failure_keeps_the_file_that_was_there(tmp_path):
     ("options", "message"),
     [
         ({"width": 0}, "size 0x240"),
-        ({"camera": Camera(10, 10, 5.0, 5.0, 4.5, 4.5)}, "give both one size"),
+        ({"camera": Camera(10, 10, 5.0, 5.0, 4.5, 4.5)}, "give both the same size"),
         ({"metadata": {"big": 10**30}}, "a.h5: making the file"),
         ({"metadata": {"nul": "a\0b"}}, "a.h5: making the file"),
     ],

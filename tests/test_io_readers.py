@@ -333,7 +333,7 @@ def test_convert_refuses(tmp_path):
     for target in (path, tmp_path / "link"):
         with pytest.raises(AmiwarpError, match="is read in this run"):
             convert(path, target, overwrite=True)
-    with pytest.raises(AmiwarpError, match="give both one size"):
+    with pytest.raises(AmiwarpError, match="give both the same size"):
         convert(path, tmp_path / "out.h5", camera=Camera(10, 10, 5.0, 5.0, 4.5, 4.5))
     assert path.read_bytes() == before
     assert sorted(os.listdir(tmp_path)) == ["link", "sample.npz"]

@@ -503,7 +503,7 @@ def test_a_port_that_is_not_there_is_said_with_those_that_are(monkeypatch: pytes
     listed(monkeypatch, ("/dev/ttyACM7", 0x16C0, 0x483))
     for where, says in (
         ("/dev/nothing", r"/dev/nothing: no such port; there are /dev/ttyACM7 \(16c0:0483 Board\)"),
-        ("1234:abcd", "USB id 1234:abcd: 0 ports have it; there are /dev/ttyACM7"),
+        ("1234:abcd", "USB id 1234:abcd: 0 ports have this id; there are /dev/ttyACM7"),
         (None, "no port sends controller data; there are /dev/ttyACM7.*no such port.*give a port by name"),
         ("nowhere://x", "nowhere://x: cannot be opened"),
     ):

@@ -109,7 +109,7 @@ def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
         for start in range(0, len(events), 50_000):
             which = slice(start, start + 50_000)
             writer.append(events[which], inside=inside[which], extrapolated=extrapolated[which])
-        with pytest.raises(AmiwarpError, match=r"a\.h5: compensated events come with inside"):
+        with pytest.raises(AmiwarpError, match=r"a\.h5: compensated events need the flags inside"):
             writer.append(events)
     source = open_recording(tmp_path / "a.h5").events
     assert_equal(read(tmp_path / "a.h5"), events)
@@ -274,7 +274,7 @@ def test_the_file_that_was_there_is_replaced_at_the_end(tmp_path):
         (lambda w: w.append(make(5)[::-1]), "event 11 .* earlier"),
         (lambda w: w.append(make(5, start=1000)), "event 10 .* earlier than the one before"),
         (lambda w: w.append(Events.from_arrays([320], [0], [9_000_000], [0])), "event 10 .* outside the 320x240 frame"),
-        (lambda w: w.append(make(5), inside=np.ones(5)), "give events from a sensor without flags"),
+        (lambda w: w.append(make(5), inside=np.ones(5)), "events from a sensor take no flags"),
         (lambda w: w.append(make(1, start=2**61)), "timestamp is damaged"),
         (lambda w: w.append_encoder([7, 6], [0.0, 0.0]), "encoder samples 7 .. 6 us do not follow"),
         (lambda w: w.append_encoder([5, 6], [0.0, 0.0]), "encoder samples 5 .. 6 us do not follow 5 us"),
@@ -299,7 +299,7 @@ def test_what_is_refused_does_not_end_the_recording(tmp_path, append, message):
 def test_writer_refuses_its_path_and_options(tmp_path):
     with pytest.raises(AmiwarpError, match="does not exist"), live(tmp_path / "no" / "a.h5"):
         pass
-    with pytest.raises(AmiwarpError, match="give both one size"):
+    with pytest.raises(AmiwarpError, match="give both the same size"):
         LiveWriter(tmp_path / "a.h5", width=10, height=10, camera=CAMERA)
     with pytest.raises(AmiwarpError, match=r"a\.h5: making the file"), live(tmp_path / "a.h5", metadata={"n": "a\0b"}):
         pass

@@ -313,7 +313,7 @@ def test_inputs_that_never_end_are_refused(place: Path, line: str) -> None:
     os.mkfifo(place / name)
     result = run(*line.format("pipe").split())
     assert result.exit_code == 1, result.output
-    assert f"{name}: is a named pipe (FIFO); give a file" in result.stderr
+    assert f"{name}: is a named pipe (FIFO); give a regular file" in result.stderr
     assert not any(f.name.startswith("out.") for f in place.iterdir())
 
 

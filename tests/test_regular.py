@@ -118,7 +118,7 @@ def test_npz_headers_that_overstate(tmp_path, shape, message):
 
 
 def test_npz_of_other_compressions(tmp_path):
-    with pytest.raises(AmiwarpError, match=r"array x is compressed by method 14; save it with numpy\.savez"):
+    with pytest.raises(AmiwarpError, match=r"array x is compressed by method 14; save the array with numpy\.savez"):
         open_recording(npz(tmp_path / "a.npz", "(2,)", bytes(16), zipfile.ZIP_LZMA))
 
 

@@ -450,7 +450,7 @@ def test_a_picture_is_cut_to_the_view() -> None:
         (lambda: SensorModel(latency_us=-1.0), "latency_us = -1"),
         (lambda: SensorModel(mismatch=math.nan), "mismatch = nan"),
         (lambda: PrismMotion(math.inf), "prism speed"),
-        (lambda: PrismMotion([[1.0, 2.0], [0.0, 2.0]]), "do not rise"),
+        (lambda: PrismMotion([[1.0, 2.0], [0.0, 2.0]]), "do not increase"),
         (lambda: CameraMotion((1.0, 2.0)), "camera rotation has shape"),
         (lambda: EncoderModel(rate_hz=0.0), "rate_hz = 0"),
         (lambda: EncoderModel(counts_per_turn=0), "counts_per_turn = 0"),
@@ -461,8 +461,8 @@ def test_a_picture_is_cut_to_the_view() -> None:
         (lambda: Scene.from_picture(np.zeros(4, np.float32)), "shape"),
         (lambda: Scene.from_picture(np.full((4, 4), -1.0)), "negative"),
         (lambda: read_picture("nowhere.png"), "nowhere.png: no such file"),
-        (lambda: base(camera_motion=CameraMotion((0.0, 30.0, 0.0))).run(), "turn it less far"),
-        (lambda: base(motion=PrismMotion(1e9)).run(), "slow it down"),
+        (lambda: base(camera_motion=CameraMotion((0.0, 30.0, 0.0))).run(), "turn the camera less far"),
+        (lambda: base(motion=PrismMotion(1e9)).run(), "slow down prism"),
     ],
 )
 def test_bad_input_is_told(make: object, message: str) -> None:

@@ -182,5 +182,5 @@ def test_cells_are_kept_and_only_what_misses_is_run(tmp_path: Path) -> None:
         assert all((r.error_px is None) == (r.outcome is Outcome.REFUSAL) for r in b.results.values())
     damaged = tmp_path / f"{every[0].cell.name}.json"
     damaged.write_text("{")
-    with pytest.raises(AmiwarpError, match="delete it"):
+    with pytest.raises(AmiwarpError, match="delete the file"):
         Store(tmp_path).load(Cell(every[0].cell.condition, 0))

@@ -54,14 +54,14 @@ def test_a_whole_hello_is_understood() -> None:
 def test_a_size_is_a_whole_number_in_range(value: str) -> None:
     for text in (f'{{"width":{value},"height":48}}', f'{{"width":64,"height":{value}}}'):
         with pytest.raises(
-            AmiwarpError, match=r"tcp:there: packet at byte 0: its hello .*expected .*1 \.\. 65536|add it"
+            AmiwarpError, match=r"tcp:there: packet at byte 0: its hello .*expected .*1 \.\. 65536|add this attribute"
         ):
             hello(text)
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity", "9" * 5000])
 def test_what_is_no_json_is_refused(value: str) -> None:
-    with pytest.raises(AmiwarpError, match="its hello is not JSON"):
+    with pytest.raises(AmiwarpError, match="its hello message is not JSON"):
         hello(f'{{"width":{value},"height":48}}')
 
 

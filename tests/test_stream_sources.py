@@ -376,13 +376,13 @@ def test_addresses_that_are_none(tmp_path):
             open_source(address)
     with socket.create_server(("127.0.0.1", 0)) as server:
         taken = f"tcp:127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(AmiwarpError, match=f"{taken}: cannot listen there: .*in use"):
+        with pytest.raises(AmiwarpError, match=f"{taken}: cannot listen at this address: .*in use"):
             SocketSink(taken, HELLO)
     for address in (taken, f"unix:{tmp_path}/nobody"):
         with pytest.raises(AmiwarpError, match=f"{address}: .*start its sender first"):
             open_source(address)
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(AmiwarpError, match="cannot listen there"):
+    with pytest.raises(AmiwarpError, match="cannot listen at this address"):
         open_sink(f"unix:{tmp_path}/file", HELLO)
     assert (tmp_path / "file").read_text() == "mine"
 
@@ -391,7 +391,7 @@ def test_a_socket_left_behind_is_replaced_one_in_use_is_not(tmp_path):
     address = f"unix:{tmp_path}/s"
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(f"{tmp_path}/s")
-    with SocketSink(address, HELLO), pytest.raises(AmiwarpError, match="cannot listen there"):
+    with SocketSink(address, HELLO), pytest.raises(AmiwarpError, match="cannot listen at this address"):
         SocketSink(address, HELLO)
     assert not (tmp_path / "s").exists()
 
@@ -480,7 +480,7 @@ def test_a_camera_without_its_library(monkeypatch):
     for name, remedy in (("dv_processing", r"amiwarp\[dv\]"), ("metavision_core.event_io", "install OpenEB")):
         monkeypatch.setitem(sys.modules, name, None)
         spec = "dv" if name.startswith("dv") else "prophesee:0004"
-        with pytest.raises(AmiwarpError, match=f"^{spec}: needs {name.partition('.')[0]} .*{remedy}"):
+        with pytest.raises(AmiwarpError, match=f"^{spec}: needs the library {name.partition('.')[0]} .*{remedy}"):
             open_source(spec)
 
 

@@ -143,7 +143,7 @@ def test_bad_sequences_are_told(tmp_path: Path) -> None:
         ("junk.mp4", None, "cannot be read as a video"),
         ("junk.npy", 10.0, "cannot be read as an array"),
         ("one.npy", 10.0, "shape"),
-        ("loud.npy", None, "give fps"),
+        ("loud.npy", None, "give the pictures per second"),
         ("loud.npy", -1.0, "fps = -1"),
         ("empty", 10.0, "0 pictures"),
         ("empty", None, "times.csv"),

@@ -282,7 +282,7 @@ DAMAGE: list[tuple[str, Any, str]] = [
     ("truth/events/place", lambda old: old[:, :2], "truth/events/place has shape"),
     ("truth/events/place", lambda old: old[:, 0], "no 2-dimensional dataset 'truth/events/place'"),
     ("truth/events/cause", lambda old: old.astype(np.float32), "dataset 'truth/events/cause' is float32"),
-    ("truth/frames/t", lambda old: old[::-1], "truth/frames/t does not rise"),
+    ("truth/frames/t", lambda old: old[::-1], "truth/frames/t does not increase"),
     ("truth/frames/depth", lambda old: old[:, :-1], "dataset 'truth/frames/depth' has shape"),
     ("truth/frames/flow", lambda old: old[..., 0], "no 4-dimensional dataset 'truth/frames/flow'"),
     ("truth/poses/camera", lambda old: old[:, :6], "dataset 'truth/poses/camera' has shape"),
@@ -444,7 +444,7 @@ def test_flow_as_mvsec_stores_it(recording: amiwarp.Recording, tmp_path: Path) -
             expected = np.nan_to_num(frames[2].flow_with_prism[..., axis], nan=0.0) * 0.01
             np.testing.assert_allclose(found[name][2], expected, rtol=1e-6, atol=1e-6)
     one = simulation().run(truth_times_us=[0])
-    with pytest.raises(AmiwarpError, match="needs two of them, there are 1"):
+    with pytest.raises(AmiwarpError, match="needs ground truth of two instants, there are 1"):
         amiwarp.save_flow_mvsec(tmp_path / "one.npz", frames_of(one))
 
 
@@ -546,7 +546,10 @@ def test_world_files_and_files_of_poses(named: Path) -> None:
         (("--world", "room", "--rotate-deg-s", "0,5,0"), "--rotate-deg-s"),
         (("--world", "room", "--preview", "seen.jpg"), "ends in .png"),
         (("--picture", "none.jpg", "--trajectory", "still"), "--trajectory applies to a world"),
-        (("--picture", "none.jpg", "--seeing", "maps"), "--seeing applies to a world; give --world, or leave it out"),
+        (
+            ("--picture", "none.jpg", "--seeing", "maps"),
+            "--seeing applies to a world; give --world, or remove --seeing",
+        ),
         (("--picture", "none.jpg", "--motion-px", "1"), "--motion-px applies to a world"),
         (("--world", "room", "--motion-px", "3"), "motion_px = 3.0"),
         (("--world", "room", "--motion-px", "1", "--seeing", "rays"), "--motion-px applies to maps"),

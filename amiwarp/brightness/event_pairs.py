@@ -1,6 +1,7 @@
-"""Pairs of consecutive events of a pixel: the equations of :mod:`amiwarp.brightness.solver`.
+"""Pairs of consecutive events of a pixel, which are the equations of :mod:`amiwarp.brightness.solver`.
 
-They are built on the device: sort the events by pixel, mark candidates for pairs, write the marked ones.
+Pairs are built on the device in three steps: sort the events by pixel, mark candidates for pairs, write the marked
+pairs.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 
 COLUMNS = {"x": 1, "y": 1, "tile": 1, "on": 1, "azimuth": 4, "time": 2, "slope": 2}
-"""Number of values per pair in each array of the kernels' ``Pairs``."""
+"""Number of values per pair in each array of the kernels' struct ``Pairs``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,37 +45,37 @@ class SensorTiming:
     """
 
     latency_us: float = 0.0
-    """Time from a brightness change to its time stamp [us]."""
+    """Time from a brightness change at the pixel to the time stamp of its event [us]."""
     refractory_us: float = 0.0
     """Refractory period: time after an event until the pixel takes its new reference [us]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairSet:
-    """Pairs on a device: two events of a pixel, or one event and the end of the time window."""
+    """Pairs on a device. Each is two events of a pixel, or one event and the start or end of the time window."""
 
     arrays: Any
-    """The kernels' struct ``Pairs``."""
+    """Columns of the pairs: the kernels' struct ``Pairs``."""
     device: Any
 
     def __len__(self) -> int:
         return int(self.arrays.count)
 
     def column(self, name: str) -> NDArray[Any]:
-        """Return ``x``, ``y``, ``tile`` or ``on`` as a host array, shape (n,)."""
+        """Return the column ``x``, ``y``, ``tile`` or ``on`` of the pairs as a NumPy array, shape (n,)."""
         values: NDArray[Any] = getattr(self.arrays, name).numpy()
         return values[: len(self)]
 
     @property
     def time(self) -> NDArray[np.float32]:
-        """Both times of each pair [s], relative to the window's middle, shape (2, n)."""
+        """First and second time of each pair [s], relative to the window's middle, shape (2, n)."""
         values: NDArray[np.float32] = self.arrays.time.numpy()
         return values.reshape(2, -1)[:, : len(self)]
 
     def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
-        """Attach the change of the prism angle per unit of a drifting parameter, and return the set.
+        """Attach to each pair the change of its prism angles per unit of a drifting parameter, and return the set.
 
-        ``slope_of`` returns that change for times [us].
+        ``slope_of`` returns the change of the angle at given times [us].
         """
         values = np.zeros((2, self.arrays.stride), np.float32)
         for k, t in enumerate(self.time.astype(np.float64)):
@@ -84,7 +85,7 @@ class PairSet:
 
     @classmethod
     def concatenate(cls, parts: Sequence[PairSet]) -> PairSet:
-        """Concatenate pair sets, which must give silence the same weight."""
+        """Join pair sets, in which equations from silence must have the same weight."""
         if len(parts) == 1:
             return parts[0]
         first = parts[0].arrays
@@ -100,11 +101,11 @@ class PairSet:
         return cls(out, parts[0].device)
 
     def of_tiles(self, listed: NDArray[np.bool_]) -> PairSet:
-        """Return the pairs of the tiles for which ``listed`` is true."""
+        """Return the pairs on tiles whose value in ``listed`` is true, shape (tiles,)."""
         return self._select(kernels.mark_listed, [self.arrays.tile, _int_array(listed, self.device)])
 
     def of_square(self, left: int, top: int, side: int) -> PairSet:
-        """Return the pairs of a square of pixels."""
+        """Return the pairs of the pixels in a square of ``side`` px with corner (``left``, ``top``)."""
         return self._select(kernels.mark_square, [self.arrays, left, top, side])
 
     def on_tiles(
@@ -115,9 +116,9 @@ class PairSet:
         tile_of: NDArray[np.int32],
         listed: NDArray[np.bool_],
     ) -> PairSet:
-        """Return the pairs whose compensated events both fall on the same tile, if it is ``listed``.
+        """Return the pairs whose compensated events both fall on the same tile, if ``listed`` is true for that tile.
 
-        ``tile_of``: tile of each pixel of the map.
+        ``tile_of`` gives the tile of each pixel of the map, or -1.
         """
         places = wp.empty(len(self), dtype=wp.vec4, device=self.device)
         inputs = [
@@ -133,15 +134,15 @@ class PairSet:
         return self._select(kernels.mark_same_tile, marked, [self.arrays.tile])
 
     def hold_out(self, every: int) -> int:
-        """Hold out every ``every``-th pair of two events, which must come first in the set.
+        """Mark every ``every``-th pair of two events as held out, so that it is not fitted; return the number held out.
 
-        Returns the number held out.
+        Pairs of two events must come first in the set.
         """
         launch(kernels.hold_out, len(self), [every], [self.arrays.on], device=self.device)
         return int(np.count_nonzero(self.column("on") & int(HELD)))
 
     def _select(self, kernel: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> PairSet:
-        """Return the pairs that ``kernel`` marks."""
+        """Return the pairs that a kernel marks."""
         flag = wp.empty(len(self), dtype=int, device=self.device)
         launch(kernel, len(self), inputs, [*outputs, flag], device=self.device)
         place, count = _running_count(flag)
@@ -154,7 +155,7 @@ class EventTable:
     """Events of one or more time spans on a device, sorted by pixel."""
 
     def __init__(self, spans: Sequence[Events], tile_of: Any, device: Any) -> None:
-        """Copy the events to the device.
+        """Copy the events of the time spans to the device, without sorting them.
 
         Only pixels with ``tile_of`` >= 0 are used: shape (height, width), NumPy or on the device.
         """
@@ -175,7 +176,7 @@ class EventTable:
         return min(int(s.t[0]) for s in self.spans), max(int(s.t[-1]) for s in self.spans)
 
     def sort(self) -> None:
-        """Sort by span and pixel; within a pixel, events stay in time order."""
+        """Sort the events by time span and pixel; within a pixel, events stay in time order."""
         s, n = self.arrays, len(self.arrays.x)
         flag = wp.empty(n, dtype=int, device=self.device)
         launch(kernels.mark_inside, n, [s.x, s.y, self.tile_of], [flag], device=self.device)
@@ -241,14 +242,14 @@ class EventTable:
         return PairSet(out, device)
 
     def _mark_quiet(self, edges: Any, at_least: int, base: int, flag: Any) -> None:
-        """Mark the spans of pixels that are silent."""
+        """Mark the time spans in which pixels are silent."""
         fired = wp.zeros((len(edges) - 1) * self.arrays.pixels, dtype=wp.uint8, device=self.device)
         launch(kernels.mark_spans, len(self.arrays.x), [self.arrays, edges], [fired], device=self.device)
         inputs = [fired, self.tile_of.flatten(), at_least, base]
         launch(kernels.mark_quiet, self.arrays.pixels, inputs, [flag], device=self.device)
 
     def exclude_hot_pixels(self) -> NDArray[np.int32]:
-        """Set ``tile_of`` to -1 for pixels that fire far more often than the busiest pixels around them.
+        """Exclude pixels that fire far more often than the busiest pixels around them, by setting ``tile_of`` to -1.
 
         Returns the number of events of each pixel, shape (height, width).
         """
@@ -257,7 +258,7 @@ class EventTable:
         n = len(self.arrays.x)
         launch(
             kernels.count_pixels, n, [self.arrays], [count], device=self.device, smallest=n + 1
-        )  # in one slice: all slices add to the same counters
+        )  # one CPU thread only: several would add to the same counters
         launch(kernels.mark_hot, rows * columns, [count.reshape((rows, columns)), 0], [self.tile_of.flatten()],
                device=self.device)  # fmt: skip
         counts: NDArray[np.int32] = count.numpy().reshape(rows, columns)
@@ -265,11 +266,11 @@ class EventTable:
 
 
 def off_excess(pairs: PairSet, *, with_leak: bool = False) -> float:
-    """Return OFF threshold over ON threshold, minus 1, from counts of pairs.
+    """Return the ratio of the OFF to the ON threshold, minus 1, from the numbers of ON and OFF pairs.
 
-    A solved value would be biased, because damping shrinks it together with the map. Over a whole turn, brightness
-    returns to its start. So ON steps and OFF steps sum to zero, or, ``with_leak``, to the leakage: places with many and
-    with few events then separate the two.
+    A solution for the ratio would be biased, because damping shrinks it together with the map. Over a whole turn,
+    brightness returns to its start. So ON steps and OFF steps sum to zero, or, ``with_leak``, to the leakage: places
+    with many and places with few events then separate ratio and leak.
     """
     on = pairs.column("on") == 1
     if not with_leak:
@@ -304,7 +305,7 @@ def _int_array(values: NDArray[Any], device: Any) -> Any:
 
 
 def _running_count(flag: Any) -> tuple[Any, int]:
-    """Return the running count of the marks, and the total."""
+    """Return the running count of the marked entries, and their total."""
     place = wp.empty_like(flag)
     if not len(flag):
         return place, 0
@@ -313,7 +314,7 @@ def _running_count(flag: Any) -> tuple[Any, int]:
 
 
 def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) -> Any:
-    """Return empty pairs, padded with zeros to whole blocks."""
+    """Return a pair set without pairs, whose arrays are padded with zeros to whole blocks."""
     out = Pairs()
     block = int(BLOCK)
     out.count, out.stride, out.weak = count, -(-count // block) * block, weak

@@ -1,4 +1,7 @@
-"""Multigrid preconditioner: corrections of a large map on coarser and coarser grids, which transport brightness far."""
+"""Multigrid preconditioner for large maps.
+
+Corrections are computed on coarser and coarser grids, which transport brightness far across the map.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,16 @@ from amiwarp.kernels import multilevel as k
 from amiwarp.kernels.conjugate_gradients import gather
 
 COARSEST = 6
-"""Smallest number of rows or columns of a grid."""
+"""Smallest number of rows or columns of a grid; coarser grids are not made."""
 STRIDE = 8
-"""Stride over the pairs that estimate a coarse grid's diagonal, which need not be exact."""
+"""Every how many pairs of events one is used to estimate a coarse grid's diagonal, which need not be exact."""
 
 
 class GridHierarchy:
-    """Grids over one tile of (rows, columns) nodes; each has twice the spacing of the one before."""
+    """Grids over one tile of (rows, columns) map nodes. Each grid has twice the node spacing of the previous grid."""
 
     def __init__(self, rows: int, columns: int, device: Any) -> None:
-        """Allocate the grids."""
+        """Allocate the grids over a tile of ``rows`` × ``columns`` nodes."""
         self.shapes = [(rows, columns)]
         while min(self.shapes[-1]) // 2 + 1 >= COARSEST:
             self.shapes.append((self.shapes[-1][0] // 2 + 1, self.shapes[-1][1] // 2 + 1))
@@ -36,7 +39,7 @@ class GridHierarchy:
             program.add(gather, len(diagonal), [sums], [diagonal])
 
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
-        """Add to ``program``: ``out`` = sum of all grids' corrections for the ``residual`` of the finest grid."""
+        """Add to ``program`` the step ``out`` = sum of the grids' corrections for the finest grid's ``residual``."""
         program.add(k.divide, len(out), [diagonal, residual], [out])
         fine = residual
         for level, (rows, columns) in enumerate(self.shapes[1:], start=1):

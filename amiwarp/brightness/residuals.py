@@ -1,4 +1,4 @@
-"""Statistics of the residuals of a map's equations, computed on the device: costs, sums, median."""
+"""Statistics of the residuals of a map's equations, computed on the device: mean cost, sums, median."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ CHUNKS = 8
 
 
 class Residuals:
-    """Residuals of the equations of ``pairs`` [thresholds], NaN for pairs off the map, and their weights."""
+    """Residuals of the equations of ``pairs`` [thresholds] and the equations' weights.
+
+    A pair off the map has the residual NaN.
+    """
 
     def __init__(self, pairs: PairSet, tiles: int) -> None:
         self.pairs, self.tiles, self.device, self.count = pairs, tiles, wp.get_device(pairs.device), len(pairs)
@@ -33,9 +36,10 @@ class Residuals:
         self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
 
     def mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> float:
-        """Return the mean Cauchy cost, log(1 + (r / ``scale``)²), of all residuals, or, if ``held``, of those held out.
+        """Return the mean Cauchy cost, log(1 + (r / ``scale``)²), of the residuals r of all pairs or the held-out ones.
 
-        A pair off the map has the residual ``missing``; NaN excludes it.
+        ``held``: whether only held-out pairs count. ``missing``: residual of pairs off the map; NaN excludes these
+        pairs.
         """
         threads, parts = self._sum_shape
         partial = self._doubles(2, parts)
@@ -59,7 +63,8 @@ class Residuals:
         for slope in slopes:
             sums = wp.zeros((2, size), dtype=wp.int64, device=self.device)
             inputs = [self.pairs.arrays, self.tiles, slope, self.weight, self.values, 0, sums]
-            wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)  # one slice: sums are shared
+            # one CPU thread only: several would add to the same sums
+            wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)
             total, number = sums.numpy()
             rows.append(total[number > 0] / 2.0**32)
         return np.array(rows)
@@ -80,7 +85,7 @@ class Residuals:
 
     @cached_property
     def _sum_shape(self) -> tuple[int, int]:
-        """Number of threads and of partial sums for a sum over all pairs."""
+        """Numbers of threads and of partial sums for a sum over all pairs."""
         threads = -(-self.count // self._width)
         return threads, threads if self.device.is_cpu else -(-threads // BLOCK_DIM)
 

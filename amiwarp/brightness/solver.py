@@ -38,45 +38,49 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 DAMPING = 0.02
-"""Weight of the map's square relative to the equations. It fixes unknowns that no equation determines."""
+"""Weight of the squared map values relative to the equations. It determines unknowns that no equation does."""
 FEW_BLOCKS = 256
 """Smallest number of blocks of pairs for which a second CPU thread is used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Smoothness:
-    """Smoothness prior: extends the map into regions without equations, and suppresses isolated outliers."""
+    """Smoothness prior of the map.
+
+    It extends the map into regions without equations, and suppresses isolated outliers.
+    """
 
     weight: float
-    """Weight of the squared difference of neighbouring nodes; an equation has weight 1."""
+    """Weight of the squared difference of neighbouring map nodes; an equation from events has weight 1."""
     edge: float = 0.0
-    """Difference of neighbours above which their link weakens (Charbonnier) [thresholds]; 0 for equal weights."""
+    """Difference of neighbouring nodes above which their link weakens (Charbonnier) [thresholds]; 0: all links have
+    equal weight."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tiles:
-    """Parts of the map: rectangles of equal size, with nodes ``1 / density`` px apart."""
+    """Rectangular parts of the map, all of the same size, with nodes ``1 / density`` px apart."""
 
     origin: NDArray[np.float32]
-    """Pixel of each tile's first node, shape (tiles, 2)."""
+    """Pixel coordinates (x, y) of each tile's first node [px], shape (tiles, 2)."""
     rows: int
     """Number of rows of nodes per tile."""
     columns: int
     """Number of columns of nodes per tile."""
     density: float = 2.0
-    """Nodes per pixel along each axis."""
+    """Map nodes per pixel along each axis."""
 
     @property
     def nodes(self) -> int:
-        """Total number of nodes."""
+        """Total number of map nodes."""
         return len(self.origin) * self.rows * self.columns
 
 
 class BrightnessMap:
-    """Brightness map for a set of pairs, and its solver; owns its buffers. A solve starts from the last map.
+    """Brightness map for a set of pairs of events, and its solver. Owns its buffers; a solve starts from the last map.
 
-    Repeated launches are recorded once (:class:`amiwarp.kernels.recorded_launches.Program`). Nothing is read back in
-    between.
+    Repeated launches are recorded once (:class:`amiwarp.kernels.recorded_launches.Program`). No values are copied to
+    the host between launches.
     """
 
     def __init__(
@@ -90,14 +94,14 @@ class BrightnessMap:
         smoothness: Smoothness | None = None,
         middle_us: int = 0,
     ) -> None:
-        """Allocate buffers.
+        """Allocate the buffers.
 
         ``off_excess``: OFF threshold over ON threshold, minus 1, if it is known; it is then fixed, not solved for.
-        ``middle_us``: time to which a rotating camera is turned back; the times of the pairs are relative to it.
-        Raises :class:`AmiwarpError` if there are no pairs.
+        ``middle_us``: reference time of a rotating camera, to which the times of the pairs are relative [us]. Raises
+        :class:`AmiwarpError` if there are no pairs.
         """
         if not len(pairs):
-            raise AmiwarpError("no pixel fired twice in time, so there are no pairs of events; give a longer recording")
+            raise AmiwarpError("no pixel fired twice in time, so no brightness can be found; give a longer recording")
         self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
         self.pairs, self.middle_us, self.smoothness = pairs, middle_us, smoothness
         self._atlas = kernels.Atlas()
@@ -111,7 +115,7 @@ class BrightnessMap:
         self._make_vectors(unknowns)
         self._make_prior(damping, unknowns)
         if off_excess is not None:
-            self._prior.held = tiles.nodes + 1  # the leak comes first
+            self._prior.held = tiles.nodes + 1  # of the sensor unknowns, the leak comes first
             self._image[-1:].fill_(off_excess)
         self.residuals = Residuals(pairs, len(tiles.origin))
         self._scale = self._zeros(1)
@@ -121,7 +125,7 @@ class BrightnessMap:
         return wp.zeros(n, dtype=float, device=self.device)
 
     def _make_vectors(self, unknowns: int) -> None:
-        """Allocate the vectors of the conjugate gradients."""
+        """Allocate the vectors of the conjugate-gradient method."""
         self._width = cg.CPU_WIDTH if self.device.is_cpu else 1
         self._threads = -(-unknowns // self._width)
         self._u, self._dots = cg.Unknowns(), cg.Dots()
@@ -146,7 +150,7 @@ class BrightnessMap:
         self._z = self._zeros(unknowns * one)
 
     def _new_geometry(self) -> Any:
-        """Return buffers for the positions of the pairs on the map."""
+        """Allocate buffers for the positions of the pairs on the map."""
         g = Geometry()
         g.stride = self.pairs.arrays.stride
         g.cell = wp.full(2 * g.stride, -1, dtype=int, device=self.device)
@@ -156,7 +160,7 @@ class BrightnessMap:
     # -- positions of the pairs
 
     def place(self, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
-        """Compute the positions of the pairs on the map, with the camera rotation compensated to ``middle_us``."""
+        """Compute the positions of the pairs on the map, for a model and a camera rotation about ``middle_us``."""
         self._place(model, drift, camera_rotation, self._geometry)
 
     def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
@@ -182,7 +186,7 @@ class BrightnessMap:
 
     @cached_property
     def _sides(self) -> tuple[Any, Any]:
-        """Two more geometries, for finite differences."""
+        """Buffers for the pairs' positions at two more parameter values, for finite differences."""
         return self._new_geometry(), self._new_geometry()
 
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float) -> Any:
@@ -199,7 +203,10 @@ class BrightnessMap:
         return out
 
     def keep(self, nodes: NDArray[np.bool_]) -> None:
-        """Exclude pairs of two events, as noise, if either event is off ``nodes`` (tiles, rows, columns)."""
+        """Exclude pairs of two events, as noise, if either event is off the nodes for which ``nodes`` is true.
+
+        ``nodes`` has shape (tiles, rows, columns).
+        """
         on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
         inputs = [on, self.pairs.arrays.on, self._geometry.stride]
         launch(keep_nodes, self.count, inputs, [self._geometry.cell], device=self.device)
@@ -207,9 +214,10 @@ class BrightnessMap:
     # -- solving
 
     def solve(self, scale: float, *, steps: int, rounds: int = 1) -> None:
-        """Run ``rounds`` of Cauchy weights of ``scale`` [thresholds] with ``steps`` of conjugate gradients each.
+        """Solve for the map: ``rounds`` times, set the Cauchy weights and run ``steps`` conjugate-gradient steps.
 
-        Afterwards ``residuals`` holds the residual of every pair [thresholds] on the device, NaN for pairs off the map.
+        ``scale`` is the residual at which an equation gets half weight [thresholds]. Afterwards ``residuals`` holds the
+        residual of every pair [thresholds] on the device, NaN for pairs off the map.
         """
         self._scale.fill_(scale)
         for _ in range(rounds):
@@ -219,16 +227,16 @@ class BrightnessMap:
         self._weigh.run()
 
     def restart(self, smoothness: float) -> None:
-        """Clear the map and set another weight of the smoothness prior."""
+        """Set the map to zero and change the weight of the smoothness prior."""
         self._image[: self.tiles.nodes].zero_()
         self._prior.smooth.fill_(smoothness)
 
     def prepare_projection(self) -> None:
-        """Prepare :meth:`unexplained` with the weights of the last :meth:`solve`."""
+        """Prepare :meth:`unexplained` with the weights that the last :meth:`solve` set."""
         self._prepare.run()
 
     def new_change(self) -> Any:
-        """Return a zero change of the map on the device, as a start for :meth:`unexplained`."""
+        """Return a change of the map that is zero, on the device, as a start for :meth:`unexplained`."""
         return self._zeros(len(self._image))
 
     def unexplained(self, target: Any, change: Any, *, steps: int) -> Any:
@@ -254,7 +262,7 @@ class BrightnessMap:
 
     @cached_property
     def _weigh(self) -> Any:
-        """Program that computes residuals and weights."""
+        """Program that computes the residuals and the weights of the equations."""
         program = Program(self.device)
         self._add_weigh(program)
         return program
@@ -265,7 +273,7 @@ class BrightnessMap:
 
     @cached_property
     def _prepare(self) -> Any:
-        """Program that computes links and diagonals for the current weights and map."""
+        """Program that computes the smoothness links and the diagonals for the current weights and map."""
         program = Program(self.device)
         if self.smoothness is not None:
             inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
@@ -288,7 +296,7 @@ class BrightnessMap:
 
     @property
     def unknowns(self) -> NDArray[np.float32]:
-        """Copy of the map, followed by the leak [1/s] and by OFF threshold over ON threshold, minus 1."""
+        """Copy of the unknowns: map, leak [thresholds/s], and OFF threshold over ON threshold, minus 1."""
         values: NDArray[np.float32] = self._image.numpy()
         return values.copy() if self.device.is_cpu else values
 
@@ -338,7 +346,7 @@ class _ConjugateGradients:
         self._add_step(self._step)
 
     def run(self, steps: int) -> None:
-        """Start from the current image and run ``steps`` iterations."""
+        """Start from the current ``image`` and run ``steps`` iterations."""
         self._start.run()
         self._step.run(steps)
 

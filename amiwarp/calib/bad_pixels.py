@@ -25,55 +25,63 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events, EventSource
 
 MOST_TURNS, LEAST_TURNS, MOST_EVENTS = 8, 2, 2_500_000
-"""Limits of the analysed part of a recording. A longer part reveals slower hot pixels, but costs time."""
+"""Limits of the part of a recording that is searched for bad pixels: most turns of the prism, fewest turns, most
+events. A longer part reveals slower hot pixels, but costs time."""
 BINS = 8
-"""Number of angle bins per turn."""
+"""Number of angle bins per turn of the prism in which events are counted."""
 HARMONICS = 2
-"""Number of harmonics of the angle that measure the folded events. Low ones tolerate small delays of an edge."""
+"""Number of harmonics of the prism angle used to count the events of a pixel that do not repeat from turn to turn. Low
+harmonics tolerate small delays of an edge."""
 BLOCKS = 4
-"""Number of spans of turns that are folded separately. More reduce the noise of the measure, but cost time."""
+"""Number of groups of successive turns in which unrepeated events are counted separately before the counts are added.
+More groups reduce the noise of the count, but cost time."""
 NEIGHBOURS = 2
-"""Half width of the square of pixels with which a pixel is compared [px]."""
+"""Half width of the square of neighbouring pixels with whose event counts a pixel's event count is compared [px]."""
 LEAST_LOW = 19
-"""Number of the 24 neighbours that must count far less than a hot pixel: corners and thin lines have fewer."""
+"""Smallest number of the 24 neighbours that must have far fewer events than a pixel before it counts as hot. Pixels of
+corners and thin lines have fewer such neighbours."""
 CELL = 16
-"""Side of the cells in which flicker is detected [px]."""
+"""Side of the square cells whose event rate is searched for flicker [px]."""
 BIN_US = 1000
-"""Time bin for the detection of flicker [us]: it resolves up to 500 Hz."""
+"""Length of the time bins in which flicker is detected [us]: 1 ms resolves up to 500 Hz."""
 LONGEST_US = 1_000_000
-"""Duration from the middle of the events that is searched for flicker [us]."""
+"""Longest duration, around the middle of the events, that is searched for flicker [us]."""
 SLOWEST_HZ = 40.0
-"""Lowest flicker frequency [Hz]. Slower changes cannot be distinguished from those of the scene."""
+"""Lowest detected flicker frequency [Hz]. Slower changes of the light cannot be distinguished from motion of the scene.
+"""
 LAMP_CYCLES = 6
-"""Smallest number of cycles that determine a frequency."""
+"""Smallest number of cycles of a lamp during the events from which its frequency can be determined."""
 LEAST_SHARE = 0.3
-"""Smallest share of a cell's or a pixel's events that follow the lamp. Texture alone reaches 0.2."""
+"""Smallest share of a cell's or a pixel's events that must oscillate with the lamp for it to count as flickering.
+Texture alone reaches 0.2."""
 LEAST_RATIO = 4.0
-"""Smallest ratio of the lamp's power to that of nearby frequencies, see :data:`NEAR_TURNS`. Texture alone reaches 3."""
+"""Smallest ratio of a lamp's power to the power of nearby frequencies (see :data:`NEAR_TURNS`). Texture alone reaches
+3."""
 NEAR_TURNS = 2.6
-"""Range of nearby frequencies, in multiples of the prism's frequency, so that it contains the prism's harmonics."""
+"""Distance of the frequencies to which a lamp's power is compared, in multiples of the prism's rotation frequency. The
+range then contains harmonics of the prism's rotation."""
 FEWEST_EVENTS = 100
-"""Smallest number of events for a cell's spectrum."""
+"""Smallest number of events of a cell whose spectrum is analysed."""
 LEAST_SIGMA = 4.0
-"""Smallest amplitude of a pixel's oscillation, in standard deviations of random events."""
+"""Smallest amplitude of a flickering pixel's oscillation, in standard deviations expected for random events."""
 MOST_LAMPS = 3
-"""Largest number of flicker frequencies."""
+"""Largest number of flicker frequencies that are searched for."""
 SMOOTHING = 5
-"""Side of the square of pixels over which the oscillation is summed [px]."""
+"""Side of the square of pixels over which each pixel's oscillation is summed [px]."""
 
 
 @dataclass(frozen=True, slots=True)
 class BadPixelSummary:
-    """Numbers of bad pixels. As text, a warning for the user."""
+    """Numbers of hot and of flickering pixels in a recording. As text, a warning for the user."""
 
     hot: int
     """Number of hot pixels, which fire at random."""
     flickering: int
     """Number of pixels that see a flickering lamp."""
     lamps_hz: tuple[float, ...]
-    """Flicker frequencies, the strongest first [Hz]."""
+    """Frequencies of flickering lamps, the strongest lamp first [Hz]."""
     share: float
-    """Share of the events on bad pixels."""
+    """Share of all events that lie on bad pixels, 0 to 1."""
 
     def __str__(self) -> str:
         """Return, for example, ``12 hot pixels and 3400 that flicker at 100 Hz left out, 41 % of the events``."""
@@ -101,7 +109,7 @@ def stretch(source: EventSource, encoder: Encoder) -> Events:
 def strange_pixels(
     events: Events, encoder: Encoder, size: tuple[int, int]
 ) -> tuple[NDArray[np.bool_], BadPixelSummary]:
-    """Find hot and flickering pixels.
+    """Find hot pixels and pixels that see a flickering lamp.
 
     Hot pixels are found by their event rate and, from two turns on, by events that do not repeat from turn to turn. The
     second test fails while the camera rotates fast.
@@ -138,7 +146,7 @@ def strange_pixels(
 
 
 def without_pixels(events: Events, mask: NDArray[np.bool_]) -> Events:
-    """Return the events outside the masked pixels; ``mask`` is True for masked ones, shape (height, width)."""
+    """Return the events outside the masked pixels; ``mask`` is True for masked pixels, shape (height, width)."""
     return events[~mask[events.y, events.x]] if mask.any() else events
 
 
@@ -147,9 +155,9 @@ class MaskedEventSource:
     """Event source that drops the events of masked pixels on reading. ``len`` still counts them."""
 
     source: EventSource
-    """The source to read from."""
+    """Event source whose events are read and masked."""
     mask: NDArray[np.bool_]
-    """True for masked pixels, shape ``(height, width)``."""
+    """Mask of bad pixels: True for pixels whose events are dropped, shape ``(height, width)``."""
 
     def __len__(self) -> int:
         return len(self.source)
@@ -167,7 +175,7 @@ class MaskedEventSource:
         return self.source.size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Return the remaining ones of the source's events ``start <= index < stop``."""
+        """Return the events with ``start <= index < stop`` of the source that lie outside the mask."""
         return without_pixels(self.source.slice(start, stop), self.mask)
 
     def find(self, t: int) -> int:
@@ -177,7 +185,7 @@ class MaskedEventSource:
         return without_pixels(self.source.between(t_start, t_end), self.mask)
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """Yield the remaining events of each block of the source."""
+        """Yield, for each block of the source's events, those that lie outside the mask."""
         return (without_pixels(block, self.mask) for block in self.source.blocks(count=count, duration_us=duration_us))
 
 
@@ -185,7 +193,7 @@ class MaskedEventSource:
 
 
 def outliers(count: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the pixels that count far more than at least :data:`LEAST_LOW` of their 24 neighbours.
+    """Return the pixels with far more events than at least :data:`LEAST_LOW` of their 24 neighbours.
 
     Far more than a neighbour's n means more than 3 n + 5 √n + 8: beyond Poisson statistics and a picture's contrast. A
     few neighbours may count as much, so adjacent hot pixels do not hide each other.
@@ -231,7 +239,10 @@ def unrepeated_counts(
 
 
 def harmonics() -> NDArray[np.float64]:
-    """Return low harmonics of the angle at the bin centres, each with mean square 1, shape (harmonics, BINS)."""
+    """Return a constant, cosines and sines of the angle at the bin centres, shape (harmonics, BINS).
+
+    Each has the mean square 1.
+    """
     phase = np.outer(np.arange(1, HARMONICS + 1), (np.arange(BINS) + 0.5) * (TWO_PI / BINS))
     return np.concatenate([np.ones((1, BINS)), math.sqrt(2.0) * np.cos(phase), math.sqrt(2.0) * np.sin(phase)])
 
@@ -272,7 +283,7 @@ def _flickering(
         if not patch.any():
             break
         found |= patch
-        if all(round(hz) != round(other) for other in lamps):  # the rest of a known lamp may be found again
+        if all(round(hz) != round(other) for other in lamps):  # a second search may find more pixels of the same lamp
             lamps.append(hz)
     return found, tuple(lamps)
 
@@ -318,7 +329,7 @@ def _signals(
 
 
 def _largest_near(amplitude: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
-    """Return the largest amplitude at distances of 2 to ``reach`` bins: a line itself is up to two bins wide."""
+    """Return the largest amplitude at 2 to ``reach`` frequency bins away: a spectral line is up to two bins wide."""
     from scipy.ndimage import maximum_filter1d
 
     window = (reach - 1) | 1  # odd, so that it has a middle
@@ -331,7 +342,7 @@ def _largest_near(amplitude: NDArray[np.float64], reach: int) -> NDArray[np.floa
 def _patch(
     events: Events, pixel: NDArray[np.int32], hz: float, cells: NDArray[np.bool_], without: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return the patch of pixels that oscillate at a frequency [Hz], grown from the cells that see the lamp."""
+    """Return the connected region of pixels that oscillate at ``hz`` [Hz], grown from the cells that see the lamp."""
     from scipy import ndimage
 
     height, width = without.shape

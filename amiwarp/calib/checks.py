@@ -1,4 +1,4 @@
-"""Checks of a recording and of an answer. Each one raises an error that gives the reason and the remedy."""
+"""Checks of a recording and of calibrated parameters. A failed check raises an error with the reason and the remedy."""
 
 from __future__ import annotations
 
@@ -20,37 +20,40 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000
-"""Smallest number of events."""
+"""Smallest number of events for a calibration."""
 SMALLEST_ROTATION = math.pi / 2
-"""Smallest rotation of the prism during the events [rad]."""
+"""Smallest angle that the prism must turn during the events [rad]."""
 LEAST_SIGNIFICANCE = 5.0
-"""Smallest gain in sharpness over the opposite phase, and over no compensation [standard deviations]."""
+"""Smallest gain in sharpness of the calibrated parameters over the opposite phase, and over no compensation [standard
+deviations]."""
 LARGEST_FROM_NOMINAL = 0.18
-"""Largest relative difference between the prism's size and the nominal one."""
+"""Largest relative difference between the calibrated and the nominal size of the prism's orbit."""
 LARGEST_FLICKER = 0.7
-"""Largest share of bad pixels."""
+"""Largest share of the pixels that may be masked as bad."""
 LARGEST_DRIFT = 0.02
-"""Largest drift of the index pulses over a recording [turns]."""
+"""Largest drift of the index pulses relative to the encoder counts over a recording [turns]."""
 FEWEST_PULSES = 3
 """Smallest number of index pulses for the check of an encoder's scale."""
 STEADY = 0.2
-"""A drift is steady if no pulse deviates from a straight line by more than this share of the drift."""
+"""Largest deviation of an index pulse from a straight line over time, as a share of the total drift. A drift with
+smaller deviations is steady."""
 LARGEST_COHERENCE = 0.97
-"""Largest coherence of the edge directions: 0 if all directions are equally frequent, 1 if all edges are parallel."""
+"""Largest coherence of the edge directions for which a calibration is accepted: 0 if all directions are equally
+frequent, 1 if all edges are parallel."""
 
 
 class NoSharpOptimumError(AmiwarpError):
-    """No motion of a prism makes the image of events sharp. A rotating camera can be the cause."""
+    """Raised if no motion of a prism makes the image of events sharp. A rotating camera can be the cause."""
 
 
 def check_events(count: int, name: str) -> None:
-    """Check the number of events."""
+    """Raise :class:`AmiwarpError` if a recording has too few events for a calibration."""
     if count < FEWEST_EVENTS:
         raise AmiwarpError(f"{name}: {count} events are too few to calibrate; record at least {FEWEST_EVENTS}")
 
 
 def check_unmasked_events(count: int, mask: NDArray[np.bool_], name: str) -> None:
-    """Check the number of events outside the bad pixels; ``mask`` is True for bad ones."""
+    """Raise :class:`AmiwarpError` if too few events lie outside the bad pixels; ``mask`` is True for bad pixels."""
     if count < FEWEST_EVENTS:
         pixels = int(np.count_nonzero(mask))
         raise AmiwarpError(
@@ -108,7 +111,7 @@ def wrong_scale(
     )
     return AmiwarpError(
         f"{name}: {what} every {turns:.4f} turns of the encoder, not every turn; {evidence} its scale is off by a "
-        f"factor of {turns:.4f}: read its log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
+        f"factor of {turns:.4f}: read the encoder log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
     )
 
 
@@ -145,28 +148,28 @@ def check_nominal(model: str, parameters: Mapping[str, float], nominal: Prism, n
     share = parameters[size] / (nominal.apex if size == "apex" else nominal.deflection)
     if not abs(share - 1.0) <= LARGEST_FROM_NOMINAL:
         raise AmiwarpError(
-            f"{name}: the answer is {100 * share:.0f} % of its nominal {size} (nominal apex "
+            f"{name}: the calibrated size of the prism is {100 * share:.0f} % of its nominal {size} (nominal apex "
             f"{math.degrees(nominal.apex):.4g} deg): the camera shakes with the prism, or the nominal prism or the "
             f"focal length is wrong; correct these, or give bounds of {size} if the answer is right"
         )
 
 
 def significance(best: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Return the mean gain in sharpness over disjoint parts of the events [standard deviations of the mean]."""
+    """Return the mean of ``best - other``, a gain in sharpness of disjoint parts [standard deviations of the mean]."""
     gain = best - other
     spread = float(gain.std(ddof=1)) / math.sqrt(len(gain))
     return float(gain.mean()) / max(spread, 1e-12)
 
 
 def _in_words(gain: float) -> str:
-    """Return a significance in words. A negative number would carry no information."""
+    """Return a significance as text. A negative number is not shown, because it carries no information."""
     return f"{gain:.1f} standard deviations" if gain > 0.0 else "it is less sharp, or the same"
 
 
 def check_texture(
     best: NDArray[np.float64], opposite: NDArray[np.float64], still: NDArray[np.float64], name: str
 ) -> None:
-    """Check that the optimum is sharper than chance.
+    """Check that the image is sharper at the optimum than by chance, and than without compensation.
 
     Each array holds the sharpness of disjoint parts of the events: at the optimum, with half a turn added to the phase,
     and without motion compensation.
@@ -202,7 +205,7 @@ def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
 
 
 def check_directions(image: NDArray[np.float32], name: str) -> None:
-    """Check that the edges have more than one direction: motion along an edge is invisible."""
+    """Check that the image has edges of more than one direction: motion along an edge is invisible."""
     coherence = edge_coherence(image)
     if coherence > LARGEST_COHERENCE:
         raise AmiwarpError(

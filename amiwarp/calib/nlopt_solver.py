@@ -32,7 +32,7 @@ GLOBAL_ALGORITHMS = (
     "G_MLSL",
     "G_MLSL_LDS",
 )
-"""NLopt's derivative-free global algorithms. The MLSL algorithms run a local algorithm inside."""
+"""NLopt's derivative-free global algorithms. The MLSL algorithms run one of the local algorithms inside."""
 LOCAL_ALGORITHMS = (
     "LN_COBYLA",
     "LN_BOBYQA",
@@ -49,24 +49,24 @@ _NEEDS_TWO = ("LN_BOBYQA", "LN_NEWUOA", "LN_NEWUOA_BOUND")
 
 @dataclass(frozen=True, kw_only=True)
 class SearchStage:
-    """One run of a search algorithm: its best point and all evaluated points."""
+    """Record of one run of a search algorithm: its best point and all evaluated points."""
 
     algorithm: str
-    """Name of the algorithm."""
+    """Name of the search algorithm, such as ``LN_BOBYQA``."""
     x: NDArray[np.float64]
-    """Best evaluated point [px], shape ``(n,)`` for n free parameters."""
+    """Evaluated point with the highest score [px], shape ``(n,)`` for n free parameters."""
     score: float
-    """Score at the best point."""
+    """Score at the best point; higher is better."""
     evaluations: int
-    """Number of evaluations of the score."""
+    """Number of evaluations of the score in the run."""
     seconds: float
-    """Run time [s]."""
+    """Run time of the search [s]."""
     ended: str
-    """Reason why the search ended."""
+    """Reason why the search ended, in words."""
     points: NDArray[np.float64] = field(repr=False)
     """All evaluated points in order [px], shape ``(evaluations, n)``."""
     scores: NDArray[np.float64] = field(repr=False)
-    """Score of each point, shape ``(evaluations,)``."""
+    """Score of each evaluated point, shape ``(evaluations,)``."""
 
 
 def best_of(
@@ -162,7 +162,7 @@ def maximise(
 
 
 class _EvaluationLog:
-    """Objective for NLopt: records every evaluation, and stops NLopt at the budget or at an exception."""
+    """Objective function for NLopt. It records every evaluation, and stops NLopt at the budget or at an exception."""
 
     def __init__(self, score: Callable[[NDArray[np.float64]], float], most: int, stop: Callable[[], None]) -> None:
         self.points: list[NDArray[np.float64]] = []
@@ -173,7 +173,7 @@ class _EvaluationLog:
         self._most = most
 
     def release(self) -> None:
-        """Drop the reference to the score, because NLopt never frees its callbacks."""
+        """Drop the reference to the score function, because NLopt never frees its callbacks."""
         self._score = self._stop = None
 
     def cost(self, x: NDArray[np.float64], _gradient: Any) -> float:
@@ -209,7 +209,7 @@ def _optimiser(
     step: float,
     inner: str,
 ) -> Any:
-    """Return a configured NLopt optimiser."""
+    """Return an NLopt optimiser with bounds, budget and tolerances set."""
     import nlopt
 
     n = len(low)

@@ -1,7 +1,7 @@
-"""Calibration method of He et al., Science Robotics 2024, for comparison: circle model, their cost J, grid search.
+"""Calibration by He et al. (Science Robotics 2024), for comparison: circle model, their cost J, and a grid search.
 
 The grid is refined about the values that the hardware gives: the nominal prism and the mounted phase. The paper states
-neither the grid nor η. As in the paper there are no checks of the answer and no uncertainty.
+neither the grid nor η. As in the paper, the result is not checked and has no uncertainty.
 """
 
 from __future__ import annotations
@@ -34,13 +34,14 @@ if TYPE_CHECKING:
 WINDOW_US = 2_000_000
 """Duration of the events that the paper calibrates on [us]."""
 LEVELS = 3
-"""Number of successive grids, each as wide as two steps of the previous one."""
+"""Number of successive grids, each as wide as two steps of the previous grid."""
 SIDE = 11
 """Number of values of each parameter on a grid."""
 SIZE_RANGE = (0.5, 1.5)
-"""Range of the deflection on the first grid, relative to the nominal one."""
+"""Lowest and highest deflection on the first grid, relative to the nominal deflection."""
 PHASE_RANGE = math.radians(45.0)
-"""Half width of the phase on the first grid about the mounted phase [rad]. Without one: the full turn."""
+"""Half width of the range of phases on the first grid, about the mounted phase [rad]. If no phase is given, the grid
+spans a full turn."""
 
 
 def calibrate_as_paper(
@@ -80,7 +81,7 @@ def calibrate_as_paper(
 
 
 def _grid_search(search: Search, *, mounted: bool, progress: Progress | None) -> SearchStage:
-    """Return the best point of successively finer grids; ``mounted``: the start gives the mounted phase."""
+    """Return the best point of successively finer grids; ``mounted``: whether the phase of the mount is given."""
     space, began = search.space, time.perf_counter()
     nominal = space.start
     size, phase = nominal[space.size_name], nominal["phase"]

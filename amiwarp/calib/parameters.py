@@ -56,17 +56,18 @@ keeps its ratio to fx. ``rate_*`` and ``change_*`` describe the camera's rotatio
 """
 
 DRIFTS = ("clock_offset", "rpm")
-"""Parameters that shift the prism angle of each event by its own amount."""
+"""Parameters that shift the prism angle of each event by an amount that depends on the event's time."""
 RATES = ("rate_x", "rate_y", "rate_z")
-"""Angular velocity of the camera."""
+"""Angular velocity of the camera about its x, y and z axes: names of the parameters."""
 CHANGES = ("change_x", "change_y", "change_z")
-"""Angular acceleration of the camera."""
+"""Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
 MOTION = (*RATES, *CHANGES)
-"""All parameters of the camera's rotation."""
+"""Names of all parameters of the camera's rotation."""
 EXACT_PARAMETERS = ("apex", "index", "tilt_x", "tilt_y")
-"""Parameters that the circle models do not have."""
+"""Parameters of the exact model that the circle models do not have."""
 DEGENERATE_WITH_APEX = ("index", "focal_length")
-"""Left to the photometric stage if it runs: nearly degenerate with the apex in sharpness."""
+"""Parameters that the sharpness stage does not search if the photometric stage follows: in sharpness they are nearly
+degenerate with the apex."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +81,7 @@ class ParameterSpace:
     model: str
     """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
-    """Nominal camera. If the focal length is free, its value replaces that of the camera."""
+    """Nominal camera. If the focal length is free, its value replaces the camera's focal length."""
     prism: Prism
     """Nominal prism. It gives the flat side, and the index if that is not free."""
     names: tuple[str, ...]
@@ -90,15 +91,16 @@ class ParameterSpace:
     high: Mapping[str, float]
     """Upper bound of each free parameter, in its unit."""
     start: Mapping[str, float]
-    """Values of all parameters of the model, free ones at their start, in their units."""
+    """Values of all parameters of the model, in their units. The search starts at the values of the free parameters."""
     pixels: Mapping[str, float]
     """Displacement of events per unit of each free parameter [px rms]."""
     middle_us: int
-    """Time to whose camera orientation events are rotated back [us]."""
+    """Reference time of the camera's rotation [us]: events are rotated back to the camera's orientation at this time.
+    """
     duration_us: float
     """Duration of the events [us]."""
     undrifted: Mapping[str, float]
-    """Values of ``clock_offset`` or ``rpm`` for which the events' given prism angles hold, in their units."""
+    """Values of ``clock_offset`` or ``rpm``, in their units, for which the prism angles stored with the events hold."""
 
     @property
     def size_name(self) -> str:
@@ -122,7 +124,7 @@ class ParameterSpace:
         return any(self.start.get(n) or n in self.names for n in MOTION)
 
     def without(self, names: tuple[str, ...]) -> ParameterSpace:
-        """Return the space in which some parameters are fixed at their start.
+        """Return the parameter space with some parameters fixed at their start values.
 
         Parameters
         ----------
@@ -137,7 +139,7 @@ class ParameterSpace:
         return replace(self, names=tuple(n for n in self.names if n not in names))
 
     def holding(self, values: Mapping[str, float]) -> ParameterSpace:
-        """Return the space with other start values.
+        """Return the parameter space with other start values.
 
         Parameters
         ----------
@@ -187,7 +189,7 @@ class ParameterSpace:
         return v
 
     def to_values(self, v: NDArray[np.float64]) -> dict[str, float]:
-        """Return the parameter values of a search vector.
+        """Return the parameter values that a search vector stands for.
 
         Parameters
         ----------
@@ -211,7 +213,7 @@ class ParameterSpace:
         return values
 
     def deviations(self, v: NDArray[np.float64], covariance: NDArray[np.float64]) -> dict[str, float]:
-        """Return the standard deviations of the free parameters.
+        """Convert the covariance of the search vector to standard deviations of the free parameters.
 
         Parameters
         ----------
@@ -239,7 +241,7 @@ class ParameterSpace:
         return {n: float(math.sqrt(max(s, 0.0))) for n, s in zip(self.names, variances, strict=True)}
 
     def build(self, values: Mapping[str, float]) -> Model:
-        """Return the model of parameter values.
+        """Build the optical model that has the given parameter values.
 
         Parameters
         ----------
@@ -254,7 +256,7 @@ class ParameterSpace:
         return build_model(self.model, self.camera, self.prism, values)
 
     def camera_rotation(self, values: Mapping[str, float]) -> CameraRotation:
-        """Return the camera's rotation among parameter values.
+        """Return the camera rotation that the parameter values describe.
 
         Parameters
         ----------
@@ -314,14 +316,14 @@ def size_name(model: str) -> str:
 
 
 def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraRotation:
-    """Return the camera's rotation among parameter values; a missing rate counts as 0."""
+    """Return the camera rotation that the parameter values describe; a missing rate is taken as 0."""
     x, y, z = (values.get(n, 0.0) for n in RATES)
     a, b, c = (values.get(n, 0.0) for n in CHANGES)
     return CameraRotation((x, y, z), (a, b, c), middle_us)
 
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
-    """Return the model of parameter values. What they do not name comes from ``camera`` and ``prism``."""
+    """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
     one_of(model, MODELS, "model")
     if "focal_length" in values:
         scale = values["focal_length"] / camera.fx

@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
 
 LINEAR_UNKNOWNS = ("off_ratio", "leak")
-"""Free parameters of the photometric stage alone: unknowns of its linear equations."""
+"""Free parameters that only the photometric stage has: unknowns of its linear equations."""
 ROTATION_WINDOW_TURNS, ROTATION_WINDOW_US = 2.1, 100_000.0
-"""Length of the window that is used if the camera's rotation is free: in turns, or in microseconds without a prism."""
+"""Length of the part of a recording that is used if the camera's rotation is free: in turns, or without a prism in
+microseconds."""
 
 
 def prepare(
@@ -82,7 +83,7 @@ def linear_unknowns(settings: Settings) -> tuple[str, ...]:
 
 
 def zero_time(recording: Recording, space: ParameterSpace) -> int | None:
-    """Return the time at which the prism angle counts as 0 [us] if no encoder gives it; None if one does."""
+    """Return the time at which the prism angle is defined as 0 [us] if there is no encoder; None if there is one."""
     return _middle(recording) if recording.encoder is None and space.sized else None
 
 
@@ -120,7 +121,7 @@ def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], 
 
 
 def _middle(recording: Recording) -> int:
-    """Return the time in the recording's middle [us]: there a change of the speed changes the phase least."""
+    """Return the middle time of the recording [us], about which a change of speed changes the phase least."""
     return (recording.events.t_first + recording.events.t_last) // 2
 
 
@@ -152,7 +153,7 @@ def _space(
 def _calibration_events(
     events: Events, encoder: Encoder, space: ParameterSpace, middle: int, fold: int
 ) -> CalibrationEvents:
-    """Return the events with the encoder, and with their angle's slope over a free clock offset or rpm."""
+    """Return the calibration events with their encoder and the angles' derivative by a free clock offset or rpm."""
     if fold and (space.moving or {"clock_offset", "rpm"} & set(space.names)):
         raise AmiwarpError(
             f"fold = {fold} with {', '.join(space.names)} free: folding discards the events' times; set fold to 0"

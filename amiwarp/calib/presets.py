@@ -1,4 +1,4 @@
-"""Presets: JSON files with settings for ``calibrate`` or ``compensate`` that a chart chose for a budget."""
+"""Presets: JSON files of settings for ``calibrate`` or ``compensate`` that ``amiwarp chart`` chose for a budget."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Preset:
     """Content of a preset file."""
 
     kind: str
-    """``calibration`` or ``compensation``."""
+    """Command for which the preset holds settings: ``calibration`` or ``compensation``."""
     settings: Mapping[str, Any]
-    """Settings by name, in types that JSON knows."""
+    """Settings by name; the values have types that JSON can store."""
     measured: Mapping[str, Any]
-    """Measurements of these settings on the chart: error and time, by name."""
+    """Error and time that the chart measured with these settings, by name."""
 
     def save(self, path: Path) -> None:
         """Write the JSON file. Raises :class:`AmiwarpError` if it exists or cannot be written."""
@@ -54,7 +54,7 @@ class Preset:
         """Read a preset of one ``kind``. Raises :class:`AmiwarpError` naming file and field."""
         data = read_json(path, "a preset")
         if data.get("format") != FORMAT or data.get("version") != VERSION:
-            raise AmiwarpError(f"{path}: is not an {FORMAT} file of version {VERSION}; create one with 'amiwarp chart'")
+            raise AmiwarpError(f"{path}: not an {FORMAT} file of version {VERSION}; create one with 'amiwarp chart'")
         if data.get("kind") != kind:
             given = shown(data.get("kind"))
             raise AmiwarpError(f"{path}: kind is {given}; give a preset for {kind}")
@@ -68,12 +68,12 @@ class Preset:
         return cls(kind, settings, measured)
 
     def calibration_settings(self) -> Settings:
-        """Return the preset's settings; fields that it does not contain have their defaults."""
+        """Return the preset as calibration settings; fields that the preset does not contain have their defaults."""
         return settings_from(self.settings)
 
 
 def settings_from(values: Mapping[str, Any]) -> Settings:
-    """Return the settings for a preset's values, given in types that JSON knows."""
+    """Return the calibration settings for a preset's values, which have types that JSON can store."""
     plain: dict[str, Any] = {n: values[n] for n in CALIBRATION if n in values}
     if "stages" in plain:
         plain["stages"] = tuple(plain["stages"])
@@ -81,7 +81,7 @@ def settings_from(values: Mapping[str, Any]) -> Settings:
 
 
 def settings_to(settings: Settings) -> dict[str, Any]:
-    """Return all fields that a preset may contain, in types that JSON knows."""
+    """Return all settings that a preset may contain, in types that JSON can store."""
     out = {n: getattr(settings, n) for n in CALIBRATION}
     out["stages"] = list(settings.stages)
     out["photometric"] = {n: getattr(settings.photometric, n) for n in PHOTOMETRIC}
@@ -97,7 +97,7 @@ def check(kind: str, settings: Mapping[str, Any]) -> None:
     _check_names(settings, (*CALIBRATION, "photometric"), "")
     photometric = settings.get("photometric", {})
     if not isinstance(photometric, dict):
-        raise AmiwarpError(f"photometric is {shown(photometric)}; expected an object")
+        raise AmiwarpError(f"field photometric is {shown(photometric)}; expected an object with settings by name")
     _check_names(photometric, PHOTOMETRIC, "photometric.")
     plain = {n: v for n, v in settings.items() if n != "photometric"}
     for name, value in plain.items():
@@ -110,7 +110,8 @@ def check(kind: str, settings: Mapping[str, Any]) -> None:
 def _check_names(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise AmiwarpError(f"field {where}{shown(unknown[0])[1:-1]} is unknown; choose among {', '.join(known)}")
+        field = f"{where}{shown(unknown[0])[1:-1]}"
+        raise AmiwarpError(f"preset field {field} is unknown; choose among {', '.join(known)}")
 
 
 def _check_type(name: str, value: Any, default: Any) -> None:

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 CELL = 8
 """Side of the cells in which events are counted [px]."""
 BIN_US = 1000
-"""Length of the time bins [us]."""
+"""Length of the time bins in which events are counted [us]."""
 LONGEST_US = 3_000_000
-"""Duration from the start of the recording that is analysed [us]."""
+"""Longest duration from the start of the recording that is analysed [us]."""
 FASTEST_BINS = 5
-"""Shortest detectable period [bins]: 12,000 rpm."""
+"""Shortest detectable period of the prism [time bins]: five bins of 1 ms are 12,000 rpm."""
 LEAST_CORRELATION = 0.1
-"""Smallest autocorrelation that counts as a repetition."""
+"""Smallest autocorrelation of event counts at which the events are considered to repeat."""
 ANGLE_BINS, MOST_TURNS = 96, 24
 """Angle bins per turn and largest number of turns for the check of an encoder's scale."""
 
@@ -91,7 +91,10 @@ def _signed_counts(
 
 
 def autocorrelation(counts: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the unbiased autocorrelation over bins, summed over cells: 1 at lag 0, lags up to 3/4 of the length."""
+    """Return the unbiased autocorrelation of event counts, summed over cells.
+
+    It is 1 at lag 0; the lags reach 3/4 of the duration.
+    """
     n = len(counts)
     power = np.zeros(n + 1)
     for part in np.array_split(counts - counts.mean(axis=0), max(1, counts.shape[1] // 512), axis=1):
@@ -125,7 +128,7 @@ def _first_period(correlation: NDArray[np.float64], name: str) -> float:
 
 
 def _peak_near(correlation: NDArray[np.float64], lag: float, reach: float) -> float:
-    """Return the lag of the largest value within ``reach`` bins, refined by a parabola."""
+    """Return the lag of the largest correlation within ``reach`` bins of ``lag``, refined by a parabola."""
     low = max(1, int(np.floor(lag - reach)))
     high = min(len(correlation) - 2, int(np.ceil(lag + reach)))
     k = low + int(np.argmax(correlation[low : high + 1]))

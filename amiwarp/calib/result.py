@@ -37,7 +37,7 @@ VERSION = 1
 NEEDED = ("format", "version", "model", "camera", "prism", "parameters", "sharpness", "zero_us", "photometric",
           "events", "seconds", "warnings", "stages")  # fmt: skip
 OPTIONAL = ("middle_us", "ladder")
-"""Fields that older files lack."""
+"""Fields of the calibration file that files of earlier versions lack."""
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 LENSES: dict[str, type[Distortion]] = {"radial_tangential": RadialTangential, "fisheye": Fisheye}
 SHARPNESS = [kind.value for kind in Sharpness]
@@ -67,27 +67,28 @@ class Calibration:
     model_name: str
     """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
-    """Nominal camera. If ``parameters`` contain a focal length, it replaces that of the camera."""
+    """Nominal camera. If ``parameters`` contain a focal length, it replaces the camera's focal length."""
     prism: Prism
     """Nominal prism. It gives the flat side, and the index if that was not free."""
     parameters: Mapping[str, float]
-    """Parameter values by name, in the units of ``amiwarp.calib.parameters.UNITS``."""
+    """Parameter values by name: angles in rad, ``clock_offset`` in us, ``rpm`` in 1/min, ``focal_length`` in px,
+    ``rate_*`` in rad/s, ``change_*`` in rad/s²."""
     uncertainty: Mapping[str, float]
-    """Standard deviations of free parameters, in the same units."""
+    """Standard deviations of the free parameters by name, in the units of ``parameters``."""
     free: tuple[str, ...]
-    """Names of the free parameters."""
+    """Names of the parameters that the calibration determined."""
     sharpness_name: str
     """Name of the sharpness measure, a value of :class:`amiwarp.Sharpness`."""
     sharpness_before: float
-    """Sharpness of the events as recorded."""
+    """Sharpness of the events before compensation."""
     sharpness_after: float
-    """Sharpness of the compensated events."""
+    """Sharpness of the events after compensation by this calibration."""
     stages: tuple[StageSummary, ...]
-    """Stages of the search, in order."""
+    """Stages of the search (global, local, photometric), in the order in which they ran."""
     events: int
     """Number of events that the last sharpness search used."""
     seconds: float
-    """Total run time, reading included [s]."""
+    """Total run time of the calibration, reading included [s]."""
     warnings: tuple[str, ...] = ()
     """Warnings for the user, one sentence each."""
     zero_us: int | None = None
@@ -97,11 +98,11 @@ class Calibration:
     middle_us: int | None = None
     """Time on the events' clock for which the camera's rates hold [us]; None if its rotation was not free."""
     ladder: ModelChoice | None = None
-    """How the model was chosen; None if the settings named a model."""
+    """Evidence for the choice of the model; None if the settings named a model."""
 
     @property
     def model(self) -> Model:
-        """Calibrated model."""
+        """Optical model with the calibrated parameters."""
         return build_model(self.model_name, self.camera, self.prism, self.parameters)
 
     @property
@@ -193,7 +194,7 @@ class Calibration:
         return out
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the JSON file.
+        """Write the calibration to a JSON file.
 
         Parameters
         ----------
@@ -211,7 +212,7 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:
-        """Read a file that :meth:`save` wrote.
+        """Read a calibration from a JSON file that :meth:`save` wrote.
 
         Parameters
         ----------
@@ -231,7 +232,7 @@ class Calibration:
         data = read_json(path, "a calibration")
         if data.get("format") != FORMAT or data.get("version") != VERSION:
             raise AmiwarpError(
-                f"{path}: is not an {FORMAT} file of version {VERSION}; create one with 'amiwarp calibrate'"
+                f"{path}: not an {FORMAT} file of version {VERSION}; create one with 'amiwarp calibrate'"
             )
         with errors_name(Path(path), lambda: "damaged calibration, calibrate again"):
             return cls._from_json(data)
@@ -264,7 +265,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class _Entry:
-    """One parameter in the file."""
+    """Entry of one parameter in the calibration file."""
 
     value: float
     free: bool
@@ -276,7 +277,7 @@ class _Entry:
 
 @dataclass(frozen=True)
 class _Sharpness:
-    """The sharpness in the file."""
+    """Sharpness values in the calibration file."""
 
     kind: str
     before: float
@@ -298,7 +299,7 @@ class _PlainFields:
 
 
 def _entry(name: str, data: Any) -> _Entry:
-    """Return one parameter of the file. Units are not converted, so any other unit raises :class:`AmiwarpError`."""
+    """Return the entry of one parameter in the file; raise :class:`AmiwarpError` for any unit but the expected one."""
     unit, entry = UNITS[name], build(_Entry, data, f"parameters.{name}")
     if entry.unit != unit:
         raise AmiwarpError(f"field parameters.{name}.unit is {shown(entry.unit)}; expected {unit}")
@@ -338,7 +339,7 @@ def camera_from_json(data: Any, where: str = "") -> Camera:
 
 
 def cost_surface(stages: tuple[StageSummary, ...], size: str) -> NDArray[np.float64]:
-    """Return all samples of a size and a phase: size, phase, score and stage number of each, shape (n, 4)."""
+    """Return all evaluated points in the plane of size and phase: size, phase, score, stage number, shape (n, 4)."""
     rows = [
         (point[size], point["phase"], point["score"], k)
         for k, stage in enumerate(stages)

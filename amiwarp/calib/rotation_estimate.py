@@ -26,15 +26,18 @@ PATCHES = (6, 5)
 SMOOTHING_PX = 2.0
 """Standard deviation of the Gaussian that smooths the correlations [px]."""
 PEAKS = 3
-"""Number of correlation peaks examined per patch."""
+"""Number of correlation peaks examined per image patch."""
 STARTS = 12
-"""Number of hypotheses from which the angular velocity is refined."""
+"""Number of candidate angular velocities from which the estimate is refined."""
 ROLLS = tuple(range(-60, 61, 12))
-"""Rotations about the optical axis that are tried with each peak [1/focal length per turn]."""
+"""Rotations about the optical axis that are combined with each correlation peak [1/focal length per turn]."""
 
 
 def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> tuple[float, float, float]:
-    """Return the camera's mean angular velocity [rad/s] from about two turns of ``events``; zeros from less."""
+    """Return the camera's mean angular velocity [rad/s] from about two turns of events.
+
+    The result is zero for less than 1.25 turns.
+    """
     from scipy.ndimage import map_coordinates
     from scipy.optimize import minimize
     from scipy.spatial.transform import Rotation
@@ -77,7 +80,7 @@ def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> tuple[fl
 
 
 def hypotheses(surfaces: NDArray[np.float64], unit: float) -> list[tuple[float, float, float]]:
-    """Return candidate angular velocities [rad/s]: the correlation peaks of each patch, each with several rolls."""
+    """Return candidate angular velocities [rad/s]: each patch's correlation peaks, combined with several rolls."""
     found = []
     for surface in [surfaces.sum(axis=0), *surfaces]:
         for _ in range(PEAKS):

@@ -1,4 +1,4 @@
-"""Calibration of one model: sharpness stage, photometric stage, and refusal of answers that the events do not support.
+"""Calibration of one model: sharpness stage, photometric stage, and refusal of results that the events do not support.
 
 If no brightness map explains the events, three causes are tried in turn: hot or flickering pixels, a rotating camera,
 and a wrong scale of the encoder.
@@ -29,16 +29,17 @@ if TYPE_CHECKING:
 LEAST_BAD_SHARE = 0.01
 """Share of the events on hot or flickering pixels above which these pixels are masked."""
 LEAST_SHARPNESS_KEPT = 0.7
-"""Share of the gain in sharpness that the photometric answer must keep.
+"""Smallest share of the gain in sharpness that the parameters of the photometric stage must keep.
 
 The true parameters keep 0.93 to 0.99 of the gain, 0.8 with many hot pixels (measured).
 """
 LARGEST_STILL_COST = 0.2
-"""Cost of the photometric stage that a still camera and a correct encoder scale leave at most."""
+"""Largest cost of the photometric stage, relative to that without a brightness map, that a still camera and a correct
+encoder scale leave."""
 LARGEST_COST_RATIO = 0.75
-"""A camera rotation or an encoder scale is accepted if it reduces the cost to this share or less."""
+"""Ratio of the new to the previous cost up to which a camera rotation or a corrected encoder scale is accepted."""
 LEAST_SCALE_ERROR = 0.003
-"""Smallest relative error of an encoder's scale that is reported: three turns measure it to about 0.001."""
+"""Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
 
 
 def calibrate_model(
@@ -81,9 +82,10 @@ def _without_bad_pixels(
     device: Any,
     progress: Progress | None,
 ) -> tuple[Recording, Calibration | AmiwarpError]:
-    """Mask hot and flickering pixels if they have a notable share of the events, and calibrate again.
+    """Mask hot and flickering pixels if they have a notable share of the events, and calibrate without them.
 
-    Return the masked recording and the better of both answers. Raises :class:`AmiwarpError` if most pixels flicker.
+    Return the masked recording and the better of both calibrations. Raises :class:`AmiwarpError` if most pixels
+    flicker.
     """
     source, encoder = recording.events, recording.encoder
     assert encoder is not None
@@ -101,12 +103,12 @@ def _without_bad_pixels(
 
 
 def _accepted(found: Calibration | AmiwarpError) -> bool:
-    """Return whether the photometric stage accepted its answer."""
+    """Return whether the photometric stage accepted its result."""
     return not isinstance(found, AmiwarpError) and found.photometric is not None and found.photometric.accepted
 
 
 def _unexplained(found: Calibration | AmiwarpError) -> bool:
-    """Return whether the answer leaves so much unexplained that the camera may have rotated."""
+    """Return whether the photometric cost of a calibration is so high that the camera may have rotated."""
     if isinstance(found, AmiwarpError):
         return isinstance(found, checks.NoSharpOptimumError)
     return found.photometric is not None and found.photometric.cost > LARGEST_STILL_COST
@@ -119,7 +121,7 @@ def _explain(
     device: Any,
     progress: Progress | None,
 ) -> Calibration | AmiwarpError:
-    """Return the calibration with the camera's rotation free, the error of a wrong encoder scale, or ``found``.
+    """Return the calibration with a free camera rotation, the error of a wrong encoder scale, or ``found`` unchanged.
 
     A slow camera rotation and a wrong encoder scale have similar effects on the events. If the rotation leaves a high
     cost, the cause with the lower cost is taken.
@@ -135,7 +137,7 @@ def _explain(
 
 
 def _cost(found: Calibration | AmiwarpError) -> float:
-    """Return the photometric cost; 1, the cost without any map, if there is none."""
+    """Return the cost of the photometric stage relative to that without a map; 1 if the stage did not run."""
     return 1.0 if isinstance(found, AmiwarpError) or found.photometric is None else found.photometric.cost
 
 
@@ -146,7 +148,7 @@ def _with_other_scale(
     device: Any,
     progress: Progress | None,
 ) -> tuple[float, float] | None:
-    """Return the encoder's turns per period of the events, and the cost with the scale corrected by it.
+    """Return after how many encoder turns events repeat, and the photometric cost with the scale corrected by it.
 
     The events of a still scene repeat every turn of the prism. If they repeat at another encoder angle, the encoder's
     scale may be wrong. None if the corrected scale does not lower the cost enough.
@@ -171,7 +173,7 @@ def _with_rotation(
     device: Any,
     progress: Progress | None,
 ) -> Calibration | AmiwarpError:
-    """Return the calibration with the camera's rotation free if that lowers the cost enough; else ``found``."""
+    """Return the calibration with a free camera rotation if that lowers the photometric cost enough; else ``found``."""
     free = (size_name(settings.model), "phase", "motion")
     moving = _calibration_or_error(recording, replace(settings, free=free), device, progress)
     if isinstance(moving, AmiwarpError) or moving.photometric is None or not moving.photometric.accepted:
@@ -195,7 +197,7 @@ def _with_rotation(
 
 
 def _check_confirmed(found: Calibration, name: str) -> None:
-    """Raise :class:`AmiwarpError` unless the photometric stage accepted its answer.
+    """Raise :class:`AmiwarpError` unless the photometric stage accepted its result.
 
     The answer of sharpness alone may be off by tenths of a pixel.
     """
@@ -203,8 +205,8 @@ def _check_confirmed(found: Calibration, name: str) -> None:
         return
     reasons = [w for w in found.warnings if "photometric" in w]
     raise AmiwarpError(
-        f"{name}: {'; '.join(reasons)}; the answer of sharpness alone may be off by several tenths of a pixel: "
-        "accept it with --stages sharpness, or record a scene that stays still"
+        f"{name}: {'; '.join(reasons)}; the result of the sharpness stage alone may be off by several tenths of "
+        "a pixel: accept it with --stages sharpness, or record a scene that stays still"
     )
 
 
@@ -245,7 +247,7 @@ def _calibrate_once(recording: Recording, settings: Settings, device: Any, progr
 def _photometric_stage(
     recording: Recording, search: Search, result: Calibration, progress: Progress | None
 ) -> Calibration:
-    """Return the answer of the photometric stage, or that of sharpness with a warning that gives the reason."""
+    """Return the photometric stage's result, or the sharpness stage's result with a warning that says why."""
     try:
         found, summary = refine(recording, search, linear_unknowns(search.settings), progress=progress)
     except AmiwarpError as error:

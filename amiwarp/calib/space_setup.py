@@ -33,7 +33,7 @@ _DEFAULT_RANGE = {
     "tilt_x": math.radians(5.0), "tilt_y": math.radians(5.0), "clock_offset": 5000.0, "index": 0.2,
     **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0),
 }  # fmt: skip
-"""Half width of the default bounds about the start, in the parameter's unit."""
+"""Half width of the default bounds of each parameter about its start value, in the parameter's unit."""
 _FULL_PHASE_RANGE = (-math.pi, math.pi)
 
 
@@ -95,7 +95,7 @@ def make_space(
     for name in names:
         low[name], high[name] = bounds.get(name) or _default_bounds(name, values[name], prism)
         if not low[name] < high[name]:
-            raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower first")
+            raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower bound first")
         values[name] = min(max(values[name], low[name]), high[name])
     shifts = _pixels_per_unit(
         model, camera, prism, names=names, values=values, rad_per_us=rad_per_us, duration_us=duration_us
@@ -108,7 +108,7 @@ def make_space(
 
 
 def _ordered_names(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the free parameters' names in the order of the vector; raise for unknown or conflicting ones."""
+    """Return the free parameters' names in the search vector's order; raise for unknown or conflicting names."""
     size = size_name(model)
     wanted = {size if n in ("apex", "deflection") else n for n in free if n != "motion"}
     wanted |= set(RATES if "motion" in free else ())
@@ -130,7 +130,7 @@ def _ordered_names(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
 def _check_given(
     model: str, names: tuple[str, ...], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Raise :class:`AmiwarpError` for a start or bounds that would have no effect."""
+    """Raise :class:`AmiwarpError` for start values that the model lacks and bounds of parameters that are not free."""
     exact = () if model in ("circle", "radial") else _EXACT_ONLY
     known = (size_name(model), "phase", *DRIFTS, *exact, "focal_length", *MOTION)
     for name in start:
@@ -165,7 +165,7 @@ def _pixels_per_unit(
     rad_per_us: float,
     duration_us: float,
 ) -> dict[str, float]:
-    """Return the displacement of events per unit of each free parameter [px rms].
+    """Return how far events move per unit of each free parameter [px rms].
 
     The displacement is differentiated by finite differences over a grid of pixels and prism angles, at the nominal
     size.

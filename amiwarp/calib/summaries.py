@@ -13,22 +13,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class StageSummary:
-    """One stage of the search, as the calibration's file stores it."""
+    """Summary of one stage of the search, as the calibration file stores it."""
 
     name: str
-    """Stage: ``global``, ``local``, ``photometric`` or ``grid``."""
+    """Name of the stage: ``global``, ``local``, ``photometric`` or ``grid``."""
     algorithm: str
-    """Name of the algorithm."""
+    """Name of the search algorithm, such as ``GN_DIRECT_L`` or ``gauss-newton``."""
     evaluations: int
-    """Number of evaluations of the score."""
+    """Number of evaluations of the sharpness or of the photometric score."""
     seconds: float
-    """Run time [s]."""
+    """Run time of the stage [s]."""
     sharpness: float
-    """Score of the stage's answer. Scores of different stages are not comparable: their images differ."""
+    """Score of the best parameters of the stage. Scores of different stages are not comparable, because their images
+    differ."""
     ended: str
-    """Reason why the search ended."""
+    """Reason why the search ended, in words."""
     points: list[dict[str, float]] = field(default_factory=list, repr=False)
-    """Free parameters of every evaluation, each with its ``score``, in order."""
+    """Values of the free parameters at every evaluation, each with its ``score``, in the order of evaluation."""
 
     @classmethod
     def of(cls, name: str, stage: SearchStage, space: ParameterSpace) -> StageSummary:
@@ -63,31 +64,31 @@ class PhotometricSummary:
     """Result of the photometric stage, and whether it is accepted."""
 
     accepted: bool
-    """Whether the result passed all checks."""
+    """Whether the result of the photometric stage passed all checks and is the calibration's result."""
     verdict: str
     """Reason why the result is accepted or rejected, in words."""
     parameters: Mapping[str, float]
-    """The stage's answer, also if it is rejected: values by name, in the parameters' units."""
+    """Parameter values that the stage found, even if they are rejected: by name, in the parameters' units."""
     uncertainty: Mapping[str, float]
     """Standard deviation of each free parameter, in its unit."""
     sharpness_parameters: Mapping[str, float]
-    """Answer of the sharpness stage: values by name, in the parameters' units."""
+    """Parameter values that the sharpness stage found: by name, in the parameters' units."""
     moved_px: float
-    """Distance between the answers of the two stages [px rms]."""
+    """Distance between the results of the sharpness and the photometric stage [px rms]."""
     cost: float
-    """Mean robust residual at the answer, relative to that without a brightness map."""
+    """Mean robust residual at the stage's result, relative to that without a brightness map."""
     cost_at_sharpness: float
-    """Cost at the answer of the sharpness stage, relative to that without a brightness map."""
+    """Mean robust residual at the result of the sharpness stage, relative to that without a brightness map."""
     residual: float
-    """Median magnitude of the residuals [ON thresholds]."""
+    """Median magnitude of the residuals of the brightness equations [ON thresholds]."""
     pairs: int
-    """Number of pairs of events used."""
+    """Number of pairs of successive events of a pixel that were used."""
     off_over_on: float
     """Ratio of the OFF to the ON threshold: estimated if it was free, else taken from the numbers of events."""
     leak: float = 0.0
-    """Drift of a pixel's reference level [thresholds/s]: solved for if it was free, else 0."""
+    """Drift of a pixel's reference level [thresholds/s]: estimated if it was free, else 0."""
     held: tuple[str, ...] = ()
-    """Free parameters that the events do not determine. They keep their start values."""
+    """Free parameters that the events do not determine. They keep the values of the sharpness stage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,13 +96,13 @@ class ModelCandidate:
     """One model that the automatic choice considered, and the evidence for and against it."""
 
     model: str
-    """Name of the model."""
+    """Name of the candidate model."""
     numbers: str
-    """Number of the model's parameters, and which are given."""
+    """Number of the model's free parameters, and the parameters that must be known."""
     predicted_px: float
     """Predicted error: rms distance [px] at the events between the exact model and this model fitted to it."""
     sharpness: float
-    """Sharpness on held-out turns."""
+    """Mean sharpness of the model on held-out turns."""
     loss: float
     """Sharpness of the exact model on held-out turns, minus this model's."""
     loss_std: float
@@ -113,9 +114,9 @@ class ModelCandidate:
     cost_ns: float
     """Measured time for one event's angle, displacement and vote [ns]."""
     chosen: bool
-    """Whether this model was chosen."""
+    """Whether the automatic choice selected this model."""
     verdict: str
-    """Reason for the decision, in words."""
+    """Reason why the model was chosen or not, in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,34 +126,36 @@ class FreedParameter:
     name: str
     """Name of the parameter or the pair: ``clock_offset``, ``tilt``, ``index`` or ``rpm``."""
     freed: bool
-    """Whether it was freed."""
+    """Whether the parameter was freed in a second calibration."""
     determined: bool
-    """Whether the recording determines it."""
+    """Whether the recording determines the parameter."""
     std_px: float | None
-    """Its standard deviation, as displacement of events [px rms]; None if it hardly moves them."""
+    """Standard deviation of the parameter, as displacement of events [px rms]; None if the parameter hardly moves
+    events."""
     gain_px: tuple[float, float] | None
-    """Gain on held-out turns as a displacement, like :attr:`ModelCandidate.seen_px`; None if it was not measured."""
+    """Gain in sharpness on held-out turns with the parameter free, converted to a displacement [px]; None if it was not
+    measured."""
     verdict: str
-    """Reason for the decision, in words."""
+    """Reason why the parameter was freed or not, in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelChoice:
-    """Automatic choice of the model: the candidates and the evidence."""
+    """Result of the automatic choice of the model: the candidates and the evidence."""
 
     budget_px: float
-    """Largest model error that is tolerated [px rms]."""
+    """Largest tolerated error of a smaller model relative to the exact model [px rms]."""
     timing_px: float
     """Estimated blur from encoder noise, clock resolution and latency jitter [px rms]."""
     agreed: bool
-    """Whether prediction and held-out turns agree on the chosen model and on all smaller ones."""
+    """Whether the predicted errors and the held-out turns agree on the chosen model and on all smaller models."""
     exact: Mapping[str, float]
     """Parameters of the exact model, to which the smaller models were fitted: values by name, in their units."""
     exact_uncertainty: Mapping[str, float]
-    """Their standard deviations, in the same units."""
+    """Standard deviations of the exact model's free parameters, in the parameters' units."""
     rungs: tuple[ModelCandidate, ...]
-    """The candidates, from the smallest model to the exact one."""
+    """Candidate models, from the smallest one to the exact model."""
     parameters: tuple[FreedParameter, ...]
-    """Parameters that were considered for freeing."""
+    """Parameters that might have been freed, with the decision for each."""
     seconds: float
     """Time for the choice, without the first calibration of the exact model [s]."""

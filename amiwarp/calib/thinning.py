@@ -32,7 +32,7 @@ def thin(recording: Recording, most: int) -> Events:
 
 
 def _every_run(block: Events, step: int) -> Events:
-    """Return copies of the first of every ``step`` runs, so that the block's memory can be freed."""
+    """Return a copy of every ``step``-th run of :data:`RUN` events, so that the block's memory can be freed."""
     whole = len(block) // (step * RUN) * step * RUN
 
     def pick(values: NDArray[Any]) -> NDArray[Any]:

@@ -19,7 +19,7 @@ def say(message: str) -> None:
 
 
 def fail(code: int, message: str) -> NoReturn:
-    """Print one line on stderr and exit with ``code``."""
+    """Print one line on stderr and exit with the exit code ``code``."""
     # Typer puts each choice of an option on a line of its own.
     say(f"amiwarp: {message.strip().replace(chr(10) + chr(9), ' ')}")
     sys.exit(code)

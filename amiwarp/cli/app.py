@@ -1,4 +1,4 @@
-"""The application: registration of the subcommands, and exit codes for failures."""
+"""Application of the command line: registration of the subcommands, and exit codes for failures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from amiwarp.errors import AmiwarpError
 BAD_INPUT, USAGE = 1, 2
 
 _UsageError: Any = typer.BadParameter.__base__
-"""Click's ``UsageError``. Taken from Typer, because newer versions of Typer carry their own copy of click."""
+"""Class ``UsageError`` of click, taken from Typer, because newer versions of Typer contain their own copy of click."""
 
 
 class _Group(TyperGroup):

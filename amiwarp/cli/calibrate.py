@@ -31,7 +31,7 @@ _SEARCH, _PARAMETERS = "Search", "Parameters"
 
 
 class CalibrationMethod(enum.StrEnum):
-    """Calibration method."""
+    """Method of the calibration: amiwarp's own, or the paper's."""
 
     AMIWARP = "amiwarp"
     PAPER = "paper"
@@ -39,7 +39,7 @@ class CalibrationMethod(enum.StrEnum):
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """Options for the search. Defaults are those of ``amiwarp.Settings``."""
+    """Options for the search of the calibration. Defaults are those of ``amiwarp.Settings``."""
 
     model: Annotated[
         str | None,
@@ -126,7 +126,10 @@ class SearchOptions:
     ] = 0.0
 
     def changes(self, base: PhotometricSettings) -> dict[str, Any]:
-        """Return the fields of the settings that options give. ``base`` holds the other photometric settings."""
+        """Return the fields of the settings that options set.
+
+        ``base`` provides the photometric settings without an option.
+        """
         from amiwarp.brightness.event_pairs import SensorTiming
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
@@ -180,7 +183,7 @@ class ParameterOptions:
     ] = None
 
     def changes(self) -> dict[str, Any]:
-        """Return the fields of the settings that options give.
+        """Return the fields of the settings that options set.
 
         Raises :class:`AmiwarpError` for unknown parameters and values that cannot be read.
         """
@@ -272,11 +275,11 @@ def run(
 def check_paper(search: SearchOptions, parameters: ParameterOptions, preset: Path | None) -> None:
     """Raise :class:`AmiwarpError` if settings other than the start phase are given for the paper's method."""
     if search != SearchOptions() or preset is not None or replace(parameters, start=None) != ParameterOptions():
-        raise AmiwarpError("--method paper accepts no search options except --start phase=…; leave the others out")
+        raise AmiwarpError("--method paper accepts no search options except --start phase=…; remove the other options")
 
 
 def cut(recording: Recording, window: str) -> Recording:
-    """Return the part of the recording in ``window``: ``START:END`` [s from the first event]; both are optional.
+    """Return the part of the recording in a time window: ``START:END`` [s from the first event]; both are optional.
 
     Raises :class:`AmiwarpError` if the text is not a time span, or no event is in it.
     """
@@ -319,7 +322,7 @@ def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
 
 
 def _ladder(ladder: ModelChoice | None) -> list[Any]:
-    """Return the comparison of the models and the check of additional parameters."""
+    """Return a table that compares the models, and the check of additional parameters, as lines of text."""
     if ladder is None:
         return []
     models = [
@@ -349,7 +352,7 @@ def _ladder(ladder: ModelChoice | None) -> list[Any]:
 
 
 def _exact(ladder: ModelChoice) -> list[str]:
-    """Return the apex of the exact model, for a chosen model without an apex."""
+    """Return a line of text with the apex of the exact model, for a chosen model that has no apex parameter."""
     std = ladder.exact_uncertainty.get("apex", 0.0)
     return [f"the exact model's apex: {math.degrees(ladder.exact['apex']):.6g} ± {math.degrees(std):.2g} deg"]
 

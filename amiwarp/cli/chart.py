@@ -72,7 +72,10 @@ def run(
 
 
 def summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
-    """Return the fronts, defaults and chosen settings for JSON. The full tables are in the files."""
+    """Return the Pareto fronts, the default settings and the chosen settings for JSON.
+
+    The full tables are in the files.
+    """
 
     def fields(row: Row) -> dict[str, Any]:
         return {"label": row.label, "job": row.job, "mev_per_s": row.mev_per_s, "ms": row.seconds * 1e3,

@@ -25,7 +25,7 @@ _IWE = "Image of warped events"
 
 @dataclass(frozen=True)
 class IweOptions:
-    """Options for images of warped events (IWE), written during the compensation."""
+    """Options for images of warped events (IWE) that are written during the compensation."""
 
     iwe: Annotated[
         list[Path] | None,

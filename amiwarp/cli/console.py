@@ -1,4 +1,4 @@
-"""Parts that the commands share: choice of the device, progress bar, printed result."""
+"""Functions that all commands use: choice of the device, progress bar, printed result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def choose_device(name: str | None) -> str:
 
 @contextlib.contextmanager
 def _without(line: str) -> Iterator[None]:
-    """Remove one expected line from what native code writes to stderr; print the rest."""
+    """Print what native code writes to stderr, except for one expected line."""
     sys.stderr.flush()
     original = os.dup(2)
     with tempfile.TemporaryFile() as caught:

@@ -16,7 +16,7 @@ from amiwarp.cli.options import OUTPUT_FOLDER, Common
 EXAMPLE = "amiwarp demo --out amiwarp-demo"
 
 OWN_FOLDER = Path("amiwarp-demo")
-"""Default folder. Files of an earlier demo in it are replaced."""
+"""Default folder for the demo's files. Files of an earlier demo in it are replaced."""
 
 
 def run(
@@ -51,7 +51,7 @@ def run(
 
 
 def lines(d: dict[str, Any]) -> list[Any]:
-    """Return the outcome as lines of text."""
+    """Return the results of the demo as lines of text."""
     rows = [
         ("apex", f"{d['apex_deg']:.4f} deg found, {d['apex_true_deg']:.4f} deg true"),
         ("model error", f"{d['model_error_px']:.4f} px rms over image and turn, "

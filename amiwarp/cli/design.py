@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp design --size 640x480 --fov-deg 60 --tolerance-px 0.5 --out amiwarp-design"
 FOV_DEG = 60.0
-"""Horizontal field of view if no option describes the camera [deg]."""
+"""Horizontal field of view that is assumed if no option describes the camera [deg]."""
 _LIMITS, _FAULTS, _PRISM = "Limits", "Faults", "Prism"
 
 
@@ -57,7 +57,7 @@ class GridOptions:
 
 @dataclass(frozen=True)
 class LimitOptions:
-    """Options for the limits that a choice must meet."""
+    """Options for the limits that prism and speed must meet."""
 
     tolerance_px: Annotated[
         float,
@@ -85,7 +85,7 @@ class LimitOptions:
     ] = None
 
     def build(self) -> Limits:
-        """Return the limits of the study."""
+        """Return the limits that the options set for the study."""
         from amiwarp.studies.design import Limits
 
         most = None if self.bandwidth_mev_s is None else self.bandwidth_mev_s * 1e6
@@ -94,7 +94,7 @@ class LimitOptions:
 
 @dataclass(frozen=True)
 class FaultOptions:
-    """Options for the errors of the sensor and the encoder."""
+    """Options for the errors of event times and encoder angles."""
 
     clock_us: Annotated[
         float,

@@ -1,4 +1,4 @@
-"""``amiwarp emulate``: an emulated prism controller behind a serial port that other programs can open."""
+"""``amiwarp emulate``: emulated prism controller behind a serial port that other programs can open."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"
 
 STEP_S = 0.05
-"""Interval between two checks whether to end [s]."""
+"""Interval between two checks whether the emulation shall end [s]."""
 AFTER_S = 1.0
 """Time for which the controller continues after the camera's last event [s]."""
 LATE_US = 100_000
@@ -78,7 +78,7 @@ class ControllerOptions:
     ] = None
 
     def build(self, rotor: Rotor, seed: int) -> Controller:
-        """Return the controller of ``rotor``."""
+        """Return an emulated controller, with the options' settings, that drives ``rotor``."""
         return Controller(
             rotor,
             counts_per_turn=self.counts_per_turn,

@@ -118,7 +118,7 @@ def _camera(recording: Recording) -> dict[str, Any]:
 
 
 def _world(truth: Truth, count: int) -> dict[str, Any] | None:
-    """Return the ground truth that is stored in addition to the parameters, or None."""
+    """Return a description of the ground truth that is stored in addition to the parameters, or None."""
     stores = {"cause": truth.stored_causes, "instance": truth.stored_instances, "depth": truth.stored_depths,
               "place": truth.stored_places}  # fmt: skip
     stored = [name for name, store in stores.items() if store is not None]
@@ -140,7 +140,7 @@ def _world(truth: Truth, count: int) -> dict[str, Any] | None:
 
 
 def _causes(truth: Truth, count: int) -> dict[str, int] | None:
-    """Return the number of events by cause, or None if it is not stored."""
+    """Return the number of events by cause; None if the causes are not stored."""
     if truth.stored_causes is None:
         return None
     totals = np.zeros(256, np.int64)
@@ -150,7 +150,7 @@ def _causes(truth: Truth, count: int) -> dict[str, int] | None:
 
 
 def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the rows about the ground truth of events and of a world."""
+    """Return table rows about the ground truth of events and of a world."""
     rows = []
     if d["causes"] is not None:
         total = max(sum(d["causes"].values()), 1)

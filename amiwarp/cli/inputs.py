@@ -87,7 +87,7 @@ class NominalPrismOptions:
     ] = None
 
     def build(self, known: NominalPrism | None) -> NominalPrism | None:
-        """Return ``known`` with the given options replaced, or None if neither exists.
+        """Return the nominal prism ``known`` with the values that options give; None if neither exists.
 
         The apex stays unknown if neither ``known`` nor the options hold one.
         """
@@ -132,7 +132,7 @@ FORMS = {
     "px": (("px",), "554px"),
     "1": ((), "1.5168"),
 }
-"""For each unit of a parameter: the accepted suffixes and an example for error messages."""
+"""Accepted suffixes of a parameter in each unit, and an example for error messages."""
 
 
 def number(text: str, unit: str, name: str) -> float:
@@ -170,7 +170,7 @@ def _suffix(text: str, unit: str) -> str:
 
 
 def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
-    """Convert values separated by commas. Raises :class:`AmiwarpError` unless there are ``count``."""
+    """Convert ``count`` values separated by commas. Raises :class:`AmiwarpError` for another number of values."""
     try:
         values = tuple(float(word) for word in text.split(","))
     except ValueError:

@@ -67,7 +67,7 @@ class AdaptiveOptions:
     ] = None
 
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
-        """Set the motor's first speed and return the speed control, or None without ``--adaptive``."""
+        """Set the motor's first speed and return the speed control; None without ``--adaptive``."""
         from amiwarp.live.stream.speed_control import SpeedKeeper
 
         if not self.adaptive:
@@ -118,7 +118,7 @@ class OutputOptions:
 
     @property
     def use_stdout(self) -> bool:
-        """Whether packets go to standard output."""
+        """Whether compensated packets go to standard output."""
         return "-" in (self.to, self.raw_to)
 
 
@@ -195,7 +195,7 @@ def run(
 
 
 class _Receivers:
-    """Writers and sinks of a session. ``resources`` closes them at the end."""
+    """Writers and sinks that receive the events of a session. ``resources`` closes them at the end."""
 
     def __init__(
         self, options: OutputOptions, source: Source, found: Calibration, *, offset_us: float,
@@ -220,7 +220,7 @@ class _Receivers:
 
     @property
     def sinks(self) -> tuple[Callable[[Compensated], None], ...]:
-        """Functions that take compensated packets."""
+        """Functions that take compensated packets and send them."""
         return () if self.sink is None else (_send_to(self.sink),)
 
 
@@ -238,7 +238,7 @@ def _session(
 
 
 def _follow(session: Session, stop: threading.Event, line: StatusLine, receivers: _Receivers) -> SessionStatus:
-    """Run the session to its end with its status on ``line``."""
+    """Run the session to its end and show its status on ``line``."""
 
     def update(status: SessionStatus) -> None:
         line.update(status)

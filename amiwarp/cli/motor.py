@@ -17,15 +17,15 @@ from amiwarp.live.link.protocol import FAULTS, STATES
 
 EXAMPLE = "amiwarp motor set --port /dev/ttyACM0 --rpm 720"
 LIMIT_RPM = 3000.0
-"""Default of ``--limit-rpm`` [turns/min]."""
+"""Default of ``--limit-rpm``, the largest accepted speed [turns/min]."""
 WAIT_S = 2.5
-"""Longest wait for the status, which the controller sends once a second, and for its clock [s]."""
+"""Longest wait for the controller's status, which is sent once a second, and for its clock [s]."""
 STEP_S = 0.02
-"""Interval between two readings of the link [s]."""
+"""Interval between two readings of the data that the controller has sent [s]."""
 
 
 class Action(enum.StrEnum):
-    """Action of the command."""
+    """Action of ``amiwarp motor``: print the status, set the speed, or stop."""
 
     STATUS = "status"
     SET = "set"
@@ -50,7 +50,10 @@ def run(
     ] = 500.0,
     limit_rpm: Annotated[
         float,
-        typer.Option(min=0.0, help="Largest speed accepted (turns/min): what the prism, mount and bearing can bear."),
+        typer.Option(
+            min=0.0,
+            help="Largest accepted speed (turns/min): what prism, mount and bearing withstand.",
+        ),
     ] = LIMIT_RPM,
     common: Common,
 ) -> None:
@@ -62,7 +65,8 @@ def run(
         raise AmiwarpError("'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it")
     if rpm is not None and not abs(rpm) <= limit_rpm:
         raise AmiwarpError(
-            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if the prism bears it"
+            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if prism and mount "
+            "withstand it"
         )
     with Link(port) as link:
         messages: list[str] = []
@@ -117,5 +121,5 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _hint(d: dict[str, Any]) -> list[str]:
-    """Return how to stop the motor if it keeps turning."""
+    """Return a line that tells how to stop the motor, if it keeps turning."""
     return [f"the motor keeps turning; to stop it: amiwarp motor stop --port {d['port']}"] if d["target_rpm"] else []

@@ -1,4 +1,4 @@
-"""Groups of options as dataclasses: each group is defined once and used by any number of commands."""
+"""Groups of command line options as dataclasses: each group is defined once and used by any number of commands."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from amiwarp.io import atomic_output as output
 from amiwarp.io.regular_file import check_regular
 
 OUTPUT = "output"
-"""Mark in ``Annotated`` for an option that names a file to write. Paths without a mark are read."""
+"""Mark in ``Annotated`` of an option that names a file to write. Paths without a mark are files to read."""
 OUTPUT_FOLDER = "output folder"
-"""Mark for an option that names a folder to write to. The command itself checks the files in it."""
+"""Mark in ``Annotated`` of an option that names a folder to write to. The command itself checks the files in it."""
 
 NO_FILE = "no file"
-"""Mark for an option with a path that is neither read nor written as a file."""
+"""Mark in ``Annotated`` of an option with a path that is neither read nor written as a file."""
 
 _FORCE = Annotated[
     bool,
@@ -32,7 +32,7 @@ _FORCE = Annotated[
 
 @dataclass(frozen=True)
 class Common:
-    """Options of every command."""
+    """Options that every command has."""
 
     json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.", rich_help_panel="Common")
@@ -87,7 +87,7 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
 
 
 def _paths(values: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
-    """Yield every path among the option values, with the option's name."""
+    """Yield every path among the values of the options, with the option's name."""
     for name, value in values.items():
         for one in value if isinstance(value, list | tuple) else [value]:
             if isinstance(one, Path):

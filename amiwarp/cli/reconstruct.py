@@ -30,7 +30,7 @@ _WINDOW, _PICTURE = "Window", "Picture"
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """Options for the events to use."""
+    """Options for the time window whose events are used."""
 
     start: Annotated[
         float | None,
@@ -64,12 +64,12 @@ class WindowOptions:
     ] = None
 
     def span(self, work: Reconstruction) -> tuple[int, int]:
-        """Return the start and the length of the window [us]."""
+        """Return the start and the length of the time window [us]."""
         start = work.recording.events.t_first + round((self.start or 0.0) * 1e6)
         return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
 
     def camera_rotation(self) -> CameraRotation | None:
-        """Return the camera's rotation, or None if it is not given."""
+        """Return the camera's rotation given by an option, or None."""
         if self.omega is None:
             return None
         x, y, z = numbers(self.omega, 3, "--omega")
@@ -78,7 +78,7 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """Options for the content of the picture."""
+    """Options for the content and the format of the picture."""
 
     fill: Annotated[
         Fill,

@@ -77,7 +77,7 @@ class RigOptions:
     ] = "0,0"
 
     def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
-        """Return the camera. ``default`` is its size [px] if no option gives one."""
+        """Return the camera. ``default`` is the size of its image [px] if no option gives one."""
         width, height = default if self.size is None else parse_size(self.size)
         if self.camera is None:
             return Camera.from_fov(width, height, math.radians(60.0 if self.fov_deg is None else self.fov_deg))
@@ -86,16 +86,16 @@ class RigOptions:
         return read_camera(self.camera, width, height)
 
     def build_prism(self) -> Prism:
-        """Return the true prism."""
+        """Return the prism with its true parameters."""
         return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
 
     def build_nominal(self) -> Prism:
-        """Return the nominal prism that the recording stores."""
+        """Return the nominal prism that is stored with the recording."""
         nominal = self.apex_deg if self.nominal_apex_deg is None else self.nominal_apex_deg
         return replace(self.build_prism(), apex=math.radians(nominal))
 
     def build_motion(self) -> PrismMotion:
-        """Return the prism's speed, phase and tilt."""
+        """Return the prism's motion: speed, phase and tilt."""
         x, y = (math.radians(v) for v in numbers(self.tilt_deg, 2, "--tilt-deg"))
         rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
         return PrismMotion(rpm, math.radians(self.phase_deg), (x, y))
@@ -167,7 +167,7 @@ class SensorOptions:
     )
 
     def build(self) -> SensorModel:
-        """Return the sensor model."""
+        """Return the sensor model that the options describe."""
         from amiwarp.simulation.sensor import SensorModel
 
         if self.ideal and self.sensor is not None:
@@ -198,7 +198,7 @@ class EncoderModelOptions:
     )
 
     def build(self) -> EncoderModel:
-        """Return the encoder model."""
+        """Return the encoder model that the options describe."""
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
         if self.counts_per_turn == 0:
             given["counts_per_turn"] = None

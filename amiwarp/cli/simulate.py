@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
 
 AVERAGE_S = 600.0
-"""Time over which the speed of a simulation is averaged [s]. A time span of a slow world may take minutes."""
+"""Time over which the speed of a simulation is averaged to predict its end [s]. A block of a slow world may take
+minutes."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def run(
 def _scene(
     picture: Path | None, world: WorldOptions, scene: SceneOptions, duration: float, seed: int
 ) -> Scene | WorldScene:
-    """Return the picture or the world."""
+    """Return the scene of the simulation: a picture or a world."""
     from amiwarp.simulation.scene import Scene
 
     if picture is not None:

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
 SEEDS, QUICK_SEEDS = 20, 1
-"""Recordings per value of an axis, by default and with ``--quick``."""
+"""Number of recordings per value of an axis, by default and with ``--quick``."""
 QUICK_MINUTES = 9.0
-"""Time limit of ``--quick`` [min]."""
+"""Time limit of a run with ``--quick`` [min]."""
 
 
 def run(
@@ -82,7 +82,7 @@ def run(
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
     make_folder(cells_in)
-    earlier = any(cells_in.iterdir())  # the figures in this folder belong to these cells and may be replaced
+    earlier = any(cells_in.iterdir())  # existing figures were drawn from the cells in this folder and may be replaced
     began = time.perf_counter()
     new = left = 0
     if redraw:
@@ -127,7 +127,7 @@ def _run(
     axes: Sequence[Axis], seeds: int, methods: Sequence[Method], folder: Path, device: str, scheduler: str | None,
     minutes: float | None, first: int,
 ) -> tuple[list[Stored], int]:  # fmt: skip
-    """Run all missing cells. Return all cells and the number of new ones."""
+    """Run all missing cells (single recordings). Return all cells and the number of new cells."""
     from amiwarp.studies.stability import run
 
     end = None if minutes is None else time.monotonic() + 60.0 * minutes
@@ -155,7 +155,7 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
     Raises :class:`AmiwarpError` if Dask is not installed, the scheduler does not answer, or workers die.
     """
     try:
-        distributed: Any = importlib.import_module("distributed")  # has no type hints
+        distributed: Any = importlib.import_module("distributed")  # distributed has no type hints
     except ModuleNotFoundError as error:
         raise AmiwarpError("'amiwarp stability' needs Dask; run: pip install 'amiwarp[cluster]'") from error
     with contextlib.ExitStack() as stack:
@@ -168,7 +168,7 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
         try:
             client = stack.enter_context(distributed.Client(where, timeout=20))
         except (OSError, ValueError) as error:
-            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); "
+            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers at this address ({error}); "
                                "start one with: dask scheduler") from error  # fmt: skip
         client.register_worker_callbacks(functools.partial(_prepare, device, scheduler is None))
         try:
@@ -179,7 +179,7 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
 
 
 def _prepare(device: str, local: bool) -> None:
-    """Prepare a worker: silence Warp; a local worker leaves Ctrl-C to its parent process."""
+    """Prepare a worker: silence Warp. A local worker also leaves Ctrl-C to its parent process."""
     if local:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     choose_device(device)

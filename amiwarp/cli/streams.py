@@ -1,4 +1,4 @@
-"""Parts that ``record`` and ``live`` share: source, link to the controller, status line, end of a session."""
+"""Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ class SourceOptions:
     ] = 0.0
 
     def open(self, spec: str, say: Callable[[str], None]) -> Source:
-        """Open the source named ``spec``. ``say`` gets its messages."""
+        """Open the source named ``spec``. ``say`` is called with its messages."""
         from amiwarp.live.stream.source_opening import open_source
 
         return open_source(spec, pace=None if self.fast else 1.0, wait_s=self.wait_for_source, say=say)
 
     @contextlib.contextmanager
     def link(self) -> Iterator[Link | None]:
-        """Open the link to the controller for the duration of the context; None if no port is given."""
+        """Open the link to the controller while the ``with`` block runs; None if no port is given."""
         if self.port is None:
             yield None
             return
@@ -81,7 +81,7 @@ class SourceOptions:
 
 @contextlib.contextmanager
 def stopped_by_interrupt(stop: threading.Event) -> Iterator[None]:
-    """Let SIGINT (Ctrl-C) and SIGTERM set ``stop``; a second signal raises KeyboardInterrupt."""
+    """Let SIGINT (Ctrl-C) and SIGTERM set ``stop`` in a ``with`` block; a second signal raises KeyboardInterrupt."""
 
     def interrupted(number: int, frame: Any) -> None:
         if stop.is_set():
@@ -104,7 +104,7 @@ class StatusLine:
         self._console = Console(stderr=True, highlight=False)
         self._live = Live(console=self._console, refresh_per_second=5, transient=True)
         self.messages: deque[str] = deque(maxlen=1000)
-        """The most recent messages."""
+        """Most recent messages that were printed."""
 
     def __enter__(self) -> StatusLine:
         if self._console.is_terminal:
@@ -162,7 +162,7 @@ def check_angles(source: Source, link: Link | None) -> None:
 
 
 def check_whole(source: Source, status: SessionStatus) -> None:
-    """Raise :class:`AmiwarpError` if the stream broke off. To be called after the files are complete."""
+    """Raise :class:`AmiwarpError` if the stream broke off. Call this function after the files are complete."""
     problem = getattr(source, "problem", None)
     if problem is None:
         return

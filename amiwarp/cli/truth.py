@@ -1,4 +1,4 @@
-"""``amiwarp truth``: the ground truth of a simulated world in the files of other data sets."""
+"""``amiwarp truth``: export of the ground truth of a simulated world to the file formats of other data sets."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def run(
     source = open_recording(recording)
     truth = source.truth
     if truth is None or (truth.frames is None and truth.poses is None):
-        raise AmiwarpError(f"{recording}: holds no ground truth of a world; simulate one with --world")
+        raise AmiwarpError(f"{recording}: holds no ground truth of a world; simulate a recording with --world")
     if flow is not None and truth.frames is None:
-        raise AmiwarpError(f"{recording}: holds no ground truth of instants; simulate it with --truth-hz")
+        raise AmiwarpError(f"{recording}: holds no ground truth of instants; simulate the recording with --truth-hz")
     make_folder(out)
     data: dict[str, Any] = {"folder": str(out), "flow_maps": 0, "pose_files": 0}
     with progress("writing flow") as advance:
@@ -73,7 +73,7 @@ def run(
 def _save_poses(folder: Path, truth: Truth) -> int:
     """Write the poses of the camera and of each moving body; return the number of files."""
     if truth.poses is None:
-        raise AmiwarpError("the recording holds no poses; simulate it with --world")
+        raise AmiwarpError("the recording holds no poses; simulate a recording with --world")
     make_folder(folder)
     save_poses_tum(folder / "camera.txt", truth.poses)
     names: dict[str, str] = {}

@@ -29,12 +29,12 @@ EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
 _PICTURE, _SERVER = "Picture", "Server"
 LEAST_PX, MOST_PX = 100, 8000
-"""Smallest and largest side of a picture [px]."""
+"""Smallest and largest width or height of a screenshot [px]."""
 
 
 @dataclass(frozen=True)
 class ScreenshotOptions:
-    """Options for a picture that is written instead of opening the page."""
+    """Options for a screenshot that is written instead of opening the page."""
 
     screenshot: Annotated[
         Path | None,
@@ -101,9 +101,9 @@ class StreamOptions:
 
     @contextlib.contextmanager
     def follow(self, source: str) -> Iterator[Callable[[], Recording] | None]:
-        """Follow the stream; yield a function that returns its last seconds. Without ``--live`` yield None.
+        """Follow the stream while the ``with`` block runs; yield a function that returns its last seconds.
 
-        Waits until the stream holds one turn of the prism.
+        Without ``--live`` None is yielded. Waits until the stream holds one turn of the prism.
         """
         if not self.live:
             yield None
@@ -167,7 +167,7 @@ class PageOptions:
 
 @dataclass(frozen=True)
 class StartOptions:
-    """Options for what the page shows first."""
+    """Options for the parameters and the time window that the page shows first."""
 
     calibration: Annotated[Path | None, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")] = None
     window: Annotated[
@@ -183,7 +183,7 @@ class StartOptions:
     ] = None
 
     def build(self, recording: Recording, device: str, latest: Callable[[], Recording] | None) -> Inspector:
-        """Return an inspector of the recording. ``latest`` returns the present end of a stream."""
+        """Return an inspector of the recording. ``latest`` returns the latest events of a stream."""
         from amiwarp.calib import Calibration
         from amiwarp.viewer.inspector import Inspector
 
@@ -232,7 +232,7 @@ def run(
             opened = open_recording(recording) if latest is None else latest()
             return start.build(complete(opened, camera, prism), device, latest)
 
-        waiting = [new_inspector()]  # reports bad input before the page opens
+        waiting = [new_inspector()]  # made before the page opens, so that bad input is reported now
         if picture.screenshot is not None:
             data = {**picture.write(waiting[0], picture.screenshot), "device": device}
             report(common, data, _lines(data))

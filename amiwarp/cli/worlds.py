@@ -1,4 +1,4 @@
-"""Options for simulated worlds: the world, the camera's way through it, what is recorded and drawn."""
+"""Options for simulated worlds: the world, the camera's trajectory in it, and the ground truth to record and draw."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 _WORLD = "World"
 WORLD_FILES = (".toml", ".json")
-"""Endings of world files."""
+"""File suffixes of world files."""
 POSE_FILES = (".txt", ".csv", ".tum")
-"""Endings of files of poses."""
+"""File suffixes of files with poses."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,14 @@ class WorldOptions:
         if self.world is None:
             for name, value in given.items():
                 if value is not None:
-                    raise AmiwarpError(f"{name} applies to a world; give --world, or leave it out")
+                    raise AmiwarpError(f"{name} applies to a world; give --world, or remove {name}")
         if self.motion_px is not None and self.seeing is Seeing.RAYS:
-            raise AmiwarpError("--motion-px applies to maps; give --seeing maps, or leave it out")
+            raise AmiwarpError("--motion-px applies to maps; give --seeing maps, or remove --motion-px")
         if self.preview is not None and self.preview.suffix.lower() != ".png":
             raise AmiwarpError(f"{self.preview}: a preview is a PNG file; give a name that ends in .png")
 
     def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
-        """Return the world and the camera's trajectory. ``blur``: of the optics [px]."""
+        """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""
         from amiwarp.simulation.worlds.world_scene import WorldScene
 
         world, trajectory = self._load(duration_s, seed)
@@ -134,7 +134,7 @@ class WorldOptions:
         return world, chosen
 
     def draw_preview(self, simulation: Simulation) -> None:
-        """Write the preview, if one is wanted."""
+        """Write the preview figure if an option asks for it."""
         if self.preview is None:
             return
         from amiwarp.plotting.world_preview import draw_preview

@@ -1,4 +1,4 @@
-"""Batches of a stream's events on their way through a device: copied together, compensated, fetched, voted."""
+"""Batches of a stream's events on a device: packets are joined, compensated, fetched and voted into an image."""
 
 from __future__ import annotations
 
@@ -31,20 +31,21 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 ROUNDS = 4
-"""Number of batches that the buffers hold: the votes of earlier batches may still be pending."""
+"""Number of batches for which the buffers have room, because the votes of earlier batches may still be pending."""
 LEAST_VOTED = 1 << 16
-"""Number of pending events from which they are voted into the image."""
+"""Number of pending events at which they are voted into the image."""
 LEAST_PARALLEL = 4096
-"""Number of blocks from which several CPU threads are used."""
+"""Number of blocks of events from which several CPU threads compensate them."""
 LEAST_DIRECT = 1 << 16
-"""Number of events from which a GPU writes its results to the arrays that are handed out, not to the buffers."""
+"""Number of events from which a GPU writes its results directly to the arrays that the caller gets, not to the buffers.
+"""
 RESULTS = ("out_x", "out_y", "inside")
-"""Columns of results."""
+"""Names of the columns that the kernel writes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StagedBatch:
-    """A batch whose packets are being copied to positions ``at`` to ``end`` of the buffers."""
+    """Batch whose packets are being copied to the positions ``at`` to ``end`` of the buffers."""
 
     parts: list[Events]
     at: int
@@ -53,36 +54,37 @@ class StagedBatch:
     p: NDArray[np.uint8]
     arrived_us: int
     pooled_t: PooledArray | None
-    """Array that holds the times; None if they are in the buffers."""
+    """Array for the events' times that the caller will get; None if the times stay in the buffers."""
     wait: Callable[[], ColumnCheck]
-    """Wait until the packets are copied, and return what was found."""
+    """Function that waits until the packets are copied, and returns the properties found while copying."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BatchInFlight:
-    """A batch that a device works on: positions ``at`` to ``end`` of the buffers."""
+    """Batch that a device works on, at the positions ``at`` to ``end`` of the buffers."""
 
     at: int
     end: int
     t: NDArray[np.int64]
     p: NDArray[np.uint8]
     unknown: int
-    """Number of events at its beginning without a prism angle."""
+    """Number of events at the start of the batch that have no prism angle."""
     arrived_us: int
     out: list[NDArray[Any]] | None
-    """Arrays to which a GPU writes x, y and the inside flag; None for the buffers."""
+    """Arrays to which a GPU writes x, y and the inside flag; None if it writes to the buffers."""
     done: Any
-    """A ``wp.Event`` on CUDA, else None."""
+    """Event that marks the end of the device's work (``wp.Event``) on CUDA, else None."""
 
 
 class BatchPipeline:
-    """Buffers for the compensation of a stream, allocated once, and the steps of a batch. For one thread.
+    """Buffers for the compensation of a stream, allocated once, and the steps of a batch.
 
-    A batch is staged (:meth:`stage`), submitted to the device (:meth:`submit`) and fetched (:meth:`finish`).
+    A batch is staged (:meth:`stage`), submitted to the device (:meth:`submit`) and fetched (:meth:`finish`). Use one
+    pipeline from one thread only.
     """
 
     def __init__(self, model: Model, batch: int, device: Any) -> None:
-        """``batch``: largest number of events per batch."""
+        """Allocate the buffers for batches of at most ``batch`` events."""
         self._device, self._at = device, 0
         self._encoder: Any = None
         self._unvoted: list[tuple[int, int]] = []  # ranges of the buffers
@@ -102,7 +104,7 @@ class BatchPipeline:
         self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
         self._recorded: dict[bool, RecordedLaunch] = {}
         self._pool = PinnedPool(batch)
-        self._copiers = [PacketCopier(), PacketCopier()]  # one may still copy the batch before
+        self._copiers = [PacketCopier(), PacketCopier()]  # two, because the first may still copy the previous batch
         self._votes = Votes(CanvasShape(*self._plan.size), device)
         self._vote_range = self._votes.range_voter(columns.out_x, columns.out_y, self._layer)
         if device.is_cuda and batch > LEAST_DIRECT:
@@ -112,7 +114,7 @@ class BatchPipeline:
     def set_encoder(self, encoder: Encoder, first: int, last: int) -> None:
         """Copy the encoder's pieces over a span of event times [us] to the device.
 
-        They go into one bucket, in which the kernel searches, because they are few.
+        All pieces go into one bucket, which the kernel searches for an event's piece, because they are few.
         """
         origin, *pieces = encoder_pieces(encoder, first, last)
         n, p = len(pieces[0]), self._encoder
@@ -134,7 +136,7 @@ class BatchPipeline:
             command.set(3, p)
 
     def stage(self, parts: list[Events], arrived_us: int) -> StagedBatch:
-        """Start to copy packets into the buffers, by several threads if they are long."""
+        """Start to copy packets into the buffers; long packets are copied by several threads."""
         n, several = sum(part.t.size for part in parts), len(parts) > 1
         at, end = self._reserve(n)
         direct, p = self._device.is_cuda and n > LEAST_DIRECT, parts[0].p
@@ -146,13 +148,13 @@ class BatchPipeline:
         if several or n > PIECE:
             self._copiers.reverse()
             wait = self._copiers[0](parts, n, [address(column) for column in to], with_p=several).wait
-        else:  # the fastest way for a single short packet
+        else:  # a single short packet is copied fastest without threads
             to[0][:], to[1][:], to[2][:] = parts[0].x, parts[0].y, parts[0].t
             wait = partial(ColumnCheck, bool((t[1:] < t[:-1]).any()), int(to[0].max()), int(to[1].max()))
         return StagedBatch(parts=parts, at=at, end=end, t=t, p=p, arrived_us=arrived_us, pooled_t=pooled_t, wait=wait)
 
     def _reserve(self, n: int) -> tuple[int, int]:
-        """Return start and end of a free range of the buffers; wait for votes that still use it."""
+        """Return start and end of a free range of ``n`` events of the buffers; wait for votes that still use it."""
         padded = self._plan.padded(n)
         if self._at + padded > self._room:
             self._at = 0
@@ -164,7 +166,7 @@ class BatchPipeline:
         return at, at + n
 
     def submit(self, staged: StagedBatch, unknown: int) -> BatchInFlight:
-        """Send a batch to the device; its first ``unknown`` events get no coordinates.
+        """Send a batch to the device; its first ``unknown`` events have no prism angle and get no coordinates.
 
         Raises :class:`AmiwarpError` if a packet is not sorted.
         """
@@ -172,7 +174,7 @@ class BatchPipeline:
         at, end, n = s.at, s.end, s.end - s.at
         if check.unsorted:
             raise AmiwarpError(
-                f"events of {s.parts[0].t[0]} to {s.parts[-1].t[-1]} us are not sorted; sort each packet"
+                f"events of {s.parts[0].t[0]} to {s.parts[-1].t[-1]} us are not sorted; sort each packet by time"
             )
         if self._device.is_cuda:
             self._copy(self._columns, self._host_columns, ("x", "y") if s.pooled_t else ("x", "y", "t"), at, end)
@@ -197,7 +199,7 @@ class BatchPipeline:
         return BatchInFlight(at=at, end=end, t=t, p=s.p, unknown=unknown, arrived_us=s.arrived_us, out=out, done=done)
 
     def finish(self, in_flight: BatchInFlight) -> list[NDArray[Any]]:
-        """Wait for a batch; return x, y [px], and 1 for each event outside the image."""
+        """Wait for a batch; return its x and y [px], and 1 for each event outside the image."""
         if in_flight.done is not None:
             wp.synchronize_event(in_flight.done)
         if in_flight.out is None:
@@ -207,7 +209,7 @@ class BatchPipeline:
         return [x, y, np.bitwise_xor(inside, np.uint8(1), out=inside)]
 
     def _copy_back(self, at: int, end: int, direct: bool) -> list[NDArray[Any]] | None:
-        """Start to copy results from a GPU: to the buffers, or, if ``direct``, to arrays that are handed out."""
+        """Start to copy results from a GPU: to the buffers, or, if ``direct`` is given, to arrays for the caller."""
         if not direct:
             self._copy(self._host_columns, self._columns, RESULTS, at, end)
             return None
@@ -232,7 +234,7 @@ class BatchPipeline:
         command(first, blocks)
 
     def _invalidate(self, start: int, stop: int) -> None:
-        """Set coordinates to NaN."""
+        """Set the coordinates of a range of events to NaN."""
         if start >= stop:
             return
         for name in ("out_x", "out_y"):
@@ -266,7 +268,7 @@ class BatchPipeline:
 
 
 def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Join ranges that follow one another."""
+    """Join index ranges that follow one another."""
     out: list[tuple[int, int]] = []
     for start, stop in ranges:
         if out and out[-1][1] == start:

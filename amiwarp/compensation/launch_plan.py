@@ -1,4 +1,4 @@
-"""The compensation kernel and its launch arguments."""
+"""Choice of the compensation kernel, and its launch arguments."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ class LaunchPlan:
     """Kernel and arguments that compensate events by one model on one device."""
 
     def __init__(self, model: Model, device: Any) -> None:
-        """Load the kernel here, so that threads do not each try. ``device``: a ``wp.Device``."""
+        """Load the kernel, so that threads that use the plan do not each try to. ``device``: a ``wp.Device``."""
         name = str(device)
         self.size = model.camera.width, model.camera.height
         """Sensor width and height [px]."""
         self.kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
         self.block = int(kernels.BLOCK) if device.is_cpu else 1
-        """Events per thread of the kernel; columns are padded to a multiple of it."""
+        """Number of events per thread of the kernel; columns are padded to a multiple of this number."""
         self._camera = camera_params(model.camera, name)
         self._pinhole = pinhole_params(model.camera) or self._camera
         self._model, self._limits, self._azimuths = model.params(name), wp.vec2(*self.size), azimuths(name)
         load(self.kernel, device)
 
     def padded(self, n: int) -> int:
-        """Return the length of a column for ``n`` events."""
+        """Return the padded length of a column of ``n`` events."""
         return -(-n // self.block) * self.block
 
     def any_outside(self, max_x: int, max_y: int) -> bool:
-        """Return whether events with these largest coordinates [px] reach outside the sensor."""
+        """Return whether any event can lie outside the sensor, given the largest coordinates of the events [px]."""
         return max_x >= self.size[0] or max_y >= self.size[1]
 
     def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:
         """Return the kernel's inputs, except the first block.
 
-        ``encoder``: ``EncoderParams``. ``columns``: ``Columns``. ``outside``: whether pixels may lie outside the
-        sensor. If not, the pinhole camera is used where the lens has no distortion: its kernel is faster, but reads
+        ``encoder``: ``EncoderParams``. ``columns``: ``Columns``. ``outside``: whether events may lie outside the
+        sensor. If none does and the lens has no distortion, the faster kernel for a pinhole camera is used, which reads
         the ellipse model's per-pixel table without a bounds check.
         """
         camera = self._camera if outside else self._pinhole

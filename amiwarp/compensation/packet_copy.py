@@ -16,42 +16,43 @@ from amiwarp.kernels.launch import RecordedLaunch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
 
 PIECE = 1 << 17
-"""Number of events from which several threads copy a batch, and largest number of events per row of the table."""
+"""Number of events from which several threads copy a batch, and largest number of events per row of the table of
+copies."""
 THREADS = 2
-"""Threads that copy a long batch together with the calling thread."""
+"""Number of threads that copy a long batch together with the calling thread."""
 CALLER_SHARE = 8
-"""The calling thread copies one packet in this many.
+"""Share of the packets that the calling thread copies: one packet in eight.
 
-While its native code runs, the other threads can take Python's lock and start. Without a share of its own, the caller
-would keep the lock, and the threads would only start once the caller waits for them.
+While its native code runs, the other threads can take Python's lock and start. Without packets to copy, the caller
+would keep the lock, and the threads would start only once the caller waits for them.
 """
 WIDTHS = (2, 2, 8, 1)
 """Bytes per event of x, y, t and p."""
 
 
 class ColumnCheck(NamedTuple):
-    """Properties of copied packets that the copy finds in passing."""
+    """Properties of packets that are found while they are copied."""
 
     unsorted: bool
-    """Whether the times of any packet decrease."""
+    """Whether the times decrease within any packet."""
     max_x: int
-    """Largest x [px]."""
+    """Largest x of all events [px]."""
     max_y: int
-    """Largest y [px]."""
+    """Largest y of all events [px]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CopyInProgress:
-    """A copy on which threads work."""
+    """Copy of packets on which threads are working."""
 
     jobs: list[Future[None]]
     found: NDArray[np.int32]
-    """Results of the threads, shape (packets, 3): unsorted, largest x, largest y."""
+    """Results of the threads for each packet, shape (packets, 3): whether unsorted, largest x, largest y [px]."""
     sources: list[Pointers]
-    """Keep the packets' memory alive: the threads only have addresses."""
+    """References that keep the packets' memory alive, because the threads only have addresses."""
 
     def wait(self) -> ColumnCheck:
-        """Wait for the copy and return what it found."""
+        """Wait until all packets are copied, and return their properties."""
         for job in self.jobs:
             job.result()
         unsorted, max_x, max_y = self.found.max(axis=0).tolist()
@@ -59,15 +60,15 @@ class CopyInProgress:
 
 
 class PacketCopier:
-    """Copier of many packets by several threads, see :mod:`amiwarp.kernels.packet_copy`. One copy at a time."""
+    """Copies many packets by several threads, see :mod:`amiwarp.kernels.packet_copy`. One copy at a time."""
 
     def __init__(self, find_pointers: FindPointers | None = None) -> None:
-        """``find_pointers``: see :mod:`amiwarp.compensation.pointers`; by default the fastest that works."""
+        """Set the function that finds the arrays' memory, see :mod:`amiwarp.compensation.pointers`."""
         self._find_pointers = find_pointers or fastest()
         self._allocate(64)
 
     def _allocate(self, rows: int) -> None:
-        """Allocate the table of packets with ``rows`` rows."""
+        """Allocate a table of copies with ``rows`` rows."""
         table, found = (
             wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu"),
             wp.zeros(rows * FOUND, dtype=int, device="cpu"),
@@ -76,9 +77,9 @@ class PacketCopier:
         self._commands = [RecordedLaunch(gather_parts, [table, found], [], device="cpu") for _ in range(1 + THREADS)]
 
     def __call__(self, parts: list[Events], n: int, to: list[int], *, with_p: bool) -> CopyInProgress:
-        """Start to copy all ``n`` events of ``parts`` to the addresses ``to`` of x, y, t and p (only if ``with_p``).
+        """Start to copy all ``n`` events of ``parts`` to the addresses ``to`` of the columns x, y, t and p.
 
-        Call ``wait`` of the result before the next copy.
+        Polarities (p) are copied only if ``with_p`` is true. Call ``wait`` of the result before the next copy.
         """
         follows: Any = 0  # whether a row's first event directly follows the last of the row before in memory
         counts = np.array([part.t.size for part in parts])
@@ -98,7 +99,7 @@ class PacketCopier:
         return CopyInProgress(self._run(len(parts), THREADS if n > PIECE else 0), self._found[: len(parts)], sources)
 
     def _run(self, rows: int, threads: int) -> list[Future[None]]:
-        """Copy the caller's share, while the other threads start on theirs."""
+        """Copy the calling thread's share of the packets, while background threads start to copy their shares."""
         ours = rows // CALLER_SHARE if threads else rows
         edges = [0, *(ours + (rows - ours) * k // max(threads, 1) for k in range(threads + 1))]
 
@@ -111,12 +112,12 @@ class PacketCopier:
 
 
 def _cut(parts: list[Events]) -> tuple[list[Events], list[int]]:
-    """Cut parts into pieces of at most :data:`PIECE`; 1 for each piece that continues the one before."""
+    """Cut packets into pieces of at most :data:`PIECE` events; return also 1 for each piece that continues a packet."""
     whole = [Events(*_contiguous([part.x, part.y, part.t, part.p])) for part in parts]
     cut = [(part[k : k + PIECE], int(k > 0)) for part in whole for k in range(0, len(part), PIECE)]
     return [piece for piece, _ in cut], [follows for _, follows in cut]
 
 
 def _contiguous(columns: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Copy the columns that have gaps in memory."""
+    """Replace columns that have gaps in memory by contiguous copies."""
     return [column if column.flags.c_contiguous else np.ascontiguousarray(column) for column in columns]

@@ -26,12 +26,12 @@ HEAD = object.__basicsize__
 
 @dataclass(frozen=True, slots=True)
 class Pointers:
-    """Pointers to the values of some arrays, in memory that native code can read."""
+    """Pointers to the values of several arrays, in memory that native code can read."""
 
     at: NDArray[np.uint64]
-    """Address of each pointer, shape ``(n,)``."""
+    """Address at which each pointer is stored, shape ``(n,)``."""
     owners: object
-    """Objects that own the pointers and the values. Keep them until native code has finished."""
+    """Objects that own the pointers and the values. Keep these objects until native code has finished."""
 
 
 FindPointers: TypeAlias = Callable[[list[NDArray[Any]]], Pointers]
@@ -43,7 +43,7 @@ def address(array: NDArray[Any]) -> int:
 
 
 def listed_pointers(arrays: list[NDArray[Any]]) -> Pointers:
-    """Return copies of the pointers in a new array, read through NumPy's public interface."""
+    """Return copies of the arrays' pointers in a new array, read through NumPy's public interface."""
     values = np.array([address(array) for array in arrays], np.uint64)
     return Pointers(
         np.uint64(address(values)) + np.uint64(8) * np.arange(len(arrays), dtype=np.uint64), (values, arrays)
@@ -51,9 +51,9 @@ def listed_pointers(arrays: list[NDArray[Any]]) -> Pointers:
 
 
 def pointers_in_place(arrays: list[NDArray[Any]]) -> Pointers:
-    """Return the addresses at which NumPy's array objects store their pointers to the values.
+    """Return the addresses at which NumPy's array objects store the pointers to their values.
 
-    Nothing is copied. Use it only if :func:`layout_is_known`.
+    Nothing is copied. Use this function only if :func:`layout_is_known` returns True.
     """
     return Pointers(np.array(list(map(id, arrays)), np.uint64) + np.uint64(HEAD), arrays)
 
@@ -66,5 +66,5 @@ def layout_is_known() -> bool:
 
 
 def fastest() -> FindPointers:
-    """Return the fastest function that works with this NumPy."""
+    """Return :func:`pointers_in_place` if it works with the installed NumPy, else :func:`listed_pointers`."""
     return pointers_in_place if layout_is_known() else listed_pointers

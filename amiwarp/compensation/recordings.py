@@ -36,14 +36,14 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 DEFAULT_BLOCK = 1 << 20
-"""Number of events per block if the caller gives no size."""
+"""Number of events per block if the caller does not give one."""
 PIECE = 2 * CHUNK
-"""Number of events per thread and piece, from file to file: few enough to stay in the core's cache."""
+"""Number of events that a thread reads, compensates and writes at a time: few enough to stay in the core's cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompensationSummary:
-    """Result of a compensation.
+    """Summary of the compensation of a recording.
 
     Examples
     --------
@@ -56,11 +56,11 @@ class CompensationSummary:
     outside: int
     """Number of events outside the image or without coordinates (NaN). They are kept and marked."""
     seconds: float
-    """Duration, including reading and writing [s]."""
+    """Duration of the compensation, including reading and writing [s]."""
 
     @property
     def mev_per_s(self) -> float:
-        """Million events per second."""
+        """Speed of the compensation [million events/s]."""
         return self.events / max(self.seconds, 1e-9) / 1e6
 
 
@@ -68,7 +68,7 @@ class BlockCompensator:
     """Compensation of blocks of events by one model and one encoder on a device. Any thread may call it."""
 
     def __init__(self, model: Model, encoder: Encoder, t_first: int, t_last: int, device: Any) -> None:
-        """Copy model and encoder to the device.
+        """Copy the model, and the encoder's samples for a span of event times, to the device.
 
         Raises :class:`AmiwarpError` if the encoder does not cover the times ``t_first`` .. ``t_last`` [us].
         """
@@ -79,7 +79,7 @@ class BlockCompensator:
         self._one_thread = contextlib.nullcontext() if self._device.is_cpu else threading.Lock()
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
-        """Return the compensated events (NaN for no coordinates), and 1 for each inside the image, shape ``(n,)``."""
+        """Return compensated events (NaN without coordinates), and 1 for each inside the image, shape ``(n,)``."""
         check_sensor(events)
         if not len(events):
             return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
@@ -105,14 +105,14 @@ class BlockCompensator:
 
 
 def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
-    """Return a padded column on the device, on CPUs without a copy if possible."""
+    """Return values as a padded column on the device; on CPUs without a copy if possible."""
     if len(values) < padded:
         values = np.concatenate([values, np.zeros(padded - len(values), values.dtype)])
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
 
 
 def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = "cpu") -> NDArray[np.float32]:
-    """Compensate events.
+    """Compensate events in memory: return their positions without the prism.
 
     Parameters
     ----------
@@ -158,7 +158,10 @@ def inside_image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np
 def compensated_blocks(
     recording: Recording, model: Model, encoder: Encoder, *, device: Any = "cpu", **blocks: int
 ) -> Iterator[Events]:
-    """Yield all events of the recording in order, compensated, in blocks of ``count=`` events or ``duration_us=``."""
+    """Yield all events of the recording in order, compensated.
+
+    ``blocks`` gives the block size: ``count=`` events or ``duration_us=``.
+    """
     source = recording.events
     if not len(source):
         return
@@ -257,7 +260,10 @@ def compensate(
 def compensated_pieces(
     source: EventSource, compensator: BlockCompensator
 ) -> Iterator[Callable[[], tuple[Events, NDArray[np.uint8]]]]:
-    """Yield functions that return compensated pieces of the recording. Threads read native files in parallel."""
+    """Yield functions that each return one compensated piece of the recording.
+
+    Threads may call them in parallel; pieces of native files are then read in parallel too.
+    """
     if isinstance(source, NativeEvents):
         for read in source.pieces(PIECE):
             yield partial(_read_and_compensate, read, compensator)
@@ -271,7 +277,9 @@ def _read_and_compensate(read: Callable[[], Events], compensator: BlockCompensat
 
 
 def check_size(fitted: Calibration | Model, size: tuple[int, int], name: str, *, what: str = "calibration") -> None:
-    """Raise :class:`AmiwarpError` if a calibration or model is for another sensor size [px] than that of ``name``."""
+    """Raise :class:`AmiwarpError` if a calibration or model belongs to another sensor size than ``size`` [px]."""
     width, height = fitted.camera.width, fitted.camera.height
     if size != (width, height):
-        raise AmiwarpError(f"{name}: is {size[0]}x{size[1]}, the {what} is for {width}x{height}; calibrate this camera")
+        raise AmiwarpError(
+            f"{name}: its sensor is {size[0]}x{size[1]}, the {what} is for {width}x{height}; calibrate this camera"
+        )

@@ -22,19 +22,20 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 OUTSIDE, EXTRAPOLATED, NO_ANGLE = 1, 2, 4
-"""Flags of an event, which add up.
+"""Flags of a compensated event. The flags of an event are added.
 
 OUTSIDE: the coordinates are outside the image. EXTRAPOLATED: no encoder sample arrived in time, so the prism angle is
 extrapolated at constant speed. NO_ANGLE: no prism angle is known, so the coordinates are NaN.
 """
 LEAST_RETURNED = 2
-"""Number of batches after which :meth:`Compensator.take` leaves those in flight on a GPU to the next call."""
+"""Number of finished batches after which :meth:`Compensator.take` no longer waits for batches that a GPU still
+computes. The next call returns those."""
 AHEAD_US = 100_000
-"""Span of encoder samples that is copied to the device at once, if available [us]."""
+"""Span of encoder samples that is copied to the device at once, if the samples are available [us]."""
 OVERHEAD = 1024
-"""Memory of a packet beyond its arrays: the Python objects that hold them [bytes]."""
+"""Memory of a packet's Python objects in addition to its arrays [bytes]."""
 QueuedPacket: TypeAlias = tuple[Events, int, int, int]
-"""A packet, its last time, the time when it was put, and the time when it arrived [us]."""
+"""Queued packet, its last event time, the time when it was queued, and its time of arrival [us]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,11 +54,12 @@ class Compensated:
     """
 
     events: Events
-    """Coordinates without the prism, float32 [px], NaN if there are none; times and polarities are unchanged."""
+    """Compensated events: coordinates without the prism, float32 [px], NaN if there are none. Times and polarities are
+    unchanged."""
     flags: NDArray[np.uint8]
     """Sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED` and :data:`NO_ANGLE` for each event, shape ``(n,)``."""
     arrived_us: int = 0
-    """Arrival time of the first packet, by the caller's clock [us]."""
+    """Arrival time of the first packet of these events, by the caller's clock [us]."""
 
 
 def held_bytes(events: Events) -> int:
@@ -127,9 +129,9 @@ class Compensator:
         self._least_returned = LEAST_RETURNED if self._device.is_cuda else math.inf
         self._queue: deque[QueuedPacket] = deque()
         self.waiting = 0
-        """Number of events in the queue."""
+        """Number of events in the queue, which wait for encoder samples."""
         self.waiting_bytes = 0
-        """Memory of the packets in the queue [bytes], see :func:`held_bytes`."""
+        """Memory of the packets in the queue [bytes], as computed by :func:`held_bytes`."""
         self._staged: StagedBatch | None = None
         self._in_flight: tuple[BatchInFlight, NDArray[np.bool_] | None] | None = None
         self._t_last = -(2**62)
@@ -158,7 +160,9 @@ class Compensator:
         if not t.size:
             return
         if t.item(0) < self._t_last:
-            raise AmiwarpError(f"a packet starts at {t[0]} us, the last one ended at {self._t_last} us; sort it first")
+            raise AmiwarpError(
+                f"a packet starts at {t[0]} us, the previous one ended at {self._t_last} us; sort the packets by time"
+            )
         parts = [events]
         if t.size > self.batch:
             if (t[self.batch :: self.batch] < t[self.batch - 1 : -1 : self.batch]).any():
@@ -193,7 +197,7 @@ class Compensator:
         """
         out: list[Compensated] = []
         while True:
-            # three batches overlap: one is copied together, a GPU works on the one before, and a third is fetched
+            # three batches overlap: one is copied to the buffers, a GPU computes the second, the third is fetched
             packets = self._pop_ready(now_us)
             if not packets and len(out) >= self._least_returned:
                 return out
@@ -207,7 +211,7 @@ class Compensator:
                 return out
 
     def flush(self) -> list[Compensated]:
-        """Return everything that still waits, with extrapolated prism angles if necessary.
+        """Return all events that still wait, with extrapolated prism angles if necessary.
 
         Call it at the end of a stream.
 
@@ -232,7 +236,7 @@ class Compensator:
         return self._pipeline.image()
 
     def _pop_ready(self, now_us: int) -> list[QueuedPacket]:
-        """Remove the packets of the next batch from the queue: those that are covered, or have waited for too long."""
+        """Remove the next batch from the queue: packets that encoder samples cover or that waited too long."""
         packets: list[QueuedPacket] = []
         count, covered = 0, self.encoder.last
         patience = self.start_us if covered is None else self.wait_us
@@ -252,7 +256,7 @@ class Compensator:
         return self._pipeline.stage([events for events, *_ in packets], packets[0][3])
 
     def _submit(self, staged: StagedBatch) -> tuple[BatchInFlight, NDArray[np.bool_] | None]:
-        """Submit a batch; also return which of its events have an extrapolated angle, None for none."""
+        """Submit a batch; return also which of its events have an extrapolated angle, or None if none has."""
         parts, n = staged.parts, staged.end - staged.at
         first, last = int(parts[0].t[0]), int(parts[-1].t[-1])
         first_known, last_known = self.encoder.first, self.encoder.last
@@ -273,7 +277,7 @@ class Compensator:
         return Compensated(Events(x, y, in_flight.t, in_flight.p), flags, in_flight.arrived_us)
 
     def _set_encoder(self, first: int, last: int, last_known: int) -> None:
-        """Copy the encoder over a span of event times [us] to the device, unless it is there already."""
+        """Copy the encoder's samples over a span of event times [us] to the device, unless it has them already."""
         if self._covered is None or first < self._covered[0] or last > self._covered[1]:
             until = max(last, min(last_known, last + AHEAD_US))
             self._pipeline.set_encoder(self.encoder.over(first, until), first, until)

@@ -21,7 +21,7 @@ The difference and the sum of any two times then fit int64.
 """
 
 SENSOR_DTYPE = np.dtype(np.uint16)
-"""Type of pixel coordinates from a sensor. Compensated events have float32 coordinates."""
+"""Data type of pixel coordinates from a sensor. Compensated events have float32 coordinates instead."""
 
 
 def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
@@ -33,7 +33,7 @@ def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
         with np.errstate(over="ignore"):
             short = array.astype(np.float32, copy=False)
         if np.isinf(short).any():
-            raise AmiwarpError(f"events' {name} holds a coordinate that float32 cannot hold; drop that event")
+            raise AmiwarpError(f"events' {name} holds a coordinate that is too large for float32; drop that event")
         return short
     if array.dtype == np.uint16:
         return array
@@ -64,7 +64,7 @@ def as_times(values: ArrayLike) -> NDArray[np.int64]:
 
 
 def check_sensor(events: Events) -> None:
-    """Raise :class:`AmiwarpError` for compensated events, whose coordinates are not uint16."""
+    """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
     if events.x.dtype != SENSOR_DTYPE:
         raise AmiwarpError(
             f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
@@ -108,6 +108,6 @@ def check_events(
     if after_t is not None and events.t[0] < after_t:
         fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
     if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # the times are sorted here
-        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; it is damaged")
+        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; drop this event")
     if int(events.p.max()) > 1:
         fail(events.p > 1, "has a polarity that is neither 0 nor 1")

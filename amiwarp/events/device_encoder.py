@@ -25,13 +25,14 @@ def azimuths(device: str) -> wp.array:
 
 
 def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -> EncoderParams:
-    """Return the samples around the event times ``t_first`` .. ``t_last`` [us], for ``kernels.encoder.angle_at``.
+    """Return the encoder's samples around a span of event times [us] as parameters of the device function ``angle_at``.
 
     Raises :class:`AmiwarpError` if the encoder does not cover that span.
     """
     encoder.angle_at(np.array([t_first, t_last], np.int64))
     origin, start, angle, slope = encoder_pieces(encoder, t_first, t_last)
-    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1  # a bucket is at most as long as an average piece
+    # a bucket of samples lasts 2**shift us, at most the mean interval between samples
+    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1
     edges = np.arange((int(start[-1]) >> shift) + 1, dtype=np.int64) << shift
     first = np.append(np.searchsorted(start, edges, side="right") - 1, start.size - 1)
     p = EncoderParams()
@@ -44,7 +45,10 @@ def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -
 
 
 def encoder_pieces(encoder: "Encoder", t_first: int, t_last: int) -> tuple[int, Any, Any, Any]:
-    """Return origin, starts, angles and slopes of :class:`EncoderParams`. The encoder must cover the span."""
+    """Return origin, starts, angles and slopes of :class:`EncoderParams`.
+
+    The encoder must cover the span of event times.
+    """
     # The clock offset is split into its whole and its fractional part. A piece starts at the first whole event time
     # at or after its sample.
     whole = math.floor(encoder.clock_offset_us)
@@ -59,6 +63,6 @@ def encoder_pieces(encoder: "Encoder", t_first: int, t_last: int) -> tuple[int, 
 
 
 def _wrapped(turns: Any) -> Any:
-    """Return turns as uint64 in units of 2**-64 turn, without the whole turns."""
+    """Return turns without their whole part as uint64, in units of 2**-64 turn."""
     part = np.maximum(turns - np.floor(turns + 0.5), -0.5)
     return np.ldexp(part, 64).astype(np.int64).view(np.uint64)

@@ -21,9 +21,11 @@ from amiwarp.validation import array, instance, real, whole
 TWO_PI = 2.0 * math.pi
 """One turn [rad]."""
 MOST_SAMPLES = 1 << 28
-"""Largest number of samples of :meth:`Encoder.constant_speed`: three days at one sample per millisecond."""
+"""Largest number of samples that :meth:`Encoder.constant_speed` makes: three days at one sample per millisecond."""
+LARGEST_RPM = 1e9
+"""Largest speed of a prism [turns/min] that :meth:`Encoder.constant_speed` accepts."""
 LARGEST_ANGLE = 1e10
-"""Largest magnitude of an angle [rad]: 1.6e9 turns. Up to it float64 resolves 2e-6 rad."""
+"""Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +53,7 @@ class Encoder:
     clock_offset_us: float = 0.0
     """Encoder time minus event time [us]."""
     index_t: NDArray[np.int64] | None = None
-    """Times of the index pulses on the encoder's clock [us], shape ``(k,)``, or None."""
+    """Times of the index pulses on the encoder's clock [us], shape ``(k,)``; None if the encoder has none."""
 
     def __post_init__(self) -> None:
         for name in ("t", "angle"):
@@ -64,10 +66,10 @@ class Encoder:
         late = self.t[1:] <= self.t[:-1]
         if late.any():
             at = int(np.argmax(late)) + 1
-            raise AmiwarpError(f"encoder sample {at} (t = {self.t[at]} us) is not later than the one before; sort them")
+            raise AmiwarpError(f"encoder sample {at} ({self.t[at]} us) is not later than the one before; sort by time")
         if not (self.t[0] > -TIME_LIMIT and self.t[-1] < TIME_LIMIT):
             span = f"{self.t[0]} .. {self.t[-1]} us"
-            raise AmiwarpError(f"encoder samples span {span}, beyond {TIME_LIMIT} us from 0; they are damaged")
+            raise AmiwarpError(f"encoder samples span {span}, beyond {TIME_LIMIT} us from 0; times are damaged")
         good = np.abs(self.angle) <= LARGEST_ANGLE  # NaN fails
         if not good.all():
             at = int(np.argmin(good))
@@ -80,7 +82,7 @@ class Encoder:
 
     def _check_index(self, index_t: NDArray[np.int64]) -> None:
         if instance(index_t, np.ndarray, "encoder index_t").ndim != 1 or index_t.dtype != np.int64:
-            raise AmiwarpError(f"encoder index_t is {index_t.dtype} of shape {index_t.shape}; expected int64, (k,)")
+            raise AmiwarpError(f"encoder index_t is {index_t.dtype} of shape {index_t.shape}; expected int64 (k,)")
         inside = (index_t >= self.t[0]) & (index_t <= self.t[-1])
         if not inside.all():
             bad = index_t[int(np.argmin(inside))]
@@ -88,7 +90,7 @@ class Encoder:
 
     @classmethod
     def from_angles(cls, t_us: ArrayLike, angle: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
-        """Create an encoder from angles.
+        """Create an encoder from samples of the prism angle.
 
         Parameters
         ----------
@@ -124,7 +126,7 @@ class Encoder:
         index_t_us: ArrayLike | None = None,
         clock_offset_us: float = 0.0,
     ) -> Encoder:
-        """Create an encoder from counts.
+        """Create an encoder from encoder counts.
 
         The counter may keep counting, restart each turn, or wrap at its width.
 
@@ -197,7 +199,7 @@ class Encoder:
         >>> amiwarp.Encoder.constant_speed(600.0, 0, 100_000).angle_at([50_000]).round(4)
         array([3.1416])
         """
-        rpm = real(rpm, "constant speed", hint=" [turns/min]")
+        rpm = real(rpm, "constant speed", -LARGEST_RPM, LARGEST_RPM, " turns/min")
         for t, what in ((t_first, "t_first"), (t_last, "t_last")):
             whole(t, f"constant speed: {what}", -TIME_LIMIT + 1, TIME_LIMIT - 1, " us")
         whole(interval_us, "constant speed: interval_us", 1, TIME_LIMIT, " us")
@@ -208,7 +210,7 @@ class Encoder:
         return cls(elapsed + t_first, elapsed.astype(np.float64) * (direction * rpm * TWO_PI / 60e6))
 
     def with_clock_offset(self, clock_offset_us: float) -> Encoder:
-        """Return the same samples with another clock offset.
+        """Return an encoder with the same samples and another clock offset.
 
         Parameters
         ----------
@@ -223,7 +225,7 @@ class Encoder:
         return dataclasses.replace(self, clock_offset_us=clock_offset_us)
 
     def with_index(self, index_t_us: ArrayLike) -> Encoder:
-        """Return the same samples with the angle zero at the index pulses.
+        """Return an encoder with the same samples whose angle is zero at the index pulses.
 
         Parameters
         ----------
@@ -242,7 +244,7 @@ class Encoder:
         """
         index_t = np.atleast_1d(as_times(index_t_us))
         if not index_t.size:
-            raise AmiwarpError("no index pulse given; leave index_t_us out if there is none")
+            raise AmiwarpError("index_t_us contains no pulse; leave index_t_us out if the encoder has no index pulse")
         self._check_index(index_t)
         at_pulse = np.interp(index_t - self.t[0], self.t - self.t[0], self.angle)
         # The circular mean chooses where to cut the circle. The median around it is robust to spurious pulses.
@@ -251,7 +253,7 @@ class Encoder:
         return dataclasses.replace(self, angle=self.angle - zero, index_t=index_t)
 
     def slip(self) -> NDArray[np.float64]:
-        """Return the angle error at each index pulse.
+        """Return the angle error at each index pulse: the distance of the angle from a multiple of 2 pi.
 
         Returns
         -------
@@ -352,7 +354,7 @@ class Encoder:
         return float(self.t[-1] - self.t[0]) / (self.t.size - 1)
 
     def gaps(self, max_interval_us: float) -> list[tuple[int, int]]:
-        """Return the gaps between samples.
+        """Return the gaps: intervals between samples that are too long.
 
         Parameters
         ----------
@@ -373,7 +375,7 @@ class Encoder:
         return float((self.angle[-1] - self.angle[0]) / TWO_PI * 60e6 / float(self.t[-1] - self.t[0]))
 
     def _near(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the encoder times of ``t``, and the times and angles of the samples around them.
+        """Return the encoder times for event times ``t``, and the times and angles of the samples around them.
 
         All times are relative to the first of these samples. Only samples near ``t`` are used, so the cost does not
         depend on the recording's length.
@@ -383,7 +385,7 @@ class Encoder:
         if not self.covers(low, high):
             first, last = self.coverage
             raise AmiwarpError(
-                f"events at {low} .. {high} us lie outside the encoder's {first} .. {last} us; drop them"
+                f"events at {low} .. {high} us lie outside the encoder's {first} .. {last} us; drop these events"
             )
         start = int(np.searchsorted(self.t, math.floor(low + self.clock_offset_us))) - 1
         start = min(max(start, 0), self.t.size - 2)

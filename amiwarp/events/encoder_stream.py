@@ -1,4 +1,4 @@
-"""Encoder samples of a live rig: a buffer of the latest ones, with extrapolation beyond the last."""
+"""Encoder samples of a live rig: a buffer of the latest samples, with extrapolation after the last one."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ class EncoderStream:
     """
 
     SPEED_WINDOW_US = 50_000
-    """Angles after the last sample are extrapolated at the mean speed of this time before it [us]."""
+    """Duration before the last sample whose mean speed extrapolates the angles after it [us]."""
     GAP_US = 20_000
-    """Samples further apart than this have a gap between them [us]. Angles in a gap are estimates."""
+    """Longest time between two samples that is not a gap [us]. Angles in a gap are regarded as estimates."""
     MAX_GAPS = 64
-    """Number of gaps that are remembered; older ones are forgotten."""
+    """Number of latest gaps that are remembered."""
 
     def __init__(self, clock_offset_us: float = 0.0, *, capacity: int = 1 << 16) -> None:
         if capacity < 16:
-            raise AmiwarpError(f"capacity = {capacity} samples; give 16 or more")
+            raise AmiwarpError(f"capacity = {capacity} samples; give a capacity of 16 samples or more")
         self.clock_offset_us = clock_offset_us
         self.dropped = 0
-        """Number of samples that were dropped because they were not later than the sample before."""
+        """Number of samples that were dropped because they were not later than the sample before them."""
         self._t, self._angle = np.zeros(2 * capacity, np.int64), np.zeros(2 * capacity, np.float64)
         self._stop = 0
         self._gaps: list[tuple[int, int]] = []
@@ -63,7 +63,10 @@ class EncoderStream:
 
     @property
     def first(self) -> int | None:
-        """First event time with an angle [us]: one interval before the first sample. None with fewer than two."""
+        """First event time with an angle [us]: one sample interval before the first sample.
+
+        None with fewer than two samples.
+        """
         if len(self) < 2:
             return None
         return math.ceil(int(2 * self._t[0] - self._t[1]) - self.clock_offset_us)
@@ -74,11 +77,11 @@ class EncoderStream:
         return None if len(self) < 2 else math.floor(int(self._t[self._stop - 1]) - self.clock_offset_us)
 
     def restart(self) -> None:
-        """Mark that later samples do not continue earlier ones, for example after a reset of the controller."""
+        """Mark that later samples do not continue earlier samples, for example after a reset of the controller."""
         self._restarted = len(self) > 0
 
     def append(self, t_us: ArrayLike, angle: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Append samples. Samples that are not later than the one before are dropped.
+        """Append samples. Samples that are not later than the sample before them are dropped.
 
         Parameters
         ----------
@@ -139,7 +142,10 @@ class EncoderStream:
 
     @property
     def rpm(self) -> float | None:
-        """Speed of the latest samples [turns/min], negative if the angle decreases. None with fewer than two."""
+        """Speed of the prism over the latest samples [turns/min], negative if the angle decreases.
+
+        None with fewer than two samples.
+        """
         return None if len(self) < 2 else self._speed() * 60e6 / TWO_PI
 
     def _speed(self) -> float:
@@ -151,7 +157,7 @@ class EncoderStream:
         return float(angles[-1] - angles[since]) / span if span else 0.0
 
     def _extrapolate(self, t: int) -> float:
-        """Return the angle [rad] at encoder time ``t`` [us] after the last sample, at the mean speed before it."""
+        """Return the angle [rad] at encoder time ``t`` [us] after the last sample, at the latest mean speed."""
         return float(self._angle[self._stop - 1]) + self._speed() * float(t - self._t[self._stop - 1])
 
     def over(self, t_first: int, t_last: int) -> Encoder:
@@ -173,7 +179,9 @@ class EncoderStream:
             If there are fewer than two samples.
         """
         if len(self) < 2:
-            raise AmiwarpError("the encoder has given fewer than two samples so far; append more first")
+            raise AmiwarpError(
+                "the encoder stream has fewer than two samples so far; append at least two samples first"
+            )
         times, angles = self._t[: self._stop], self._angle[: self._stop]
         low = int(np.searchsorted(times, math.floor(t_first + self.clock_offset_us), side="right")) - 1
         low = min(max(low, 0), times.size - 2)
@@ -200,7 +208,7 @@ class EncoderStream:
         return len(self) >= 2 and not any(low < t_last and t_first < high for low, high in self._estimated_spans())
 
     def _estimated_spans(self) -> Iterator[tuple[int, int]]:
-        """Yield the spans of event times [us], ends excluded, in which angles are estimated."""
+        """Yield the spans of event times [us], ends excluded, in which angles are extrapolated or in a gap."""
         yield -(2**62), math.ceil(int(self._t[0]) - self.clock_offset_us)
         for begin, end in self._gaps:
             yield math.floor(begin - self.clock_offset_us), math.ceil(end - self.clock_offset_us)

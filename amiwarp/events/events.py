@@ -44,7 +44,7 @@ class Events:
     y: NDArray[Any]
     """Row [px], shape ``(n,)``, of the type of ``x``."""
     t: NDArray[np.int64]
-    """Time [us], shape ``(n,)``."""
+    """Time of each event [us], shape ``(n,)``."""
     p: NDArray[np.uint8]
     """Polarity, shape ``(n,)``: 1 is ON, 0 is OFF."""
 
@@ -101,7 +101,7 @@ class Events:
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Events]) -> Events:
-        """Join blocks in the given order.
+        """Join blocks of events in the given order.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class Events:
 
 @runtime_checkable
 class EventSource(Protocol):
-    """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its beginning."""
+    """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its start."""
 
     def __len__(self) -> int: ...
 
@@ -144,7 +144,7 @@ class EventSource(Protocol):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Sensor size (width, height) [px]."""
+        """Size of the sensor (width, height) [px]."""
 
     def slice(self, start: int, stop: int) -> Events:
         """Return the events with ``start <= index < stop``.
@@ -252,7 +252,7 @@ class MemoryEvents:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Sensor size (width, height) [px]."""
+        """Size of the sensor (width, height) [px]."""
         return self._size
 
     def slice(self, start: int, stop: int) -> Events:
@@ -325,9 +325,10 @@ class MemoryEvents:
 
 
 def regroup(chunks: Iterable[Events], *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-    """Return sequential chunks as blocks of equal count or equal duration, with at most one block in memory.
+    """Regroup successive chunks of events into blocks of equal count or equal duration.
 
-    Raises :class:`AmiwarpError` if both are given or one is below 1.
+    At most one block is in memory. Raises :class:`AmiwarpError` if both ``count`` and ``duration_us`` are given or one
+    is below 1.
     """
     if count is not None and duration_us is not None:
         raise AmiwarpError("blocks have both count and duration_us; give one of them")

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 MetadataValue: TypeAlias = str | int | float | bool
-"""A value of a recording's metadata."""
+"""Type of a value in a recording's metadata."""
 
 
 class PointStore(Protocol):
-    """Array of points that is indexed by slices: an array in memory, or a file that is read on demand."""
+    """Array of points that is indexed by slices: in memory, or in a file that is read on demand (protocol)."""
 
     def __getitem__(self, which: slice, /) -> NDArray[np.float32]:
         """Return the points of a slice [px], shape ``(n, 2)``, float32."""
@@ -29,7 +29,7 @@ class PointStore(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Ground truth of a synthetic recording.
+    """Ground truth of a simulated recording.
 
     Examples
     --------
@@ -106,16 +106,16 @@ class Recording:
     """
 
     events: EventSource
-    """The events."""
+    """Events of the recording, in order of time."""
     camera: Camera | None = None
-    """The camera, or None if unknown."""
+    """Camera intrinsics, or None if unknown."""
     encoder: Encoder | None = None
-    """The prism angle over time, or None if unknown."""
+    """Encoder, which gives the prism angle over time, or None if there is none."""
     prism: NominalPrism | None = None
     """The nominal prism of the data sheet, not the calibrated one, or None if unknown. Its apex may be unknown."""
     truth: Truth | None = None
     """Ground truth of a synthetic recording, else None."""
     metadata: dict[str, MetadataValue] = field(default_factory=dict)
-    """Other information, such as the format, repairs made while reading, and the simulator's seed."""
+    """Other information by name, such as the file format, repairs made while reading, and the simulator's seed."""
     name: str = "recording"
-    """Short name for messages and titles: the file name without its extension."""
+    """Short name of the recording in messages and titles: the file name without its extension."""

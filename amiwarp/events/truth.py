@@ -1,4 +1,4 @@
-"""Ground truth of simulated worlds: of each event, of chosen instants, and the poses of camera and bodies."""
+"""Ground truth of simulated recordings: of each event, of all pixels at given instants, and poses over time."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Cause(enum.StrEnum):
     """
 
     SIGNAL = "signal"
-    """The light changed by the contrast threshold. Code 0."""
+    """Change of the light by the contrast threshold. Code 0."""
     SHOT_NOISE = "shot_noise"
     """Shot noise of the photons. Code 1."""
     LEAK = "leak"
-    """The leak of the pixel's stored level. Code 2."""
+    """Drift of the pixel's stored reference level (leak). Code 2."""
     HOT_PIXEL = "hot_pixel"
-    """The additional rate of a hot pixel. Code 3."""
+    """Additional random events of a hot pixel. Code 3."""
 
     @property
     def code(self) -> int:
@@ -40,7 +40,7 @@ class Cause(enum.StrEnum):
 
 
 class EventValues(Protocol):
-    """Array with one row per event that is indexed by slices: in memory, or a file that is read on demand."""
+    """Array with one row per event that is indexed by slices: in memory, or in a file read on demand (protocol)."""
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
         """Return the rows of a slice, shape ``(n,)`` or ``(n, k)``."""
@@ -96,7 +96,7 @@ class EventTruth:
 
 @dataclass(frozen=True, slots=True)
 class WorldLabels:
-    """Names in a simulated world.
+    """Names of the instances in a simulated world, and their classes.
 
     Examples
     --------
@@ -106,7 +106,7 @@ class WorldLabels:
     """
 
     name: str
-    """Name of the world."""
+    """Name of the simulated world."""
     instances: tuple[str, ...]
     """Labels of the instances. The label at index i has the instance number i + 1; number 0 is the sky."""
     categories: tuple[str, ...]
@@ -127,7 +127,7 @@ class FrameTruth:
     """
 
     t_us: int
-    """Time, on the clock of the events [us]."""
+    """Time of the instant, on the clock of the events [us]."""
     depth: NDArray[np.float32]
     """Depth along the camera's axis [m], shape ``(height, width)``; infinite for the sky."""
     normal: NDArray[np.float32]
@@ -137,7 +137,7 @@ class FrameTruth:
     flow: NDArray[np.float32]
     """Optical flow without the prism [px/s], shape ``(height, width, 2)``; NaN where a point leaves the image plane."""
     flow_with_prism: NDArray[np.float32]
-    """Optical flow of what the pixel sees through the turning prism [px/s], shape ``(height, width, 2)``."""
+    """Optical flow of the scene that the pixel sees through the turning prism [px/s], shape ``(height, width, 2)``."""
     intensity: NDArray[np.float32]
     """Linear luminance without the prism, shape ``(height, width)``."""
     intensity_with_prism: NDArray[np.float32]
@@ -147,7 +147,7 @@ class FrameTruth:
     position: NDArray[np.float64]
     """Position of the camera in the world [m], shape ``(3,)``."""
     joints: dict[str, NDArray[np.float64]]
-    """Positions of the world's joints [m], shape ``(3,)`` each."""
+    """Positions of the world's joints by name [m], shape ``(3,)`` each."""
 
 
 MAPS = {
@@ -159,15 +159,15 @@ MAPS = {
     "intensity": (np.float32, ()),
     "intensity_with_prism": (np.float32, ()),
 }
-"""Maps of :class:`FrameTruth`: their types, and their shapes after (height, width)."""
+"""Data types of the maps of :class:`FrameTruth`, and their shapes after (height, width)."""
 
 
 class FrameStore(Protocol):
-    """Ground truth of several instants: in memory, or a file that is read on demand."""
+    """Ground truth of several instants, in memory or in a file that is read on demand (protocol)."""
 
     @property
     def t(self) -> NDArray[np.int64]:
-        """Times of the instants, rising [us], shape ``(k,)``."""
+        """Times of the instants [us], increasing, shape ``(k,)``."""
 
     def __getitem__(self, index: int, /) -> FrameTruth:
         """Return the ground truth of the instant ``t[index]``."""
@@ -204,7 +204,7 @@ class Poses:
     """
 
     t: NDArray[np.int64]
-    """Times, on the clock of the events, rising [us], shape ``(k,)``."""
+    """Times of the poses on the clock of the events [us], increasing, shape ``(k,)``."""
     camera: NDArray[np.float64]
     """Poses of the camera, shape ``(k, 7)``."""
     bodies: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -240,7 +240,7 @@ class Poses:
 
 
 def as_poses(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return poses of matrices ``(..., 3, 3)`` and positions ``(..., 3)`` [m]: shape ``(..., 7)``."""
+    """Convert rotation matrices ``(..., 3, 3)`` and positions ``(..., 3)`` [m] to poses of shape ``(..., 7)``."""
     from scipy.spatial.transform import Rotation
 
     quaternions = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()
@@ -248,17 +248,17 @@ def as_poses(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> ND
 
 
 def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix ``(3, 3)`` of a pose of shape ``(7,)``."""
+    """Return the rotation matrix ``(3, 3)`` of a pose of shape ``(7,)``."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
 
 
 class PoseStore(Protocol):
-    """Poses that are indexed by slices: :class:`amiwarp.Poses`, or a file that is read on demand."""
+    """Poses that are indexed by slices: :class:`amiwarp.Poses`, or a file that is read on demand (protocol)."""
 
     def __len__(self) -> int:
-        """Return the number of times."""
+        """Return the number of times for which there are poses."""
 
     def __getitem__(self, which: slice, /) -> Poses:
-        """Return the poses of a slice."""
+        """Return the poses at the times in a slice."""

@@ -17,40 +17,43 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 WIDTHS = tuple(range(8, 33))
-"""Widths of hardware counters that are recognised automatically [bits]."""
+"""Widths of hardware counters that are recognised automatically in encoder counts [bits]."""
 WIDEST = 64
-"""Largest width of a counter that may be given [bits]."""
+"""Largest width of a hardware counter that a caller may give [bits]."""
 ONCE_A_TURN = 0
 """Value of ``counter_bits`` for a counter that restarts each turn."""
 SHORTEST_PERIOD = 3
-"""Shortest period of a counter that wraps [counts]. With fewer states the direction is unobservable."""
+"""Shortest period of a counter that wraps [counts]. With fewer states the direction of rotation is unobservable."""
 SPEED_STEPS = 5
-"""Number of steps whose median speed predicts another step."""
+"""Number of preceding steps between samples whose median speed predicts the next step."""
 FEWEST_SAMPLES = 20
-"""Fewest samples from which a counter's width is found. A swinging prism could give fewer ones."""
+"""Smallest number of samples from which the width of a counter is found. Fewer samples could come from a swinging
+prism."""
 GAP = 3.0
-"""Intervals longer than this multiple of the typical one are gaps."""
+"""Ratio to the typical sample interval above which an interval is a gap."""
 LARGEST_RESIDUAL = 0.25
-"""Largest residual as a fraction of the period. With a larger one the number of wraps is ambiguous."""
+"""Largest difference of a step from its prediction, as a fraction of the period. Above it the number of wraps is
+ambiguous."""
 DECISIVE_RATIO = 3.0
-"""Factor by which unwrapping must reduce the residuals for a period to be accepted."""
+"""Factor by which unwrapping at a period must reduce the steps' differences from prediction for the period to be
+accepted."""
 ROUNDING_COUNTS = 2.0
-"""Residual that rounding to whole counts explains [counts]."""
+"""Difference of a step from its prediction that rounding to whole counts explains [counts]."""
 ROUNDING_TURNS = 1.0 / 64.0
-"""Residual that the resolution of angles explains [turns]."""
+"""Difference of a step from its prediction that the resolution of angles explains [turns]."""
 
 
 class UnwrapError(AmiwarpError):
-    """Error for samples that cannot be unwrapped."""
+    """Raised for encoder samples that cannot be unwrapped."""
 
     sample: int = 0
     """Index of the first sample that shows the problem."""
     problem: str = ""
-    """Description of the problem and its remedy."""
+    """Description of the problem with the samples, and its remedy."""
 
     @classmethod
     def at(cls, sample: int, problem: str) -> UnwrapError:
-        """Return the error for one sample."""
+        """Return the error for the encoder sample with index ``sample``."""
         error = cls(f"encoder sample {sample}: {problem}")
         error.sample, error.problem = sample, problem
         return error
@@ -58,63 +61,63 @@ class UnwrapError(AmiwarpError):
 
 @dataclass(frozen=True)
 class _Steps:
-    """Steps between neighbouring samples, unwrapped by one period."""
+    """Steps between neighbouring encoder samples, unwrapped at one period."""
 
     period: float
-    """Period in the samples' unit; 0 without unwrapping."""
+    """Period at which the values wrap, in the samples' unit; 0 without unwrapping."""
     step: NDArray[np.float64]
-    """Unwrapped steps, shape ``(m - 1,)``."""
+    """Unwrapped steps, in the samples' unit, shape ``(m - 1,)``."""
     wraps: NDArray[np.float64]
-    """Number of periods added to each step."""
+    """Number of periods added to each step, shape ``(m - 1,)``."""
     expected: NDArray[np.float64]
-    """Steps that the preceding speed predicts."""
+    """Steps that the preceding speed predicts, in the samples' unit, shape ``(m - 1,)``."""
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """Each step minus its prediction."""
+        """Difference of each step from its prediction, in the samples' unit."""
         return np.asarray(self.step - self.expected)
 
     @property
     def cost(self) -> float:
-        """Sum of the absolute residuals."""
+        """Sum of the absolute differences between steps and their predictions."""
         return float(np.abs(self.residual).sum())
 
 
 @dataclass(frozen=True)
 class _Samples:
-    """Samples to unwrap, with the words for error messages."""
+    """Encoder samples to unwrap, with the words that describe them in error messages."""
 
     t: NDArray[np.int64]
-    """Sample times [us]."""
+    """Times of the samples [us], shape ``(m,)``."""
     value: NDArray[np.float64]
-    """Counts, or angles [rad]."""
+    """Values of the samples: counts, or angles [rad], shape ``(m,)``."""
     turn: float
     """One turn in the unit of ``value``."""
     rounding: float
-    """Residual that rounding explains, in the unit of ``value``."""
+    """Difference of a step from its prediction that rounding explains, in the unit of ``value``."""
     noun: str
-    """Name of the values in messages."""
+    """Name of the values in error messages: count or angle."""
     unit: float
-    """Factor from the unit of ``value`` to that of messages."""
+    """Factor from the unit of ``value`` to the unit in error messages."""
     remedy: str
-    """What the user can do."""
+    """Remedy for the user in error messages."""
 
     @property
     def interval(self) -> NDArray[np.float64]:
-        """Times between samples [us]."""
+        """Times between neighbouring samples [us], shape ``(m - 1,)``."""
         return np.diff(self.t).astype(np.float64)
 
     @property
     def gap(self) -> NDArray[np.bool_]:
-        """Whether each interval is a gap."""
+        """Whether each interval between samples is a gap."""
         return np.asarray(self.interval > GAP * np.median(self.interval))
 
     def shown(self, value: float) -> str:
-        """Format a value in the unit of messages."""
+        """Format a value in the unit of error messages."""
         return f"{value * self.unit:,.6g}"
 
     def steps(self, period: float) -> _Steps:
-        """Return the steps unwrapped by ``period``, each nearest to what the median speed predicts."""
+        """Return the steps unwrapped at ``period``: each nearest to its prediction from the median speed."""
         raw = np.diff(self.value)
         step = raw
         if period:
@@ -165,7 +168,7 @@ def unwrap_angles(t: NDArray[np.int64], angle: NDArray[np.float64]) -> NDArray[n
 
 
 def expected_steps(step: NDArray[np.float64], interval: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the steps predicted by the median speed of the steps before, or of those after for the first steps."""
+    """Return the steps predicted by the median speed of preceding steps, or of following ones at the start."""
     speed = step / interval
     n = speed.size
     if n < 2 * SPEED_STEPS:
@@ -193,14 +196,14 @@ def _can_wrap(samples: _Samples) -> bool:
 
 
 def _count_periods(samples: _Samples) -> Iterator[float]:
-    """Yield the periods that the range of the counts allows."""
+    """Yield the periods at which counts in the given range can wrap."""
     if samples.turn >= SHORTEST_PERIOD and np.ptp(samples.value) <= samples.turn:
         yield samples.turn
     yield from (2.0**bits for bits in WIDTHS if _fits(samples.value, 2.0**bits, signed=True))
 
 
 def _fits(count: NDArray[np.float64], period: float, *, signed: bool) -> bool:
-    """Return whether the range of the counts fits into a period."""
+    """Return whether the range of the counts fits into a period of the counter."""
     low, high = float(count.min()), float(count.max())
     if not signed:
         return high - low <= period
@@ -208,7 +211,7 @@ def _fits(count: NDArray[np.float64], period: float, *, signed: bool) -> bool:
 
 
 def _period_name(samples: _Samples, period: float) -> str:
-    """Describe a period for messages."""
+    """Return a name for a period, for error messages."""
     if period == samples.turn:
         return "one turn"
     bits = math.log2(period)
@@ -216,7 +219,7 @@ def _period_name(samples: _Samples, period: float) -> str:
 
 
 def _find(samples: _Samples, periods: Iterable[float]) -> _Steps:
-    """Return the steps unwrapped by the only period that fits, or the plain steps if nothing wraps."""
+    """Return the steps unwrapped at the only period that fits, or the plain steps if nothing wraps."""
     plain = samples.steps(0.0)
     wrapped = [found for found in map(samples.steps, sorted({*periods})) if found.wraps.any()]
     best = min([plain, *wrapped], key=lambda found: found.cost)
@@ -244,19 +247,19 @@ def _find(samples: _Samples, periods: Iterable[float]) -> _Steps:
 
 
 def _ambiguous(samples: _Samples, found: _Steps) -> str:
-    """Describe a wrap that is neither certain nor excluded."""
+    """Return the problem, for an error message, of a wrap that is neither certain nor excluded."""
     period = _period_name(samples, found.period)
     return f"the {samples.noun} may have wrapped here, at {period}, or not; {samples.remedy}"
 
 
 def _jump(samples: _Samples, found: _Steps, at: int) -> str:
-    """Describe a step that differs from its prediction."""
+    """Return the problem, for an error message, of a step that differs from its prediction."""
     step, expected = samples.shown(float(found.step[at])), samples.shown(float(found.expected[at]))
     return f"the {samples.noun} changes by {step} where about {expected} was expected"
 
 
 def _check_period(samples: _Samples, best: _Steps, periods: list[float]) -> None:
-    """Reject a period that the mean residual at the wraps contradicts, or cannot distinguish from another."""
+    """Raise :class:`UnwrapError` if the wraps contradict the period, or cannot distinguish it from another one."""
     if best.period < 8.0 * samples.rounding:
         return
     weight = float((best.wraps**2).sum())
@@ -277,7 +280,7 @@ def _check_period(samples: _Samples, best: _Steps, periods: list[float]) -> None
 
 
 def _checked(samples: _Samples, found: _Steps) -> _Steps:
-    """Return the steps, or raise if a step fits another number of wraps as well.
+    """Return the steps unchanged; raise :class:`UnwrapError` if a step fits another number of wraps as well.
 
     If the period is a whole number of turns, steps in gaps are not checked: additional turns in a gap change no angle
     outside it.
@@ -301,7 +304,7 @@ def _checked(samples: _Samples, found: _Steps) -> _Steps:
 
 
 def _accumulate(samples: _Samples, found: _Steps) -> NDArray[np.float64]:
-    """Return the unwrapped values of the samples."""
+    """Return the unwrapped values of all samples, summed from the wraps."""
     if not found.wraps.any():
         return samples.value
     # Whole periods are added to the samples themselves, so that rounding does not accumulate.

@@ -28,11 +28,11 @@ class Layers(enum.StrEnum):
     """
 
     MERGED = "merged"
-    """Number of events of both polarities, shape ``(height, width)``."""
+    """One image: number of events of both polarities, shape ``(height, width)``."""
     SIGNED = "signed"
-    """Number of ON events minus number of OFF events, shape ``(height, width)``."""
+    """One image: number of ON events minus number of OFF events, shape ``(height, width)``."""
     POLARITY = "polarity"
-    """Number of OFF events, then number of ON events, shape ``(2, height, width)``."""
+    """Two images: number of OFF events, then number of ON events, shape ``(2, height, width)``."""
 
 
 class Sharpness(enum.StrEnum):
@@ -45,12 +45,14 @@ class Sharpness(enum.StrEnum):
     """
 
     VARIANCE = "variance"
-    """Variance of the image divided by its mean: 1 for events at random pixels, higher where events gather."""
+    """Variance of the image of warped events divided by its mean: 1 for events at random pixels, higher where events
+    gather."""
     GRADIENT = "gradient"
-    """Mean squared gradient, divided by the image's mean."""
+    """Mean squared gradient of the image of warped events, divided by the image's mean."""
     LAPLACIAN = "laplacian"
-    """Mean squared Laplacian, divided by the image's mean."""
+    """Mean squared Laplacian of the image of warped events, divided by the image's mean."""
     PAPER_J = "paper_j"
-    """Minus He et al.'s J = Σ over h > 0 of 1/(1 + exp(h/η)). It fails as ``docs/explanation/calibration.md`` shows."""
+    """Minus the cost J of He et al., J = Σ 1/(1 + exp(h/η)) over pixels with h > 0 events. It fails as
+    ``docs/explanation/calibration.md`` shows."""
     ENTROPY = "entropy"
     """Minus the entropy of the distribution of votes over pixels [nat]."""

@@ -35,9 +35,9 @@ TURNS = 1 << 16
 On an orbit with a radius of 10 px, the rounding moves an event by at most 0.0005 px.
 """
 LARGEST_FOLD = 1 << 16
-"""Largest number of angle bins per turn for folding."""
+"""Largest number of angle bins per turn into which a pixel's events can be merged."""
 LARGEST_WEIGHT = 63
-"""Largest number of events that one point may represent, see :mod:`amiwarp.kernels.tiles`."""
+"""Largest number of events that one weighted point may represent; :mod:`amiwarp.kernels.tiles` packs the weight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +45,21 @@ class DeviceEvents:
     """Events with their prism angles on a device; made by :func:`upload_events`."""
 
     arrays: Any
-    """Struct ``amiwarp.kernels.votes.EventArrays``.
+    """Columns of the events: Warp struct ``amiwarp.kernels.votes.EventArrays``.
 
-    Its layer is the image of each event: OFF goes to the first and ON to the second, or both to the only one.
+    Its column ``layer`` gives the image of each event: OFF goes to the first and ON to the second image, or both to the
+    only one.
     """
     count: int
     """Number of events, without padding."""
     base: Any
-    """Prism angles [1/65536 turn] without drift, or None if there is no slope."""
+    """Prism angles at drift 0 [1/65536 turn]; None if the angles do not depend on a drifting parameter."""
     slope: Any
-    """Change of the angles [1/65536 turn] per unit of the drifting parameter, or None."""
+    """Change of each prism angle per unit of the drifting parameter [1/65536 turn]; None if there is no such parameter.
+    """
 
     def drift(self, value: float) -> None:
-        """Set the prism angles to those at the value ``value`` of the drifting parameter."""
+        """Set the prism angles for the value ``value`` of the drifting parameter."""
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:
@@ -140,7 +142,7 @@ def upload_events(
 
 
 def _padded(n: int, device: Any) -> int:
-    """Return the length of a column of ``n`` events: CPU kernels process whole blocks."""
+    """Return the padded length of a column of ``n`` events: CPU kernels process whole blocks."""
     return -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
 
 

@@ -28,15 +28,15 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events, EventSource
 
 PERCENTILE = 99.5
-"""Percentile of the non-empty pixels that is shown as white."""
+"""Percentile of the pixels with events whose count is shown as white."""
 GAMMA = 0.5
-"""Display gamma. Counts span decades; their square root keeps weak edges visible next to strong ones."""
+"""Gamma of displayed images. Counts span decades; their square root keeps weak edges visible next to strong ones."""
 MOST_WINDOWS = 100_000
-"""Largest number of time windows."""
+"""Largest number of time windows, each written as one image."""
 
 
 def tone(counts: NDArray[Any]) -> NDArray[np.float32]:
-    """Return brightness 0 .. 1 for counts of zero or more: the :data:`PERCENTILE` is 1, with gamma :data:`GAMMA`."""
+    """Return the brightness 0 .. 1 of event counts >= 0: the :data:`PERCENTILE` is 1, with gamma :data:`GAMMA`."""
     positive = counts[counts > 0]
     top = float(np.percentile(positive, PERCENTILE)) if positive.size else 1.0
     return np.asarray(np.clip(counts / top, 0.0, 1.0) ** GAMMA, np.float32)
@@ -61,13 +61,13 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
 
 
 def save_png(path: Path, picture: Any, *, overwrite: bool = False) -> None:
-    """Write an 8-bit picture (an array or a Pillow image) as a complete PNG file, or no file."""
+    """Write an 8-bit picture (an array or a Pillow image) as a PNG file. On failure no file remains."""
     with NewFile(path, overwrite=overwrite) as new:
         encode_png(new.part, picture)
 
 
 def encode_png(path: Path, picture: Any) -> None:
-    """Write an 8-bit picture (an array or a Pillow image) to a temporary file that is not yet renamed."""
+    """Write an 8-bit picture (an array or a Pillow image) as PNG to a temporary file, which the caller renames."""
     from PIL import Image
 
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
@@ -75,7 +75,7 @@ def encode_png(path: Path, picture: Any) -> None:
 
 
 def encode_image(path: Path, image: Any, kind: str, **options: Any) -> None:
-    """Write a Pillow image to a temporary file. Raises OSError on a full disk, which Pillow itself may miss."""
+    """Write a Pillow image to a temporary file. Raises OSError on a full disk, which Pillow may not notice."""
     buffer = io.BytesIO()
     image.save(buffer, format=kind, **options)
     path.write_bytes(buffer.getbuffer())
@@ -96,7 +96,7 @@ class IweFiles:
         """
         for path in paths:
             if path.suffix.lower() not in (".png", ".npy"):
-                raise AmiwarpError(f"{path}: images of events are written as .png or .npy; give such an ending")
+                raise AmiwarpError(f"{path}: images of events are written as .png or .npy; give one of these suffixes")
         self.written: list[Path] = []
         self._layers = layers = choice(Layers, layers, "layers")
         width, height = source.size
@@ -130,14 +130,14 @@ class IweFiles:
                 new.discard()
 
     def add(self, events: Events) -> None:
-        """Vote compensated events. Blocks must be in time order."""
+        """Add compensated events to the image of their time window. Blocks must be in time order."""
         for window, piece in self._pieces(events):
             while self._window < window:
                 self._write_window()
             self._votes.add_unmoved(piece)
 
     def _pieces(self, events: Events) -> Iterator[tuple[int, Events]]:
-        """Yield the index of the time window and a piece of the events, each piece within one window."""
+        """Split the events by time window; yield the index of the window and the events in it."""
         edges = {0, len(events), *range(0, len(events), PIECE)}
         window = np.zeros(len(events), np.int64)
         if self._window_us is not None:
@@ -178,7 +178,7 @@ class IweFiles:
         return path if self._window_us is None else path.with_name(f"{path.stem}_{at:05d}{path.suffix}")
 
     def _check_outputs(self) -> None:
-        """Raise :class:`AmiwarpError` before any work if an output cannot be written."""
+        """Check all output paths before any work; raise :class:`AmiwarpError` if one of them cannot be written."""
         for path in self._paths:
             count = self._count if path.suffix.lower() == ".png" else 1
             check_output(self._numbered(path, 0) if count > 1 else path)
@@ -188,7 +188,7 @@ class IweFiles:
                     check_output(name)
 
     def _begin_file(self, path: Path) -> Path:
-        """Open an unfinished file and return its temporary path."""
+        """Create the temporary file of one output and return its path."""
         self._unfinished.append(NewFile(path))
         return self._unfinished[-1].part
 

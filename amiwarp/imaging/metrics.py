@@ -33,15 +33,15 @@ RIDGE_SCALE = 1.0
 WEAKEST_EDGE = 0.3
 """Smallest strength of an edge, relative to the 95th percentile of all edges. Weaker ridges are mostly noise."""
 TRUTH_PERCENTILES = (0.5, 99.5)
-"""Percentiles that define the range of a true picture. PSNR is relative to this range."""
+"""Percentiles of a true picture between which its range is measured; PSNR is relative to this range."""
 
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Sub-pixel edge points of an IWE: its ridges."""
+    """Sub-pixel points on the edges of an IWE, found as ridges of the image."""
 
     xy: NDArray[np.float64]
-    """Positions [px], shape (n, 2)."""
+    """Positions of the edge points [px], shape (n, 2)."""
     normal: NDArray[np.float64]
     """Unit vectors across the edge, shape (n, 2)."""
     label: NDArray[np.int64]
@@ -106,9 +106,11 @@ def edge_blur(
     AmiwarpError
         If the IWE has no edges, or no event is near an edge.
 
-    Notes ----- Edges are the ridges of the IWE of ``sharp_xy`` (Steger, PAMI 1998). An event belongs to an edge if it
-    is within 3 px. Each event is weighted by the probability that it is not part of the uniform background, which
-    consists of noise and neighbouring texture.
+    Notes
+    -----
+    Edges are the ridges of the IWE of ``sharp_xy`` (Steger, PAMI 1998). An event belongs to an edge if it is within
+    3 px. Each event is weighted by the probability that it is not part of the uniform background, which consists of
+    noise and neighbouring texture.
 
     Examples
     --------
@@ -143,8 +145,8 @@ def edge_blur(
 def _edge_probability(across: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability that each event belongs to the edge rather than to the uniform background.
 
-    ``across``: signed distances from the edge [px]. The density over all edges is counted in bins of 0.1 px. The
-    background is the mean density in the outermost sixth of the strip.
+    ``across`` holds the signed distances of events from their nearest edge [px]. The density over all edges is counted
+    in bins of 0.1 px. The background is the mean density in the outermost sixth of the strip.
     """
     bins = np.clip(((across + STRIP_HALF_WIDTH) * 10.0).astype(np.int64), 0, round(20 * STRIP_HALF_WIDTH) - 1)
     density = np.bincount(bins, minlength=round(20 * STRIP_HALF_WIDTH)).astype(np.float64)
@@ -225,19 +227,22 @@ def model_error(model: Model, truth: ExactModel) -> ModelError:
 
 @dataclass(frozen=True, slots=True)
 class PictureQuality:
-    """Similarity of a picture to the truth after fitting gain and offset, which events do not determine."""
+    """Similarity of a picture to the true picture after a fit of gain and offset, which events do not determine."""
 
     correlation: float
-    """Pearson correlation of log intensity, -1 .. 1; negative for an inverted picture."""
+    """Pearson correlation of log intensity with the true picture, -1 .. 1; negative for an inverted picture."""
     psnr_db: float
-    """PSNR of log intensity after the fit [dB], relative to the truth's range over :data:`TRUTH_PERCENTILES`.
+    """PSNR of log intensity after the fit [dB], relative to the true picture's range over :data:`TRUTH_PERCENTILES`.
 
     Infinite if there is no error.
     """
     gain: float
-    """Log intensity of the truth per unit of the picture. If that unit is the ON threshold: the threshold."""
+    """Slope of the fit: log intensity of the true picture per unit of the reconstructed picture.
+
+    If the unit of the reconstructed picture is the ON threshold, the gain is the value of that threshold.
+    """
     offset: float
-    """Log intensity of the truth where the picture is 0."""
+    """Log intensity of the true picture where the reconstructed picture is 0."""
 
 
 def picture_quality(
@@ -254,14 +259,15 @@ def picture_quality(
         where = np.ones(np.shape(truth), np.bool_)
     if not np.shape(log) == np.shape(truth) == where.shape:
         shapes = f"{np.shape(log)}, {np.shape(truth)} and {where.shape}"
-        raise AmiwarpError(f"picture, truth and `where` have shapes {shapes}; expected equal shapes")
+        raise AmiwarpError(f"picture, truth and mask `where` have shapes {shapes}; expected equal shapes")
     a, b = log[where].astype(np.float64), truth[where].astype(np.float64)
     span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))
     if not (np.isfinite(a).all() and np.isfinite(b).all() and math.isfinite(span)):
-        raise AmiwarpError("picture or truth is not finite in some pixels; exclude them with `where`")
+        raise AmiwarpError("picture or truth is not finite in some pixels; exclude these pixels with the mask `where`")
     if not (a.size and np.ptp(a) > 0.0 and np.ptp(b) > 0.0 and span > 0.0):
         raise AmiwarpError(
-            f"picture or truth is constant over the {a.size} pixels of `where`, so no gain can be fitted"
+            f"picture or truth is constant over the {a.size} pixels of the mask `where`, so no gain can be fitted; "
+            "compare pictures with contrast"
         )
     da, db = a - a.mean(), b - b.mean()
     gain = float(da @ db / (da @ da))

@@ -12,6 +12,7 @@ SKY_BLUE = "#56b4e9"
 VERMILION = "#d55e00"
 
 OFF_COLOUR, ON_COLOUR = BLUE, VERMILION
-"""Polarities on a light ground."""
+"""Colours of OFF and ON events on a light ground."""
 OFF_ON_BLACK, ON_ON_BLACK = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)
-"""Polarities on a black ground, where the darker pair would be hard to see."""
+"""Colours of OFF and ON events on a black ground, as RGB from 0 to 1. The colours for a light ground would be too dark.
+"""

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PAPER_ETA = 1.0
-"""η of the paper's J [events]; He et al. do not state theirs."""
+"""Parameter η of the paper's sharpness cost J [events]; He et al. do not state the value that they used."""
 LARGEST_SMOOTHING = 1000.0
-"""Largest standard deviation of a Gaussian [px]."""
+"""Largest accepted standard deviation of the smoothing Gaussian [px]."""
 FEW_SUMS = 256
-"""Number of partial sums per layer that the host adds up."""
+"""Number of partial sums per image layer that the device computes and the host adds up."""
 
 
 class SharpnessMeter:
-    """Smooth images of one canvas and measure their sharpness; owns its buffers."""
+    """Measures the sharpness of images of one canvas, after smoothing. Owns its buffers."""
 
     def __init__(self, canvas: CanvasShape, kind: Sharpness, *, smoothing: float, device: Any) -> None:
         """Allocate buffers. ``smoothing``: standard deviation of the Gaussian [canvas px]; 0 disables smoothing."""
@@ -36,7 +36,7 @@ class SharpnessMeter:
         self.kind = choice(Sharpness, kind, "sharpness")
         self.device = wp.get_device(device)
         self.image = Image(canvas, len(weights), self.device)
-        """Image to measure [events]; the caller writes it."""
+        """Image whose sharpness is measured [events per pixel]; the caller writes its pixels."""
         self._weights = wp.array(weights, dtype=float, device=device)
         self._half, self._smooth = (wp.zeros_like(self.image.pixels) for _ in range(2))
         layers, rows, columns = canvas.shape
@@ -75,7 +75,7 @@ class SharpnessMeter:
         return self.results()[0]
 
     def _score(self, total: float, terms: float) -> float:
-        """Return the sharpness from the sum of the image and the sum of the measure's terms."""
+        """Return the sharpness from the sum of the image's pixels and the sum of the measure's terms."""
         if total <= 0.0:
             return 0.0
         if self.kind is Sharpness.VARIANCE:
@@ -88,7 +88,10 @@ class SharpnessMeter:
 
 
 def gaussian(sigma: float) -> NDArray[np.float32]:
-    """Return weights of a Gaussian at 0, 1, … 3 sigma; the full symmetric kernel sums to 1. Just [1] for sigma 0."""
+    """Return the weights of a Gaussian at 0, 1, … 3 sigma pixels; [1] for sigma 0.
+
+    The symmetric kernel of these weights sums to 1.
+    """
     sigma = real(sigma, "smoothing", 0.0, LARGEST_SMOOTHING, " px, a standard deviation")
     if sigma == 0.0:
         return np.ones(1, dtype=np.float32)

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 class TileVotes:
-    """Events sorted by image tile, and the vote images of a few candidates. Buffers are allocated once.
+    """Events sorted by image tile, and the vote images of a few candidate parameter sets.
 
-    ``launch`` only launches kernels, so it can be captured in a CUDA graph. Kernels read the parameters from device
-    memory when they run.
+    Buffers are allocated once. ``launch`` only launches kernels, so it can be captured in a CUDA graph. Kernels read
+    the parameters from device memory when they run.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class TileVotes:
         self._camera = (pinhole_params(like.camera) if still else None) or model_camera(like, self.device)
         self._arrays = self._sort(events)
         self.votes = wp.zeros((candidates, len(image.pixels)), dtype=wp.int64, device=device)
-        """Votes of each candidate [1/256 event], in the memory layout of the image."""
+        """Votes of each candidate parameter set [1/256 event], in the memory layout of the image."""
         frame, self._layout = image.frame, kernels.Layout()
         self._layout.stride, self._layout.layer, self._layout.first = frame.stride, frame.layer, frame.first
         self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
@@ -61,7 +61,7 @@ class TileVotes:
         self._motion = kernels.Still() if still else motion
 
     def _sort(self, events: DeviceEvents) -> Any:
-        """Sort the events by tile and pack them."""
+        """Sort the events by tile and pack each event into one word."""
         a, n, device = events.arrays, events.count, self.device
         layers = self.canvas.shape[0]
         size = min(kernels.TILE, max(1, int(kernels.TILE / self.canvas.scale)))
@@ -81,7 +81,7 @@ class TileVotes:
         return out
 
     def _chunks(self, counts: Any, size: int, across: int, down: int) -> Any:
-        """Return runs of at most CHUNK events of one tile and layer, each with its window centred on the tile."""
+        """Return runs of at most CHUNK events of one tile and layer, each with a vote window centred on the tile."""
         stops = np.cumsum(counts)
         pieces = [
             (start, min(start + kernels.CHUNK, stop), key)
@@ -100,7 +100,7 @@ class TileVotes:
         return chunks
 
     def set(self, k: int, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
-        """Set the parameters of candidate ``k`` for the next :meth:`launch`. No launch may be in progress."""
+        """Set the parameters of candidate ``k`` for the next :meth:`launch`. A previous launch must have finished."""
         self._drifts[k] = drift
         for array, struct in (
             (self._host[0], model.params(self.device)),
@@ -110,7 +110,7 @@ class TileVotes:
             ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)
 
     def launch(self) -> None:
-        """Vote all events for all candidates."""
+        """Compute the image of warped events of every candidate."""
         for host, there in zip(self._host, self._on_device, strict=True):
             wp.copy(there, host)
         self.votes.zero_()

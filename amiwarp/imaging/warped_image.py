@@ -40,16 +40,18 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 PIECE = 1 << 22
-"""Number of events copied to the device at a time."""
+"""Number of events that are copied to the device at a time."""
 FIRST_BATCH, LARGEST_BATCH = 1 << 21, 1 << 27
-"""Sizes of the first and the largest batch of the fast vote on CUDA [events].
+"""Sizes of the first and the largest batch of the fast voting kernel on CUDA [events].
 
-The fast vote does not check whether a word of the image overflows; words are cleared after each batch. The first batch
-is small. Later ones have a size that fills the fullest word to about :data:`TARGET_FILL`. If a word overflowed, or if
-there are fewer events than the first batch, the exact vote is used, which checks every addition.
+The fast kernel does not check whether a 32-bit word of the image overflows; the words are added to the image and
+cleared after each batch. The first batch is small. Later batches have a size that fills the fullest word to about
+:data:`TARGET_FILL`. If a word overflowed, or if there are fewer events than the first batch, the exact kernel votes,
+which checks every addition.
 """
 TARGET_FILL = 600
-"""Number of events that the fullest word should receive per batch; a word holds up to 1,023."""
+"""Number of events that the fullest word of the image should receive per batch of the fast voting kernel. A word holds
+up to 1,023."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,21 +59,22 @@ class CanvasShape:
     """Shape of a vote image: the sensor's image, extended by ``pad`` px on each side, then scaled."""
 
     width: int
-    """Sensor width [px]."""
+    """Width of the sensor [px]."""
     height: int
-    """Sensor height [px]."""
+    """Height of the sensor [px]."""
     pad: int = 0
-    """Border [sensor px] that keeps displaced events inside the image."""
+    """Border on each side of the sensor's image that keeps displaced events inside the canvas [sensor px]."""
     scale: float = 1.0
-    """Canvas pixels per sensor pixel."""
+    """Canvas pixels per sensor pixel, along each axis."""
     per_polarity: bool = False
-    """Use two layers, OFF then ON, instead of one."""
+    """Whether OFF and ON events get separate layers, in this order."""
     vote: Vote = Vote.BILINEAR
     """How a vote is shared among pixels."""
     parts: int = 1
     """Number of disjoint subsets of the events with separate images; event k belongs to subset ``k % parts``."""
     dither: bool = False
-    """Put each event at a pseudo-random place in its pixel: at the centres, the pixel grid would add sharpness."""
+    """Whether each event is voted at a pseudo-random position in its pixel. At pixel centres the pixel grid would add
+    sharpness."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vote", choice(Vote, self.vote, "vote"))
@@ -81,7 +84,7 @@ class CanvasShape:
 
     @property
     def layers(self) -> int:
-        """Number of layers: one per part, or two per part with separate polarities."""
+        """Number of image layers: one per part, or two per part with separate polarities."""
         return self.parts * (2 if self.per_polarity else 1)
 
     @property
@@ -92,7 +95,7 @@ class CanvasShape:
         return (self.layers, rows, columns)
 
     def params(self) -> Any:
-        """Return the canvas as the kernels' struct."""
+        """Return the canvas as the struct that the kernels take."""
         c = Canvas()
         c.pad, c.scale = float(self.pad), self.scale
         c.nearest, c.dither = int(self.vote is Vote.NEAREST), float(self.dither)
@@ -102,10 +105,10 @@ class CanvasShape:
 
 
 class Image:
-    """Image of a canvas on a device, padded with zeros so that kernels need not test for the border."""
+    """Vote image on a device, with a border of zeros so that kernels need not test for the image's edge."""
 
     def __init__(self, canvas: CanvasShape, radius: int, device: Any) -> None:
-        """Allocate the image. ``radius``: how far from a pixel kernels read [px]."""
+        """Allocate the image. ``radius``: largest distance from a pixel at which kernels read [px]."""
         self.shape = canvas.shape
         self.device = wp.get_device(device)
         self.width = CPU_WIDTH if self.device.is_cpu else 1
@@ -120,7 +123,7 @@ class Image:
         self.pixels = wp.zeros(f.first + layers * f.layer + f.stride, dtype=float, device=device)
 
     def _view(self, flat: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the pixels inside the padding."""
+        """Return the pixels in a flat array without the border around them, shape (layers, rows, columns)."""
         layers, rows, columns = self.shape
         end = self.frame.first + layers * self.frame.layer
         stacked = flat[self.frame.first : end].reshape(layers, -1, self.frame.stride)
@@ -138,9 +141,10 @@ class Image:
 
 
 class Votes:
-    """Vote buffers of a canvas on a device, allocated once: one image per CPU slice, one image on CUDA.
+    """Buffers in which events are voted into the image of a canvas, allocated once.
 
-    No vote is lost, even if very many events fall on one pixel. On CUDA, do not change the events before :meth:`take`.
+    There is one image per CPU slice, or one image on CUDA. No vote is lost, even if very many events fall on one pixel.
+    On CUDA, do not change the events before :meth:`take`.
     """
 
     def __init__(self, canvas: CanvasShape, device: Any) -> None:
@@ -182,7 +186,7 @@ class Votes:
         self._read: tuple[Image, Any] | None = None
 
     def clear(self) -> None:
-        """Discard all votes."""
+        """Discard all votes, so that the image is empty."""
         self._discard_batches()
         self._words.zero_()
         if self._any_total:
@@ -191,7 +195,7 @@ class Votes:
 
     @property
     def _any_total(self) -> bool:
-        """Whether any word overflowed into the totals."""
+        """Whether a word of the image may have overflowed; always True on CUDA."""
         return bool(self.device.is_cuda or self._spilled.numpy().any())
 
     def add_events(
@@ -217,7 +221,7 @@ class Votes:
             self._vote_exactly(vote_events, inputs, events.count)
 
     def add_points(self, x: Any, y: Any, layer: Any, count: int | None = None) -> None:
-        """Vote points without moving them.
+        """Vote points at their coordinates, without compensation.
 
         ``x``, ``y``: Warp arrays of float [px]. ``layer``: Warp array of uint8, the index of each point's layer.
         ``count``: number of points to vote; None for all.
@@ -228,7 +232,7 @@ class Votes:
         self._vote_exactly(vote_points, inputs, count - blocks * int(BLOCK), blocks * int(BLOCK))
 
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
-        """Return a function that votes ``count`` points from index ``first`` on, for long-lived arrays of points.
+        """Return a function that votes ``count`` of the points from index ``first`` on, for arrays that stay allocated.
 
         On a CPU, indices count blocks of 64 points, and one thread votes.
         """
@@ -241,11 +245,11 @@ class Votes:
         self.add_points(x, y, wp.array(events.p, dtype=wp.uint8, device=self.device))
 
     def _vote_exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
-        """Vote with a check for overflow at every addition."""
+        """Vote by the exact kernel, which checks for overflow at every addition."""
         launch_slices(kernel, count, inputs, self._cells, device=self.device, first=first)
 
     def _vote_in_batches(self, inputs: list[Any], count: int) -> None:
-        """Vote on CUDA by the fast kernel and verify later; few events, or crowded words, are voted exactly at once."""
+        """Vote on CUDA by the fast kernel, whose result is verified later; few events are voted exactly at once."""
         start, vote = 0, None
         while start < count:
             batch = min(count - start, self._batch)
@@ -265,7 +269,7 @@ class Votes:
             start += batch
 
     def _recorded_vote(self, inputs: list[Any]) -> Any:
-        """Return the recorded launch of the fast vote. Launching it again takes a tenth of the time of a new launch."""
+        """Return the recorded launch of the fast kernel, which takes a tenth of the time of a new launch."""
         if self._recorded is not None:
             before, vote = self._recorded
             if type(inputs[0]) is type(before[0]) and all(a is b for a, b in zip(inputs[1:], before[1:], strict=True)):
@@ -278,7 +282,7 @@ class Votes:
         return vote
 
     def _verify_batches(self) -> None:
-        """Keep the fast votes if no word overflowed; otherwise vote their events again, exactly."""
+        """Keep the votes of the fast kernel if no word overflowed; otherwise vote their events again exactly."""
         if not self._batches:
             return
         counts = self._counts[: len(self._batches)].numpy().sum(axis=1)
@@ -296,7 +300,7 @@ class Votes:
         self._discard_batches()
 
     def _discard_batches(self) -> None:
-        """Discard the fast votes that are not verified yet."""
+        """Discard the votes of the fast kernel that are not verified yet."""
         if self._batches:
             self._fast.totals.zero_()
             self._counts.zero_()

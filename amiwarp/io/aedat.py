@@ -39,7 +39,7 @@ def open_aedat4(path: Path) -> Recording:
 
 
 def _check_frame(path: Path, file: BinaryIO) -> None:
-    """Check the header, and that each packet ends within the file. Raises :class:`AmiwarpError` with the bad byte."""
+    """Check the header, and that each packet ends within the file; raise :class:`AmiwarpError` if not."""
     file_bytes = path.stat().st_size
     head = file.read(len(MAGIC) + 4)
     if not head.startswith(MAGIC) or len(head) < len(MAGIC) + 4:
@@ -66,7 +66,7 @@ def _check_frame(path: Path, file: BinaryIO) -> None:
 
 
 def _check_header(path: Path, header: bytes) -> int:
-    """Check the header's XML, and return the position of the file's table, which is not positive without a table.
+    """Check the header's XML, and return the position of the file's table; 0 or less if there is no table.
 
     The header is a FlatBuffer with the compression, the position of the table and the XML text.
     """
@@ -77,7 +77,7 @@ def _check_header(path: Path, header: bytes) -> int:
         start = root + text + struct.unpack_from("<I", header, root + text)[0]
         (length,) = struct.unpack_from("<I", header, start)
         if min(fields, text) <= 0 or start + 4 + length > len(header):
-            raise ValueError("its text lies outside it")
+            raise ValueError("its text lies outside the header")
         ElementTree.fromstring(header[start + 4 : start + 4 + length].decode("utf-8"))
         return int(struct.unpack_from("<q", header, root + position)[0]) if position else 0
     except (struct.error, ValueError, ElementTree.ParseError) as error:
@@ -85,7 +85,7 @@ def _check_header(path: Path, header: bytes) -> int:
 
 
 def read_head(path: str) -> Reply:
-    """Return width, height and number of the first stream of events. Runs in the reading process."""
+    """Return width, height and number of the first stream of events. Called in the reading process."""
     from faery.extension import aedat
 
     with aedat.Decoder(path) as decoder:
@@ -96,7 +96,7 @@ def read_head(path: str) -> Reply:
 
 
 def read_packets(notes: dict[str, int], path: str, number: int) -> Iterator[Packet]:
-    """Yield the packets of a stream of events. Runs in the reading process."""
+    """Yield the packets of a stream of events. Called in the reading process."""
     from faery.extension import aedat
 
     with aedat.Decoder(path) as decoder:

@@ -25,10 +25,10 @@ from amiwarp.io.input_files import inputs_in_use, inputs_noted, same_file
 from amiwarp.io.regular_file import KINDS
 
 HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:32]
-"""Name of this machine, in the names of unfinished files. Process ids are valid on one machine only."""
+"""Name of this machine, which is part of the names of unfinished files: process ids are valid on one machine only."""
 
 UNFINISHED = re.compile(r"\..+\.(?P<host>\w+)-(?P<pid>\d+)-[0-9a-f]{8}\.part")
-"""Pattern of the names of unfinished files."""
+"""Pattern of the names of unfinished files, with the machine and the process that writes them."""
 
 
 @dataclass
@@ -38,7 +38,7 @@ class _Permissions:
     overwrite: bool = False
     """Whether all existing files may be replaced."""
     folders: list[Path] = field(default_factory=list)
-    """Folders whose files may be replaced."""
+    """Folders in which existing files may be replaced."""
 
 
 _permissions = _Permissions()
@@ -61,7 +61,7 @@ def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool)
             for path in outputs:
                 target = check_output(path)
                 if target in targets:
-                    raise AmiwarpError(f"{path}: is given for two outputs; give each its own name")
+                    raise AmiwarpError(f"{path}: is given for two outputs; give each output its own name")
                 targets.add(target)
             yield
     finally:
@@ -71,7 +71,7 @@ def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool)
 
 @contextlib.contextmanager
 def own_folder(path: Path) -> Iterator[None]:
-    """Allow the replacement of files in a folder that holds only files of the same job."""
+    """Allow this command to replace existing files in a folder that only holds the command's own results."""
     folder = path.resolve()
     _permissions.folders.append(folder)
     try:
@@ -95,7 +95,7 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
         what = KINDS.get(stat.S_IFMT(mode), "not a regular file")
         raise AmiwarpError(f"{path}: is {what}; give the name of a file")
     if not target.parent.is_dir():
-        raise AmiwarpError(f"{path}: its folder {target.parent} does not exist; make it first")
+        raise AmiwarpError(f"{path}: its folder {target.parent} does not exist; create it first")
     if not os.access(target.parent, os.W_OK):
         raise AmiwarpError(f"{path}: its folder {target.parent} is not writable; choose another place")
     if mode is not None:
@@ -107,15 +107,15 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
 
 
 def _may_replace(target: Path, overwrite: bool) -> bool:
-    """Return whether an existing file may be replaced."""
+    """Return whether an existing file may be replaced: any file, or a file in a folder of the command's own results."""
     return overwrite or _permissions.overwrite or target.parent in _permissions.folders
 
 
 class NewFile:
-    """A file that is written next to ``path`` and renamed to it when it is complete.
+    """File that is written next to ``path`` and renamed to ``path`` when it is complete.
 
-    A ``with`` block renames it at the end, and removes it after an exception. Raises :class:`AmiwarpError` as
-    :func:`check_output` does, at the start and again before renaming.
+    A ``with`` block renames the file at its end, and removes the file after an exception. Raises :class:`AmiwarpError`
+    as :func:`check_output` does, at the start and again before renaming.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -142,7 +142,7 @@ class NewFile:
             self.discard()
 
     def commit(self) -> None:
-        """Rename the file to its final name."""
+        """Rename the unfinished file to its final name."""
         put_in_place(self.part, self.path, overwrite=self._overwrite)
         _unfinished.discard(self.part)
 
@@ -152,7 +152,10 @@ class NewFile:
 
 
 def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
-    """Rename ``part`` to the target of ``path``. Raises :class:`AmiwarpError` and keeps it if that is not allowed."""
+    """Rename the file ``part`` to the target of ``path``.
+
+    If that is not allowed, raise :class:`AmiwarpError` and keep ``part``.
+    """
     target = check_output(path, overwrite=overwrite)
     try:
         if not _may_replace(target, overwrite):
@@ -168,7 +171,7 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
 
 
 def _link(part: Path, target: Path) -> None:
-    """Rename without replacing a file that another program has just created, which os.replace would do."""
+    """Rename a file without replacing one that another program has just created, which os.replace would replace."""
     try:
         os.link(part, target)
     except FileExistsError:
@@ -180,7 +183,10 @@ def _link(part: Path, target: Path) -> None:
 
 
 def allocate(handle: int, start: int, count: int) -> None:
-    """Reserve disk space for a file. Raises OSError if the disk is full. Systems without this function do nothing."""
+    """Reserve disk space for a file.
+
+    Raises OSError if the disk is full. Systems that cannot reserve space do nothing.
+    """
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(handle, start, count)
@@ -191,7 +197,7 @@ def allocate(handle: int, start: int, count: int) -> None:
 
 @contextlib.contextmanager
 def scratch_folder(folder: Path) -> Iterator[Path]:
-    """Create a folder for temporary files. It is removed at the end, or by the next run if this one is killed."""
+    """Create a folder for temporary files. It is removed at the end, or by the next run if the process is killed."""
     remove_abandoned(folder.resolve())
     made = _unfinished_name(folder.resolve() / "scratch")
     _unfinished.add(made)
@@ -243,7 +249,7 @@ def _is_alive(pid: int) -> bool:
 
 @atexit.register
 def _discard_unfinished() -> None:
-    """Remove the unfinished files of this process, but not those of a process that it was forked from."""
+    """Remove the unfinished files of this process, but not files of the process that it was forked from."""
     for part in list(_unfinished):
         if f"-{os.getpid()}-" in part.name:
             _remove(part)

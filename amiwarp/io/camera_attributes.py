@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[Any], default: Any = None) -> Any:
-    """Return an attribute as ``kind``. Raises :class:`AmiwarpError` if it is missing or of another type."""
+    """Return an attribute as type ``kind``; raise :class:`AmiwarpError` if it is missing or of another type."""
     if name not in attributes and default is None:
-        raise AmiwarpError(f"{where} has no attribute '{name}'; add it")
+        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute")
     value = attributes.get(name, default)
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
@@ -39,7 +39,7 @@ def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[A
 
 
 def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[float]]:
-    """Return the attributes of a camera."""
+    """Return a camera as attributes of an HDF5 group, by name."""
     attributes: dict[str, int | float | str | list[float]] = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
     attributes["distortion_model"] = "none"
     for name, kind in DISTORTIONS.items():
@@ -76,7 +76,7 @@ def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
 
 
 def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
-    """Return the nominal prism of attributes. Its apex angle is unknown if ``apex`` is missing."""
+    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing."""
     side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
     prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
     return prism.with_apex(attribute(attributes, where, "apex", float)) if "apex" in attributes else prism

@@ -20,22 +20,25 @@ from amiwarp.kernels.cpu_threads import cpu_threads
 Result = TypeVar("Result")
 
 CHUNK = 1 << 18
-"""Events per HDF5 chunk. With Blosc's LZ4 and bit shuffle, writing and reading are faster than uncompressed."""
+"""Number of events per HDF5 chunk. With Blosc's LZ4 and bit shuffle, chunks are written and read faster than without
+compression."""
 
 BLOSC, FLETCHER32 = 32001, 3
-"""Filter numbers in HDF5."""
+"""Numbers of the Blosc and of the Fletcher-32 filter in HDF5."""
 
 BLOSC_HEADER_BYTES = 16
 """Size of the header of a Blosc frame [bytes]."""
 
 MAX_THREADS = 16
-"""Largest number of threads. More would wait for Python's lock, and each holds events in memory."""
+"""Largest number of threads that encode or decode chunks. More would wait for Python's lock, and each holds events in
+memory."""
 
 EXTRA_JOBS = 4
-"""Number of jobs in flight in addition to one per thread. Their results wait in memory for their turn."""
+"""Number of encoding or decoding jobs in flight in addition to one per thread. Their results wait in memory for their
+turn."""
 
 CHECKSUM_ROW = 256
-"""Number of 16-bit words that a checksum sums at a time."""
+"""Number of 16-bit words that the checksum sums at a time."""
 
 
 def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, None]:
@@ -75,7 +78,7 @@ def encode(values: NDArray[Any]) -> bytes:
 
 
 def decode(stored: bytes, out: NDArray[Any]) -> bool:
-    """Decode stored bytes into ``out``, which is one chunk long. Return whether they are undamaged."""
+    """Decode a stored chunk into ``out``, which is one chunk long. Return whether the chunk is undamaged."""
     if len(stored) < BLOSC_HEADER_BYTES + 4:
         return False
     frame = memoryview(stored)[:-4]
@@ -117,12 +120,12 @@ def _moment(sums: NDArray[np.uint32]) -> int:
 
 
 def _fold_carries(total: int) -> int:
-    """Return a sum modulo 65535 as end-around carry gives it: a multiple of 65535 is 65535, except 0."""
+    """Return a sum modulo 65535 as end-around carries give it: 65535 for every multiple of 65535 except 0."""
     return (total - 1) % 65535 + 1 if total else 0
 
 
 class StoredColumn:
-    """A dataset of the native layout. Threads read its chunks in parallel, without HDF5."""
+    """Dataset of the native layout whose chunks threads read in parallel, without HDF5."""
 
     def __init__(
         self,

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 GAP_INTERVALS = 5
-"""Encoder samples further apart than this number of median intervals are reported as a gap."""
+"""Number of median sample intervals above which the time between two encoder samples is reported as a gap."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConversionSummary:
-    """Summary of a conversion.
+    """Summary of the conversion of a recording.
 
     Examples
     --------
@@ -37,23 +37,24 @@ class ConversionSummary:
     """
 
     events: int
-    """Number of events written."""
+    """Number of events that were written."""
     t_first: int | None
     """Time of the first event [us], or None without events."""
     t_last: int | None
     """Time of the last event [us], or None without events."""
     width: int
-    """Sensor width [px]."""
+    """Width of the sensor [px]."""
     height: int
-    """Sensor height [px]."""
+    """Height of the sensor [px]."""
     repairs: dict[str, int]
-    """Number of repairs and other findings while reading, by name."""
+    """Number of repairs and other findings while reading, by name of the finding."""
     encoder_covers: bool | None
     """Whether the encoder has an angle for every event, or None without an encoder."""
     encoder_gaps: tuple[tuple[int, int], ...]
-    """Gaps in the encoder samples: the sample times before and after each [us]."""
+    """Gaps in the encoder samples: the times of the samples before and after each gap [us]."""
     index_slip: float | None
-    """Largest angle error at an index pulse [rad], or None without pulses. More than one count means lost counts."""
+    """Largest angle error at an index pulse [rad], or None without pulses. A value above one count means that counts
+    were lost."""
 
 
 def convert(

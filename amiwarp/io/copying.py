@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from amiwarp.progress import Progress
 
 POSE_BLOCK = 1 << 16
-"""Poses that are copied at a time."""
+"""Number of poses that are copied at a time."""
 
 
 def copy_events(recording: Recording, writer: RecordingWriter, progress: Progress | None = None) -> None:
@@ -33,7 +33,7 @@ def copy_events(recording: Recording, writer: RecordingWriter, progress: Progres
 
 
 def _copy_world_truth(truth: Truth, writer: RecordingWriter) -> None:
-    """Append the ground truth of instants, and the poses."""
+    """Append the ground truth of instants, and the poses, to a writer."""
     if truth.frames is not None:
         for index in range(len(truth.frames.t)):
             writer.append_frame(truth.frames[index])

@@ -40,7 +40,10 @@ def read_encoder_csv(
         late = np.flatnonzero(t[1:] <= t[:-1])
         if late.size:
             line = lines[int(late[0]) + 1]
-            raise AmiwarpError(f"{path}: line {line}: t_us is not later than in the line before; sort and deduplicate")
+            raise AmiwarpError(
+                f"{path}: line {line}: t_us is not later than in the line before; sort the lines by t_us and remove "
+                "duplicates"
+            )
         try:
             encoder = _encoder(
                 path, columns, t, counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
@@ -51,7 +54,7 @@ def read_encoder_csv(
             return encoder
         bad = np.flatnonzero((columns["index"] != 0) & (columns["index"] != 1))
         if bad.size:
-            raise AmiwarpError(f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1; correct it")
+            raise AmiwarpError(f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1; correct this line")
         pulses = columns["index"] == 1
         # A pulse that stays high over several samples is one pulse at its first sample.
         rising = pulses & ~np.concatenate([[False], pulses[:-1]])
@@ -70,7 +73,7 @@ def _encoder(
     """Return the encoder of the log's columns."""
     if "count" in columns:
         if counts_per_turn is None:
-            raise AmiwarpError(f"{path}: holds counts; give counts_per_turn")
+            raise AmiwarpError(f"{path}: holds counts; give the counts per turn as counts_per_turn")
         return Encoder.from_counts(
             t, columns["count"], counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
         )
@@ -107,7 +110,7 @@ def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
 
 
 def _first_bad_line(numbers: list[int], lines: list[str], width: int) -> str:
-    """Describe the first line that does not hold ``width`` finite numbers."""
+    """Return a description of the first line that does not hold ``width`` finite numbers, for error messages."""
     for number, line in zip(numbers, lines, strict=True):
         try:
             values = np.array([float(word) for word in line.split(",")])

@@ -17,7 +17,7 @@ from amiwarp.io.regular_file import check_regular
 
 
 def open_es(path: Path) -> Recording:
-    """Open an Event Stream file. Its rows count from the bottom and are flipped."""
+    """Open an Event Stream file. Its rows are counted from the bottom, so they are flipped."""
     check_regular(path)
     with errors_name(path, lambda: "reading the header"):
         width, height = run("amiwarp.io.event_stream:read_head", os.path.abspath(path))
@@ -27,7 +27,7 @@ def open_es(path: Path) -> Recording:
 
 
 def read_head(path: str) -> Reply:
-    """Return width and height. Runs in the reading process."""
+    """Return width and height of the sensor. Called in the reading process."""
     from faery.extension import es
 
     with es.Decoder(path, 0) as decoder:
@@ -38,7 +38,7 @@ def read_head(path: str) -> Reply:
 
 
 def read_packets(notes: dict[str, int], path: str, height: int) -> Iterator[Packet]:
-    """Yield packets of events. Runs in the reading process."""
+    """Yield packets of events. Called in the reading process."""
     from faery.extension import es
 
     with es.Decoder(path, 0) as decoder:

@@ -1,4 +1,4 @@
-"""Event source for files without an index: a first pass counts, checks and repairs, and every use reads again.
+"""Event source for files without an index: a first pass counts, checks and repairs; later uses read the file again.
 
 Two faults of real recordings are repaired and counted, in all formats alike. An event that is earlier than one before
 it is moved to the largest time so far. An event outside the frame is dropped. If more than 1 % of the events have one
@@ -22,13 +22,14 @@ from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
 
 Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
-"""Arrays x, y [px], t [us] and p (ON if positive) as stored in the file: integers or booleans of one shape ``(n,)``."""
+"""Packet of events: arrays x, y [px], t [us] and p (ON if positive) as stored in the file: integers or booleans of one
+shape ``(n,)``."""
 
 KEEP_EVENTS = 1 << 22
 """Largest recording that stays in memory after the first pass [events], 55 MB."""
 
 SENSORS = ((128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480), (1280, 720))
-"""Sizes of known sensors [px], for files without a size."""
+"""Sizes of known sensors (width, height) [px], for files that do not state a size."""
 
 
 def smallest_sensor(x_max: int, y_max: int) -> tuple[int, int]:
@@ -41,24 +42,24 @@ def smallest_sensor(x_max: int, y_max: int) -> tuple[int, int]:
 
 @dataclass(slots=True)
 class PassCounts:
-    """Counts of a pass over a file so far."""
+    """Counts of the events that a pass over a file has read so far."""
 
     count: int = 0
-    """Events that were kept."""
+    """Number of events that were kept."""
     t_first: int = 0
-    """Time of the first event [us]."""
+    """Time of the first event so far [us]."""
     t_last: int = 0
-    """Time of the latest event [us]."""
+    """Time of the latest event so far [us]."""
     x_max: int = 0
-    """Largest column [px]."""
+    """Largest column of an event so far [px]."""
     y_max: int = 0
-    """Largest row [px]."""
+    """Largest row of an event so far [px]."""
     late: int = 0
-    """Events that were out of order and moved to a later time."""
+    """Number of events that were out of order and moved to a later time."""
     outside: int = 0
-    """Events outside the frame, which were dropped."""
+    """Number of events outside the frame, which were dropped."""
     notes: dict[str, int] = field(default_factory=dict)
-    """Other findings of the format's reader, by name."""
+    """Counts of other findings of the format's reader, by name of the finding."""
 
     def position(self) -> str:
         """Return the current position of the pass, for messages."""
@@ -66,10 +67,10 @@ class PassCounts:
 
 
 class FileEvents:
-    """Events of a file that can be read only from its beginning. The constructor makes the first pass.
+    """Events of a file that can be read only from its start. The constructor makes the first pass over the file.
 
     If the file has more than :data:`KEEP_EVENTS` events, every ``slice`` and ``between`` reads it again. Conversion to
-    the native format makes them fast. Raises :class:`AmiwarpError` for a damaged file and for one without events.
+    the native format makes these fast. Raises :class:`AmiwarpError` for a damaged file and for a file without events.
     """
 
     def __init__(
@@ -79,14 +80,19 @@ class FileEvents:
         *,
         size: tuple[int, int] | None,
     ) -> None:
-        """Make the first pass. ``packets`` starts a pass and gets a dictionary for counts. ``size`` may be unknown."""
+        """Make the first pass over the file.
+
+        ``packets`` is a function that starts a pass and gets a dictionary for counts. ``size`` is None if the sensor
+        size is unknown.
+        """
         if size is not None:
             check_size(*size, path)
         self.path = path
         self._packets = packets
         self._size = size
         self.size_is_known = size is not None
-        """Whether the file stores the sensor size. Otherwise the smallest known sensor with all events is taken."""
+        """Whether the file stores the sensor size. Otherwise the smallest known sensor that contains all events is
+        assumed."""
         self._kept: list[Events] | None = []
         self._counts = PassCounts()
         for block in self._pass(self._counts):
@@ -98,7 +104,7 @@ class FileEvents:
         register_reader(self, self.path)
 
     def _check_counts(self) -> None:
-        """Raise :class:`AmiwarpError` for too many faulty events, and for none at all."""
+        """Raise :class:`AmiwarpError` if the file has no events, or too many faulty events."""
         counts = self._counts
         for bad, what in ((counts.outside, f"lie outside the frame {self._size}"), (counts.late, "are out of order")):
             if bad * 100 > counts.count + counts.outside:
@@ -109,7 +115,7 @@ class FileEvents:
 
     @property
     def repairs(self) -> dict[str, int]:
-        """Number of repairs and other findings by name, without zeros."""
+        """Number of repairs and other findings by name; names with the number 0 are left out."""
         repairs = {"repaired_time_events": self._counts.late, "dropped_outside_events": self._counts.outside}
         return {name: count for name, count in {**repairs, **self._counts.notes}.items() if count}
 

@@ -1,4 +1,4 @@
-"""Access to HDF5 files of events, which the reading process opens.
+"""Access to HDF5 files of events, which a separate process opens.
 
 Files of amiwarp have a checksum on each chunk. Their chunks are read and decoded in this process, on all cores. HDF5 in
 the reading process reads files of other layouts or filters, and everything that is read once when a file is opened.
@@ -25,10 +25,10 @@ PIECE = 1 << 20
 """Number of elements that the reading process reads per request."""
 
 READ_ON_DEMAND = ("events/", "truth/x", "truth/y", "truth/events/", "ms_to_idx")
-"""Prefixes of the datasets that are read often after a file was opened."""
+"""Prefixes of the datasets that are read repeatedly after a file was opened."""
 
 SERVER = "amiwarp.io.hdf5_server"
-"""Module that runs in the reading process."""
+"""Name of the module that runs in the reading process."""
 
 
 class Hdf5File:
@@ -53,9 +53,9 @@ class Hdf5File:
             raise
         self._attributes = about["attributes"]
         self.unfinished = bool(about["unfinished"])
-        """Whether the file is still being written, or its writer was interrupted."""
+        """Whether the file is still being written, or the program that wrote it was interrupted."""
         self.columns = {name: Column(self, handle, name, column) for name, column in about["columns"].items()}
-        """Datasets by name. They refer to the file weakly, so the reader must keep it."""
+        """Datasets of the file by name. They refer to the file weakly, so a reader must keep the file."""
 
     def attributes(self, group: str) -> Mapping[str, Any] | None:
         """Return the attributes of a group, or None if the file has no such group."""
@@ -63,7 +63,7 @@ class Hdf5File:
         return found
 
     def settle(self) -> None:
-        """End the opening. Give the reading process back if the datasets that are read often do not need it."""
+        """Finish opening the file: give the reading process back unless datasets that are read repeatedly need it."""
         if all(column.is_stored for name, column in self.columns.items() if name.startswith(READ_ON_DEMAND)):
             with self._lock:
                 _give_back(self._process)
@@ -79,12 +79,12 @@ class Hdf5File:
         self._process[:] = [borrow()]
         about, _ = self._process[0].call(f"{SERVER}:open_file", self._absolute)
         if about["identity"] != self._identity:
-            raise AmiwarpError("was replaced by another file while it was read; open it again")
+            raise AmiwarpError("was replaced by another file while it was read; open the file again")
         return about
 
 
 class Column:
-    """A dataset that is read by rows: of numbers, or of arrays of one shape."""
+    """Dataset that is read by rows: of numbers, or of arrays of one shape."""
 
     def __init__(self, file: Hdf5File, handle: int, name: str, about: Mapping[str, Any]) -> None:
         self._file = weakref.proxy(file)
@@ -94,7 +94,7 @@ class Column:
         self.dtype = np.dtype(about["dtype"])
         places = about["places"]
         self.row = tuple(int(size) for size in about["row"])
-        """Shape of an element: empty for numbers."""
+        """Shape of a row: empty for numbers."""
         self._stored = None if places is None else StoredColumn(handle, self.dtype, self._count, places, self.row)
 
     def __len__(self) -> int:
@@ -102,7 +102,7 @@ class Column:
 
     @property
     def is_stored(self) -> bool:
-        """Whether the dataset is read without HDF5."""
+        """Whether the dataset's chunks are read without HDF5."""
         return self._stored is not None
 
     def read(self, start: int, stop: int) -> NDArray[Any]:

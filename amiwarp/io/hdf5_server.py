@@ -30,7 +30,7 @@ ATTRIBUTES = {
     "truth/world": ("name",),
     "metadata": (),
 }
-"""Attributes that are read, by group; of ``truth`` and ``metadata`` all. Others are ignored."""
+"""Attributes that are read, by group; of ``truth`` and ``metadata`` all are read. Other attributes are ignored."""
 
 COLUMNS = {
     **{f"events/{name}": "iub" for name in ("t", "p", "inside", "extrapolated")},
@@ -53,7 +53,7 @@ COLUMNS = {
     "truth/joints/position": "f",
     **{f"truth/{name}": "S" for name in ("world/instances", "world/categories", "poses/body_names", "joints/names")},
 }
-"""Datasets that are read, and the allowed kinds of their types, as in NumPy's ``dtype.kind``."""
+"""Datasets that are read, with the kinds of data types allowed for each, as in NumPy's ``dtype.kind``."""
 
 DIMENSIONS = {
     "t_offset": 0,
@@ -62,7 +62,7 @@ DIMENSIONS = {
     **{f"truth/frames/{name}": 3 for name in ("depth", "instance", "intensity", "intensity_with_prism")},
     **{f"truth/frames/{name}": 4 for name in ("normal", "flow", "flow_with_prism")},
 }
-"""Numbers of dimensions of the datasets; 1 for all others."""
+"""Numbers of dimensions of the datasets that do not have exactly one dimension."""
 
 READ_AT_ONCE = (
     "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "truth/frames/t", "truth/world/instances",
@@ -71,7 +71,8 @@ READ_AT_ONCE = (
 """Datasets that are read into memory at once, and therefore have stricter size limits."""
 
 AT_ONCE_BYTES, AT_ONCE_RATIO = 1 << 24, 1000
-"""Limits of these datasets: size in memory [bytes], or ratio to the size in the file. The larger limit applies."""
+"""Limits of the datasets in :data:`READ_AT_ONCE`: size in memory [bytes], or ratio to the size in the file. The larger
+limit applies."""
 
 CHUNK_BYTES = 1 << 28
 """Largest chunk that is read [bytes]. HDF5 holds a decoded chunk in memory."""
@@ -80,7 +81,7 @@ CACHE_BYTES = 1 << 22
 """HDF5's cache of decoded chunks per dataset [bytes]. Chunks of other writers may exceed the default of 1 MB."""
 
 ATTRIBUTE_BYTES = 1 << 16
-"""Largest attribute that is read [bytes]."""
+"""Size of the largest attribute that is read [bytes]."""
 
 ATTEMPTS = 24
 """Number of attempts to read a block that is being written. The pauses double from 1 ns; their sum is 17 ms."""
@@ -115,13 +116,13 @@ def open_file(path: str) -> Reply:
 
 
 def read(name: str, start: int, stop: int) -> Reply:
-    """Return a part of a dataset."""
+    """Return the rows ``start`` to ``stop`` (excluded) of a dataset."""
     dataset = kept("columns")[name]
     return None, [np.atleast_1d(dataset[()] if dataset.ndim == 0 else dataset[start:stop])]
 
 
 def _open(path: str) -> tuple[Any, bool]:
-    """Return the file and whether it is unfinished. HDF5 opens only live recordings while they are unfinished."""
+    """Open a file and return whether it is unfinished. HDF5 opens unfinished files only if they are live recordings."""
     try:
         return h5py.File(path, "r", rdcc_nbytes=CACHE_BYTES), False
     except OSError:
@@ -139,7 +140,7 @@ def _open(path: str) -> tuple[Any, bool]:
 
 
 def _identity(file: Any) -> list[int]:
-    """Return device and inode of the open file, because its name may refer to another file by now."""
+    """Return device and inode of the open file. They identify it even if its name refers to another file by now."""
     found = os.fstat(file.id.get_vfd_handle()) if hasattr(os, "pread") else os.stat(file.filename)
     return [found.st_dev, found.st_ino]
 
@@ -158,12 +159,12 @@ def _member(file: Any, name: str) -> Any:
         if not found.id.links.exists(part.encode()):
             return None
         if found.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
-            raise AmiwarpError(f"'{name}' is a soft or external link; copy what it links to into the file")
+            raise AmiwarpError(f"'{name}' is a soft or external link; replace the link by a copy of the data")
         found = found[part]
     if isinstance(found, h5py.Dataset):
         creation = found.id.get_create_plist()
         if creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count():
-            raise AmiwarpError(f"dataset '{name}' takes its values from other files; copy them into this one")
+            raise AmiwarpError(f"dataset '{name}' takes its values from other files; copy the values into this file")
     return found
 
 
@@ -182,7 +183,7 @@ def _attributes(group: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _value(group: Any, name: str, attribute: str) -> Any:
-    """Return an attribute: a number, a string, or a list of them."""
+    """Return the value of an attribute: a number, a string, or a list of these."""
     stored = group.attrs.get_id(attribute)
     classes = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
     if stored.get_type().get_class() not in classes or stored.get_space().get_simple_extent_type() == h5py.h5s.NULL:
@@ -204,13 +205,16 @@ def _plain(value: Any) -> Any:
 
 
 def _text(value: Any) -> str:
-    """Return text with bytes that are not UTF-8 replaced."""
+    """Decode text as UTF-8; bytes that are not UTF-8 are replaced."""
     stored = value if isinstance(value, bytes) else value.encode("utf-8", "surrogateescape")
     return stored.decode("utf-8", "replace")
 
 
 def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) -> dict[str, Any]:
-    """Return type, length and filters of a dataset, and the positions of its chunks if they are read without HDF5."""
+    """Return type, length and filters of a dataset.
+
+    If the chunks are read without HDF5, their positions in the file are returned too.
+    """
     dimensions = DIMENSIONS.get(name, 1)
     if not isinstance(dataset, h5py.Dataset) or dataset.ndim != dimensions:
         wanted = "one-dimensional" if dimensions == 1 else f"{dimensions}-dimensional"
@@ -241,38 +245,49 @@ def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) 
 
 
 def row_bytes(dataset: Any) -> int:
-    """Return the size of a row in memory [bytes]; for one-dimensional datasets that of an element."""
+    """Return the size of a dataset's row in memory [bytes]."""
     return int(dataset.dtype.itemsize) * math.prod(dataset.shape[1:])
 
 
 def _plain_length(dataset: Any, name: str, path: str) -> int:
-    """Return the length of a dataset without chunks, after checking that the file holds all of it."""
+    """Return the length of a dataset without chunks, after checking that the file holds all of its data."""
     count, offset = int(dataset.shape[0]) if dataset.shape else 1, dataset.id.get_offset()
     declared, stored = count * row_bytes(dataset), dataset.id.get_storage_size()
     compact = dataset.id.get_create_plist().get_layout() == h5py.h5d.COMPACT
     inside = compact or (offset is not None and offset + declared <= os.path.getsize(path))
     if count and (stored < declared or not inside):
-        raise AmiwarpError(f"dataset '{name}' declares {count} elements, which the file does not hold; it is damaged")
+        raise AmiwarpError(
+            f"dataset '{name}' declares {count} elements, which the file does not hold; copy the file again"
+        )
     return count
 
 
 def _chunked_length(dataset: Any, name: str, chunks: list[Any], unfinished: bool) -> int:
-    """Return the length of a dataset with all chunks present, or up to the first missing one in an unfinished file."""
+    """Return the length of a dataset with chunks, after checking that no chunk is missing.
+
+    In an unfinished file, the length is that up to the first missing chunk.
+    """
     count, size = int(dataset.shape[0]), dataset.chunks[0]
     held = next((at for at, chunk in enumerate(chunks) if chunk.chunk_offset[0] != at * size), len(chunks))
     if unfinished:
         return min(count, held * size)
     if held != -(-count // size) or len(chunks) != held:
         raise AmiwarpError(
-            f"dataset '{name}' declares {count} elements, the file holds {len(chunks)} chunks of {size}; it is damaged"
+            f"dataset '{name}' declares {count} elements, the file holds {len(chunks)} chunks of {size}; copy the "
+            "file again"
         )
     return count
 
 
 def _chunks(dataset: Any, name: str, filters: list[Any], path: str, unfinished: bool) -> list[Any]:
-    """Return all chunks in order, after checking each. HDF5 and its Blosc filter would read beyond a damaged chunk."""
+    """Return all chunks of a dataset in order, after checking each chunk.
+
+    HDF5 and its Blosc filter would read beyond a damaged chunk.
+    """
     if dataset.chunks[0] * row_bytes(dataset) > CHUNK_BYTES:
-        raise AmiwarpError(f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller ones")
+        raise AmiwarpError(
+            f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store the dataset in smaller chunks"
+        )
     chunks: list[Any] = []
     dataset.id.chunk_iter(chunks.append)
     chunks.sort(key=lambda chunk: chunk.chunk_offset[0])
@@ -314,7 +329,7 @@ def _chunk_is_damaged(dataset: Any, filters: list[Any], chunk: Any, raw: Any) ->
 
 
 def stored_places(dataset: Any, filters: list[Any], chunks: list[Any]) -> list[tuple[int, int]] | None:
-    """Return offset and size of every chunk in the native layout, or None for other layouts, which HDF5 reads."""
+    """Return offset and size of every chunk in the native layout [bytes]; None for other layouts, which HDF5 reads."""
     file = dataset.file
     plain = hasattr(os, "pread") and file.driver == "sec2" and file.userblock_size == 0 and dataset.dtype.isnative
     if not plain or dataset.chunks[0] != CHUNK or [code for code, *_ in filters] != [BLOSC, FLETCHER32]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError, printable
 
 _sources: weakref.WeakKeyDictionary[object, tuple[Path, ...]] = weakref.WeakKeyDictionary()
-"""Files of the open event sources."""
+"""Files that each open event source reads."""
 _noted: set[Path] | None = None
 """Files that the running command has read, or None if no command runs."""
 
@@ -39,7 +39,7 @@ def inputs_noted(paths: Iterable[Path]) -> Iterator[None]:
 
 
 def inputs_in_use() -> tuple[Path, ...]:
-    """Return the files of the open sources and those that the running command has read."""
+    """Return the files that open event sources read, and those that the running command has read."""
     return (*(path for paths in list(_sources.values()) for path in paths), *(_noted or ()))
 
 
@@ -52,9 +52,10 @@ def same_file(first: Path, second: Path) -> bool:
 
 @contextlib.contextmanager
 def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
-    """Turn any exception of a library into an :class:`AmiwarpError` with the file and the ``place`` in it.
+    """Turn any exception of a library into an :class:`AmiwarpError` with the file and the place in it.
 
-    Panics of compiled decoders derive from BaseException, so BaseException is caught.
+    ``place`` is a function that returns the place. Panics of compiled decoders derive from BaseException, so
+    BaseException is caught.
     """
     try:
         yield

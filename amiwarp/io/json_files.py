@@ -21,7 +21,7 @@ Made = TypeVar("Made")
 MOST_BYTES = 64 << 20
 """Largest JSON file that is read [bytes]. A calibration with all points of its search takes about 1 MB."""
 LARGEST_INTEGER = 2**62
-"""Largest magnitude of a whole number, equal to :data:`amiwarp.events.checks.TIME_LIMIT`."""
+"""Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.checks.TIME_LIMIT`."""
 
 
 def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
@@ -73,12 +73,12 @@ def parse_json(text: bytes) -> Any:
 
 
 def _refuse(word: str) -> NoReturn:
-    """Raise for the words NaN and Infinity."""
+    """Raise :class:`AmiwarpError` for the words NaN and Infinity, which JSON does not allow."""
     raise AmiwarpError(f"the JSON holds {word}; expected finite numbers")
 
 
 def _finite(digits: str) -> float:
-    """Return a finite number from its digits."""
+    """Convert digits to a finite number; raise :class:`AmiwarpError` if it is too large for float64."""
     value = float(digits)
     if not math.isfinite(value):
         raise AmiwarpError(f"the JSON holds {shown(digits)}, beyond the largest float64")
@@ -86,7 +86,7 @@ def _finite(digits: str) -> float:
 
 
 def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a JSON object after checking that it has all ``needed`` fields and otherwise only ``optional`` ones.
+    """Return a JSON object after checking that it has all ``needed`` fields and no others except ``optional`` fields.
 
     ``where`` names the object for messages; it is empty for the whole file. Raises :class:`AmiwarpError`, which names
     the field.
@@ -96,7 +96,7 @@ def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = (
     prefix = f"{where}." if where else ""
     for name in needed:
         if name not in data:
-            raise AmiwarpError(f"field {prefix}{name} is missing; add it")
+            raise AmiwarpError(f"field {prefix}{name} is missing; add this field")
     for name in data:
         if name not in needed and name not in optional:
             raise AmiwarpError(
@@ -124,7 +124,7 @@ def build(kind: type[Made], data: Any, where: str) -> Made:
 
 
 def _value(kind: Any, value: Any, where: str) -> Any:
-    """Return a value as its annotated type."""
+    """Convert a JSON value to its annotated type."""
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         return build(kind, value, where)
     if get_origin(kind) is types.UnionType:
@@ -144,7 +144,7 @@ def _value(kind: Any, value: Any, where: str) -> Any:
 
 
 def _container(kind: Any, value: Any, where: str) -> Any:
-    """Return a list, a tuple or a mapping as its annotated type."""
+    """Convert a JSON value to its annotated list, tuple or mapping type."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (dict, Mapping):
         given = value if isinstance(value, dict) else fields_of(value, where)

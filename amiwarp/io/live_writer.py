@@ -37,22 +37,23 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 SMALL_CHUNK = 4096
-"""Elements per chunk of the small datasets. They are not compressed, so that they grow in place."""
+"""Number of elements per chunk of the small datasets. They are not compressed, so that they grow in place."""
 
 END_ADDRESS_OFFSET = 28
 """Offset of the end-of-file address in an HDF5 file's header [bytes]. Bytes after that address are unused."""
 
 FINISH_BYTES = 1 << 19
-"""Bytes that are reserved to finish a file in addition to its data: for HDF5's structures and partial chunks."""
+"""Disk space that is reserved to finish a file in addition to its data [bytes]: for HDF5's structures and partial
+chunks."""
 
 MOST_WAITING = 1 << 24
-"""Largest amount of encoder samples that wait for the next flush [bytes]. Beyond it they are written immediately."""
+"""Largest amount of encoder samples that wait for the next flush [bytes]. More samples are written immediately."""
 
 MOST_PULSES = 1 << 16
-"""Largest number of index pulses that wait for encoder samples. Beyond it the oldest ones are dropped."""
+"""Largest number of index pulses that wait for encoder samples. If there are more, the oldest are dropped."""
 
 MAX_WASTE_BYTES = 1 << 24
-"""Superseded chunks that a finished file may contain [bytes]. With more the file is copied without them."""
+"""Largest size of superseded chunks in a finished file [bytes]. With more, the file is copied without these chunks."""
 
 
 class LiveWriter:
@@ -93,15 +94,15 @@ class LiveWriter:
         self._small: dict[str, _GrowingDataset] = {}
         self._pending: list[Columns] = []
         self._pending_count = 0
-        self._written = 0  # events in full chunks
-        self._stored = 0  # events in the file, those of the last chunk included
+        self._written = 0  # number of events in full chunks
+        self._stored = 0  # number of events in the file, including those of the last, partial chunk
         self._flushed_at = 0.0  # [s], monotonic
         self._reserved = 0  # [bytes]
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
-        self._encoder_span: tuple[int, int] | None = None  # first and last sample
-        self._pulses = np.zeros(0, np.int64)  # later than the last sample
+        self._encoder_span: tuple[int, int] | None = None  # times of the first and the last encoder sample [us]
+        self._pulses = np.zeros(0, np.int64)  # index pulses later than the last encoder sample
         self._encoder: Encoder | None = None
 
     def __len__(self) -> int:
@@ -116,7 +117,7 @@ class LiveWriter:
                 allocate(file.fileno(), 0, self._to_finish())
         except FileExistsError as error:
             what = "is being written, or was left by an interrupted recording; it can be opened like any recording"
-            raise AmiwarpError(f"{self.part}: {what}; rename or delete it") from error
+            raise AmiwarpError(f"{self.part}: {what}; rename or delete this file") from error
         except OSError as error:
             self.part.unlink(missing_ok=True)
             raise AmiwarpError(f"{self.path}: cannot be created: {error.strerror}; choose another place") from error
@@ -134,7 +135,7 @@ class LiveWriter:
         return self
 
     def _create_datasets(self) -> None:
-        """Create all datasets. In single-writer mode none can be added later."""
+        """Create all datasets, because none can be added in single-writer mode."""
         file, coordinate = self._file, np.float32 if self._compensated else np.uint16
         write_header(file, self._size, self._camera, self._prism, self._metadata)
         dtypes = {"x": coordinate, "y": coordinate, "p": np.uint8, "t": np.int64}
@@ -160,7 +161,7 @@ class LiveWriter:
             error.add_note(f"{self.path}: holds the {len(self)} events before the error")
 
     def append(self, events: Events, *, inside: ArrayLike | None = None, extrapolated: ArrayLike | None = None) -> None:
-        """Append events. Compensated ones need the flags ``inside`` and may have ``extrapolated``, shape ``(n,)``."""
+        """Append events. Compensated events need the flags ``inside`` and may have ``extrapolated``, shape ``(n,)``."""
         self._check_open("append")
         with errors_name(self.path, lambda: f"after {len(self)} events"):
             columns = self._as_columns(events, inside, extrapolated)
@@ -207,7 +208,8 @@ class LiveWriter:
             first, last = self._encoder_span or (int(t[0]), int(t[0]) - 1)
             if t[0] <= last or (t[1:] <= t[:-1]).any():
                 raise AmiwarpError(
-                    f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {last} us; append them in order"
+                    f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {last} us; append samples in "
+                    "order of time"
                 )
             self._reserve(2 * t.nbytes)
             self._small["encoder/t"].add(t)
@@ -228,7 +230,7 @@ class LiveWriter:
         self._encoder = encoder
 
     def tick(self) -> None:
-        """Flush if the interval has passed. Call it while no events arrive."""
+        """Flush if the flush interval has passed. Call this method while no events arrive."""
         if self._file is not None and time.monotonic() - self._flushed_at >= self._flush_s:
             with errors_name(self.path, lambda: f"after {len(self)} events"):
                 self._flush()
@@ -244,7 +246,7 @@ class LiveWriter:
             raise AmiwarpError(f"{self.path}: events come with {events.x.dtype} coordinates; expected {wanted}")
         if (inside is not None) != self._compensated or (extrapolated is not None and not self._compensated):
             raise AmiwarpError(
-                f"{self.path}: compensated events come with inside; give events from a sensor without flags"
+                f"{self.path}: compensated events need the flags inside, events from a sensor take no flags"
             )
         columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
         if self._compensated:
@@ -265,7 +267,10 @@ class LiveWriter:
         )
 
     def _reserve(self, extra: int = 0) -> None:
-        """Reserve the space to finish the file and ``extra`` bytes. If there is none, finish the file and raise."""
+        """Reserve disk space to finish the file, and ``extra`` bytes.
+
+        If the disk is full, finish the file and raise :class:`AmiwarpError`.
+        """
         end = self._file.id.get_filesize() + self._to_finish() + extra
         if end <= self._reserved:
             return
@@ -278,7 +283,7 @@ class LiveWriter:
         self._reserved = end
 
     def _write(self) -> None:
-        """Write the pending events of the current chunk. Start a new chunk if it is full."""
+        """Write the pending events of the current chunk. Start a new chunk if the chunk is full."""
         count = self._pending_count
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
         with contextlib.closing(in_order(partial(encode, column[:count]) for column in joined.values())) as encoded:
@@ -299,7 +304,10 @@ class LiveWriter:
         self._flushed_at = time.monotonic()
 
     def _finish(self, *, tidy: bool) -> None:
-        """Write the rest and rename the part to ``path``, or copy it there if it has many superseded chunks."""
+        """Write the remaining data and rename the part file to ``path``.
+
+        If the part file has many superseded chunks, it is copied to ``path`` without them instead.
+        """
         with errors_name(self.path, lambda: f"finishing after {len(self)} events; {self.part} holds all but the last"):
             if tidy and self._encoder is not None:
                 self._replace_encoder(self._encoder)
@@ -334,7 +342,7 @@ class LiveWriter:
 
 
 class _GrowingDataset:
-    """A small dataset whose new values wait in memory until they are written."""
+    """Small dataset whose new values wait in memory until they are written."""
 
     def __init__(self, dataset: Any) -> None:
         self._dataset = dataset

@@ -31,26 +31,30 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of a block of events, by the names of their datasets in the file."""
 
 MAX_MS = 100_000_000
-"""Longest recording [ms], 28 h. Beyond it a timestamp must be damaged, and the millisecond index would be huge."""
+"""Longest recording that can be written [ms], 28 h. In a longer one a timestamp must be damaged, and the millisecond
+index would be huge."""
 
 
 def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
-    """Raise :class:`AmiwarpError` for an impossible sensor size, or one that differs from the camera's."""
+    """Raise :class:`AmiwarpError` for an impossible sensor size, or a size that differs from the camera's."""
     check_size(width, height, path)
     if camera is not None and (camera.width, camera.height) != (width, height):
         given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
-        raise AmiwarpError(f"{path}: {given}; give both one size")
+        raise AmiwarpError(f"{path}: {given}; give both the same size")
 
 
 def check_lengths(columns: Columns, count: int) -> None:
-    """Raise :class:`AmiwarpError` for a column that does not have one element, or one row, per event."""
+    """Raise :class:`AmiwarpError` for a column whose number of elements or rows differs from the number of events."""
     for name, column in columns.items():
         if column.shape[:1] != (count,) or (column.ndim > 1 and not name.startswith("truth/")):
             raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
 
 
 def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) -> Iterator[NDArray[np.int64]]:
-    """Yield entries of ms_to_idx from ``first_ms`` on, for events at ``t`` [us] that follow ``before`` others."""
+    """Yield entries of the millisecond index ms_to_idx from entry ``first_ms`` on.
+
+    ``t`` are the times of new events [us], which follow ``before`` earlier events.
+    """
     last_ms = (int(t[-1]) - t_offset) // 1000
     if last_ms > MAX_MS:
         span = f"{t_offset} .. {int(t[-1])} us"
@@ -61,14 +65,14 @@ def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) 
 
 
 def chunks_of(columns: Columns) -> Iterator[NDArray[Any]]:
-    """Yield all chunks of the first column, then those of the next."""
+    """Yield all chunks of the first column, then all chunks of the next columns."""
     for column in columns.values():
         for at in range(0, len(column), CHUNK):
             yield column[at : at + CHUNK]
 
 
 def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
-    """Describe columns and their types for messages."""
+    """Return names and data types of columns as text for messages."""
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
 
 
@@ -95,7 +99,7 @@ def write_header(
     prism: NominalPrism | None,
     metadata: Mapping[str, MetadataValue],
 ) -> None:
-    """Write what is known before the first event: format, size, camera, prism and metadata."""
+    """Write the parts of a file that are known before the first event: format, size, camera, prism and metadata."""
     file.attrs["format"] = FORMAT
     file.attrs["format_version"] = FORMAT_VERSION
     file.attrs["width"], file.attrs["height"] = size

@@ -37,7 +37,7 @@ class NativeEvents:
     """Events of an HDF5 recording, read on demand. Raises :class:`AmiwarpError` for a damaged file."""
 
     def __init__(self, path: Path, file: Hdf5File) -> None:
-        """Take the events that are complete now, if the file is unfinished."""
+        """Open the events of a file. If the file is unfinished, these are the events that are complete now."""
         self.path = path
         self._file = file
         self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
@@ -105,11 +105,11 @@ class NativeEvents:
         return events
 
     def inside(self, start: int, stop: int) -> NDArray[np.bool_] | None:
-        """Return whether each compensated event lies inside the image, shape ``(n,)``, or None if not stored."""
+        """Return whether each compensated event lies inside the image, shape ``(n,)``; None if this is not stored."""
         return self._flags("inside", start, stop)
 
     def extrapolated(self, start: int, stop: int) -> NDArray[np.bool_] | None:
-        """Return whether the angle of each event was extrapolated, shape ``(n,)``, or None if not stored."""
+        """Return whether each event's angle was extrapolated, shape ``(n,)``; None if the file does not store it."""
         return self._flags("extrapolated", start, stop)
 
     def _flags(self, name: str, start: int, stop: int) -> NDArray[np.bool_] | None:
@@ -158,7 +158,7 @@ class NativeEvents:
         return self._columns[name].read(start, stop)
 
     def _bracket(self, t: int) -> tuple[int, int]:
-        """Return a short range of event indices around ``t``, from the millisecond index or by bisection."""
+        """Return a short range of event indices around time ``t`` [us], from the millisecond index or by bisection."""
         ms = (t - self._offset) // 1000
         if self._ms_to_idx is not None and 0 <= ms < len(self._ms_to_idx):
             ends = self._ms_to_idx.read(ms, min(ms + 2, len(self._ms_to_idx))).tolist()
@@ -199,7 +199,7 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
     found = None if camera is None else read_camera(camera, f"{path}: /camera")
     if found is not None and (found.width, found.height) != events.size:
         raise AmiwarpError(
-            f"{path}: camera is {found.width}x{found.height}, events are {events.size}; both must have one size"
+            f"{path}: camera is {found.width}x{found.height}, events are {events.size}; both must have the same size"
         )
     recording = Recording(
         events=events,

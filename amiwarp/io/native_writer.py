@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8]]
-"""Compensated events, and flags of shape ``(n,)``: 1 if the event lies inside the image."""
+"""Compensated events with flags of shape ``(n,)``: 1 if the event lies inside the image."""
 
 
 class RecordingWriter:
@@ -273,7 +273,7 @@ class RecordingWriter:
             self._open_truth().append_frame(frame)
 
     def append_poses(self, poses: Poses) -> None:
-        """Append true poses.
+        """Append true poses of camera, bodies and joints.
 
         Parameters
         ----------
@@ -305,7 +305,7 @@ class RecordingWriter:
         return columns
 
     def _index(self, t: NDArray[np.int64]) -> None:
-        """Extend ms_to_idx, whose entry m is the index of the first event at or after m milliseconds."""
+        """Extend the index ms_to_idx, whose entry m is the index of the first event at or after m milliseconds."""
         for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
             self._ms.append(entries)
             self._ms_count += entries.size

@@ -29,7 +29,10 @@ PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def open_npz(path: Path) -> Recording:
-    """Open an archive of events. Arrays are read in pieces, and read again for each use if too large to keep."""
+    """Open an archive of events.
+
+    Arrays are read in pieces, and read again for each use if they are too large to keep in memory.
+    """
     check_regular(path)
     with errors_name(path, lambda: "reading width and height"), zipfile.ZipFile(path) as archive:
         size = None
@@ -44,7 +47,9 @@ def _array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], tup
     """Open an array of the archive: its bytes, shape and type. Its header must agree with the archive's directory."""
     about = archive.getinfo(f"{name}.npy")
     if about.compress_type not in PACKED:
-        raise AmiwarpError(f"array {name} is compressed by method {about.compress_type}; save it with numpy.savez")
+        raise AmiwarpError(
+            f"array {name} is compressed by method {about.compress_type}; save the array with numpy.savez"
+        )
     with archive.open(about) as stream:
         version = npy.read_magic(stream)
         read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
@@ -55,12 +60,14 @@ def _array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], tup
         if dtype.kind not in "iub":
             raise AmiwarpError(f"array {name} is {dtype}; expected integers (t in microseconds), no pickled objects")
         if math.prod(shape) * dtype.itemsize != about.file_size - stream.tell():
-            raise AmiwarpError(f"array {name} declares shape {shape}, which the archive does not hold; it is damaged")
+            raise AmiwarpError(
+                f"array {name} declares shape {shape}, which the archive does not hold; copy the file again"
+            )
         yield stream, shape, dtype
 
 
 def _number(archive: zipfile.ZipFile, name: str) -> int:
-    """Return the single number of an array."""
+    """Return the single number in an array of the archive."""
     with _array(archive, name) as (stream, shape, dtype):
         if math.prod(shape) != 1:
             raise AmiwarpError(f"{name} has shape {shape}; expected one number")

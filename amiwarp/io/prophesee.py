@@ -19,7 +19,8 @@ from amiwarp.io.reading_process import packets
 from amiwarp.io.regular_file import check_regular
 
 WIDEST = (2048, 2048)
-"""Largest size that EVT coordinates can represent [px]. The decoder gets it, so that it accepts all events."""
+"""Largest width and height that EVT coordinates can represent [px]. The decoder is given this size, so that it accepts
+all events."""
 
 GENERATIONS = {
     "gen3": (640, 480),
@@ -28,7 +29,7 @@ GENERATIONS = {
     "gen41": (1280, 720),
     "imx636": (1280, 720),
 }
-"""Sensor sizes [px] by name, for headers without a geometry."""
+"""Sensor sizes (width, height) [px] by name of the sensor generation, for headers without a geometry."""
 
 
 def _read_header(path: Path) -> tuple[dict[str, str], int]:
@@ -62,7 +63,7 @@ def open_evt(path: Path) -> Recording:
 
 
 def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
-    """Return the sensor size of a header [px], or None if it has none."""
+    """Return the sensor size in a header [px]; None if the header has no size."""
     if match := re.fullmatch(r"(\d+)x(\d+)", fields.get("geometry", "")):
         return int(match[1]), int(match[2])
     parts = dict(part.partition("=")[::2] for part in fields.get("format", "").split(";") if "=" in part)
@@ -75,7 +76,7 @@ def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
 
 
 def read_evt_packets(notes: dict[str, int], path: str) -> Iterator[Packet]:
-    """Yield packets of events of a RAW file. Runs in the reading process."""
+    """Yield packets of events of a RAW file. Called in the reading process."""
     from faery.extension import evt
 
     notes["triggers"] = 0
@@ -88,7 +89,10 @@ def read_evt_packets(notes: dict[str, int], path: str) -> Iterator[Packet]:
 
 
 def open_dat(path: Path) -> Recording:
-    """Open a DAT file of 2D or CD events, version 1 or 2. Its 32-bit times, which wrap after 71 min, are unwrapped."""
+    """Open a DAT file of 2D or CD events, version 1 or 2.
+
+    Its 32-bit times, which wrap after 71 min, are unwrapped.
+    """
     fields, offset = _read_header(path)
     with errors_name(path, lambda: "reading the header"), path.open("rb") as file:
         file.seek(offset)

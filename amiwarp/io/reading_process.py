@@ -33,14 +33,15 @@ MEMORY_BYTES = 1 << 30
 """Limit of the additional memory of one request [bytes]."""
 
 PIPE_BYTES = 1 << 20
-"""Size of the pipe from the process [bytes], if the system supports it. A larger pipe needs fewer process switches."""
+"""Size of the pipe from the reading process [bytes], if the system supports it. A larger pipe needs fewer process
+switches."""
 
 START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_server import serve; serve()"
-"""Program of the process."""
+"""Python program that the reading process runs."""
 
 
 class ReadingProcess:
-    """A process that serves one reader at a time. Only one thread may use it at a time."""
+    """Process that reads files for one reader at a time. Only one thread may use it at a time."""
 
     def __init__(self) -> None:
         """Start the process. Raises :class:`OSError` if it cannot be started."""
@@ -68,7 +69,7 @@ class ReadingProcess:
 
     @property
     def usable(self) -> bool:
-        """Whether the process is alive and was started by this process. It is not usable in a fork of its owner."""
+        """Whether the process is alive and was started by this process. A fork of its owner cannot use it."""
         return self.close.alive and self.owner == os.getpid() and self._child.poll() is None
 
     def call(self, function: str, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
@@ -83,7 +84,7 @@ class ReadingProcess:
         return self.receive()
 
     def send(self, function: str, *arguments: Any) -> None:
-        """Start a call whose result :meth:`receive` returns."""
+        """Send a call to the process; :meth:`receive` returns its result."""
         limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
         request = json.dumps({"function": function, "arguments": arguments, **limits}).encode()
         try:
@@ -102,7 +103,7 @@ class ReadingProcess:
                 if array.size:
                     self._fill(array.view(np.uint8).data)
         except BaseException:
-            self.close()  # the rest of this reply must not be taken for the next one
+            self.close()  # the rest of this reply must not be read as the next reply
             raise
         if "error" in reply:
             raise AmiwarpError(reply["error"])
@@ -114,7 +115,7 @@ class ReadingProcess:
         return buffer
 
     def _ended(self) -> AmiwarpError:
-        """Return the error for a process that has ended."""
+        """Return the error to raise for a reading process that has ended."""
         code = self._child.wait()
         self.close()
         if code == -getattr(signal, "SIGXCPU", 0):
@@ -126,7 +127,7 @@ class ReadingProcess:
 
 
 def _end(child: subprocess.Popen[bytes], owner: int) -> None:
-    """Kill a process, which holds no state worth saving. A fork of its owner does nothing."""
+    """Kill a reading process, which holds no state worth saving. In a fork of its owner, do nothing."""
     if owner == os.getpid():
         child.kill()
         child.wait()
@@ -136,12 +137,12 @@ def _end(child: subprocess.Popen[bytes], owner: int) -> None:
 
 
 _idle: list[ReadingProcess] = []
-"""At most one process that waits for the next reader."""
+"""List of at most one reading process that waits for the next reader."""
 _idle_lock = threading.RLock()  # garbage collection may run a finalizer that gives back a process at any point
 
 
 def borrow() -> ReadingProcess:
-    """Take the idle process, or start one."""
+    """Take the idle reading process, or start a new one."""
     with _idle_lock:
         process = _idle.pop() if _idle else None
     if process is not None and process.usable:
@@ -150,7 +151,7 @@ def borrow() -> ReadingProcess:
 
 
 def give_back(process: ReadingProcess) -> None:
-    """Keep the process for the next reader, or close it. Starting one takes about 0.3 s."""
+    """Keep a reading process for the next reader, or end it. Starting one takes about 0.3 s."""
     if process.usable:
         with contextlib.suppress(AmiwarpError):
             process.call("amiwarp.io.reading_server:forget")

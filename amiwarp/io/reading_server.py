@@ -1,4 +1,4 @@
-"""Server in the process of :mod:`amiwarp.io.reading_process`: reads requests, runs functions and sends results."""
+"""Server that runs in the process of :mod:`amiwarp.io.reading_process`: it reads requests and sends results."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ PACKET = 1 << 17
 """Number of events that are joined to one packet before it is sent."""
 
 Reply = tuple[Any, list[NDArray[Any]]]
-"""A JSON value and arrays of shape ``(n,)``."""
+"""Reply to a request: a JSON value, and arrays of shape ``(n,)``."""
 
 _state: dict[str, Any] = {}
-"""Values that are kept between requests."""
+"""Values that are kept between requests, by name."""
 
 
 def serve() -> None:
@@ -106,7 +106,7 @@ def begin(function: str, *arguments: Any) -> Reply:
 
 
 def advance() -> Reply:
-    """Return the counts and the next packets, joined. At the end there are no arrays."""
+    """Return the counts and the next packets of the started generator, joined; no arrays at the end."""
     found: list[tuple[NDArray[Any], ...]] = []
     for packet in _next_packets(kept("packets")):
         found.append(packet)
@@ -114,7 +114,7 @@ def advance() -> Reply:
 
 
 def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[NDArray[Any], ...]]:
-    """Yield packets until they hold at least :data:`PACKET` events."""
+    """Return the next packets, which together hold at least :data:`PACKET` events unless the stream ends."""
     count = 0
     for packet in source:
         count += len(packet[0])

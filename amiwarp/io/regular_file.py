@@ -14,7 +14,7 @@ KINDS = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
-"""Names of the file types that are refused, for messages."""
+"""Names of the file types that are refused, used in messages."""
 
 
 def check_regular(path: Path) -> None:
@@ -33,4 +33,4 @@ def check_regular(path: Path) -> None:
         what = getattr(error, "strerror", None) or error
         raise AmiwarpError(f"{path}: cannot be opened: {what}; give another file") from error
     if kind != stat.S_IFREG:
-        raise AmiwarpError(f"{path}: is {KINDS.get(kind, 'not a regular file')}; give a file")
+        raise AmiwarpError(f"{path}: is {KINDS.get(kind, 'not a regular file')}; give a regular file")

@@ -27,7 +27,7 @@ READ_BYTES = 1 << 22
 """Amount of text that is parsed at once [bytes]: about 200,000 events."""
 
 LONGEST_LINE = 1000
-"""Longest line that is accepted [characters]."""
+"""Longest accepted line of a text recording [characters]."""
 
 
 def open_text(path: Path) -> Recording:
@@ -56,7 +56,10 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
 
 
 def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]:
-    """Return the size from a first line of two numbers, and the number of lines read; else None and 0."""
+    """Return the sensor size from a first line of two numbers, and the number of lines read.
+
+    If the first line is an event, return None and 0.
+    """
     words = file.readline(LONGEST_LINE).split()
     if len(words) != 2:
         file.seek(0)
@@ -84,7 +87,7 @@ def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
 
 
 def _parse(path: Path, lines: list[bytes], line_number: int) -> Packet:
-    """Return the events of some lines that follow line ``line_number``."""
+    """Return the events in lines of text; ``line_number`` is the number of the line before them."""
     kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
     if not kept:
         nothing = np.zeros(0, np.int64)
@@ -102,7 +105,7 @@ def _parse(path: Path, lines: list[bytes], line_number: int) -> Packet:
 
 
 def _plausible(table: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which rows ``t x y p`` hold usable numbers."""
+    """Return for each row ``t x y p`` whether its numbers are usable."""
     t, x, y, p = table.T
     # Pixels must be whole and fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
     whole: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31) & (np.floor(x) == x) & (np.floor(y) == y)
@@ -110,7 +113,7 @@ def _plausible(table: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _first_bad_line(lines: list[bytes], line_number: int) -> str:
-    """Describe the first line that does not hold an event."""
+    """Return a description of the first line that does not hold an event, for error messages."""
     for number, line in enumerate(lines, line_number + 1):
         if not line.strip() or line.lstrip().startswith(b"#"):
             continue

@@ -24,10 +24,10 @@ from amiwarp.io.atomic_output import NewFile, make_folder
 from amiwarp.progress import Progress
 
 DSEC_SCALE, DSEC_ZERO = 128.0, 1 << 15
-"""Steps per pixel of DSEC's flow, and the number that stands for 0."""
+"""Steps per pixel of displacement in DSEC's flow pictures, and the number that stands for displacement 0."""
 
 POSE_ROWS = 1 << 14
-"""Poses that are written at a time."""
+"""Number of poses that are written at a time."""
 
 
 def save_flow_dsec(
@@ -149,7 +149,7 @@ def save_flow_mvsec(
     """
     path = Path(path)
     if path.suffix.lower() != ".npz":
-        raise AmiwarpError(f"{path}: MVSEC's flow is a .npz file; give such an ending")
+        raise AmiwarpError(f"{path}: MVSEC's flow is a .npz file; give a name that ends in .npz")
     intervals = _intervals(frames)
     lengths = [stop - start for start, stop in intervals]
     lengths.append(lengths[-1])
@@ -213,10 +213,10 @@ def save_poses_tum(
 
 
 def _intervals(frames: FrameStore) -> list[tuple[int, int]]:
-    """Return the intervals between instants [us]. Raises :class:`AmiwarpError` for fewer than two instants."""
+    """Return the intervals between instants [us]; raise :class:`AmiwarpError` if there are fewer than two instants."""
     t = [int(at) for at in frames.t]
     if len(t) < 2:
-        raise AmiwarpError(f"flow between instants needs two of them, there are {len(t)}; simulate with --truth-hz")
+        raise AmiwarpError(f"flow needs ground truth of two instants, there are {len(t)}; simulate with --truth-hz")
     return list(itertools.pairwise(t))
 
 
@@ -227,7 +227,7 @@ def _displacement(frames: FrameStore, index: int, length_us: int, *, with_prism:
 
 
 def dsec_picture(displacement: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Return DSEC's picture of displacements [px], shape (height, width, 3)."""
+    """Return displacements as a flow picture of DSEC, shape (height, width, 3)."""
     known: NDArray[np.bool_] = np.asarray(np.isfinite(displacement).all(axis=2))
     levels = np.rint(np.where(known[..., None], displacement, 0.0) * DSEC_SCALE) + DSEC_ZERO
     known &= np.asarray(((levels >= 0) & (levels < 1 << 16)).all(axis=2))
@@ -236,7 +236,7 @@ def dsec_picture(displacement: NDArray[np.float64]) -> NDArray[np.uint16]:
 
 
 def encode_png16(picture: NDArray[np.uint16]) -> bytes:
-    """Return a PNG of 16 bits and three channels. Pillow cannot write these."""
+    """Encode a picture as PNG with three channels of 16 bits, which Pillow cannot write."""
     height, width, _ = picture.shape
     rows = picture.astype(">u2").reshape(height, -1).view(np.uint8)
     lines = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)  # each line begins with its filter: none

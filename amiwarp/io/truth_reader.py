@@ -23,7 +23,7 @@ from amiwarp.io.input_files import errors_name
 from amiwarp.io.truth_writer import EVENT_COLUMNS
 
 Read = Callable[[int, int], NDArray[Any]]
-"""Function that reads rows ``start`` .. ``stop``."""
+"""Function that reads rows from ``start`` up to ``stop`` (excluded) of a dataset."""
 
 
 def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
@@ -44,11 +44,11 @@ def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) ->
 
 
 class _StoredRows:
-    """Rows of a dataset, or of several as columns, that are read on demand."""
+    """Rows of a dataset, or of several datasets as columns, that are read on demand."""
 
     def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
         self._path, self._name, self._count, self._read = path, name, count, read
-        self._file = file  # its columns refer to it weakly
+        self._file = file  # keeps the file open, because its columns refer to it weakly
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
         start, stop, _ = which.indices(self._count)
@@ -83,7 +83,7 @@ def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> EventVal
 
 
 def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
-    """Read rows as a type. Raises :class:`AmiwarpError` for integers that the type cannot hold."""
+    """Read rows of a dataset as ``dtype``; raise :class:`AmiwarpError` for integers that do not fit."""
     values = column.read(start, stop)
     if values.dtype.kind in "iu" and values.size and not np.can_cast(values.dtype, dtype):
         limits = np.iinfo(dtype)
@@ -102,7 +102,7 @@ def _labels(path: Path, file: Hdf5File) -> WorldLabels | None:
 
 
 def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
-    """Return names, or none if the dataset is missing."""
+    """Return the names in a dataset; none if the dataset is missing."""
     column = file.columns.get(name)
     if column is None:
         return ()
@@ -110,7 +110,7 @@ def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
 
 
 def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
-    """Return a dataset. Raises :class:`AmiwarpError` if it is missing or does not have the given shape."""
+    """Return a dataset; raise :class:`AmiwarpError` if it is missing or does not have the expected shape."""
     if name not in file.columns:
         raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
     column = file.columns[name]
@@ -122,7 +122,7 @@ def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int,
 
 
 class _StoredFrames:
-    """Ground truth of instants, read on demand."""
+    """Ground truth of all pixels at several instants, read on demand."""
 
     def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
         self._path, self._file = path, file
@@ -130,7 +130,7 @@ class _StoredFrames:
         self.t = as_times(times.read(0, len(times)))
         """Times of the instants [us], shape ``(k,)``."""
         if (np.diff(self.t) <= 0).any():
-            raise AmiwarpError(f"{path}: truth/frames/t does not rise; the file is damaged")
+            raise AmiwarpError(f"{path}: truth/frames/t does not increase; the file is damaged")
         count, (width, height) = len(times), size
         self._maps = {
             name: _column(file, f"truth/frames/{name}", count, (height, width, *tail))
@@ -153,7 +153,7 @@ class _StoredFrames:
 
 
 class _StoredPoses:
-    """Poses, read on demand."""
+    """Poses of camera, bodies and joints, read on demand."""
 
     def __init__(self, path: Path, file: Hdf5File) -> None:
         self._path, self._file = path, file

@@ -22,14 +22,14 @@ EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
     "depth": (np.float32, ()),
     "place": (np.float32, (3,)),
 }
-"""Datasets of ``truth/events``: their types, and the shapes of their rows."""
+"""Datasets of ``truth/events``: their data types, and the shapes of their rows."""
 
 POSE_ROWS = 1024
-"""Rows per chunk of the datasets of poses."""
+"""Number of rows per chunk of the datasets of poses."""
 
 
 def event_columns(truth: EventTruth, count: int) -> Columns:
-    """Return the datasets of the ground truth of ``count`` events. Raises :class:`AmiwarpError` for other lengths."""
+    """Return the datasets of the ground truth of ``count`` events; raise :class:`AmiwarpError` for other lengths."""
     columns: Columns = {}
     if truth.points is not None:
         points = np.asarray(truth.points, np.float32)
@@ -47,22 +47,25 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
 
 
 class TruthWriter:
-    """Writes labels, instants and poses into an open HDF5 file. Each instant and each table must match the first."""
+    """Writer of labels, instants and poses into an open HDF5 file.
+
+    Each instant and each table of poses must have the same arrays as the first.
+    """
 
     def __init__(self, file: Any, path: Path, size: tuple[int, int]) -> None:
-        """``size``: width and height of the sensor [px]."""
+        """Set up the writer; ``size`` is the width and height of the sensor [px]."""
         self._file, self._path, self._size = file, path, size
         self._datasets: dict[str, Any] = {}
         self._names: dict[str, tuple[str, ...]] = {}
 
     def write_labels(self, labels: WorldLabels) -> None:
-        """Write the names of a world."""
+        """Write the names of a world's instances and their classes."""
         self._file.require_group("truth/world").attrs["name"] = labels.name
         self._write_names("truth/world/instances", labels.instances)
         self._write_names("truth/world/categories", labels.categories)
 
     def append_frame(self, frame: FrameTruth) -> None:
-        """Append the ground truth of an instant, later than those before."""
+        """Append the ground truth of an instant, which must be later than those before."""
         width, height = self._size
         rows: dict[str, NDArray[Any]] = {}
         for name, (dtype, tail) in MAPS.items():
@@ -80,7 +83,7 @@ class TruthWriter:
             self._append(f"truth/frames/{name}", values[None], 1)
 
     def append_poses(self, poses: Poses) -> None:
-        """Append poses, later than those before."""
+        """Append poses, which must be later than those before."""
         if not len(poses):
             return
         self._check_later("truth/poses/t", int(poses.t[0]))
@@ -97,7 +100,7 @@ class TruthWriter:
             self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), POSE_ROWS)
 
     def _keep_names(self, name: str, given: Iterable[str]) -> None:
-        """Write names at the first call; check that later calls give the same."""
+        """Write names at the first call, and check that later calls give the same names."""
         names = tuple(given)
         if name not in self._names:
             self._names[name] = names
@@ -115,7 +118,9 @@ class TruthWriter:
     def _check_later(self, name: str, t: int) -> None:
         stored = self._datasets.get(name)
         if stored is not None and t <= int(stored[-1]):
-            raise AmiwarpError(f"{self._path}: {name} {t} us does not follow {int(stored[-1])} us; append in order")
+            raise AmiwarpError(
+                f"{self._path}: {name} {t} us does not follow {int(stored[-1])} us; append in order of time"
+            )
 
     def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
         """Append rows to a dataset through HDF5."""

@@ -45,13 +45,13 @@ class PinholeParams:
 
 @wp.func
 def invalid_pixel() -> wp.vec2:
-    """Return the invalid pixel, NaN."""
+    """Return an invalid pixel, whose coordinates are NaN."""
     return wp.vec2(NAN, NAN)
 
 
 @wp.func
 def invalid_ray() -> wp.vec3:
-    """Return the invalid bearing, NaN."""
+    """Return an invalid bearing, whose components are NaN."""
     return wp.vec3(NAN, NAN, NAN)
 
 
@@ -176,7 +176,7 @@ def ray_to_pixel(c: CameraParams, ray: wp.vec3) -> wp.vec2:
 
 @wp.kernel
 def fill_rays(c: CameraParams, rays: wp.array2d(dtype=wp.vec3)):
-    """Fill the camera's table of bearings."""
+    """Fill the camera's table of bearings: one bearing per pixel."""
     row, col = wp.tid()
     rays[row, col] = solve_ray(c, wp.vec2(float(col), float(row)))
 

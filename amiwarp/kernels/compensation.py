@@ -25,7 +25,7 @@ BLOCK = wp.constant(64)  # events per CPU thread, which displaces eight at a tim
 
 @wp.struct
 class Columns:
-    """Event columns as stored in a recording, padded to whole blocks, and the compensated positions [px]."""
+    """Columns of events as in a recording, padded to whole blocks, and of their compensated positions [px]."""
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)

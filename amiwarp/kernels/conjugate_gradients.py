@@ -1,8 +1,8 @@
-"""Conjugate gradients over the unknowns of a map; sums in fixed point do not depend on the order of threads.
+"""Kernels of the conjugate-gradient method for the unknowns of a brightness map.
 
-A thread processes ``width`` unknowns in order: many on a CPU, one on CUDA, where each block adds up its threads. Dot
-products are stored as partial sums; each block of the next kernel adds them up itself. Nothing is copied to the host,
-and the results are bit-identical on every run.
+Sums are in fixed point, so they do not depend on the order of threads. A thread processes ``width`` unknowns in order:
+many on a CPU, one on CUDA, where each block adds up its threads. Dot products are stored as partial sums; each block of
+the next kernel adds them up itself. Nothing is copied to the host, and the results are bit-identical on every run.
 """
 
 import warp as wp
@@ -20,7 +20,7 @@ CPU_WIDTH = 4096  # unknowns per CPU thread
 
 @wp.struct
 class Unknowns:
-    """Vectors of the conjugate gradients, each as long as the part of the image that is solved for."""
+    """Vectors of the conjugate-gradient method, with one element per unknown that is solved for."""
 
     diagonal: wp.array(dtype=float)  # of the operator, prior included
     residual: wp.array(dtype=float)  # r, of the normal equations
@@ -30,7 +30,7 @@ class Unknowns:
 
 @wp.struct
 class Dots:
-    """Dot products on the device."""
+    """Dot products of the conjugate-gradient method on the device."""
 
     scalars: wp.array(dtype=wp.float64)  # r·z of the present search direction, and of the next
     pq: wp.array(dtype=wp.float64)  # partial sums
@@ -39,13 +39,13 @@ class Dots:
 
 @wp.func
 def to_fixed(value: float) -> wp.int64:
-    """Convert to fixed point."""
+    """Convert a value to fixed point (units of 2**-32)."""
     return wp.int64(wp.float64(value) * FIXED)
 
 
 @wp.func
 def add_fixed(sums: wp.array(dtype=wp.int64), i: int, value: float):
-    """Add a value in fixed point, atomically."""
+    """Add a value to element ``i`` of fixed-point sums, atomically."""
     wp.atomic_add(sums, i, to_fixed(value))
 
 
@@ -60,12 +60,12 @@ def add_fixed(sums: wp.array(dtype=wp.int64), i: int, value: float):
 #endif
 """)
 def add_two(sums: wp.array(dtype=wp.int64), i: int, a: wp.int64, b: wp.int64):
-    """Add to two neighbours: atomically on CUDA; on a CPU both at once, if no other thread writes to the array."""
+    """Add two values to neighbouring elements: atomically on CUDA; on a CPU both at once, if no other thread writes."""
 
 
 @wp.func
 def take_total(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
-    """Return the total over the slices, and clear them for the next pass."""
+    """Return the total of an element over the slices of sums, and clear the element for the next pass."""
     total = wp.int64(0)
     for k in range(sums.shape[0]):
         total += sums[k, i]
@@ -75,7 +75,7 @@ def take_total(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
 
 @wp.kernel
 def gather(sums: wp.array2d(dtype=wp.int64), start: int, out: wp.array(dtype=float)):
-    """Compute the totals over the slices, and clear the slices."""
+    """Compute the total of each element over the slices of sums, and clear the slices."""
     i = start + wp.tid()
     if i < out.shape[0]:
         out[i] = take_total(sums, i)
@@ -83,7 +83,7 @@ def gather(sums: wp.array2d(dtype=wp.int64), start: int, out: wp.array(dtype=flo
 
 @wp.kernel
 def gather_diagonal(sums: wp.array2d(dtype=wp.int64), prior: Prior, start: int, out: wp.array(dtype=float)):
-    """Compute the diagonal of the equations and the prior, and clear the slices."""
+    """Compute the diagonal of the operator from the equations' sums and the prior, and clear the sums."""
     i = start + wp.tid()
     if i < out.shape[0]:
         out[i] = take_total(sums, i) + prior_diagonal(prior, i)
@@ -91,14 +91,14 @@ def gather_diagonal(sums: wp.array2d(dtype=wp.int64), prior: Prior, start: int, 
 
 @wp.func
 def block_sum(value: wp.float64) -> wp.float64:
-    """Return the sum over the threads of a block, in fixed order, to every thread."""
+    """Return the sum of a value over the threads of a block to every thread, added in fixed order."""
     total = wp.tile_sum(wp.tile(value))
     return total[0]
 
 
 @wp.func
 def total_of(partial: wp.array(dtype=wp.float64), thread: int) -> wp.float64:
-    """Return the total of partial sums, to every thread of the block."""
+    """Return the total of partial sums to every thread of the block."""
     total = wp.float64(0.0)
     for i in range(thread % wp.block_dim(), partial.shape[0], wp.block_dim()):
         total += partial[i]
@@ -150,7 +150,7 @@ def next_ratio(dots: Dots, thread: int) -> float:
 
 @wp.kernel
 def update_search_direction(width: int, start: int, u: Unknowns, dots: Dots):
-    """Compute the search direction p = z + b p, where z = r / diagonal."""
+    """Compute the search direction p = z + b p, where z = r / diagonal and b is :func:`next_ratio`."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
     for i in range(thread * width, wp.min((thread + 1) * width, u.residual.shape[0])):
@@ -160,7 +160,7 @@ def update_search_direction(width: int, start: int, u: Unknowns, dots: Dots):
 
 @wp.kernel
 def update_search_direction_with(z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots: Dots):
-    """Compute the search direction p = z + b p for a given z."""
+    """Compute the search direction p = z + b p for a given z, where b is :func:`next_ratio`."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
     for i in range(thread * width, wp.min((thread + 1) * width, z.shape[0])):

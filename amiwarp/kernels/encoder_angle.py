@@ -14,9 +14,9 @@ THETA_U32_RAD = wp.constant(2.0 * 3.141592653589793 / 4294967296.0)  # unit of t
 
 @wp.struct
 class EncoderParams:
-    """Piecewise linear prism angle over time; the first and last pieces extend beyond the samples.
+    """Prism angle over time as a piecewise linear function.
 
-    Built by :mod:`amiwarp.events.device_encoder`.
+    The first and last pieces extend beyond the samples. Built by :mod:`amiwarp.events.device_encoder`.
     """
 
     origin: wp.int64  # event time at the start of the first bucket [us]

@@ -40,7 +40,7 @@ PAST_STEP = wp.constant(2.0)  # a fraction of the step beyond its end
 
 @wp.struct
 class SensorParams:
-    """Sensor model."""
+    """Sensor parameters in the units of the simulator."""
 
     on: float  # nominal ON and OFF thresholds [log intensity]
     off: float
@@ -61,7 +61,7 @@ class SensorParams:
 
 @wp.struct
 class Pixel:
-    """State of one pixel."""
+    """State of one simulated pixel."""
 
     level: float  # level at the last step, after the photoreceptor [log intensity]
     reference: float  # reference level [log intensity]
@@ -78,7 +78,7 @@ class Pixel:
 
 @wp.struct
 class Interval:
-    """A step, or one of the equal pieces of a step."""
+    """Time interval over which a pixel is advanced: a step, or one of the equal pieces of a step."""
 
     ticks: int
     per_tick: float  # intervals per tick
@@ -88,7 +88,7 @@ class Interval:
 
 @wp.struct
 class Sink:
-    """Destination of the keys: segments with limited room, each with a counter.
+    """Destination of the event keys: segments with limited room, each with a counter of events.
 
     On a CPU a segment is a run of pixels of one thread. On CUDA neighbouring pixels use different segments, because one
     counter for all pixels, or for all of a warp, would be the bottleneck.
@@ -101,7 +101,7 @@ class Sink:
 
 @wp.func
 def whole_step(steps: Steps, p: Pixel) -> Interval:
-    """Return a step of a chunk as an interval, in which the pixel leaks without jitter."""
+    """Return one step of a chunk as a time interval, in which the pixel leaks without jitter."""
     span = Interval()
     span.ticks = steps.ticks
     span.per_tick = steps.per_tick
@@ -141,7 +141,7 @@ def append_key(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64,
 
 @wp.func
 def latency(s: SensorParams, rng: wp.uint32):
-    """Return the latency [ticks] from a crossing to its time stamp, and the generator's next state."""
+    """Return a random latency [ticks] from a threshold crossing to its time stamp, and the generator's next state."""
     late = s.latency
     if s.jitter > 0.0:  # nearly Gaussian: sum of four uniform numbers, within 3.5 standard deviations
         four = wp.randf(rng) + wp.randf(rng) + wp.randf(rng) + wp.randf(rng)
@@ -168,10 +168,10 @@ def next_state(s: SensorParams, rng: wp.uint32) -> wp.uint32:
 
 @wp.func
 def thin_noise(p: Pixel, s: SensorParams, slope: float, f: float, noise: bool) -> Pixel:
-    """Return the pixel before an event at fraction ``f`` of the step; postpone a noise event if it is too bright.
+    """Return the pixel before an event at fraction ``f`` of the step; in bright light, noise may be postponed.
 
-    Noise is drawn at the rate in the dark. Postponing events at random gives the rate at the level of the moment. It
-    falls linearly with luminance, as in v2e (Hu, Liu, Delbruck, CVPR Workshops 2021).
+    Noise is drawn at the rate in the dark. Postponing noise events at random gives the rate at the level of the moment.
+    It falls linearly with luminance, as in v2e (Hu, Liu, Delbruck, CVPR Workshops 2021).
     """
     if noise and f < 1.0 and s.noise_white < 1.0:
         rng = p.rng
@@ -238,12 +238,12 @@ __syncwarp();
 #endif
 """)
 def reconverge():
-    """Reconverge a warp: after an event its lanes would otherwise diverge until the end of the chunk."""
+    """Make the threads of a warp run together again: after an event they would diverge until the end of the chunk."""
 
 
 @wp.func
 def rate_factor(sensor: SensorParams, rng: wp.uint32):
-    """Draw a pixel's leak and shot noise relative to their means; return the generator's next state, too."""
+    """Draw the ratio of a pixel's leak and shot noise to their means; return also the generator's next state."""
     factor = float(1.0)
     if sensor.spread > 0.0:
         factor = wp.exp(sensor.spread * wp.randn(rng))
@@ -297,7 +297,7 @@ def advance_pixel(
 
 @wp.func
 def shift_times(p: Pixel, passed: wp.int64) -> Pixel:
-    """Return the pixel with its times counted from ``passed`` ticks later."""
+    """Shift the pixel's times to a new origin that is ``passed`` ticks later."""
     if p.blind_until > NEVER:
         p.blind_until -= passed
     p.next_noise -= passed

@@ -1,4 +1,4 @@
-"""Keys of simulated events: joined, moved in time, counted, and converted to events with ground truth.
+"""Keys of simulated events: joined, shifted in time, counted, and converted to events with ground truth.
 
 :mod:`amiwarp.kernels.event_generation` describes the keys.
 """
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Block:
-    """Events unpacked from their keys."""
+    """Columns of simulated events that were unpacked from their keys."""
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
@@ -53,7 +53,7 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
 
 @wp.kernel
 def pack(sink: Sink, offset: wp.array(dtype=int), out: wp.array(dtype=wp.int64)):
-    """Join the segments: segment ``i`` begins at ``offset[i]``."""
+    """Join the segments of keys without gaps: segment ``i`` begins at ``offset[i]``."""
     segment, place = wp.tid()
     if place < sink.count[segment, 0]:
         out[offset[segment] + place] = sink.keys[segment, place]
@@ -61,7 +61,7 @@ def pack(sink: Sink, offset: wp.array(dtype=int), out: wp.array(dtype=wp.int64))
 
 @wp.kernel
 def rebase(keys: wp.array(dtype=wp.int64), passed: wp.int64):
-    """Subtract the duration of a finished chunk from the keys of later events."""
+    """Subtract the duration of a finished chunk from the times in keys of later events."""
     i = wp.tid()
     keys[i] -= passed
 

@@ -1,4 +1,4 @@
-"""Image of warped events (IWE): reading it from votes, smoothing it, and summing it.
+"""Image of warped events (IWE): computed from votes, smoothed, and summed for its sharpness.
 
 Kernels come in two widths: a CPU thread processes 64 pixels of a row in vectorised loops, a GPU thread one pixel. No
 two threads write to the same element, so that results do not depend on the schedule.
@@ -37,7 +37,7 @@ class Frame:
 
 @wp.func
 def block_column(frame: Frame, block: int, width: int) -> int:
-    """Return the first column of a block."""
+    """Return the image column at which a block of pixels begins."""
     return (block % frame.blocks) * width
 
 
@@ -55,7 +55,7 @@ def block_start(frame: Frame, block: int, width: int, step: int) -> int:
 
 @wp.func
 def word_field(word: wp.uint64, first: int, mask: int) -> int:
-    """Return the field of a word that begins at bit ``first``."""
+    """Return the field of a 64-bit word that begins at bit ``first``."""
     return int((word >> wp.uint64(first)) & wp.uint64(mask))
 
 
@@ -80,7 +80,7 @@ def votes_of_pixel(words: wp.array(dtype=wp.uint64), cell: int, width: int) -> i
 
 @wp.func
 def cell_of(canvas: Canvas, frame: Frame, block: int, width: int) -> int:
-    """Return the cell of a block's first pixel."""
+    """Return the index of the vote cell of a block's first pixel."""
     line = block / frame.blocks
     row = (line / frame.rows) * canvas.rows + line % frame.rows + 1
     return row * canvas.columns + block_column(frame, block, width) + 1
@@ -117,7 +117,7 @@ def add_totals(more: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64),
 
 @cache
 def read_votes(width: int) -> Any:
-    """Return the kernel that reads ``width`` pixels [events] from all slices of votes and keeps the votes."""
+    """Return the kernel that computes ``width`` pixels [events] from all slices of votes, which are kept."""
 
     @wp.kernel
     def read_votes(
@@ -154,7 +154,7 @@ def read_votes(width: int) -> Any:
 
 @cache
 def smooth(width: int) -> Any:
-    """Return the kernel that smooths ``width`` pixels along the axis of ``step``; its weights begin at the centre."""
+    """Return the kernel that smooths ``width`` pixels per thread along one axis; the weights begin at the centre."""
 
     @wp.kernel
     def smooth(
@@ -184,7 +184,7 @@ def smooth(width: int) -> Any:
 
 @wp.func
 def gradient2(image: wp.array(dtype=float), i: int, stride: int) -> float:
-    """Return the squared central-difference gradient."""
+    """Return the squared central-difference gradient at pixel ``i``."""
     dx = load_float(image, i + 1) - load_float(image, i - 1)
     dy = load_float(image, i + stride) - load_float(image, i - stride)
     return 0.25 * (dx * dx + dy * dy)
@@ -192,7 +192,7 @@ def gradient2(image: wp.array(dtype=float), i: int, stride: int) -> float:
 
 @wp.func
 def laplacian2(image: wp.array(dtype=float), i: int, stride: int) -> float:
-    """Return the squared five-point Laplacian."""
+    """Return the squared five-point Laplacian at pixel ``i``."""
     across = load_float(image, i + 1) + load_float(image, i - 1)
     value = across + load_float(image, i + stride) + load_float(image, i - stride) - 4.0 * load_float(image, i)
     return value * value
@@ -200,7 +200,7 @@ def laplacian2(image: wp.array(dtype=float), i: int, stride: int) -> float:
 
 @wp.func
 def other_term(kind: int, h: float, eta: float) -> float:
-    """Return the term of a pixel for the sharpness measures J (the paper's) and entropy."""
+    """Return a pixel's term in the sharpness measures J (the paper's) and entropy."""
     if kind == PAPER_J:
         return wp.where(h > 0.0, 1.0 / (1.0 + wp.exp(wp.min(h / eta, 80.0))), 0.0)
     return wp.where(h > 0.0, h * wp.log(wp.max(h, 1.0e-30)), 0.0)
@@ -244,7 +244,7 @@ def sum_terms(width: int, kind: int) -> Any:
 
 @wp.kernel
 def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array2d(dtype=wp.vec2d)):
-    """Add up each row of partial sums into as many sums as ``out`` has columns."""
+    """Add up the partial sums in each row, giving one sum per column of ``out``."""
     row, i = wp.tid()
     total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
     for k in range(i, sums.shape[1], out.shape[1]):

@@ -37,8 +37,9 @@ def load(kernel: Any, device: Any) -> None:
 
 
 def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:
-    """Return at most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``, each of about ``smallest`` or
-    more.
+    """Return at most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``.
+
+    Each range has about ``smallest`` elements or more.
     """
     parts = max(1, min(parts, n // smallest))
     edges = [n * k // parts for k in range(parts + 1)]
@@ -130,5 +131,5 @@ class RecordedLaunch:
 
 
 def slice_count(device: Any) -> int:
-    """Return the number of outputs that :func:`launch_slices` can use on ``device``."""
+    """Return the number of output arrays that :func:`launch_slices` can use on ``device``."""
     return cpu_threads() if wp.get_device(device).is_cpu else 1

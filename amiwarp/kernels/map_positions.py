@@ -1,4 +1,4 @@
-"""Positions of event pairs on the map, for :mod:`amiwarp.brightness.solver`."""
+"""Positions of event pairs on the brightness map, for :mod:`amiwarp.brightness.solver`."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def node_at(atlas: Atlas, tile: int, x: float, y: float):
-    """Return the index of the node to the upper left and the fractions to the next; -1 off the tile, and for NaN."""
+    """Return the map node up and left of a position, and the fractions to the next; -1 off the tile, and for NaN."""
     u = (x - load_float(atlas.origin, 2 * tile)) * atlas.density
     v = (y - load_float(atlas.origin, 2 * tile + 1)) * atlas.density
     inside = wp.where(u >= 0.0, wp.where(u < float(atlas.columns - 1), 1, 0), 0)
@@ -27,7 +27,7 @@ def node_at(atlas: Atlas, tile: int, x: float, y: float):
 
 @wp.func
 def event_azimuth(model: Any, pairs: Pairs, k: int, i: int):
-    """Return (cos, sin) of the tilt azimuth at the first (k = 0) or second event."""
+    """Return (cos, sin) of the prism's tilt azimuth at the first (k = 0) or second event of pair ``i``."""
     c = load_float(pairs.azimuth, 2 * k * pairs.stride + i)
     s = load_float(pairs.azimuth, (2 * k + 1) * pairs.stride + i)
     return c * model.phase_cos - s * model.phase_sin, s * model.phase_cos + c * model.phase_sin
@@ -37,7 +37,7 @@ def event_azimuth(model: Any, pairs: Pairs, k: int, i: int):
 def compensated_position(
     model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
-    """Return the compensated position [px] of the first (k = 0) or second event, drift and camera rotation included."""
+    """Return the compensated position [px] of the first (k = 0) or second event of a pair, at the given drift."""
     w0, w1 = event_azimuth(model, pairs, k, i)
     if pairs.slope.shape[0] > 0:
         angle = pairs.slope[k * pairs.stride + i] * drift
@@ -69,7 +69,7 @@ def find_places(
 
 @wp.func
 def store_geometry(g: Geometry, i: int, a: int, ax: float, ay: float, b: int, bx: float, by: float):
-    """Store the nodes and fractions of both events; both nodes are -1 if either is."""
+    """Store the map nodes and fractions of a pair's two events; both nodes are -1 if either is."""
     store_int(g.cell, i, wp.where(b < 0, -1, a))
     store_int(g.cell, g.stride + i, wp.where(a < 0, -1, b))
     store_float(g.part, i, ax)
@@ -89,7 +89,7 @@ def place_pairs(
     start: int,
     geometry: Geometry,
 ):
-    """Compute the positions of both events of a pair on the map."""
+    """Compute the positions of both events of a pair on the brightness map."""
     i = start + wp.tid()
     a = compensated_position(model, camera, camera_rotation, pairs, drift, i, 0)
     b = compensated_position(model, camera, camera_rotation, pairs, drift, i, 1)
@@ -101,9 +101,9 @@ def place_pairs(
 
 @wp.func
 def event_node(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, k: int, i: int):
-    """Return node and fractions of the first (k = 0) or second event.
+    """Return map node and fractions of the first (k = 0) or second event of a pair.
 
-    For a camera without distortion and rotation, and without drift.
+    This function is for a camera without distortion and rotation, and without drift.
     """
     w0, w1 = event_azimuth(model, pairs, k, i)
     u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)

@@ -1,4 +1,4 @@
-"""Prior for unknowns that no equation determines: damping, and links between neighbouring nodes."""
+"""Prior for map unknowns that no equation determines: damping, and links between neighbouring nodes."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ EXTRA = wp.constant(2)  # unknowns after the map: leak, OFF threshold
 
 @wp.struct
 class Prior:
-    """Prior cost: damping x² plus the sum of weight (xᵢ - xⱼ)² over all links. No link leaves a tile."""
+    """Prior cost of a map x: damping x² plus the sum of weight (xᵢ - xⱼ)² over all links. No link leaves a tile."""
 
     damping: float
     linked: int  # 1 if there are links, else 0
@@ -23,7 +23,7 @@ class Prior:
 
 @wp.func
 def prior_product(prior: Prior, vector: wp.array(dtype=float), i: int) -> float:
-    """Return row i of the prior's operator times a vector."""
+    """Return element ``i`` of the prior's operator times a vector."""
     total = prior.damping * vector[i]
     if prior.linked == 0:
         return total
@@ -40,7 +40,7 @@ def prior_product(prior: Prior, vector: wp.array(dtype=float), i: int) -> float:
 
 @wp.func
 def prior_diagonal(prior: Prior, i: int) -> float:
-    """Return the diagonal of the prior's operator.
+    """Return element ``i`` of the diagonal of the prior's operator.
 
     For a fixed unknown it is so large that the preconditioner suppresses every step.
     """
@@ -59,7 +59,7 @@ def prior_diagonal(prior: Prior, i: int) -> float:
 
 @wp.func
 def link_weight(difference: float, smooth: float, edge: float) -> float:
-    """Return Charbonnier's weight of a link, which falls if neighbours differ by more than ``edge``.
+    """Return Charbonnier's weight of a link, which decreases if neighbours differ by more than ``edge`` [thresholds].
 
     An ``edge`` of 0 gives all links equal weight.
     """

@@ -1,7 +1,7 @@
-"""Preconditioner of large maps: the sum of corrections on ever coarser grids.
+"""Preconditioner of large brightness maps: the sum of corrections on ever coarser grids.
 
-Bramble, Pasciak and Xu, "Parallel multilevel preconditioners", Math. Comp. 1990. The equations relate nodes near each
-other, so that brightness would propagate across the map only slowly with single-node corrections.
+Source: Bramble, Pasciak and Xu, "Parallel multilevel preconditioners", Math. Comp. 1990. The equations relate nodes
+near each other, so that brightness would propagate across the map only slowly with single-node corrections.
 """
 
 import warp as wp
@@ -17,13 +17,13 @@ HAT = wp.constant(8.0 / 3.0)  # energy of a bilinear hat function of any width u
 
 @wp.func
 def coarse_coordinates(atlas: Atlas, cell: int, f: wp.vec2, spacing: float) -> wp.vec2:
-    """Return node coordinates on the grid of that ``spacing``."""
+    """Convert node coordinates on the finest grid to the grid whose nodes are ``spacing`` apart."""
     return wp.vec2(float(cell % atlas.columns) + f[0], float(cell / atlas.columns) + f[1]) / spacing
 
 
 @wp.func
 def upper_left(at: wp.vec2, columns: int) -> int:
-    """Return the index of the node at the upper left."""
+    """Return the index of the grid node to the upper left of node coordinates."""
     return int(at[1]) * columns + int(at[0])
 
 
@@ -69,7 +69,7 @@ def add_coarse_diagonal(
 
 @wp.kernel
 def divide(diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
-    """Compute the correction on the finest grid."""
+    """Compute the correction on the finest grid: the residual divided by the diagonal."""
     i = start + wp.tid()
     if i < out.shape[0]:
         out[i] = residual[i] / diagonal[i]

@@ -8,11 +8,14 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 ROW = 10
-"""Entries per table row: addresses of the pointers to x, y, t and p; destination addresses (p: 0 to skip it); number of
-events; and 1 if the event before the first one in memory also precedes it in time.
+"""Number of entries per row of the table of packets.
+
+The entries are: addresses of the pointers to x, y, t and p; destination addresses (p: 0 to skip it); number of events;
+and 1 if the event before the first one in memory also precedes it in time.
 """
 FOUND = 3
-"""Results per table row: 1 if the times are out of order, else 0; largest x [px]; largest y [px]."""
+"""Number of results per row of the table of packets: 1 if the times are out of order, else 0; largest x [px]; largest y
+[px]."""
 
 
 @wp.func_native("""

@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Sorted:
-    """Events and their order by span and pixel.
+    """Events of the sensor, and their order by time span and pixel.
 
     ``key`` is span · pixels + pixel; ``order`` is the index of the event.
     """
@@ -32,7 +32,7 @@ class Sorted:
 
 @wp.struct
 class Window:
-    """Times of the window and of the sensor."""
+    """Times of the window, and delays of the sensor."""
 
     start: wp.int64  # of the window [us]
     stop: wp.int64
@@ -97,7 +97,7 @@ def mark_pairs(s: Sorted, window: Window, start: int, flag: wp.array(dtype=int))
 
 @wp.kernel
 def mark_ends(s: Sorted, start: int, flag: wp.array(dtype=int)):
-    """Mark the first event of each pixel, and the last.
+    """Mark the first and the last event of each pixel as candidates for pairs.
 
     The flags follow those of :func:`mark_pairs`: ``count`` flags for first events, then ``count`` for last events.
     """
@@ -108,7 +108,7 @@ def mark_ends(s: Sorted, start: int, flag: wp.array(dtype=int)):
 
 @wp.kernel
 def mark_spans(s: Sorted, edges: wp.array(dtype=wp.int64), start: int, fired: wp.array(dtype=wp.uint8)):
-    """Mark the pixels that fire in each span between two edges."""
+    """Mark the pixels that fire in each time span between two successive ``edges`` [us]."""
     i = start + wp.tid()
     t = s.t[i]
     spans = edges.shape[0] - 1
@@ -255,14 +255,14 @@ def mark_same_tile(
 
 @wp.kernel
 def mark_listed(tile: wp.array(dtype=int), listed: wp.array(dtype=int), start: int, flag: wp.array(dtype=int)):
-    """Mark pairs whose tile is listed."""
+    """Mark pairs whose tile is listed (1, else 0)."""
     i = start + wp.tid()
     flag[i] = listed[tile[i]]
 
 
 @wp.kernel
 def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: wp.array(dtype=int)):
-    """Mark pairs in a square of the sensor [px]."""
+    """Mark pairs of the pixels in a square of the sensor [px]."""
     i = start + wp.tid()
     x = int(pairs.x[i]) - left
     y = int(pairs.y[i]) - top
@@ -271,7 +271,7 @@ def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: 
 
 @wp.kernel
 def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs):
-    """Copy the marked pairs contiguously."""
+    """Copy the marked pairs to contiguous arrays."""
     i = start + wp.tid()
     if flag[i] == 0:
         return
@@ -290,7 +290,7 @@ def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), 
 
 @wp.kernel
 def hold_out(every: int, start: int, on: wp.array(dtype=wp.uint8)):
-    """Hold out every ``every``-th pair of two events; these pairs come first."""
+    """Mark every ``every``-th pair of two events as held out. These pairs come first in the arrays."""
     i = start + wp.tid()
     if i % every == 0 and on[i] < QUIET:
         on[i] = on[i] | HELD
@@ -317,14 +317,14 @@ def count_pixels(s: Sorted, start: int, count: wp.array(dtype=int)):
 
 @wp.func
 def mirrored(i: int, n: int) -> int:
-    """Return the index reflected about the centres of the outermost pixels."""
+    """Return the index ``i`` reflected about the centres of the outermost pixels of ``n``."""
     j = wp.abs(i)
     return wp.where(j < n, j, 2 * n - 2 - j)
 
 
 @wp.kernel
 def mark_hot(count: wp.array2d(dtype=int), tile: int, start: int, tile_of: wp.array(dtype=int)):
-    """Set the tile to -1 for hot pixels, and to ``tile`` for the others.
+    """Exclude hot pixels by setting their tile to -1; the other pixels get the tile ``tile``.
 
     A pixel is hot if it fires far more than at least 19 of the 25 pixels of the 5 x 5 around it.
     """

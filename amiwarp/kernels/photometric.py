@@ -46,7 +46,7 @@ class Pairs:
 
 @wp.struct
 class Atlas:
-    """Tiles of the map.
+    """Tiles of the brightness map.
 
     ``origin`` (x, y, x, …) is the pixel of each tile's first node. Nodes are ``1 / density`` px apart.
     """
@@ -73,25 +73,25 @@ class Geometry:
 
 @wp.func
 def fractions_of(g: Geometry, k: int, i: int) -> wp.vec2:
-    """Return the fractions (x, y) of the first (k = 0) or second event."""
+    """Return the fractions (x, y) between map nodes of the first (k = 0) or second event of pair ``i``."""
     return wp.vec2(load_float(g.part, 2 * k * g.stride + i), load_float(g.part, (2 * k + 1) * g.stride + i))
 
 
 @wp.func
 def fraction(node: wp.vec2) -> wp.vec2:
-    """Return the fractional part of node coordinates."""
+    """Return the fractional part of each node coordinate."""
     return wp.vec2(node[0] - wp.floor(node[0]), node[1] - wp.floor(node[1]))
 
 
 @wp.func
 def bilinear(f: wp.vec2) -> wp.vec4:
-    """Return the weights of the nodes: upper left, upper right, lower left, lower right."""
+    """Return the bilinear weights of four nodes: upper left, upper right, lower left, lower right."""
     return wp.vec4((1.0 - f[0]) * (1.0 - f[1]), f[0] * (1.0 - f[1]), (1.0 - f[0]) * f[1], f[0] * f[1])
 
 
 @wp.func
 def brightness_at(image: wp.array(dtype=float), g: Geometry, columns: int, k: int, i: int) -> float:
-    """Return the brightness at the first (k = 0) or second event; for a pair off the map that of node 0."""
+    """Return the brightness at the first (k = 0) or second event of a pair, or at node 0 for a pair off the map."""
     cell = wp.max(load_int(g.cell, k * g.stride + i), 0)
     fx = load_float(g.part, 2 * k * g.stride + i)
     fy = load_float(g.part, (2 * k + 1) * g.stride + i)
@@ -144,7 +144,7 @@ def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g:
 
 @wp.func
 def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int, value: float):
-    """Add to the sums of the leak and the OFF threshold."""
+    """Add a value to the sums of the leak and the OFF threshold."""
     extra = sums.shape[0] - EXTRA
     if atlas.with_leak > 0.0:
         add_fixed(sums, extra, value * (pairs.time[pairs.stride + i] - pairs.time[i]))
@@ -177,7 +177,7 @@ def apply_normal(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W A vector, one pair per thread."""
+    """Compute sums += Aᵀ W A vector for equations A with weights W, one pair of events per thread."""
     i = start + wp.tid()
     if geometry.cell[i] < 0:
         return
@@ -200,7 +200,7 @@ def apply_normal_blocks(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W A vector, one block of pairs per thread. For CPUs."""
+    """Compute sums += Aᵀ W A vector for equations A with weights W, one block of pairs per thread. For CPUs."""
     first = (start + wp.tid()) * BLOCK
     values = wp.zeros(shape=(64,), dtype=float)
     for k in range(BLOCK):
@@ -219,7 +219,7 @@ def apply_transpose(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W residual."""
+    """Compute sums += Aᵀ W residual for equations A with weights W."""
     i = start + wp.tid()
     transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
 
@@ -233,7 +233,7 @@ def subtract(
     start: int,
     residual: wp.array(dtype=float),
 ):
-    """Compute residual -= A vector; 0 for a pair off the map."""
+    """Compute residual -= A vector for equations A; the residual is 0 for a pair off the map."""
     i = start + wp.tid()
     if i < pairs.count:
         rest = residual[i] - difference(vector, atlas, pairs, geometry, i)

@@ -40,7 +40,7 @@ SMALL_CHANGE = wp.constant(0.3)  # of the log intensity, below which a series is
 
 @wp.struct
 class Input:
-    """Input of a photoreceptor at one instant."""
+    """Input of a photoreceptor at one instant: the light on its pixel."""
 
     level: float  # log intensity
     light: float  # its exponential
@@ -48,7 +48,7 @@ class Input:
 
 @wp.func
 def last_input(level: float) -> Input:
-    """Return the input for a level."""
+    """Return the photoreceptor's input at a level, with the exponential computed."""
     result = Input()
     result.level = level
     result.light = wp.exp(level)
@@ -57,7 +57,7 @@ def last_input(level: float) -> Input:
 
 @wp.func
 def next_input(level: float, last: Input) -> Input:
-    """Return the input for a level; ``last`` saves the exponential if it has the same level."""
+    """Return the photoreceptor's input for a level. ``last`` saves the exponential if it has the same level."""
     result = Input()
     result.level = level
     result.light = last.light

@@ -17,7 +17,7 @@ SMALLEST_DEPTH = wp.constant(1.0e-3)  # of a scene point in front of the camera
 
 @wp.struct
 class View:
-    """Camera, prism and picture maps."""
+    """What pixels see: camera, prism and the maps of the pictures."""
 
     camera: CameraParams
     prism: ExactParams
@@ -54,7 +54,7 @@ class Steps:
 
 @wp.func
 def mirror(x: float, size: int) -> float:
-    """Return a texel coordinate reflected at the map's edges; on the map it keeps its bits."""
+    """Reflect a texel coordinate at the map's edges; on the map it keeps its bits."""
     last = float(size - 1)
     r = wp.abs(x)
     r = r - 2.0 * last * wp.floor(r / (2.0 * last))
@@ -63,20 +63,20 @@ def mirror(x: float, size: int) -> float:
 
 @wp.func
 def texel_of(x: float, size: int) -> int:
-    """Return the texel whose bilinear piece holds a mirrored coordinate, which may be NaN."""
+    """Return the texel whose bilinear piece contains a mirrored coordinate, which may be NaN."""
     return wp.min(int(wp.where(x >= 0.0, x, 0.0)), size - 2)
 
 
 @wp.func
 def bilinear_level(view: View, slot: int, texel: int, fx: float, fy: float) -> float:
-    """Return the log intensity in a bilinear piece, with a single load."""
+    """Return the log intensity at a position in a texel's bilinear piece, with a single load."""
     c = view.maps[slot * (view.height * view.width) + texel]
     return c[0] + fx * c[1] + fy * (c[2] + fx * c[3])
 
 
 @wp.func
 def blend_maps(view: View, step: Step, texel: int, fx: float, fy: float) -> float:
-    """Return the log intensity in a bilinear piece, interpolated between the maps before and after an instant."""
+    """Return the log intensity in a texel's bilinear piece, interpolated between the maps around an instant."""
     level = bilinear_level(view, step.before, texel, fx, fy)
     if step.weight > 0.0:
         level += step.weight * (bilinear_level(view, step.after, texel, fx, fy) - level)
@@ -114,7 +114,7 @@ def prism_shift(m: ExactParams, along: float, z: float) -> float:
 
 @wp.func
 def depth_or_nan(depth: float) -> float:
-    """Return a depth, or NaN if it is not in front of the camera."""
+    """Return a depth, or NaN for a depth that is not in front of the camera."""
     return wp.where(depth > SMALLEST_DEPTH, depth, NAN)
 
 

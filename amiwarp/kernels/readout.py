@@ -12,7 +12,7 @@ LAG_BIT = wp.constant(3)  # lowest bit of the lag in a key
 
 @wp.struct
 class RowScan:
-    """Scan of the sensor's rows, without a pause."""
+    """Scan of the sensor's rows one after the other, without a pause."""
 
     row_ps: wp.int64  # time to read a row [ps]
     scan_ps: wp.int64  # time to read all rows [ps]
@@ -47,7 +47,7 @@ def stamp_rows(scan: RowScan, keys: wp.array(dtype=wp.int64), start: int):
 
 @wp.struct
 class Bus:
-    """Bus that transmits one event at a time."""
+    """Bus of the sensor, which transmits one event at a time."""
 
     event_ps: wp.int64  # time to transmit an event [ps]
     longest_ps: wp.int64  # longest time in the queue [ps]; events that would wait longer are lost

@@ -12,7 +12,7 @@ BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 
 
 class Program:
-    """Sequence of launches that can be run many times.
+    """Sequence of kernel launches that can be run many times.
 
     Arrays and numbers are those passed to :meth:`add`. A value that changes between runs must be stored in an array.
     """
@@ -84,7 +84,7 @@ class Program:
 
 
 def _run_stage(stage: list[Any]) -> None:
-    """Run the first slice in this thread and the others on the pool."""
+    """Run the first slice of a launch in this thread, and the others on the thread pool."""
     others = [pool().submit(command.launch) for command in stage[1:]]
     stage[0].launch()
     for other in others:

@@ -28,7 +28,7 @@ INVERSION_STEPS = wp.constant(8)
 
 @wp.struct
 class CircleParams:
-    """Circle model: constant deflection."""
+    """Circle model: rotation of each bearing by a constant deflection."""
 
     sine: float  # of the deflection; positive if the flat face looks to the scene
     versine: float  # 1 - cosine
@@ -50,7 +50,7 @@ class RadialCircleParams:
 
 @wp.struct
 class ExactParams:
-    """Exact model: refraction at both faces."""
+    """Exact model: refraction at both faces of the prism."""
 
     sin_apex: float  # of the apex angle
     cos_apex: float
@@ -65,7 +65,7 @@ class ExactParams:
 
 @wp.struct
 class EllipseParams:
-    """Ellipse model: a table of displacements per pixel."""
+    """Ellipse model: table of the displacement's offset and first harmonic for each pixel."""
 
     phase: float  # of the prism angle [rad], with its cosine and sine
     phase_cos: float
@@ -88,7 +88,7 @@ def azimuth(model: Any, theta: float) -> wp.vec2:
 
 @wp.func
 def compensate_direction(model: CircleParams, x: float, y: float, z: float, w0: float, w1: float):
-    """Compensate a direction by the circle model."""
+    """Return the direction without the prism, by the circle model."""
     return rotate_by_deflection(x, y, z, w0, w1, model.sine, model.versine)
 
 
@@ -143,7 +143,7 @@ def rotate_from_flat_side(model: RadialCircleParams, x: float, y: float, z: floa
 
 @wp.func
 def compensate_direction(model: RadialCircleParams, x: float, y: float, z: float, w0: float, w1: float):
-    """Compensate a direction by the radial circle model."""
+    """Return the direction without the prism, by the radial circle model."""
     length = wp.sqrt(x * x + y * y + z * z)
     a, b, c = x / length, y / length, z / length
     if model.deflection < 0.0:
@@ -204,14 +204,14 @@ def refract_through_prism(m: ExactParams, x: float, y: float, z: float, w0: floa
 
 @wp.func
 def trace(m: ExactParams, ray: wp.vec3, w: wp.vec2, entering: int) -> wp.vec3:
-    """Refract a bearing through the prism; :func:`refract_through_prism` with vectors."""
+    """Refract a bearing vector through the prism, as :func:`refract_through_prism` does."""
     x, y, z = refract_through_prism(m, ray[0], ray[1], ray[2], w[0], w[1], entering)
     return wp.vec3(x, y, z)
 
 
 @wp.func
 def compensate_direction(model: ExactParams, x: float, y: float, z: float, w0: float, w1: float):
-    """Compensate a direction by the exact model."""
+    """Return the direction without the prism, by the exact model."""
     return refract_through_prism(model, x, y, z, w0, w1, model.flat_to_scene)
 
 
@@ -226,14 +226,14 @@ def deflect(model: ExactParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -
 
 @wp.func
 def ellipse_displacement(m: EllipseParams, row: int, col: int, w0: float, w1: float):
-    """Return the displacement [px] of a whole pixel."""
+    """Return the displacement of a whole pixel by the ellipse model [px]."""
     x = m.table[row, col, 0] + m.table[row, col, 2] * w0 + m.table[row, col, 4] * w1
     return x, m.table[row, col, 1] + m.table[row, col, 3] * w0 + m.table[row, col, 5] * w1
 
 
 @wp.func
 def interpolate_ellipses(m: EllipseParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    """Return the displacement [px] between pixels: bilinear, constant beyond the border."""
+    """Return the displacement [px] between whole pixels: bilinear, constant beyond the border."""
     x = wp.clamp(xy[0], 0.0, float(m.table.shape[1] - 1))
     y = wp.clamp(xy[1], 0.0, float(m.table.shape[0] - 1))
     col = wp.min(int(x), wp.max(m.table.shape[1] - 2, 0))
@@ -283,7 +283,7 @@ def deflect(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2)
 
 @wp.func
 def compensate(model: Any, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
-    """Return the compensated pixel of any model that compensates directions."""
+    """Return the compensated pixel, for any model that compensates directions."""
     ray = pixel_to_ray(camera, xy)
     x, y, z = compensate_direction(model, ray[0], ray[1], ray[2], w[0], w[1])
     return ray_to_pixel(camera, wp.vec3(x, y, z))
@@ -322,7 +322,7 @@ def compensate_points(
     start: int,
     out: wp.array(dtype=wp.vec2),
 ):
-    """Compensate one pixel per thread."""
+    """Compensate one pixel per thread at its prism angle [rad]."""
     i = start + wp.tid()
     out[i] = compensate(model, camera, xy[i], azimuth(model, theta[i]))
 
@@ -336,7 +336,7 @@ def deflect_points(
     start: int,
     out: wp.array(dtype=wp.vec2),
 ):
-    """Deflect one pixel per thread."""
+    """Deflect one pixel per thread at its prism angle [rad]."""
     i = start + wp.tid()
     out[i] = deflect(model, camera, xy[i], azimuth(model, theta[i]))
 

@@ -1,4 +1,4 @@
-"""Quantities computed from residuals: their derivatives by the parameters, costs, and sums of products."""
+"""Quantities computed from the residuals of event pairs: derivatives by the parameters, costs, and sums of products."""
 
 import warp as wp
 
@@ -107,6 +107,6 @@ def magnitudes(values: wp.array(dtype=float), start: int, out: wp.array(dtype=fl
 
 @wp.kernel
 def clear_missing(values: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
-    """Replace NaN by 0."""
+    """Replace each NaN by 0."""
     i = start + wp.tid()
     out[i] = replace_nan(values[i], 0.0)

@@ -31,7 +31,7 @@ def sine_versine(a: float):
 
 @wp.func
 def rotate(r: wp.mat33, x: float, y: float, z: float):
-    """Return r · (x, y, z)."""
+    """Return the matrix product r · (x, y, z)."""
     a = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
     b = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
     return a, b, r[2, 0] * x + r[2, 1] * y + r[2, 2] * z

@@ -1,6 +1,6 @@
-"""Shared memory of a block on CUDA: the windows of :mod:`amiwarp.kernels.tiles`.
+"""Shared memory of a block of CUDA threads: the windows of :mod:`amiwarp.kernels.tiles`.
 
-It is used by address. The address is looked up once, while an array's name would be looked up at every vote.
+The memory is used by address. The address is looked up once, while an array's name would be looked up at every vote.
 """
 
 import warp as wp
@@ -36,7 +36,7 @@ def wait_for_block():
 #endif
 """)
 def set_word(address: int, value: int):
-    """Store a word in shared memory."""
+    """Store a word in shared memory at an address."""
 
 
 @wp.func_native("""
@@ -45,7 +45,7 @@ def set_word(address: int, value: int):
 #endif
 """)
 def add_to_word(address: int, value: int):
-    """Add to a word in shared memory, atomically."""
+    """Add to a word in shared memory at an address, atomically."""
 
 
 @wp.func_native("""
@@ -56,4 +56,4 @@ def add_to_word(address: int, value: int):
     return value;
 """)
 def get_word(address: int) -> int:
-    """Load a word from shared memory."""
+    """Load a word from shared memory at an address."""

@@ -31,7 +31,7 @@ CHUNK = 1 << 17  # events per chunk: at most 63 * 2**25 votes of 1/256, so that 
 
 @wp.struct
 class Chunk:
-    """Run of one tile's events; of one polarity if the polarities have separate images."""
+    """Run of one tile's events, which have one polarity if the polarities have separate images."""
 
     start: int
     stop: int
@@ -44,7 +44,7 @@ class Chunk:
 
 @wp.struct
 class TileEvents:
-    """Events sorted by tile.
+    """Events sorted by image tile and packed into words.
 
     ``packed`` holds theta_u16 (16 bits), the weight minus one (6 bits), and y and x in the tile (5 bits each).
     """
@@ -57,7 +57,7 @@ class TileEvents:
 
 @wp.struct
 class UnpackedEvent:
-    """One event, unpacked from :class:`TileEvents`."""
+    """Event that was unpacked from :class:`TileEvents`."""
 
     x: float  # on the sensor [px]
     y: float
@@ -70,14 +70,14 @@ class UnpackedEvent:
 
 @wp.struct
 class Still:
-    """Candidates that differ only in their models."""
+    """Candidate parameter sets that differ only in their models."""
 
     nothing: int  # unused: Warp requires a field
 
 
 @wp.struct
 class Motion:
-    """Parameters of the candidates besides the model, one element per candidate."""
+    """Parameters of the candidates besides the model, one array element per candidate."""
 
     drift: wp.array(dtype=float)
     camera_rotation: wp.array(dtype=CameraRotationParams)
@@ -85,7 +85,7 @@ class Motion:
 
 @wp.struct
 class Layout:
-    """Memory layout of the images; see :class:`amiwarp.kernels.iwe.Frame`."""
+    """Memory layout of the vote images; see :class:`amiwarp.kernels.iwe.Frame`."""
 
     stride: int
     layer: int
@@ -95,7 +95,7 @@ class Layout:
 
 @wp.func
 def tile_key(x: int, y: int, layer: int, across: int, tiles: int, size: int) -> int:
-    """Return the sort key of an event: its layer and its tile."""
+    """Return the sort key of an event: its image layer and its tile."""
     return layer * tiles + (y / size) * across + x / size
 
 
@@ -147,7 +147,7 @@ def pack_events(
 
 @wp.func
 def drifted_theta(motion: Still, events: TileEvents, candidate: int, i: int, turn: int):
-    """Return theta_u16 of an event; these candidates have no drift."""
+    """Return theta_u16 of an event unchanged, for candidates without drift."""
     return turn
 
 
@@ -161,7 +161,7 @@ def drifted_theta(motion: Motion, events: TileEvents, candidate: int, i: int, tu
 
 @wp.func
 def without_camera_rotation(motion: Still, camera: Any, x: float, y: float, events: TileEvents, candidate: int, i: int):
-    """Return the position unchanged; these candidates have no camera rotation."""
+    """Return the position of an event unchanged, for candidates without camera rotation."""
     return x, y
 
 
@@ -169,7 +169,7 @@ def without_camera_rotation(motion: Still, camera: Any, x: float, y: float, even
 def without_camera_rotation(
     motion: Motion, camera: CameraParams, x: float, y: float, events: TileEvents, candidate: int, i: int
 ):
-    """Return the position with the candidate's camera rotation removed."""
+    """Return the position of an event with the candidate's camera rotation removed."""
     if events.time.shape[0] == 0:
         return x, y
     xy = undo_camera_rotation(camera, wp.vec2(x, y), motion.camera_rotation[candidate], events.time[i])
@@ -192,7 +192,7 @@ def displace_event(
 
 @wp.func
 def add_outside(layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), r: int, c: int, v: int):
-    """Add ``v`` to the image at row ``r`` and column ``c``, counted from the window's corner."""
+    """Add ``v`` to the image at row ``r`` and column ``c``, both relative to the window's corner."""
     row = chunk.row + r
     col = chunk.column + c
     if row >= 0 and col >= 0 and row < canvas.rows - 2 and col < canvas.columns - 2 and v != 0:
@@ -221,9 +221,9 @@ def cast_outside(
 
 @wp.func
 def to_int(value: float) -> int:
-    """Return the nearest integer of a value below 2**22 in size.
+    """Return the nearest integer of a value below 2**22 in magnitude.
 
-    This addition takes a GPU a quarter of the time of a conversion.
+    The addition that rounds takes a GPU a quarter of the time of a conversion.
     """
     return wp.cast(value + 12582912.0, int) - 0x4B400000
 
@@ -271,7 +271,7 @@ def cast_event(
 
 @wp.func
 def unpack(packed: int, chunk: Chunk, canvas: Canvas, layout: Layout, i: int) -> UnpackedEvent:
-    """Unpack event ``i``."""
+    """Unpack event ``i`` of the packed events of a tile."""
     e = UnpackedEvent()
     e.x = float(chunk.x + (packed & 31))
     e.y = float(chunk.y + ((packed >> 5) & 31))
@@ -289,7 +289,7 @@ def unpack(packed: int, chunk: Chunk, canvas: Canvas, layout: Layout, i: int) ->
 
 @wp.func
 def clear_window(window: int, thread: int, many: int):
-    """Clear the windows of ``many`` candidates."""
+    """Set the windows of ``many`` candidates in shared memory to zero."""
     for i in range(thread, many * COLUMNS * ROWS, THREADS):
         set_word(window + 4 * i, 0)
     wait_for_block()
@@ -300,7 +300,7 @@ def flush_window(
     layout: Layout, canvas: Canvas, chunk: Chunk, images: wp.array2d(dtype=wp.int64), window: int, first: int,
     thread: int, many: int,
 ):  # fmt: skip
-    """Add the windows of ``many`` candidates to their images."""
+    """Add the windows of ``many`` candidates in shared memory to their images."""
     wait_for_block()
     for i in range(thread, many * COLUMNS * ROWS, THREADS):
         at = i % (COLUMNS * ROWS)

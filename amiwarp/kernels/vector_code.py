@@ -1,4 +1,4 @@
-"""Unstrided loads and stores, and an addition that reports carries, which let CPU compilers vectorise a loop."""
+"""Unstrided loads and stores, and an addition that reports carries. With them, CPU compilers vectorise a loop."""
 
 import warp as wp
 

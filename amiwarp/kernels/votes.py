@@ -64,7 +64,7 @@ class Canvas:
 
 @wp.struct
 class Cells:
-    """Words of one image, followed by the trash words, and the totals of what overflowed the words."""
+    """Words of the vote cells of one image, then the trash words, and the totals to which overflows are added."""
 
     words: wp.array(dtype=wp.uint64)
     totals: wp.array(dtype=wp.int64)
@@ -73,7 +73,7 @@ class Cells:
 
 @wp.func
 def add_to_totals(cells: Cells, cell: int, width: int, n: wp.int64, fx: wp.int64, fy: wp.int64, b: wp.int64):
-    """Add moments of a cell, given in the units of its word, to the totals of its four pixels."""
+    """Add the moments of a cell, in the units of its word, to the 64-bit totals of its four pixels."""
     wp.atomic_add(cells.totals, cell, wp.int64(256) * n - fx - fy + b)
     wp.atomic_add(cells.totals, cell + 1, fx - b)
     wp.atomic_add(cells.totals, cell + width, fy - b)
@@ -83,13 +83,13 @@ def add_to_totals(cells: Cells, cell: int, width: int, n: wp.int64, fx: wp.int64
 
 @wp.func
 def carry_bit(carry: wp.uint64, bit: int) -> wp.int64:
-    """Return bit ``bit`` of the carries."""
+    """Return bit ``bit`` of a word's carries."""
     return wp.int64((carry >> wp.uint64(bit)) & wp.uint64(1))
 
 
 @wp.func
 def add_carries_to_totals(cells: Cells, cell: int, width: int, carry: wp.uint64):
-    """Add the carries of a word to the totals.
+    """Add the carries of a word to the 64-bit totals.
 
     Each field lost its overflow; the field above it received a 1 that does not belong to it.
     """
@@ -164,7 +164,7 @@ def azimuth_at(model: Any, events: EventArrays, i: int):
 
 @wp.func
 def repeat_vote(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
-    """Return the word of ``weight`` events at one position: at most 255, so that no field overflows."""
+    """Return the word of an event's vote times its ``weight``: at most 255, so that no field overflows."""
     if events.weight.shape[0] == 0:
         return word
     return word * wp.uint64(events.weight[i])
@@ -199,7 +199,7 @@ def vote_blocks(
 
 @wp.kernel
 def vote_events(model: Any, camera: Any, events: EventArrays, canvas: Canvas, start: int, cells: Cells):
-    """Vote one event per thread, exactly."""
+    """Vote one event per thread, with a check of every addition for overflow."""
     i = start + wp.tid()
     _inside, cell, word = event_vote(model, camera, events, canvas, i)
     add_vote_atomically(cells, cell, canvas.columns, repeat_vote(events, i, word))
@@ -301,7 +301,7 @@ def vote_points(
     start: int,
     cells: Cells,
 ):
-    """Vote one point per thread, exactly."""
+    """Vote one point per thread, with a check of every addition for overflow."""
     i = start + wp.tid()
     layer = int(layers[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, x[i], y[i], layer)

@@ -13,24 +13,25 @@ from amiwarp.optics.lens import Distortion
 from amiwarp.validation import array, real, shown, whole
 
 LARGEST_SIZE = 65536
-"""Largest width and height of a sensor [px]. Columns and rows of events are uint16."""
+"""Largest width and height of a sensor [px], because columns and rows of events are uint16."""
 LEAST_FOCAL = 1e-3
-"""Least focal length, as a multiple of the width (fx) or height (fy): its field of view is 179.8 deg."""
+"""Smallest focal length, as a multiple of the width (fx) or height (fy). The field of view is then 179.8 deg."""
 LARGEST_FOCAL = 1e6
-"""Largest focal length [px]: one microradian per pixel. Beyond it float32 cannot represent the displacement."""
+"""Largest focal length [px]: one microradian per pixel. Above it float32 cannot represent the displacement."""
 LEAST_FOV = 1e-9
-"""Least field of view [rad]. :data:`LARGEST_FOCAL` sets the limit in practice."""
+"""Smallest accepted field of view [rad]. In practice :data:`LARGEST_FOCAL` sets the limit."""
 
 CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
-"""Names of a camera's fields without the distortion, as files and streams use them."""
+"""Names of the fields of :class:`Camera` without the distortion, in the order in which files and streams use them."""
 
 Rows = TypeVar("Rows")
-"""A NumPy array of shape (n, 2) or (n, 3), or a Warp array of vec2 or vec3. Results are of the same kind."""
+"""Type of the rows of vectors given to a camera: NumPy array (n, 2) or (n, 3), or Warp array of vec2 or vec3. Results
+have the same type."""
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera: image size, intrinsics and lens distortion.
+    """Camera intrinsics: image size, focal lengths, principal point and lens distortion.
 
     The centre of pixel ``(0, 0)`` has the image coordinates ``(0.0, 0.0)``.
 
@@ -48,17 +49,17 @@ class Camera:
     """
 
     width: int
-    """Image width [px]."""
+    """Width of the image [px]."""
     height: int
-    """Image height [px]."""
+    """Height of the image [px]."""
     fx: float
     """Focal length along x [px]."""
     fy: float
     """Focal length along y [px]."""
     cx: float
-    """Principal point, x [px]."""
+    """Coordinate x of the principal point [px]."""
     cy: float
-    """Principal point, y [px]."""
+    """Coordinate y of the principal point [px]."""
     distortion: Distortion | None = None
     """Lens distortion, or None for a pinhole camera."""
 
@@ -171,7 +172,7 @@ def check_size(width: float, height: float, where: object) -> None:
 
 
 def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) -> Any:
-    """Run a kernel over ``rows``; ``sizes`` are the vector lengths of its input and of its output."""
+    """Run a kernel over rows of vectors; ``sizes`` are the vector lengths of its input and of its output."""
     import warp as wp
 
     from amiwarp.kernels import camera as kernels

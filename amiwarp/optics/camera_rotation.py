@@ -1,4 +1,4 @@
-"""The camera's own rotation during a window: its angular velocity, constant or linear in time."""
+"""Rotation of the camera itself during a time window, with an angular velocity that is constant or linear in time."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ class CameraRotation:
     angular_acceleration: Vector = (0.0, 0.0, 0.0)
     """Angular acceleration [rad/s²], about x, y and z."""
     middle_us: int = 0
-    """Reference time [us], usually the middle of the window."""
+    """Reference time of the rotation [us], usually the middle of the time window."""
 
     def about(self, middle_us: int) -> CameraRotation:
-        """Return the same motion with another reference time.
+        """Return the same rotation, expressed about another reference time.
 
         Parameters
         ----------

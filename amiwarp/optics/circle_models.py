@@ -37,15 +37,15 @@ class CircleModel(PointDisplacement):
     """
 
     FREE: ClassVar[tuple[str, ...]] = ("deflection", "phase")
-    """Parameters that a calibration can find."""
+    """Names of the parameters that a calibration can find."""
     camera: Camera
-    """The camera."""
+    """Camera intrinsics."""
     deflection: float
     """Angle of the rotation [rad], not negative."""
     phase: float = 0.0
     """Phase θ_b, added to the encoder's angle [rad]."""
     flat_side: FlatSide = FlatSide.SCENE
-    """Side that the prism's flat face points to."""
+    """Side that the prism's flat face points to: scene or camera."""
 
     def __post_init__(self) -> None:
         _check_circle(self)
@@ -115,17 +115,17 @@ class RadialCircleModel(PointDisplacement):
     """
 
     FREE: ClassVar[tuple[str, ...]] = ("deflection", "phase")
-    """Parameters that a calibration can find."""
+    """Names of the parameters that a calibration can find."""
     camera: Camera
-    """The camera."""
+    """Camera intrinsics."""
     deflection: float
     """Angle of the rotation on the optical axis, δ₀ [rad], not negative."""
     phase: float = 0.0
     """Phase θ_b, added to the encoder's angle [rad]."""
     index: float = 1.5168
-    """Refractive index n."""
+    """Refractive index n of the prism."""
     flat_side: FlatSide = FlatSide.SCENE
-    """Side that the prism's flat face points to."""
+    """Side that the prism's flat face points to: scene or camera."""
 
     def __post_init__(self) -> None:
         _check_circle(self)

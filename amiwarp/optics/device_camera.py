@@ -40,7 +40,7 @@ def camera_params(camera: "Camera", device: str) -> kernels.CameraParams:
 
 @lru_cache(maxsize=16)
 def pinhole_params(camera: "Camera") -> "kernels.PinholeParams | None":
-    """Return the parameters for kernels without branches, or None if the lens distorts."""
+    """Return the camera's parameters for kernels without a distortion branch, or None if the lens distorts."""
     if camera.distortion is not None:
         return None
     c = kernels.PinholeParams()
@@ -50,9 +50,10 @@ def pinhole_params(camera: "Camera") -> "kernels.PinholeParams | None":
 
 
 def fold_radius(*k: float, largest: float) -> float:
-    """Return the radius up to which r(1 + k1 r² + k2 r⁴ + …) increases: the first root of its slope, or ``largest``.
+    """Return the radius up to which the distorted radius r(1 + k1 r² + k2 r⁴ + …) increases with r.
 
-    The polynomial in 1/r² is monic, so a last coefficient of zero causes no division by zero.
+    It is the first root of the slope, or ``largest`` if there is none below. The polynomial in 1/r² is monic, so a last
+    coefficient of zero causes no division by zero.
     """
     roots = np.roots([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Points = TypeVar("Points")
-"""A NumPy array of shape (n, 2), or a Warp array of vec2 of shape (n,). Results are of the same kind."""
+"""Type of points given to a model: NumPy array (n, 2), or Warp array of vec2 of shape (n,). Results have the same type.
+"""
 
 
 class HasParams(Protocol):
-    """A model with a camera and kernel parameters."""
+    """Optical model with a camera and kernel parameters (protocol)."""
 
     @property
     def camera(self) -> Camera: ...
@@ -86,7 +87,9 @@ def _run(kernel_name: str, model: HasParams, xy: Any, theta: Any) -> Any:
     kernel = getattr(kernels, kernel_name)
     if isinstance(xy, wp.array):
         if not isinstance(theta, wp.array) or theta.device != xy.device or theta.dtype is not wp.float32:
-            raise AmiwarpError(f"xy is a Warp array on {xy.device}; give theta as a float32 Warp array there too")
+            raise AmiwarpError(
+                f"xy is a Warp array on {xy.device}; give theta as a float32 Warp array on the same device"
+            )
         if xy.dtype is not wp.vec2 or xy.ndim != 1 or xy.shape != theta.shape:
             given = f"xy has type {xy.dtype} and shape {xy.shape}, theta has shape {theta.shape}"
             raise AmiwarpError(f"{given}; give vec2 for xy, and shape (n,) for both")
@@ -108,7 +111,7 @@ def _run(kernel_name: str, model: HasParams, xy: Any, theta: Any) -> Any:
 
 
 def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Wrap an angle [rad] to [-pi, pi) in float64. Call it before rounding to float32."""
+    """Wrap an angle [rad] to [-pi, pi) in float64. Wrap angles before they are rounded to float32."""
     return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
 
 
@@ -118,5 +121,5 @@ def model_camera(model: HasParams, device: Any) -> Any:
 
 
 def set_phase(params: Any, phase: float) -> None:
-    """Set the phase of a model's parameters [rad], with its cosine and sine."""
+    """Set the phase [rad] of a kernel's model parameters, with its cosine and sine."""
     params.phase, params.phase_cos, params.phase_sin = phase, math.cos(phase), math.sin(phase)

@@ -1,4 +1,4 @@
-"""Ellipse model: tables of the displacement for every pixel, fitted to another model or to measured pairs."""
+"""Ellipse model: tables of the displacement for every pixel, fitted to another model or to measured pairs of pixels."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class EllipseModel(PointDisplacement):
     """
 
     FREE: ClassVar[tuple[str, ...]] = ("apex", "phase")
-    """Parameters that a calibration can find."""
+    """Names of the parameters that a calibration can find."""
     camera: Camera
-    """The camera."""
+    """Camera intrinsics."""
     offset: NDArray[np.float32] = field(repr=False)
     """Mean displacement [px], shape ``(height, width, 2)``."""
     cosine: NDArray[np.float32] = field(repr=False)

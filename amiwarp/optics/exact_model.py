@@ -46,11 +46,11 @@ class ExactModel(PointDisplacement):
     """
 
     FREE: ClassVar[tuple[str, ...]] = ("apex", "phase", "index", "tilt_x", "tilt_y")
-    """Parameters that a calibration can find."""
+    """Names of the parameters that a calibration can find."""
     camera: Camera
-    """The camera."""
+    """Camera intrinsics."""
     prism: Prism
-    """The prism."""
+    """Prism whose faces refract the rays."""
     phase: float = 0.0
     """Phase θ_b, added to the encoder's angle [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)

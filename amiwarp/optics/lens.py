@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from amiwarp.validation import real
 
 LARGEST_COEFFICIENT = 1e6
-"""Largest magnitude of a distortion coefficient. Those of long lenses reach thousands."""
+"""Largest accepted magnitude of a distortion coefficient. The coefficients of long lenses reach thousands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ DISTORTIONS: dict[str, type[RadialTangential] | type[Fisheye]] = {
     "radial_tangential": RadialTangential,
     "fisheye": Fisheye,
 }
-"""Distortion classes by the names that files and streams use. The fields of a class are in the files' order."""
+"""Distortion classes by their names in files and streams. The fields of a class are in the files' order."""
 
 
 def _check_coefficients(lens: Distortion) -> None:

@@ -1,4 +1,4 @@
-"""Distance between two models over the image and one turn."""
+"""Distance between two optical models over the image and one turn of the prism."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class ModelError:
     """Distance between two models over the image and one turn of the prism."""
 
     rms: float
-    """Root mean square distance [px]."""
+    """Root mean square distance of the two models [px]."""
     worst: float
-    """Largest distance [px]."""
+    """Largest distance of the two models [px]."""
     lag: float
     """Constant angle that was subtracted from the first model's theta before the comparison [rad]; 0 by default."""
 

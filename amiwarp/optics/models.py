@@ -16,4 +16,4 @@ MODELS: dict[str, type[Model]] = {
     "radial": RadialCircleModel,
     "ellipse": EllipseModel,
 }
-"""Models by name, ordered by their number of calibrated parameters, then by their measured cost per event."""
+"""Optical models by name, ordered by their number of calibrated parameters, then by their measured cost per event."""

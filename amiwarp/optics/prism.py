@@ -11,11 +11,11 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.validation import choice, real, vector
 
 LARGEST_APEX = math.radians(30.0)
-"""Upper limit of the apex angle [rad]. Larger values are mistakes, such as degrees."""
+"""Upper limit of the apex angle [rad]. Larger values are mistakes, such as angles in degrees."""
 LARGEST_INDEX = 4.0
-"""Upper limit of the refractive index: that of germanium."""
+"""Upper limit of the refractive index, which is that of germanium."""
 LARGEST_PHASE = 1e6
-"""Largest magnitude of a phase [rad]. Up to it float64 resolves 1e-10 rad."""
+"""Largest accepted magnitude of a phase [rad]. Up to this phase float64 resolves 1e-10 rad."""
 
 
 class FlatSide(enum.StrEnum):
@@ -29,7 +29,7 @@ class FlatSide(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Prism:
-    """A wedge prism in air.
+    """Wedge prism in air, given by its apex angle, refractive index and flat side.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSi
     0.010337
     """
     scene = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE
-    # Traced from the camera. With the flat face to the scene the ray enters the tilted face and leaves the flat one.
+    # The ray starts at the camera. With the flat face to the scene it enters the tilted face and leaves the flat one.
     sine = index * math.sin(apex - math.asin(math.sin(apex) / index) if scene else apex)
     if not abs(sine) <= 1.0:
         raise AmiwarpError(
@@ -176,17 +176,23 @@ def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = 
 
 
 def check_index(value: object, what: str) -> float:
-    """Return a refractive index between 1 and :data:`LARGEST_INDEX`, both excluded. Raises :class:`AmiwarpError`."""
+    """Return ``value`` as a refractive index between 1 and :data:`LARGEST_INDEX`, both excluded.
+
+    Raises :class:`AmiwarpError` for any other value.
+    """
     return real(value, what, math.nextafter(1.0, 2.0), math.nextafter(LARGEST_INDEX, 0.0), "; N-BK7 has 1.5168")
 
 
 def check_phase(value: object, what: str = "phase") -> float:
-    """Return a phase [rad]. Raises :class:`AmiwarpError`."""
+    """Return ``value`` as a phase [rad]; raise :class:`AmiwarpError` if it is not finite or too large."""
     return real(value, what, -LARGEST_PHASE, LARGEST_PHASE, " rad")
 
 
 def check_tilt(value: object) -> tuple[float, float]:
-    """Return the two tilts of a rotation axis [rad], each below a right angle. Raises :class:`AmiwarpError`."""
+    """Return the two tilts of a rotation axis [rad], each below a right angle.
+
+    Raises :class:`AmiwarpError` for others.
+    """
     below = math.nextafter(math.pi / 2.0, 0.0)
     x, y = vector(value, 2, "tilt", lambda entry, what: real(entry, what, -below, below, " rad"))
     return x, y

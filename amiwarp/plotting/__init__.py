@@ -1,1 +1,1 @@
-"""Figures, point clouds, and the palette that they share."""
+"""Figures, point clouds, and the colour palette that they share."""

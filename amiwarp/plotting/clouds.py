@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 MISSING = "VTK found no OpenGL, so Matplotlib drew the point clouds; on Debian install libegl1 and libgl1-mesa-dri"
 """Note for a figure whose clouds were drawn by Matplotlib."""
 SECONDS = 60.0
-"""Time limit of the process that draws with VTK [s]."""
+"""Time limit of the process that draws the point clouds with VTK [s]."""
 HALF = (0.4, 0.5, 0.5)
-"""Half width of the box about the origin in which the points lie: x, y, angle."""
+"""Half width of the box about the origin in which the points lie: along x, y and angle."""
 _SIZE = (1100, 1000)
-"""Width and height of a picture [px]."""
+"""Width and height of the picture of a point cloud [px]."""
 _CAMERA = ((2.75, -2.75, 1.55), (0.0, 0.0, -0.03), (0.0, 0.0, 1.0))
 """Position, focal point and upward direction of the camera."""
 
@@ -39,16 +39,17 @@ __all__ = ["HALF", "MISSING", "Cloud", "draw_plain", "render"]
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """Points of one cloud."""
+    """Points of one event cloud."""
 
     xyz: NDArray[np.float32]
-    """x, y (up) and prism angle, within :data:`HALF` of the origin for points in the region, shape ``(n, 3)``."""
+    """Coordinates of the points: x, y (up) and prism angle, within :data:`HALF` of the origin for points in the region,
+    shape ``(n, 3)``."""
     on: NDArray[np.bool_]
     """Whether each point is an ON event, shape ``(n,)``."""
 
 
 def render(clouds: Sequence[Cloud]) -> list[NDArray[np.uint8]] | None:
-    """Return a picture of each cloud, drawn by VTK, shape ``(height, width, 3)``; None if VTK cannot draw here."""
+    """Draw each cloud by VTK and return its picture, shape ``(height, width, 3)``; None if VTK cannot draw here."""
     with tempfile.TemporaryDirectory() as folder:
         for k, cloud in enumerate(clouds):
             np.savez(Path(folder) / f"{k}.npz", xyz=cloud.xyz, on=cloud.on)

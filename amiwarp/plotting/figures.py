@@ -32,15 +32,16 @@ if TYPE_CHECKING:
     from amiwarp.reconstruction.result import Picture
 
 EVENTS = 2_000_000
-"""Largest number of events in an image of a figure; more are thinned evenly."""
+"""Largest number of events in the image of a figure; more events are thinned evenly."""
 POINTS = 60_000
-"""Largest number of points in a cloud."""
+"""Largest number of points in an event cloud."""
 REGION = (64, 80)
 """Width and height of the part of the image that is enlarged and drawn as clouds [px]."""
 WIDTH, TITLE = 15.0, 14.0
 """Width of the demo's figure [inch], and size of its titles [point]."""
 GREYS, FAINT = 128, 8
-"""Number of grey entries in a figure's palette of 256; largest channel difference [levels] of a grey."""
+"""Number of grey entries in a figure's palette of 256 colours, and largest difference of the channels of a grey
+[levels]."""
 FOUND, TRUTH, LOCAL = VERMILION, BLACK, ORANGE
 """Colours of the calibrated parameters, of the true parameters, and of the local search."""
 
@@ -56,7 +57,7 @@ class Images:
 
     @property
     def top(self) -> float:
-        """Count that both images show as white [events per pixel]."""
+        """Number of events per pixel that both images show as white."""
         return float(np.percentile(self.after[self.after > 0], PERCENTILE)) if (self.after > 0).any() else 1.0
 
 
@@ -69,7 +70,7 @@ def draw_calibration(path: Path, recording: Recording, calibration: Calibration,
 
 
 def images(events: Events, recording: Recording, calibration: Calibration, *, device: Any) -> Images:
-    """Return the images of ``events`` before and after compensation."""
+    """Return the images of ``events`` before and after compensation, made on the device."""
     size = recording.events.size
     encoder = calibration.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
     after = iwe(events, *size, model=calibration.model, encoder=encoder, device=device)
@@ -77,7 +78,7 @@ def images(events: Events, recording: Recording, calibration: Calibration, *, de
 
 
 def draw_images(axes: Any, pair: Images) -> None:
-    """Draw both images on the same scale."""
+    """Draw the images before and after compensation on the same scale."""
     for ax, image, title in zip(axes, (pair.before, pair.after), ("before", "after"), strict=True):
         show(ax, image, pair.top, f"events {title} compensation")
 
@@ -119,23 +120,23 @@ def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float
 
 
 def _polar(size: float, phase: float) -> tuple[float, float]:
-    """Return size cos phase and size sin phase [deg]."""
+    """Return size · cos phase and size · sin phase [deg]."""
     return math.degrees(size) * math.cos(phase), math.degrees(size) * math.sin(phase)
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstructed:
-    """Reconstructed picture with its ground truth."""
+    """Picture reconstructed from events, together with its ground truth."""
 
     picture: Picture
-    """Reconstructed picture."""
+    """Picture that was reconstructed from events."""
     original: NDArray[np.float32]
     """Log intensity that the camera would see without the prism, shape ``(height, width)``."""
     quality: PictureQuality
-    """Quality of the picture against the original."""
+    """Similarity of the reconstructed picture and the original."""
 
     def tones(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return picture and original as displayed, 0 .. 1, with the same black and white.
+        """Return the reconstructed picture and the original as displayed, 0 .. 1, with the same black and white.
 
         Black and white are those of the original. Gain and offset of the picture are those of the quality fit.
         """
@@ -188,11 +189,11 @@ class Grid:
     """Axes of the demo's figure by name, laid out by the image's aspect ratio so that nothing overlaps."""
 
     figure: Any
-    """Matplotlib's figure."""
+    """Matplotlib figure to which the axes belong."""
     axes: dict[str, Any]
-    """Axes by name."""
+    """Axes of the figure, by name."""
     height: float
-    """Height of the figure [inch]."""
+    """Height of the whole figure [inch]."""
 
     @classmethod
     def make(cls, columns: int, rows: int) -> Grid:
@@ -236,14 +237,14 @@ def enlarge(figure: Any, cost: Any) -> None:
 
 
 def mark(ax: Any, corner: tuple[int, int]) -> None:
-    """Mark the region whose top left pixel is ``corner``."""
+    """Draw a frame around the region whose top left pixel is ``corner``."""
     from matplotlib.patches import Rectangle
 
     ax.add_patch(Rectangle(corner, *REGION, fill=False, edgecolor=LOCAL, linewidth=2.0))
 
 
 def show_grey(ax: Any, image: NDArray[np.float32], title: str) -> None:
-    """A picture of values 0 .. 1."""
+    """Draw a picture of values 0 .. 1 in grey."""
     ax.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
     ax.set(xticks=(), yticks=())
     ax.set_title(title)
@@ -269,7 +270,7 @@ def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
 def _draw_clouds(
     figure: Any, axes: Any, recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
 ) -> tuple[str, ...]:
-    """Draw the clouds before and after compensation; return notes if VTK could not draw them."""
+    """Draw the event clouds before and after compensation; return notes if VTK could not draw them."""
     pair = region_clouds(recording, calibration, corner, device)
     pictures = clouds.render(pair)
     for k, (ax, title) in enumerate(zip(axes, ("before", "after"), strict=True)):
@@ -307,7 +308,7 @@ def region_clouds(
 
 
 def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int, int]) -> NDArray[np.float32]:
-    """Return coordinates relative to the centre of the region, in units of its longer side."""
+    """Return pixel coordinates relative to the centre of the region, in units of the region's longer side."""
     centred = (xy - np.array(corner) - np.array(REGION) / 2.0) / max(REGION)
     return np.column_stack([centred[:, 0], -centred[:, 1], height]).astype(np.float32)
 
@@ -319,7 +320,7 @@ def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[fl
 
 
 def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
-    """Return an empty figure."""
+    """Return an empty Matplotlib figure."""
     # Without pyplot, which would change global state and look for a display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -330,7 +331,10 @@ def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None
 
 
 def save(figure: Any, path: Path, *, all_colours: bool = False, overwrite: bool = False) -> None:
-    """Write a figure as a PNG; the write is atomic. It has 256 colours, a third of the size, or ``all_colours``."""
+    """Write a figure as a PNG; the write is atomic.
+
+    The file has 256 colours, which takes a third of the space, or ``all_colours``.
+    """
     from PIL import Image
 
     buffer = io.BytesIO()

@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 COLUMN_WIDTH, TITLE_HEIGHT = 4.6, 0.32
 """Width of a picture of the figure, and height of its title [inch]."""
 PERCENTILE = 99.0
-"""Percentile of luminance, depth and speed that has the full brightness or colour."""
+"""Percentile of luminance, depth or speed that is drawn with full brightness or colour."""
 GAMMA = 2.2
-"""Exponent with which linear luminance is drawn."""
+"""Exponent (gamma) by which linear luminance is converted to grey."""
 GOLDEN = 0.618034
-"""Golden ratio: steps of the hue between instances, so that neighbouring numbers differ."""
+"""Golden ratio, the step of the hue between successive instances, so that neighbouring numbers differ in colour."""
 SKY = (0.85, 0.92, 1.0)
-"""Colour of pixels that see the sky, in depth and instances."""
+"""Colour of pixels that see the sky, in the pictures of depth and instances."""
 WHEEL = 0.2
-"""Size of the wheel of flow directions, as a share of the picture's height."""
+"""Diameter of the colour wheel of flow directions, as a share of the picture's height."""
 LEAST_SPEED = 1e-3
-"""Speed that has the full colour if nothing moves faster [px/s]."""
+"""Speed that is drawn with the full colour if nothing moves faster [px/s]."""
 
 
 def draw_preview(path: Path, frame: FrameTruth, *, overwrite: bool = False) -> None:
-    """Write a figure of six pictures of one instant as a PNG."""
+    """Write a figure of six pictures of a world at one instant as a PNG."""
     height, width = frame.depth.shape
     size = (3 * COLUMN_WIDTH, 2 * (COLUMN_WIDTH * height / width + TITLE_HEIGHT))
     figure = blank(size, layout="compressed")
@@ -58,7 +58,7 @@ def draw_preview(path: Path, frame: FrameTruth, *, overwrite: bool = False) -> N
 
 
 def _draw_depth(figure: Any, ax: Any, depth: NDArray[np.float32]) -> None:
-    """Draw depth on a logarithmic scale, with a colour bar."""
+    """Draw the depth on a logarithmic scale, with a colour bar."""
     from matplotlib.colors import LogNorm
 
     seen = depth[np.isfinite(depth)]
@@ -78,7 +78,7 @@ def _draw_depth(figure: Any, ax: Any, depth: NDArray[np.float32]) -> None:
 
 
 def _draw_flow(ax: Any, flow: NDArray[np.float32], title: str) -> None:
-    """Draw flow as colours, with the wheel of directions in the lower left corner."""
+    """Draw the optical flow as colours, with the wheel of directions in the lower left corner."""
     speed = np.linalg.norm(flow, axis=2)
     known = speed[np.isfinite(speed)]
     full = max(float(np.percentile(known, PERCENTILE)) if known.size else 0.0, LEAST_SPEED)
@@ -94,7 +94,7 @@ def _draw_flow(ax: Any, flow: NDArray[np.float32], title: str) -> None:
 
 
 def flow_colours(flow: NDArray[np.float32], full: float) -> NDArray[np.float64]:
-    """Return flow as colours, shape (height, width, 3): hue for its direction, saturation for its speed.
+    """Return optical flow as colours, shape (height, width, 3): hue for the direction, saturation for the speed.
 
     ``full`` is the speed of full saturation. Unknown flow is black.
     """

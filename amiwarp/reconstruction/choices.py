@@ -3,11 +3,11 @@
 import enum
 
 CONTRAST = 0.25
-"""Default ON threshold [log intensity]."""
+"""Default value of the ON threshold [natural log intensity]."""
 
 
 class Fill(enum.StrEnum):
-    """How to fill the parts of a picture that the events do not determine.
+    """How to fill the parts of a reconstructed picture that the events do not determine.
 
     Examples
     --------
@@ -16,17 +16,17 @@ class Fill(enum.StrEnum):
     """
 
     NONE = "none"
-    """Leave them NaN."""
+    """Undetermined parts stay NaN."""
     SMOOTH = "smooth"
-    """Interpolate smoothly from the known parts around (a membrane)."""
+    """Undetermined parts are interpolated smoothly from the determined parts around them (a membrane)."""
     EDGE = "edge"
-    """The same with an edge-preserving prior: flat regions with sharp edges between them."""
+    """Undetermined parts are interpolated by an edge-preserving prior: flat regions with sharp edges between them."""
 
 
 class Tone(enum.StrEnum):
-    """How intensity becomes a pixel value."""
+    """Mapping of intensity to pixel values."""
 
     MAPPED = "mapped"
-    """For display: the 0.5th percentile of intensity is black, the 99.5th is white, with gamma 2.2."""
+    """Mapping for display: the 0.5th percentile of intensity is black, the 99.5th is white, with gamma 2.2."""
     LINEAR = "linear"
-    """Proportional to intensity: 0 is dark, the 99.5th percentile is the largest value."""
+    """Mapping proportional to intensity: 0 is black, the 99.5th percentile is the largest pixel value."""

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from amiwarp.reconstruction.result import Picture
 
 DARK, BRIGHT = 0.5, 99.5
-"""Percentiles of the known pixels that are shown black and white."""
+"""Percentiles of intensity over the known pixels that are shown black and white."""
 GAMMA = 2.2
-"""Display gamma."""
+"""Gamma with which pictures are displayed."""
 LIMITS_UPDATE = 0.1
-"""Weight of a new frame in a video's black and white levels, which prevents flicker."""
+"""Weight of a new frame in the running average of a video's black and white levels. A small weight prevents flicker."""
 STILL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 """File suffixes of single pictures."""
 VIDEO = ".mp4"
@@ -42,9 +42,9 @@ def limits(picture: Picture, contrast: float = CONTRAST) -> tuple[float, float]:
 def tones(
     picture: Picture, tone: Tone, *, contrast: float = CONTRAST, between: tuple[float, float] | None = None
 ) -> NDArray[np.float32]:
-    """Return the picture as values 0 .. 1, shape (height, width); 0 where it is not filled.
+    """Return the picture as pixel values 0 .. 1, shape (height, width); 0 where the picture is not filled.
 
-    ``contrast``: the ON threshold [log intensity]. ``between``: intensities of black and white, by default
+    ``contrast``: the ON threshold [log intensity]. ``between``: intensities shown black and white, by default those of
     :func:`limits`.
     """
     tone = choice(Tone, tone, "tone")
@@ -58,7 +58,7 @@ def tones(
 
 
 def check_path(path: Path, endings: tuple[str, ...] = (*STILL_SUFFIXES, VIDEO)) -> None:
-    """Raise :class:`AmiwarpError` for an unknown suffix or a folder that does not exist."""
+    """Raise :class:`AmiwarpError` for a file suffix that is not in ``endings``, or a folder that does not exist."""
     if path.suffix.lower() not in endings:
         raise AmiwarpError(f"{path}: ends in {path.suffix or 'no suffix'}; expected one of {', '.join(endings)}")
     check_output(path)
@@ -67,14 +67,14 @@ def check_path(path: Path, endings: tuple[str, ...] = (*STILL_SUFFIXES, VIDEO)) 
 def save_picture(
     picture: Picture, path: Path, *, tone: Tone = Tone.MAPPED, bits: int = 8, contrast: float = CONTRAST
 ) -> None:
-    """Write a picture as .png (8 or 16 bit), .tif (16 bit) or .npy.
+    """Write a reconstructed picture as .png (8 or 16 bit), .tif (16 bit) or .npy.
 
     A .npy file holds the natural log intensity, float32, NaN where it is not filled.
     """
     check_path(path, STILL_SUFFIXES)
     tone = choice(Tone, tone, "tone")
     if bits not in (8, 16):
-        raise AmiwarpError(f"{path}: {bits} bits; expected 8 or 16")
+        raise AmiwarpError(f"{path}: {bits} bits per pixel; expected 8 or 16")
     ending = path.suffix.lower()
     if ending == ".npy":
         with NewFile(path) as new, open(new.part, "wb") as file:
@@ -102,7 +102,10 @@ def save_grey(value: NDArray[np.float32], path: Path, *, bits: int) -> None:
 def save_video(
     pictures: Iterable[Picture], path: Path, *, fps: float, tone: Tone = Tone.MAPPED, contrast: float = CONTRAST
 ) -> int:
-    """Write an MP4 (H.264) and return its number of frames. Black and white levels follow the scene slowly."""
+    """Write an MP4 video (H.264) and return its number of frames.
+
+    Black and white levels follow the scene slowly.
+    """
 
     def frames() -> Iterator[NDArray[np.uint8]]:
         between: tuple[float, float] | None = None
@@ -118,7 +121,7 @@ def save_video(
 
 
 def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) -> int:
-    """Write frames as MP4 (H.264), or as GIF if ``path`` ends in .gif; return their number.
+    """Write frames as MP4 (H.264), or as GIF if ``path`` ends in .gif, and return the number of frames.
 
     Each frame has shape (height, width) or (height, width, 3). Raises :class:`AmiwarpError` for no frames, an unknown
     suffix, or a folder that does not exist.
@@ -142,7 +145,7 @@ def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) ->
 
 
 def _add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -> Any:
-    """Return a new video stream of a PyAV container."""
+    """Add a video stream to a PyAV container and return it."""
     rate = Fraction(fps).limit_denominator(1000)
     stream = container.add_stream("gif" if kind == "gif" else "libx264", rate=rate)
     stream.height, stream.width = shape
@@ -153,6 +156,6 @@ def _add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -
 
 
 def padded_to_even(value: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Repeat the last row and column where needed for an even size, which the codec requires."""
+    """Repeat the last row or column of an image with an odd height or width, because the codec requires even sizes."""
     rows, columns = value.shape[:2]
     return np.pad(value, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (value.ndim - 2)), mode="edge")

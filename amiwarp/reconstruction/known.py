@@ -1,4 +1,4 @@
-"""Which nodes of a map the events determine."""
+"""Decision which nodes of a brightness map the events determine."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ if TYPE_CHECKING:
 LEAST_COVERAGE = 0.5
 """Smallest sum of equation weights at a node that counts as known."""
 HOLDS_SCALE, LEAST_AGREEMENT = 0.25, 0.4
-"""A node is known only if enough of the equations around it hold.
+"""Residual [thresholds] at which an equation gets half weight, and smallest ratio of the sum of these weights to the
+sum of full weights at a known node.
 
-HOLDS_SCALE: residual at which an equation gets half weight [thresholds]. LEAST_AGREEMENT: smallest ratio of the sum
-with these weights to the sum with full weights.
+A node is known only if enough of the equations around it hold.
 """
 SMALLEST_REGION = 12
-"""Smallest region of known pixels [px]; smaller ones are noise."""
+"""Smallest number of pixels of a connected known region; smaller regions are noise."""
 LARGEST_HOLE = 4
-"""Largest hole of unknown pixels inside a known region that is set to known [px]: equations surround it."""
+"""Largest hole of unknown pixels inside a known region that is marked as known [px], because equations surround the
+hole."""
 
 
 def known_nodes(solver: BrightnessMap) -> NDArray[np.bool_]:
-    """Return the nodes that events determine: enough equations hold there, and most of those that exist."""
+    """Return the nodes that events determine: nodes with enough equations, most of which hold."""
     hold, everything = solver.coverage(HOLDS_SCALE)[0], solver.coverage(1e6)[0]
     return without_small_holes(without_small_regions((hold >= LEAST_COVERAGE) & (hold >= LEAST_AGREEMENT * everything)))
 
 
 def dilated(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Return the mask, extended ``by`` times to the direct neighbours."""
+    """Extend the true regions of a mask by ``by`` px, along rows and columns."""
     for _ in range(by):
         out = mask.copy()
         for one, other in ((out, mask), (out.T, mask.T)):
@@ -44,7 +45,7 @@ def dilated(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 
 def without_small_regions(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask without regions of fewer than :data:`SMALLEST_REGION` pixels."""
+    """Return the mask without connected regions of fewer than :data:`SMALLEST_REGION` pixels."""
     label, count = ndimage.label(known)
     size = np.bincount(label.ravel(), minlength=count + 1)
     size[0] = 0
@@ -52,7 +53,7 @@ def without_small_regions(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def without_small_holes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask with holes of up to :data:`LARGEST_HOLE` pixels closed."""
+    """Return the mask with holes of up to :data:`LARGEST_HOLE` pixels filled."""
     label, count = ndimage.label(~known)
     size = np.bincount(label.ravel(), minlength=count + 1)
     return np.asarray(known | (size[label] <= LARGEST_HOLE))

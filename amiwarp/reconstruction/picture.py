@@ -34,27 +34,28 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 SCALES = (1.0, 0.5, 0.5)
-"""Scale of the Cauchy weights in each round [thresholds]: residual at which an equation gets half weight."""
+"""Residual at which an equation gets half weight, in each round of Cauchy weights [thresholds]."""
 STEPS = 30
-"""Number of conjugate-gradient steps per round."""
+"""Number of conjugate-gradient steps in each round of Cauchy weights."""
 SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
 """Candidate weights of the smoothness prior; held-out equations choose among them."""
 WEAK_WEIGHT = 0.03
-"""Weight of equations from silence and open ends: near the best for held-out equations."""
+"""Weight of the equations from silence and from the window's ends, relative to pairs of events. Held-out pairs are
+predicted best near this weight."""
 HOLD_OUT_EVERY = 8
-"""One pair in this many is held out."""
+"""Interval of held-out pairs: every eighth pair of events is held out to choose the smoothness."""
 CHOICE_SQUARE = 96
-"""Side of the square in which the smoothness is chosen, the one with the most events [px]."""
+"""Side of the square of pixels in which the smoothness is chosen [px]: the square with the most events."""
 EDGE_STEP = 0.5
-"""Difference of neighbours above which ``Fill.EDGE`` regards them as separated by an edge [thresholds]."""
+"""Difference of neighbouring nodes above which ``Fill.EDGE`` treats them as separated by an edge [thresholds]."""
 MEAN_DAMPING = 1e-6
-"""Weight of the map's square. It fixes the mean of the map, which no equation determines."""
+"""Weight of the squared map values. It determines the mean of the map, which no equation does."""
 SPANS_PER_TURN = 8
-"""Number of spans per turn. A pixel that is silent in all of them adds one no-change equation per span."""
+"""Number of time spans per turn. A pixel that is silent in all spans of a turn adds one no-change equation per span."""
 NOISE_DISTANCE = 2
 """Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
 STILL_WINDOW_US = 100_000
-"""Default length of a window if the prism does not turn [us]."""
+"""Default length of a time window if the prism does not turn [us]."""
 
 
 class Reconstruction:
@@ -149,7 +150,7 @@ class Reconstruction:
         first, last = self.recording.events.t_first, self.recording.events.t_last
         if turns is not None:
             if length_us is not None:
-                raise AmiwarpError("turns is given, and a length is given too; give one of them")
+                raise AmiwarpError("turns and a length are both given; give one of them")
             if self.turn_us is None:
                 raise AmiwarpError("turns is given, but the prism does not turn; give a length")
             length_us = round(turns * self.turn_us)
@@ -261,14 +262,14 @@ class Reconstruction:
         return max(1, math.floor(room / step_us) + 1)
 
     def _table(self, start_us: int, length_us: int) -> tuple[EventTable, NDArray[np.int32]]:
-        """Return the window's events without hot pixels, and the events per pixel, shape (height, width)."""
+        """Return the window's events without hot pixels, and the number of events per pixel, shape (height, width)."""
         events = self.recording.events.between(start_us, start_us + length_us)
         width, height = self.recording.events.size
         table = EventTable([events], np.zeros((height, width), np.int32), self.device)
         return table, table.exclude_hot_pixels()
 
     def _pairs(self, table: EventTable, start_us: int, length_us: int) -> PairSet:
-        """Return all equations of a window: pairs of events, open ends, and silence."""
+        """Return all equations of a window: pairs of events, ends of the window, and silence."""
         turn = min(self.turn_us or length_us, length_us)
         spans = max(2, round(SPANS_PER_TURN * length_us / turn))
         edges = np.round(np.linspace(start_us, start_us + length_us, spans + 1)).astype(np.int64)
@@ -278,7 +279,7 @@ class Reconstruction:
         )  # fmt: skip
 
     def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:
-        """Return a solver for pairs on the given tiles, with the pairs displaced by the model."""
+        """Return a solver for the pairs on the given tiles, with the pairs displaced by the optical model."""
         prior = Smoothness(self._smoothness or SMOOTHNESS[0], EDGE_STEP if self.fill is Fill.EDGE else 0.0)
         solver = BrightnessMap(
             pairs, tiles, off_excess=off, damping=MEAN_DAMPING, smoothness=prior, middle_us=middle_us
@@ -287,7 +288,7 @@ class Reconstruction:
         return solver
 
     def _choose(self, count: NDArray[np.int32], pairs: PairSet, start_us: int, length_us: int, off: float) -> float:
-        """Return the smoothness with the lowest cost of held-out equations, on the busiest part of the image."""
+        """Return the smoothness weight with the lowest cost of held-out pairs, in the busiest part of the image."""
         x0, y0 = busiest_square(count, CHOICE_SQUARE)
         part = pairs.of_square(x0, y0, CHOICE_SQUARE)
         if part.hold_out(HOLD_OUT_EVERY) < 50:
@@ -305,12 +306,15 @@ class Reconstruction:
         return SMOOTHNESS[int(np.nanargmin(scores))]
 
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
-        """Return the margin before the image (columns, rows), and the map of a window."""
+        """Return the map's margin left of and above the image (columns, rows), and the map of a window."""
         return map_tile(self.model, self.camera_rotation.about(start_us + length_us // 2), length_us)
 
 
 def _solve(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tuple[float, NDArray[np.bool_]]:
-    """Solve for the map, from that of the window before if given; return the median residual and the known nodes."""
+    """Solve for the map; return the median residual and the known nodes.
+
+    ``last`` is the picture of the previous window, from which the solution starts.
+    """
     nodes = solver.tiles.nodes
     if last is not None:
         unknowns = last.unknowns.copy()
@@ -339,7 +343,7 @@ def reconstruct(
     fill: Fill = Fill.SMOOTH,
     device: Any = "cpu",
 ) -> Picture:
-    """Reconstruct the picture of one time window, from a quarter turn upwards.
+    """Reconstruct a picture of the scene from one time window, a quarter turn of the prism or longer.
 
     Use :class:`Reconstruction` for several windows.
 

@@ -1,4 +1,4 @@
-"""The result of a reconstruction."""
+"""Reconstructed picture of a scene."""
 
 from __future__ import annotations
 
@@ -33,23 +33,24 @@ class Picture:
     known: NDArray[np.bool_]
     """Whether events determine the pixel, shape (height, width)."""
     start_us: int
-    """Start of the window [us]."""
+    """Start of the time window [us]."""
     length_us: int
-    """Length of the window [us]."""
+    """Length of the time window [us]."""
     pairs: int
     """Number of equations from pairs of two events."""
     off_excess: float
-    """Assumed OFF threshold over ON threshold, minus 1."""
+    """Assumed ratio of the OFF to the ON threshold, minus 1."""
     smoothness: float
-    """Weight of the smoothness prior, chosen by held-out equations."""
+    """Weight of the smoothness prior, chosen by equations that were held out of the fit."""
     residual: float
     """Median absolute residual of the equations [ON thresholds]. Near 1, the optical model or the motion is wrong."""
     hot: int
     """Number of hot pixels that were excluded."""
     seconds: float
-    """Computing time [s]."""
+    """Computing time of the picture [s]."""
     unknowns: NDArray[np.float32] = field(repr=False)
-    """Flattened map with its margin and the sensor unknowns, from which the next window can start, shape (n,)."""
+    """Solution of the whole map with its margin, flattened, followed by the sensor's unknowns, shape (n,). The next
+    window can start from it."""
 
     def intensity(self, contrast: float = 0.25) -> NDArray[np.float32]:
         """Return relative linear intensity, 1 at the median.

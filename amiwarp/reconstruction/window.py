@@ -1,4 +1,4 @@
-"""Properties of one time window: the map that it needs, its busiest part, the ratio of the thresholds."""
+"""Properties of one time window: size of the map, busiest part of the image, ratio of the thresholds."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 LARGEST_MARGIN = 0.5
-"""Largest margin of the map around the image, relative to the image's width."""
+"""Largest margin of the map on each side of the image, relative to the image's width."""
 
 
 def map_tile(model: Model, camera_rotation: CameraRotation, length_us: int) -> tuple[int, int, Tiles]:
-    """Return the margin before the image (columns, rows), and the map: all that pixels see during the window.
+    """Return the map's margin left of and above the image (columns, rows), and the map of all that pixels see.
 
-    ``camera_rotation`` is that about the window's middle.
+    ``camera_rotation`` is the rotation about the window's middle. ``length_us`` is the window's length [us].
     """
     camera = model.camera
     margin = np.max(np.abs(border_displacements(model)), axis=0) + camera_rotation.reach(camera, length_us * 0.5e-6)
@@ -53,9 +53,10 @@ def busiest_square(count: NDArray[np.int32], side: int) -> tuple[int, int]:
 
 
 def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: int, length_us: int) -> float:
-    """Return OFF threshold over ON threshold, minus 1, from event counts over whole turns near the window.
+    """Return the ratio of the OFF to the ON threshold, minus 1, from event counts over whole turns near the window.
 
-    After a whole turn, a pixel is back at its brightness. So ONs times their threshold equal OFFs times theirs.
+    After a whole turn, a pixel is back at its brightness. So the number of ON events times the ON threshold equals the
+    number of OFF events times the OFF threshold.
     """
     first, last = source.t_first, source.t_last
     if turn_us is None or last - first < turn_us:

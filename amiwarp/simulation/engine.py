@@ -35,28 +35,30 @@ if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 FRAMES_PER_CHUNK = 8
-"""Largest number of pictures per chunk."""
+"""Largest number of pictures of a sequence that one chunk of simulated time contains."""
 
 MAPS_PER_CHUNK = 32
 """Approximate largest number of a world's maps per chunk."""
 
 CHUNK_US = {True: 100_000, False: 500_000}
-"""Span of a chunk [us] on a CPU (True) and on CUDA (False), for up to 640x480 pixels; shorter for more pixels."""
+"""Length of a chunk of simulated time [us] on a CPU (True) and on CUDA (False), for up to 640x480 pixels; shorter for
+more pixels."""
 
 LATEST_US = 1 << 16
-"""Upper bound of the time by which a time stamp can exceed the end of its chunk [us]."""
+"""Largest time by which an event's time stamp can exceed the end of its chunk of simulated time [us]."""
 
 CPU_RUN = 8192
 """Number of consecutive pixels per task of a CPU thread."""
 
 CUDA_SEGMENTS = 1024
-"""Number of event buffers on CUDA; each serves every 1024th pixel."""
+"""Number of event buffers on CUDA; buffer k gets the events of pixels k, k + 1024, k + 2048, …"""
 
 CACHE_LINE = 64
-"""Bytes between the counters of CPU threads; in a shared cache line, threads would wait for each other."""
+"""Distance of the counters of CPU threads in memory [bytes]. Threads whose counters share a cache line would wait for
+each other."""
 
 EVENTS_PER_PIXEL = 128
-"""Initial capacity of a chunk; it grows if necessary."""
+"""Initial capacity of the event buffer of a chunk [events per pixel]; the buffer grows if necessary."""
 
 
 @dataclass(slots=True)
@@ -64,7 +66,7 @@ class DeviceBlock:
     """Sorted events of one time span on the device."""
 
     arrays: Any
-    """The kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
+    """Columns of the events: the kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     count: int
     """Number of events."""
     look: Callable[[], Any] | None = None
@@ -97,7 +99,10 @@ class Engine:
     """One run of a simulation from start to end."""
 
     def __init__(self, simulation: Simulation, chunk_us: int | None = None) -> None:
-        """Place the scene and allocate the pixels. ``chunk_us``: span of a chunk [us]; None for the default."""
+        """Place the scene and allocate the pixels' states.
+
+        ``chunk_us``: length of a chunk of simulated time [us]; None for the default.
+        """
         self._simulation = simulation
         self._device = wp.get_device(simulation.device)
         self._pixels = simulation.camera.width * simulation.camera.height
@@ -144,13 +149,13 @@ class Engine:
         return max(1, int(min(span, longest)) // self._step)
 
     def prepare(self) -> None:
-        """Read the first pictures and load the kernels. Otherwise, this happens in the first chunk."""
+        """Read the first pictures and load the kernels, which otherwise happens in the first chunk."""
         launching.load(self._kernel(), self._device)
         if self._maps is not None:
             self._maps.cover(0, self._chunk_steps * self._step)
 
     def run(self) -> Iterator[DeviceBlock]:
-        """Yield the blocks of successive chunks."""
+        """Yield the sorted events of successive chunks of simulated time."""
         self.prepare()
         total = -(-self._simulation.duration_us // self._step)
         for first in range(0, total, self._chunk_steps):
@@ -164,7 +169,7 @@ class Engine:
             yield block
 
     def _tables(self, first: int, count: int) -> Any:
-        """Return the tables of a chunk's steps, computed in float64."""
+        """Return the tables that kernels need for the instants of a chunk, computed in float64."""
         simulation, margin = self._simulation, self._margin
         t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
         angle = simulation.motion.phase + simulation.motion.angle(t)
@@ -190,20 +195,20 @@ class Engine:
     def _fill_maps(
         self, maps: MapRing | WorldMapRing, table: NDArray[Any], t: NDArray[np.float64], first: int, count: int
     ) -> None:
-        """Fill in the maps before and after each instant, and the projection onto them."""
+        """Fill in, for each instant, the picture maps before and after it, and the projection onto them."""
         times, slots = maps.cover(first * self._step, (first + count) * self._step)
         self._view.maps = maps.maps
         before = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
         after = np.minimum(before + 1, len(times) - 1)
         weight = np.clip((t - times[before]) / np.maximum(times[after] - times[before], 1.0), 0.0, 1.0)
-        weight[before == after] = 0.0  # then one look-up is enough
+        weight[before == after] = 0.0  # with weight 0 the kernel reads only one map
         orientation = maps.orientations(t)
         to_texel = maps.placement.to_texel()
         table["to_texel"] = to_texel @ self._axis if orientation is None else to_texel @ orientation @ self._axis
         table["before"], table["after"], table["weight"] = slots[before], slots[after], weight
 
     def _kernel(self) -> Any:
-        """Return the kernel that runs the pixels."""
+        """Return the kernel that simulates the pixels over a chunk."""
         if self._maps is None:
             return world_events.run_filtered_world_pixels if self._filters else world_events.run_world_pixels
         if self._filters:
@@ -212,7 +217,7 @@ class Engine:
         return kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
 
     def _views(self) -> list[Any]:
-        """Return the first inputs of the kernels that run the pixels."""
+        """Return the kernel inputs that describe what the pixels see."""
         return [self._view] if self._maps is not None or self._sight is None else self._sight.inputs()
 
     def _upload(self, values: NDArray[np.float64]) -> wp.array:
@@ -220,16 +225,19 @@ class Engine:
         return wp.array(values.astype(np.float32), dtype=float, device=self._device)
 
     def _start_pixels(self, steps: Any) -> None:
-        """Initialise the pixels."""
+        """Set the initial state of every pixel."""
         inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
-        if self._filters:  # the photoreceptors have settled; their inputs are what they see
+        if self._filters:  # at the start, the photoreceptors' outputs have settled to the light that they see
             levels = np.ascontiguousarray(self._state[0].numpy()["level"])
             self._state.append(wp.array(levels, dtype=float, device=self._device))
 
     def _generate_keys(self, steps: Any, count: int) -> wp.array:
-        """Run the steps; return the sorted keys of the events before the chunk's end. Later ones are carried over."""
+        """Simulate the pixels over a chunk; return the sorted keys of the events before its end.
+
+        Later events are kept for the next chunk.
+        """
         keys = self._buffer.run(self._kernel(), [*self._views(), steps, self._sensor], self._state, self._carry)
         limit = min(count * self._step, self._simulation.duration_us - self.now_us)
         total = len(keys) // 2
@@ -239,13 +247,13 @@ class Engine:
         top = (limit + LATEST_US).bit_length() + steps.shift
         cut = self._sort(keys, total, limit << steps.shift, top)
         keys, self._carry = keys[:cut], wp.clone(keys[cut:total]) if cut < total else self._nothing
-        if len(self._carry):  # times relative to the next chunk
+        if len(self._carry):  # key times are relative to the start of their chunk
             wp.launch(event_keys.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
                       device=self._device)  # fmt: skip
         return keys
 
     def _sort(self, keys: wp.array, total: int, limit: int, top: int) -> int:
-        """Sort the first ``total`` keys, of ``top`` bits; return the number of keys below ``limit``."""
+        """Sort the first ``total`` keys by their lowest ``top`` bits; return the number of keys below ``limit``."""
         if self._device.is_cpu:
             values = keys.numpy()[:total]  # shares the memory of keys
             values.sort()
@@ -259,7 +267,7 @@ class Engine:
         return int(found.numpy()[0])
 
     def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
-        """Read out the events of sorted keys."""
+        """Convert sorted keys to events and their ground truth."""
         keys, stamps = self._readout.read(keys, steps.shift, first * self._step)
         n = len(keys)
         block = event_keys.Block()
@@ -279,10 +287,10 @@ class Engine:
 
 
 class KeyBuffer:
-    """Buffer for the keys of a chunk, by segments of pixels. It grows if a chunk has more events."""
+    """Buffer for the event keys of a chunk, in segments of pixels. It grows if a chunk has more events."""
 
     def __init__(self, pixels: int, device: Any) -> None:
-        """Allocate the buffer for a number of pixels."""
+        """Allocate the buffer for ``pixels`` pixels."""
         self._pixels, self._device = pixels, device
         self._segments = -(-pixels // CPU_RUN) if device.is_cpu else min(CUDA_SEGMENTS, pixels)
         self._sink = kernels.Sink()
@@ -292,15 +300,15 @@ class KeyBuffer:
         self._reserve(EVENTS_PER_PIXEL * -(-pixels // self._segments))
 
     def _reserve(self, capacity: int) -> None:
-        """Allocate ``capacity`` keys per segment."""
+        """Allocate room for ``capacity`` keys per segment."""
         self._capacity = capacity
         self._sink.keys = wp.empty((self._segments, capacity), dtype=wp.int64, device=self._device)
 
     def run(self, kernel: Any, inputs: list[Any], state: list[wp.array], carry: wp.array) -> wp.array:
-        """Run the pixels, whose ``state`` follows the ``inputs``; return the keys of their events, unsorted.
+        """Simulate the pixels over a chunk and return the keys of their events, unsorted, with ``carry`` appended.
 
-        ``carry`` is appended. The array has twice the needed length, because sorting on CUDA needs scratch memory
-        behind the keys.
+        The kernel gets the ``inputs``, then the pixels' ``state``. The array has twice the needed length, because
+        sorting on CUDA needs scratch memory behind the keys.
         """
         before = [wp.clone(array) for array in state]
         while True:
@@ -309,12 +317,13 @@ class KeyBuffer:
             counts = self._sink.count.numpy()[:, 0]
             if counts.max() <= self._capacity:
                 return self._pack(counts, carry)
-            for array, copy in zip(state, before, strict=True):  # the buffer was too small: run again
+            # the buffer was too small: run again from the same state
+            for array, copy in zip(state, before, strict=True):
                 wp.copy(array, copy)
             self._reserve(int(counts.max()) * 5 // 4)
 
     def _pack(self, counts: NDArray[np.int32], carry: wp.array) -> wp.array:
-        """Concatenate the segments and ``carry``."""
+        """Join the segments' keys and ``carry`` without gaps."""
         ends = np.cumsum(counts, dtype=np.int64)
         n = int(ends[-1]) + len(carry)
         keys = wp.empty(2 * n, dtype=wp.int64, device=self._device)
@@ -331,7 +340,7 @@ class KeyBuffer:
         return keys
 
     def _launch(self, kernel: Any, inputs: list[Any]) -> None:
-        """Run all pixels."""
+        """Launch the kernel that simulates the pixels, for all pixels."""
 
         def run(start: int, stop: int) -> None:
             wp.launch(kernel, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)
@@ -344,9 +353,9 @@ class KeyBuffer:
 
 
 def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
-    """Return azimuths and matrices of a table of instants in blocks, shape (n, 11, 16).
+    """Return the prism azimuths and matrices of a table of instants in blocks of 16, shape (n, 11, 16).
 
-    The last instant fills the last block.
+    The last block is filled up with the last instant.
     """
     ahead = int(prism_view.AHEAD)
     columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9)], axis=1)
@@ -355,7 +364,7 @@ def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def sensor_params(sensor: SensorModel, step: int) -> Any:
-    """Return the sensor in the kernels' units: ticks of 1/16 us, and steps of ``step`` [us]."""
+    """Return the sensor's parameters in the kernels' units: ticks of 1/16 us, and steps of ``step`` [us]."""
     ticks = float(kernels.TICKS)
     s = kernels.SensorParams()
     s.on, s.off, s.mismatch = sensor.contrast_on, sensor.contrast_off, sensor.mismatch

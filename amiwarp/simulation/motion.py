@@ -1,4 +1,4 @@
-"""What moves in a simulation: the prism, the camera, and the encoder that measures the prism."""
+"""Motion in a simulation: of the prism, of the camera, and the encoder that measures the prism."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from amiwarp.optics.prism import check_phase, check_tilt
 from amiwarp.validation import array, real, whole
 
 ROTATION_INTERVAL = 1e-3
-"""Interval at which a changing angular velocity is integrated [s]."""
+"""Interval of the steps in which a changing angular velocity is integrated [s]."""
 LARGEST_SPEED = 1e9
 """Largest accepted speed of a prism [turns/min] and of a camera's rotation [rad/s]; higher values are mistakes."""
 LONGEST_S = 86400.0
-"""Longest simulation [s]."""
+"""Longest duration of a simulation [s]."""
 LARGEST_OFFSET_US = 1e7
-"""Largest clock offset [us]: the encoder is sampled for that much longer on either side."""
+"""Largest clock offset of a simulated encoder [us]. The encoder is sampled for this much longer before and after the
+events."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,12 +37,12 @@ class PrismMotion:
     """
 
     rpm: float | ArrayLike = 720.0
-    """Speed [turns/min], negative for backward rotation.
+    """Speed of the prism [turns/min], negative for backward rotation.
 
     Or a table of rows (time [s], speed), interpolated linearly and constant outside, shape (n, 2).
     """
     phase: float = 0.0
-    """Azimuth at angle 0, θ_b [rad]."""
+    """Azimuth of the prism's tilt at encoder angle 0, θ_b [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
     """Tilt of the axis of rotation about the camera's x and y axes [rad], as in :class:`amiwarp.ExactModel`."""
 
@@ -59,7 +60,7 @@ class PrismMotion:
         phase: float = 0.0,
         tilt: tuple[float, float] = (0.0, 0.0),
     ) -> PrismMotion:
-        """Sample the speed from a function.
+        """Create a motion by sampling a function of time that gives the speed.
 
         Parameters
         ----------
@@ -90,7 +91,7 @@ class PrismMotion:
         return cls(np.column_stack([t, np.broadcast_to(speed, t.shape)]), phase, tilt)
 
     def _table(self) -> NDArray[np.float64]:
-        """Return rows (time [s], speed [rad/s])."""
+        """Return the speed as a table of rows (time [s], speed [rad/s])."""
         rpm = array(self.rpm, "prism speed").astype(np.float64)
         table = np.array([[0.0, rpm], [1.0, rpm]]) if rpm.ndim == 0 else rpm
         return table * np.array([1.0, TWO_PI / 60.0]) if table.ndim == 2 and table.shape[1] == 2 else table
@@ -121,7 +122,7 @@ class PrismMotion:
 
     @property
     def largest_speed(self) -> float:
-        """Largest magnitude of the speed [rad/s]."""
+        """Largest magnitude of the prism's speed [rad/s]."""
         return float(np.abs(self._table()[:, 1]).max())
 
 
@@ -136,7 +137,7 @@ class CameraMotion:
     """
 
     rates: ArrayLike = (0.0, 0.0, 0.0)
-    """Angular velocity in the camera's frame [rad/s], shape (3,).
+    """Angular velocity of the camera in its own frame [rad/s], shape (3,).
 
     Or a table of rows (time [s], ωx, ωy, ωz), interpolated linearly and constant outside, shape (n, 4).
     """
@@ -194,19 +195,19 @@ class CameraMotion:
 
 
 def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> None:
-    """Raise :class:`AmiwarpError` for a wrong shape, values out of range, and times that do not rise."""
+    """Raise :class:`AmiwarpError` for a table of wrong shape, with values out of range or unsorted times."""
     if table.ndim != 2 or table.shape[1] != columns or len(table) < 2:
         raise AmiwarpError(f"{what} has shape {table.shape}; give one value, or at least 2 rows of {columns} numbers")
     if not (np.abs(table) <= LARGEST_SPEED).all():  # NaN fails
         worst = table[~(np.abs(table) <= LARGEST_SPEED)][0]
         raise AmiwarpError(f"{what} contains {worst:g}; expected numbers in {-LARGEST_SPEED:g} .. {LARGEST_SPEED:g}")
     if not (np.diff(table[:, 0]) > 0).all():
-        raise AmiwarpError(f"{what}: the times of its rows do not rise; sort them")
+        raise AmiwarpError(f"{what}: the times of its rows do not increase; sort the rows by time")
 
 
 @dataclass(frozen=True, slots=True)
 class EncoderModel:
-    """Errors of a simulated encoder.
+    """Errors that a simulated encoder makes.
 
     Raises :class:`AmiwarpError` for values out of range.
 
@@ -218,17 +219,17 @@ class EncoderModel:
     """
 
     counts_per_turn: int | None = 8192
-    """Resolution: the angle is rounded to the nearest count; None disables rounding."""
+    """Resolution of the encoder [counts/turn]: the angle is rounded to the nearest count; None disables rounding."""
     rate_hz: float = 1000.0
-    """Samples per second [Hz]."""
+    """Rate of the encoder samples [Hz]."""
     jitter_us: float = 1.0
-    """Standard deviation of a sample's time stamp [us]."""
+    """Standard deviation of the time stamp of an encoder sample [us]."""
     clock_offset_us: float = 0.0
-    """Encoder clock minus camera clock [us]."""
+    """Offset of the encoder's clock: encoder time minus event time [us]."""
     dropouts_hz: float = 0.0
     """Mean number of drop-outs per second [Hz]."""
     dropout_us: float = 5000.0
-    """Duration of a drop-out, in which all samples are lost [us]."""
+    """Duration of a drop-out, in which all encoder samples are lost [us]."""
 
     def __post_init__(self) -> None:
         if self.counts_per_turn is not None:

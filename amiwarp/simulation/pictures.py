@@ -14,22 +14,23 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.regular_file import check_regular
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Weights of linear red, green and blue (ITU-R BT.709)."""
+"""Weights of linear red, green and blue in the luminance (ITU-R BT.709)."""
 
 DARK = 0.02
-"""Intensity added before the logarithm, relative to white.
+"""Intensity added to every picture before the logarithm, relative to white.
 
 It stands for stray light and dark current, and limits the contrast of shadows.
 """
 
 MOST_PIXELS = 1 << 26
-"""Largest picture that is read, 67 megapixels: a small file may unpack to a huge picture."""
+"""Largest picture that is read [px]: 67 megapixels. A small file may unpack to a huge picture."""
 
 BAND = 1 << 24
-"""Number of values converted at a time."""
+"""Number of pixel values that are converted to light at a time."""
 
 PICTURE_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
-"""Accepted formats, by Pillow's names. Others are excluded because some of them run external programs."""
+"""Formats of picture files that are read, by Pillow's names. Others are excluded because some of them run external
+programs."""
 
 LARGEST_MAP = 8192
 """Largest number of texels along a side of a map; a wider scene is resampled more coarsely."""
@@ -48,7 +49,9 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
             warnings.simplefilter("ignore")  # about Pillow's own, larger limits, and about damage that it tolerates
             with Image.open(path, formats=PICTURE_FORMATS) as image:
                 if image.width * image.height > MOST_PIXELS:
-                    raise ValueError(f"{image.width}x{image.height} is over {MOST_PIXELS} pixels; make it smaller")
+                    raise ValueError(
+                        f"{image.width}x{image.height} is over {MOST_PIXELS} pixels; make the picture smaller"
+                    )
                 wide = image.mode.startswith(("I", "F"))
                 pixels = np.asarray(image if wide else image.convert("RGB"))
     except Exception as error:  # Pillow raises errors of many types for damaged files
@@ -90,29 +93,32 @@ def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[
 
 
 def srgb_to_linear(value: NDArray[Any]) -> NDArray[np.float32]:
-    """Decode sRGB values 0 .. 1 (IEC 61966-2-1)."""
+    """Convert sRGB values 0 .. 1 to linear intensity (IEC 61966-2-1)."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Placement of a map on the picture plane, which is at z = 1 in front of the camera."""
+    """Placement of a picture map on the picture plane, which is at z = 1 in front of the camera."""
 
     width: int
-    """Number of texels along x."""
+    """Number of texels of the map along x."""
     height: int
-    """Number of texels along y."""
+    """Number of texels of the map along y."""
     box: tuple[float, float, float, float]
-    """Part of the picture that the map shows: left, top, right, bottom edges [picture px]."""
+    """Part of the picture that the map shows: left, top, right and bottom edge [picture px]."""
     left: float
-    """Plane coordinate of the map's left edge."""
+    """Coordinate x of the map's left edge on the picture plane."""
     top: float
-    """Plane coordinate of the map's top edge."""
+    """Coordinate y of the map's top edge on the picture plane."""
     pitch: tuple[float, float]
-    """Texels per unit of the plane along x and y."""
+    """Texels per unit of the picture plane, along x and along y."""
 
     def to_texel(self) -> NDArray[np.float64]:
-        """Return the matrix (3, 3) from plane to texel coordinates, in which texel centres are whole numbers."""
+        """Return the matrix (3, 3) from coordinates on the picture plane to texel coordinates.
+
+        Texel centres have whole coordinates.
+        """
         (px, py), left, top = self.pitch, self.left, self.top
         return np.array([[px, 0.0, -left * px - 0.5], [0.0, py, -top * py - 0.5], [0.0, 0.0, 1.0]])
 
@@ -124,11 +130,12 @@ def place_picture(
     *,
     fov: float | None = None,
 ) -> Placement:
-    """Place a picture of ``size`` (width, height) so that it covers ``view`` (left, top, right, bottom on the plane).
+    """Place a picture so that it covers a rectangle of the picture plane.
 
-    Its aspect ratio is kept, and parts that are never seen are cut off. With ``fov`` [rad], its horizontal extent, it
-    is centred on the optical axis instead, and mirrored at its edges if the view extends beyond. ``pitch``: texels per
-    unit.
+    ``size`` is the picture's (width, height); ``view`` is the rectangle (left, top, right, bottom) on the plane. The
+    picture's aspect ratio is kept, and parts that are never seen are cut off. With ``fov`` [rad], its horizontal
+    extent, the picture is centred on the optical axis instead, and mirrored at its edges if the view extends beyond.
+    ``pitch``: texels per unit of the plane.
     """
     width, height = size
     left, top, right, bottom = view

@@ -1,4 +1,4 @@
-"""Readout of the simulated sensor, between the pixels and the recording: rows read in turn, and a bus with a queue."""
+"""Readout of the simulated sensor: rows that are read in turn, and a bus with a queue that limits the event rate."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 LONGEST_SCAN_US = 10_000.0
-"""Longest time to read all rows [us]. The keys of events hold a time stamp that is late by up to 32 ms."""
+"""Longest time in which all rows may be read [us]. The keys of events hold a delay of up to 32 ms."""
 
 
 class Readout:
-    """Readout of one sensor. It carries the state of the bus from block to block, and needs no other memory."""
+    """Readout of one simulated sensor. It keeps the state of the bus from block to block, and needs no other memory."""
 
     def __init__(self, simulation: Simulation, device: Any) -> None:
-        """Check the time of a row scan."""
+        """Set up the readout; raise :class:`AmiwarpError` if reading all rows takes too long."""
         sensor, camera = simulation.sensor, simulation.camera
         scan_us = sensor.row_us * camera.height
         if scan_us > LONGEST_SCAN_US:
@@ -43,16 +43,19 @@ class Readout:
 
     @property
     def scans_rows(self) -> bool:
-        """Whether rows are read in turn."""
+        """Whether the sensor reads its rows in turn, instead of each event at once."""
         return self._row_ps > 0
 
     @property
     def limits_rate(self) -> bool:
-        """Whether the bus limits the rate of events."""
+        """Whether the bus limits the event rate."""
         return int(self._bus.event_ps) > 0
 
     def stamp_rows(self, keys: wp.array, count: int, shift: int, origin_us: int) -> None:
-        """Give the first ``count`` keys the times at which their rows are read. ``origin_us``: time of tick 0."""
+        """Replace the times of the first ``count`` keys by the times at which their rows are read.
+
+        ``origin_us``: time of tick 0 [us].
+        """
         if not self.scans_rows or not count:
             return
         scan = kernels.RowScan()
@@ -81,7 +84,7 @@ class Readout:
         return wp.array(values, dtype=wp.int64, device=self._device), stamps
 
     def _transmit(self, keys: NDArray[np.int64], shift: int, origin_us: int) -> NDArray[np.int64]:
-        """Return the time of transmission of each event [us]; -1 for lost ones."""
+        """Return the time at which the bus transmits each event [us]; -1 for events that do not fit into the queue."""
         t = keys >> shift
         pixel = ((keys - (t << shift)) >> int(event_generation.LOW_BITS)).astype(np.int32)
         stamp = wp.empty(len(keys), dtype=wp.int64, device="cpu")

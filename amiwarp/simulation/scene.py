@@ -16,7 +16,7 @@ from amiwarp.validation import real
 
 
 class Frames(Protocol):
-    """Pictures with times, read one after the other."""
+    """Pictures with times, which are read one after the other (protocol)."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -38,19 +38,19 @@ class Frames(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Still:
-    """A single picture that never changes."""
+    """Single picture that never changes."""
 
     light: NDArray[np.float32]
-    """Linear luminance, shape (height, width)."""
+    """Linear luminance of the picture, shape (height, width); white is 1."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height [px]."""
+        """Width and height of the picture [px]."""
         return self.light.shape[1], self.light.shape[0]
 
     @property
     def interval_us(self) -> None:
-        """None: there is only one picture."""
+        """Time between pictures: None, because there is only one picture."""
         return None
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -70,14 +70,14 @@ class Scene:
     """
 
     frames: Frames
-    """The pictures."""
+    """Pictures of the scene, in order of time."""
     fov: float | None = None
-    """Horizontal field of view of a picture [rad]; it is mirrored beyond its edges.
+    """Horizontal field of view of the picture [rad]. Beyond its edges the picture is mirrored.
 
     None: the picture is just large enough to cover everything that the camera sees through the turning prism.
     """
     blur: float = 0.5
-    """Standard deviation of the optical blur, including the pixel's aperture [sensor px]."""
+    """Standard deviation of the optical blur [sensor px], which includes the pixel's aperture."""
 
     def __post_init__(self) -> None:
         if self.fov is not None:

@@ -1,4 +1,4 @@
-"""What the simulated camera sees: the picture's placement, the speed of the image, the maps on the device."""
+"""View of the simulated camera: placement of the picture, speed of its image, and picture maps on the device."""
 
 from __future__ import annotations
 
@@ -23,32 +23,33 @@ if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 LARGEST_MOTION = 0.5
-"""Largest motion of the image per step [px]."""
+"""Largest motion of the image in a time step [px]."""
 
 LONGEST_STEP = 2000
-"""Longest step, even if nothing moves [us]."""
+"""Longest time step, even if nothing moves [us]."""
 
 STEPS_PER_FRAME = 4
-"""Smallest number of steps between two pictures of a sequence."""
+"""Smallest number of time steps between two pictures of a sequence."""
 
 TEXELS_PER_PIXEL = 1.75
-"""Resolution of a map relative to the sensor."""
+"""Texels of a picture map per sensor pixel, along each axis."""
 SMALLEST_COSINE = 0.25
-"""Cosine of the largest angle between a bearing and the picture's axis: a plane does not extend around the camera."""
+"""Cosine of the largest angle between a line of sight and the picture's axis: a plane does not extend around the
+camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageMotion:
-    """Speeds of the image."""
+    """Largest speeds of the image by the prism and by the camera."""
 
     prism: float
-    """Largest motion per angle of the prism [px/rad]."""
+    """Largest motion of the image per angle of the prism [px/rad]."""
     camera: NDArray[np.float64]
-    """Largest motion per angle of the camera about each of its axes [px/rad], shape (3,)."""
+    """Largest motion of the image per angle of the camera about each of its axes [px/rad], shape (3,)."""
 
 
 def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float = math.inf) -> int:
-    """Return the length of a step [us] in which nothing moves by more than half a pixel.
+    """Return the length of a time step [us] in which the image moves by at most half a pixel.
 
     ``world_speed``: speed of a world in the image [px/s]; ``longest``: upper bound [us].
     """
@@ -60,12 +61,14 @@ def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float 
     if frames is not None and frames.interval_us is not None:
         step = min(step, frames.interval_us / STEPS_PER_FRAME)
     if step < 1.0:
-        raise AmiwarpError(f"the image moves at {speed:.3g} px/s, over half a pixel per microsecond; slow it down")
+        raise AmiwarpError(
+            f"the image moves at {speed:.3g} px/s, over half a pixel per microsecond; slow down prism, camera or world"
+        )
     return int(step)
 
 
 def image_motion(simulation: Simulation) -> ImageMotion:
-    """Compute the motion on a grid of pixels that includes the corners, over one turn."""
+    """Compute the speeds of the image on a grid of pixels that includes the corners, over one turn of the prism."""
     camera, device = simulation.camera, simulation.device
     grid = np.stack(
         [m.ravel() for m in np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))], 1
@@ -83,7 +86,7 @@ def image_motion(simulation: Simulation) -> ImageMotion:
 
 
 def _camera_image_motion(simulation: Simulation, grid: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute the largest motion per angle of the camera about each axis [px/rad]."""
+    """Compute the largest motion of the image per angle of the camera about each of its axes [px/rad]."""
     camera = simulation.camera
     rays = camera.pixels_to_rays(wp.array(grid.astype(np.float32), dtype=wp.vec2, device=simulation.device)).numpy()
     angle = 1e-2
@@ -96,7 +99,7 @@ def _camera_image_motion(simulation: Simulation, grid: NDArray[np.float64]) -> N
 
 
 def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
-    """Return the bearings in the camera's frame that the image's border sees over one turn, shape (n, 3)."""
+    """Return the bearings that the image's border sees over one turn, in the camera's frame, shape (n, 3)."""
     camera, device = simulation.camera, simulation.device
     right, bottom = camera.width - 1.0, camera.height - 1.0
     along = np.linspace(0.0, 1.0, 33)
@@ -133,7 +136,7 @@ def place_scene(simulation: Simulation) -> Placement:
             angle = math.degrees(math.acos(max(-1.0, float(z.min()))))
             limit = math.degrees(math.acos(SMALLEST_COSINE))
             raise AmiwarpError(f"the camera looks up to {angle:.0f} deg away from the picture's centre; the limit is "
-                               f"{limit:.0f} deg; turn it less far, or narrow its field of view")  # fmt: skip
+                               f"{limit:.0f} deg; turn the camera less far, or narrow its field of view")  # fmt: skip
         plane = np.stack([x / z, y / z])
         low, high = np.minimum(low, plane.min(axis=1)), np.maximum(high, plane.max(axis=1))
     focal = max(simulation.camera.fx, simulation.camera.fy)
@@ -144,17 +147,17 @@ def place_scene(simulation: Simulation) -> Placement:
 
 
 def _pictures(simulation: Simulation) -> Scene:
-    """Return the scene of a simulation of pictures."""
+    """Return the picture scene of a simulation; raise :class:`AmiwarpError` for a world."""
     if not isinstance(simulation.scene, Scene):
-        raise AmiwarpError("a world has no picture at infinity; give a Scene")
+        raise AmiwarpError("a world has no picture at infinity; give a Scene of pictures")
     return simulation.scene
 
 
 class MapRing:
-    """Maps of the pictures around the current time span, read when needed. Each map has a slot on the device."""
+    """Maps of the pictures around the current time span on the device. Pictures are read when needed."""
 
     def __init__(self, simulation: Simulation, placement: Placement) -> None:
-        """Open the pictures."""
+        """Open the pictures without reading them."""
         focal = max(simulation.camera.fx, simulation.camera.fy)
         scene = _pictures(simulation)
         self._blur = scene.blur * math.sqrt(placement.pitch[0] * placement.pitch[1]) / focal
@@ -173,7 +176,10 @@ class MapRing:
         return self._slots.arrays[0]
 
     def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Return times [us] and slots of the maps around ``start`` .. ``stop``, at least one."""
+        """Return the times [us] and the slots on the device of the maps around ``start`` .. ``stop`` [us].
+
+        There is at least one map.
+        """
         while not self._held or self._held[-1][0] < stop:
             following = next(self._frames, None)
             if following is None:
@@ -190,14 +196,14 @@ class MapRing:
         return np.array(times, np.float64), np.array(slots, np.int32)
 
     def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return matrices (n, 3, 3) from the camera's frame to the pictures' at times [us]; None at rest."""
+        """Return the rotation from the camera's to the pictures' frame at times [us], shape (n, 3, 3); None at rest."""
         return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
 
 
 def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return coefficients of 1, x, y, xy between each texel and its right and lower neighbours.
+    """Return the coefficients of bilinear interpolation between texels, shape (height, width, 4).
 
-    Shape (height, width, 4).
+    They are the factors of 1, x, y and xy between each texel and its right and lower neighbours.
     """
     pieces = np.zeros((*texels.shape, 4), np.float32)
     pieces[..., 0] = texels
@@ -208,9 +214,9 @@ def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def log_view(simulation: Simulation) -> NDArray[np.float32]:
-    """Return the first picture as the camera would see it without the prism at t = 0.
+    """Return the first picture as the camera would see it without the prism at time 0.
 
-    Log intensity, shape (height, width).
+    The log intensity has the shape (height, width).
     """
     camera, device = simulation.camera, wp.get_device(simulation.device)
     placement = place_scene(simulation)

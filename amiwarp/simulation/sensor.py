@@ -10,7 +10,9 @@ from amiwarp.validation import one_of, real
 
 @dataclass(frozen=True, slots=True)
 class SensorModel:
-    """Pixels and readout of an event camera. The defaults are those of a good sensor in good light, with fast biases.
+    """Model of an event camera's pixels and readout.
+
+    The defaults are those of a good sensor in good light, with fast biases.
 
     By default, the photoreceptors have unlimited bandwidth, noise does not depend on light, and every event is read out
     at once.
@@ -27,26 +29,27 @@ class SensorModel:
     """
 
     contrast_on: float = 0.25
-    """ON threshold: rise of log intensity that causes an ON event."""
+    """ON threshold: increase of natural log intensity that causes an ON event."""
     contrast_off: float = 0.25
-    """OFF threshold: fall of log intensity that causes an OFF event."""
+    """OFF threshold: decrease of natural log intensity that causes an OFF event."""
     mismatch: float = 0.03
-    """Relative standard deviation of both thresholds between pixels."""
+    """Relative standard deviation of the ON and OFF thresholds between pixels."""
     refractory_us: float = 100.0
     """Refractory period: time after an event in which the pixel is blind [us].
 
-    Its reference is the level at the end of it.
+    The pixel's new reference is the brightness at the end of this period.
     """
     latency_us: float = 100.0
-    """Mean time from a change to its time stamp [us]."""
+    """Mean time from a brightness change to the time stamp of its event [us]."""
     latency_jitter_us: float = 30.0
     """Standard deviation of the latency [us]. The time stamps of one pixel stay in order."""
     leak_hz: float = 0.1
     """Rate of ON events of a pixel without any change, caused by the drift of its reference [1/s]."""
     shot_noise_hz: float = 1.0
-    """Rate of random events per pixel, half of them ON [1/s]. Each resets the reference to the level."""
+    """Rate of random events per pixel, half of them ON [1/s]. Each sets the pixel's reference to the present
+    brightness."""
     hot_fraction: float = 0.0002
-    """Fraction of hot pixels."""
+    """Fraction of the pixels that are hot."""
     hot_hz: float = 100.0
     """Additional rate of random events of a hot pixel [1/s]."""
     cutoff_hz: float | None = 0.0
@@ -182,7 +185,7 @@ class SensorModel:
 
 
 def _real_or_none(value: float | None, what: str, least: float, limit: float) -> float:
-    """Return a value in least .. limit, or 0.0 for None and 0."""
+    """Return a value between ``least`` and ``limit``; 0.0 if it is None or 0."""
     number = 0.0 if value is None else real(value, what, 0.0, limit)
     return number if number == 0.0 else real(number, what, least, limit, " (or 0 for none)")
 

@@ -33,7 +33,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", "
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class PictureFolder:
-    """Picture files with times.
+    """Folder of picture files with a time for each picture.
 
     Examples
     --------
@@ -45,9 +45,9 @@ class PictureFolder:
     """
 
     files: tuple[Path, ...]
-    """Picture files, all of one size."""
+    """Paths of the picture files, which are all of one size."""
     times_us: NDArray[np.int64]
-    """Time of each picture, starting at 0 and increasing [us], shape (n,)."""
+    """Time of each picture [us], shape (n,), starting at 0 and increasing."""
     size: tuple[int, int]
     """Width and height of each picture [px]."""
 
@@ -58,7 +58,10 @@ class PictureFolder:
 
     @property
     def duration_us(self) -> float:
-        """Time from the first picture to the end of the last, which is shown for the median interval [us]."""
+        """Time from the first picture to the end of the last one [us].
+
+        The last picture is shown for the median interval.
+        """
         return float(self.times_us[-1]) + float(np.median(np.diff(self.times_us)))
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -79,7 +82,7 @@ class PictureFolder:
             if light.shape != self.size[::-1]:
                 given = f"{light.shape[1]}x{light.shape[0]}"
                 expected = f"{self.size[0]}x{self.size[1]}"
-                raise AmiwarpError(f"{file} has {given} pixels, the first picture {expected}; resize it")
+                raise AmiwarpError(f"{file} has {given} pixels, the first picture {expected}; resize this picture")
             yield t, light
 
 
@@ -95,11 +98,12 @@ class PictureStack:
     """
 
     pictures: NDArray[Any]
-    """Pixel values, shape (n, height, width) or (n, height, width, 3), sRGB-encoded: 0 .. 1, uint8 or uint16."""
+    """Pixel values of the pictures, shape (n, height, width) or (n, height, width, 3): sRGB-encoded, 0 .. 1, uint8 or
+    uint16."""
     fps: float
-    """Pictures per second [Hz]."""
+    """Number of pictures per second [Hz]."""
     name: str
-    """Name for messages."""
+    """Name of the stack in messages."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -113,7 +117,7 @@ class PictureStack:
 
     @property
     def duration_us(self) -> float:
-        """Duration [us]."""
+        """Duration of all pictures [us]."""
         return len(self.pictures) * self.interval_us
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -135,7 +139,7 @@ class PictureStack:
                 yield round(i * self.interval_us), linear_luminance(picture, name=name)
                 continue
             if not (np.isfinite(picture).all() and picture.min() >= 0.0 and picture.max() <= 1.0):
-                raise AmiwarpError(f"{name} has values outside 0 .. 1; scale them, or store uint8")
+                raise AmiwarpError(f"{name} has values outside 0 .. 1; scale the values, or store them as uint8")
             yield (
                 round(i * self.interval_us),
                 linear_luminance(srgb_to_linear(np.asarray(picture, np.float32)), name=name),
@@ -154,19 +158,19 @@ class VideoFile:
     """
 
     path: Path
-    """Path of the video."""
+    """Path of the video file."""
     size: tuple[int, int]
     """Width and height of a frame [px]."""
     fps: float
-    """Nominal frame rate [Hz]. Times come from the time stamp of each frame."""
+    """Nominal frame rate [Hz]. The simulation uses the time stamp of each frame instead."""
     duration_us: float
-    """Duration, after stretching [us]."""
+    """Duration of the video, after its times were multiplied by ``stretch`` [us]."""
     stretch: float = 1.0
-    """Factor by which the times in the file are multiplied."""
+    """Factor by which the times in the video file are multiplied."""
 
     @property
     def interval_us(self) -> float:
-        """Nominal time between frames, after stretching [us]."""
+        """Nominal time between frames, after times were multiplied by ``stretch`` [us]."""
         return 1e6 / self.fps * self.stretch
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -193,14 +197,19 @@ class VideoFile:
                     first = stamp if first is None else first
                     t = round((stamp - first) * 1_000_000 * Fraction(self.stretch))
                     if frame.width * frame.height > MOST_PIXELS:
-                        raise AmiwarpError(f"{self.path}: frame {i} is {frame.width}x{frame.height}; make it smaller")
+                        raise AmiwarpError(
+                            f"{self.path}: frame {i} is {frame.width}x{frame.height}, which is too large; make the "
+                            "video smaller"
+                        )
                     if t > last:
                         last = t
                         yield t, linear_luminance(frame.to_ndarray(format="rgb24"), name=f"{self.path}: frame {i}")
         except AmiwarpError:
             raise
         except Exception as error:  # damage shows in errors of many types
-            raise AmiwarpError(f"{self.path} is damaged after {last / 1e6:.3f} s ({error}); cut it there") from error
+            raise AmiwarpError(
+                f"{self.path} is damaged after {last / 1e6:.3f} s ({error}); cut the video at that time"
+            ) from error
         if last < 0:
             raise AmiwarpError(f"{self.path} contains no frame that can be decoded; give another video")
 
@@ -231,14 +240,16 @@ def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
 
 
 def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
-    """Open a folder, with times from its table or from ``fps``."""
+    """Open a folder of pictures, with times from ``times.csv`` or from ``fps``."""
     table = folder / TIMES
     if table.exists() and fps is None:
         files, times = _read_times(table)
     else:
         files = sorted((f for f in folder.iterdir() if f.suffix.lower() in PICTURE_SUFFIXES), key=_natural)
         if fps is None:
-            raise AmiwarpError(f"{folder} has no times.csv (columns file, t_us); add it, or give fps")
+            raise AmiwarpError(
+                f"{folder} has no times.csv (columns file, t_us); add this file, or give the pictures per second as fps"
+            )
         times = np.rint(np.arange(len(files)) * (1e6 / fps)).astype(np.int64)
     if len(files) < 2:
         raise AmiwarpError(f"{folder} contains {len(files)} pictures; give at least 2")
@@ -257,7 +268,7 @@ def _natural(file: Path) -> list[tuple[int, int, str]]:
 
 
 def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
-    """Read the files and times of ``times.csv``."""
+    """Read the file names and times in ``times.csv``."""
     check_regular(table)
     with errors_name(table, lambda: "is not a table with the columns file, t_us"):
         with table.open("rb") as file:
@@ -289,7 +300,7 @@ def _open_stack(path: Path, fps: float | None) -> PictureStack:
     if pictures.ndim not in (3, 4) or len(pictures) < 2:
         raise AmiwarpError(f"{path} has shape {pictures.shape}; expected (n, height, width), n at least 2")
     if fps is None:
-        raise AmiwarpError(f"{path} contains no times; give fps")
+        raise AmiwarpError(f"{path} contains no times; give the pictures per second as fps")
     return PictureStack(pictures, fps, str(path))
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Everything that determines a simulated recording.
+    """Description of a simulated recording: all that determines its events.
 
     Equal values give equal events, bit for bit, on one kind of device.
 
@@ -50,27 +50,27 @@ class Simulation:
     """
 
     scene: Scene | WorldScene
-    """The scene: pictures at infinity, or a world."""
+    """Scene in front of the camera: pictures at infinity, or a world."""
     camera: Camera
-    """The camera, of at most 4194304 pixels."""
+    """Camera intrinsics, of at most 4194304 pixels."""
     prism: Prism
-    """The true prism."""
+    """Prism in front of the camera, with its true parameters."""
     duration_s: float
-    """Duration [s]."""
+    """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism."""
+    """Motion of the prism: speed, phase and tilt."""
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
-    """Rotation of the camera."""
+    """Rotation of the camera; by default none."""
     sensor: SensorModel = field(default_factory=SensorModel)
-    """Pixels of the sensor."""
+    """Model of the sensor's pixels and readout."""
     encoder_model: EncoderModel | None = field(default_factory=EncoderModel)
     """Errors of the encoder; None for a camera without a prism, whose recording has neither encoder nor prism."""
     nominal_prism: Prism | None = None
-    """The prism stored with the recording; None for the true one."""
+    """Nominal prism that is stored with the recording; None for the true prism."""
     seed: int = 0
-    """Seed of all random numbers."""
+    """Seed of all random numbers of the simulation."""
     device: str = "cpu"
-    """Device to compute on."""
+    """Device that computes, such as ``cpu`` or ``cuda:0``."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
@@ -89,11 +89,11 @@ class Simulation:
 
     @property
     def duration_us(self) -> int:
-        """Duration, rounded [us]."""
+        """Duration of the recording, rounded [us]."""
         return round(self.duration_s * 1e6)
 
     def without_prism(self) -> Simulation:
-        """Return the same simulation of a plain event camera: the prism is taken out.
+        """Return this simulation with the prism taken out, which makes it that of a plain event camera.
 
         Returns
         -------
@@ -103,7 +103,7 @@ class Simulation:
         return replace(self, prism=replace(self.prism, apex=0.0), nominal_prism=None, encoder_model=None)
 
     def encoder(self) -> Encoder | None:
-        """Sample the encoder.
+        """Sample the prism's encoder.
 
         Returns
         -------
@@ -115,7 +115,7 @@ class Simulation:
         return self.encoder_model.sample(self.motion, self.duration_us, self.seed)
 
     def truth_parameters(self) -> dict[str, float]:
-        """Return the true parameter values.
+        """Return the true values of the parameters of prism, encoder, camera motion and sensor.
 
         Returns
         -------
@@ -140,7 +140,7 @@ class Simulation:
         }
 
     def metadata(self) -> dict[str, MetadataValue]:
-        """Describe how the recording was made.
+        """Return the metadata that the recording stores about its simulation.
 
         Returns
         -------
@@ -251,7 +251,7 @@ class Simulation:
 
     @property
     def _stored_prism(self) -> Prism | None:
-        """The nominal prism of the recording, or None for a plain event camera."""
+        """Nominal prism to store with the recording, or None for a plain event camera."""
         return None if self.encoder_model is None else self.nominal_prism or self.prism
 
     def write(

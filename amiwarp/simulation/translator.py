@@ -1,4 +1,4 @@
-"""Simulate the recording of a picture sequence (a video, a folder or an array) seen through the prism."""
+"""Simulation of the recording of a picture sequence (a video, a folder or an array) seen through the prism."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def translation(
     seed: int = 0,
     device: str = "cpu",
 ) -> Simulation:
-    """Set up the simulation of a picture sequence. Log intensity is interpolated linearly between pictures.
+    """Return the simulation of a picture sequence. Log intensity is interpolated linearly between pictures.
 
     Each picture fills the camera's view, as a still picture does. By default, the camera has the size of the pictures
     and a field of view of 60 degrees, and the recording lasts as long as the pictures.
@@ -45,7 +45,7 @@ def translation(
     pictures = source if isinstance(source, Pictures) else open_pictures(source, fps=fps)
     duration = pictures.duration_us * 1e-6 if duration_s is None else duration_s
     if not duration > 0.0:
-        raise AmiwarpError(f"{source} does not state its duration; give duration_s")
+        raise AmiwarpError(f"{source} does not state its duration; give the duration as duration_s")
     return Simulation(
         Scene(pictures),
         camera or Camera.from_fov(*pictures.size, DEFAULT_FOV),

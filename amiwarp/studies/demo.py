@@ -1,4 +1,4 @@
-"""Demo: a picture is turned into a recording, calibrated, compensated and reconstructed.
+"""Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed.
 
 The calibration starts without a guess of the phase.
 """
@@ -40,14 +40,14 @@ if TYPE_CHECKING:
     from amiwarp.optics.exact_model import ExactModel
 
 APEX, PHASE = math.radians(1.0), math.radians(126.0)
-"""True apex angle and phase [rad]."""
+"""True apex angle and true phase of the simulated prism [rad]."""
 NOMINAL_APEX = math.radians(1.2)
 """Nominal apex angle of the recording [rad]. It differs from the truth, so that no search box is centred on the truth.
 """
 KNOWN_SENSOR = SensorTiming(SensorModel().latency_us, SensorModel().refractory_us)
 """Latency and refractory period of the sensor, as a data sheet would state them."""
 MEASURED = 1_000_000
-"""Largest number of events that blur is measured on; more are thinned evenly."""
+"""Largest number of events on which blur is measured; larger numbers are thinned evenly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Demo:
     """Settings of the demo."""
 
     out: Path
-    """Folder for the results."""
+    """Folder to which the demo's files are written."""
     picture: Path | None = None
     """Picture file that the scene shows; None for the map of the earth that comes with PyVista."""
     width: int = 640
@@ -63,11 +63,11 @@ class Demo:
     height: int = 480
     """Height of the image [px]."""
     duration_s: float = 0.5
-    """Length of the recording [s]."""
+    """Duration of the recording [s]."""
     seed: int = 0
     """Seed of the simulator and of the search."""
     device: str = "cpu"
-    """Warp device."""
+    """Device that computes, such as ``cpu`` or ``cuda:0``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +89,15 @@ class DemoResult:
     blur_before_px: float
     """Standard deviation of the events across edges before compensation [px]."""
     blur_after_px: float
-    """The same after compensation with the calibrated model [px]."""
+    """Standard deviation of the events across edges after compensation with the calibrated model [px]."""
     blur_with_truth_px: float
-    """The same after compensation with the true model [px]."""
+    """Standard deviation of the events across edges after compensation with the true model [px]."""
     picture_correlation: float
-    """Correlation of the picture from one turn with the view without the prism: log intensity, whole image."""
+    """Correlation of the picture reconstructed from one turn with the view without the prism: log intensity, whole
+    image."""
     picture_psnr_db: float
-    """Peak signal-to-noise ratio of that picture [dB]; see :func:`amiwarp.imaging.metrics.picture_quality`."""
+    """Peak signal-to-noise ratio of the picture reconstructed from one turn [dB]; see
+    :func:`amiwarp.imaging.metrics.picture_quality`."""
     simulate_s: float
     """Time to simulate and write the recording [s]."""
     calibrate_s: float
@@ -179,9 +181,9 @@ def _accuracy(
 
 
 def middle_turn(recording: Recording, found: Calibration, device: Any) -> Picture:
-    """Return the picture from the turn in the middle of the recording.
+    """Return the picture reconstructed from the turn in the middle of the recording.
 
-    By then every pixel's initial reference level no longer matters.
+    By then the pixels have forgotten their initial reference levels.
     """
     work = Reconstruction(recording, found, device=device)
     _, turn_us = work.span()
@@ -190,7 +192,7 @@ def middle_turn(recording: Recording, found: Calibration, device: Any) -> Pictur
 
 
 def sharpest(found: Calibration) -> Calibration:
-    """Return the calibration after the first stage, by sharpness alone."""
+    """Return the calibration after the first stage, which uses sharpness alone."""
     exact = found.exact
     return exact if exact.photometric is None else replace(exact, parameters=exact.photometric.sharpness_parameters)
 
@@ -230,9 +232,9 @@ def earth() -> Path:
 
 
 def blurs(recording: Recording, found: Calibration, truth: ExactModel, device: Any) -> tuple[float, float, float]:
-    """Return the standard deviation of events across edges [px].
+    """Return three standard deviations of events across edges [px].
 
-    In order: before compensation, compensated as calibrated, and compensated with the true model.
+    They are measured before compensation, after compensation as calibrated, and after compensation with the true model.
     """
     events = thin(recording, MEASURED)
     encoder = found.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
@@ -248,7 +250,7 @@ def blurs(recording: Recording, found: Calibration, truth: ExactModel, device: A
 
 
 def headline(values: dict[str, Any]) -> str:
-    """Return the title of the figure."""
+    """Return the title of the demo's figure."""
     return (
         f"{values['events'] / 1e6:.1f} million events: apex found {values['apex_deg']:.3f}°, "
         f"true {values['apex_true_deg']:.3f}°, nominal {math.degrees(NOMINAL_APEX):.3f}°; "

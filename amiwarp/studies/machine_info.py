@@ -15,20 +15,20 @@ from amiwarp.kernels.cpu_threads import cpu_threads
 
 
 def processor() -> str:
-    """Return the name of the CPU."""
+    """Return the name of this machine's CPU."""
     info = Path("/proc/cpuinfo")
     found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
     return (found.group(1) if found else platform.processor() or platform.machine()).strip()
 
 
 def machine(device: str) -> str:
-    """Return the name of the GPU, or that of the CPU with the number of cores that this process may use."""
+    """Return the name of the GPU; for ``cpu`` the name of the CPU, with the number of cores that may be used."""
     there = wp.get_device(device)
     return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Return the versions of amiwarp, of Python, and of those ``packages`` that are installed."""
+    """Return the versions of amiwarp, of Python, and of those ``packages`` that are installed, by name."""
     out = {"amiwarp": __version__, "python": platform.python_version()}
     for name in packages:
         try:

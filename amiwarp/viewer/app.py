@@ -39,7 +39,7 @@ LOCALHOST = "127.0.0.1"
 
 
 def has_display() -> bool:
-    """Return whether this machine can open a window."""
+    """Return whether this machine has a display on which a window can be opened."""
     return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 

@@ -4,7 +4,7 @@ import enum
 
 
 class Colour(enum.StrEnum):
-    """Quantity that the colour of a point shows."""
+    """Quantity that the colour of a point in the event clouds shows."""
 
     POLARITY = "polarity"
     ANGLE = "angle"
@@ -12,24 +12,25 @@ class Colour(enum.StrEnum):
     DENSITY = "density"
     """Number of events in the point's pixel; the scale ends at the 99th percentile."""
     RESIDUAL = "residual"
-    """Distance from the centre of the neighbouring events, up to 2 px; for an edge, the distance from its crest."""
+    """Distance of an event from the centre of the neighbouring events, up to 2 px; for an edge, the distance from its
+    crest."""
     CAUSE = "cause"
     """Cause of the event, from the ground truth of a simulation."""
     INSTANCE = "instance"
     """Instance of a simulated world that the event saw, from the ground truth."""
     DEPTH = "depth"
-    """Depth of what the event saw in a simulated world [m], from the ground truth; the scale is logarithmic."""
+    """Depth of the surface that the event saw in a simulated world [m], from the ground truth; logarithmic scale."""
 
 
 class Axis(enum.StrEnum):
-    """Third axis of the clouds, next to x and y."""
+    """Quantity along the third axis of the event clouds, next to x and y."""
 
     ANGLE = "angle"
     TIME = "time"
 
 
 class View(enum.StrEnum):
-    """Direction of view."""
+    """Direction from which the event clouds are viewed."""
 
     FREE = "free"
     XY = "x-y"

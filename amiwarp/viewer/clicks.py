@@ -20,12 +20,13 @@ class ClickDetector:
         self._plotter, self._on_click = plotter, on_click
         self._press: tuple[int, int] | None = None
         mouse = plotter.iren.interactor
-        style = mouse.GetInteractorStyle()  # it grabs the mouse on a press: only it receives the release
+        # the style grabs the mouse on a press, so only the style receives the release
+        style = mouse.GetInteractorStyle()
         self._observers = [(mouse, mouse.AddObserver("LeftButtonPressEvent", self._pressed)),
                            (style, style.AddObserver("EndInteractionEvent", self._released))]  # fmt: skip
 
     def close(self) -> None:
-        """Remove the observers. VTK's references to them are invisible to the garbage collector."""
+        """Remove the observers from VTK. The garbage collector cannot see VTK's references to them."""
         for observed, tag in self._observers:
             observed.RemoveObserver(tag)
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from amiwarp.viewer.inspector import DisplayedWindow
 
 AXIS_HEIGHT = 0.75
-"""Length of the drawn third axis, in widths of the region."""
+"""Length of the drawn third axis, as a multiple of the region's width."""
 ORBIT_COLOUR = "#009e73"
 MARK_COLOUR = "#f0e442"
 BACKGROUND_AND_INK = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
@@ -42,25 +42,25 @@ CAMERA_DIRECTIONS = {
 VIEW_ANGLE = 26.0
 """Vertical field of view of the camera [deg]."""
 MARGIN = 0.1
-"""Margin around the clouds for labels, in widths of the region."""
+"""Margin around the clouds for labels, as a multiple of the region's width."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Style of the clouds."""
+    """Style in which the event clouds are drawn."""
 
     colour: Colour = Colour.POLARITY
     """Quantity that the points' colour shows."""
     axis: Axis = Axis.ANGLE
-    """Third axis."""
+    """Quantity along the third axis: prism angle or time."""
     point_size: float = 2.0
-    """Diameter of the points [px]."""
+    """Diameter of the points in the picture [px]."""
     opacity: float = 1.0
     """Opacity of the points, 0 to 1."""
     dark: bool = False
     """Whether the background is dark."""
     overlaid: bool = False
-    """Whether both clouds are drawn in one frame, the recorded one in grey."""
+    """Whether both clouds are drawn in one frame, with the recorded cloud in grey."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
@@ -80,7 +80,7 @@ class Box:
 
     @property
     def width(self) -> int:
-        """Width of the region [px]."""
+        """Width of the shown region of the image [px]."""
         return self.right - self.left
 
     @property
@@ -141,7 +141,7 @@ class Scene:
         self._points: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)] * 2
 
     def show(self, shown: DisplayedWindow, look: Look) -> None:
-        """Draw a window. The camera moves only if the region has changed."""
+        """Draw the events of a window. The camera moves only if the region of the image has changed."""
         before = self.box
         depth = 360.0 if look.axis is Axis.ANGLE else shown.span.length_us * 1e-3
         self.box = Box(*shown.region, depth)
@@ -157,7 +157,7 @@ class Scene:
             self.look_from(self.view, look)
 
     def look_from(self, view: View, look: Look) -> None:
-        """Move the camera to a view that contains both clouds."""
+        """Move the camera to a view direction from which both clouds fit into the picture."""
         self.view = view = choice(View, view, "view")
         self._draw_frame(look)
         b = self.box
@@ -215,7 +215,8 @@ class Scene:
         if not len(away) or away.min() > 8.0:
             return None
         near = np.flatnonzero(away <= away.min() + 2.0)
-        return int(near[np.argmin(clip[near, 2] / clip[near, 3])])  # of nearly equal distances, the point in front
+        # of points at nearly equal distances from the mouse, the one in front
+        return int(near[np.argmin(clip[near, 2] / clip[near, 3])])
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the drawn picture, shape ``(height, width, 3)``."""
@@ -233,7 +234,7 @@ class Scene:
             self.plotter.renderers[0].camera.Azimuth(360.0 / frames)
 
     def close(self) -> None:
-        """Release the renderer and its memory."""
+        """Release the VTK renderer and its memory."""
         self.plotter.close()
 
     @property
@@ -262,7 +263,7 @@ class Scene:
         actor.prop.point_size, actor.prop.opacity = look.point_size, look.opacity
 
     def _draw_frame(self, look: Look) -> None:
-        """Draw box, ticks and titles, if they have changed."""
+        """Draw the box, the ticks and the axis titles, if they have changed."""
         wanted = (self.box, look.axis, look.dark, look.overlaid, self.view)
         if wanted == self._framed:
             return

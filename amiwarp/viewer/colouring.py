@@ -1,4 +1,4 @@
-"""Colours of the points, and the quantities that they show."""
+"""Colours of the points in the event clouds, and the quantities that the colours show."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from amiwarp.viewer.inspector import DisplayedWindow
 
 NEAR_PX = 3.0
-"""Size of the neighbourhood whose centre is compared with an event: two standard deviations [px]."""
+"""Diameter of the neighbourhood whose centre an event is compared with: two standard deviations [px]."""
 
 
 def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
-    """Return the prism angle of each point [deg], or its time since the window's start [ms], shape ``(n,)``."""
+    """Return each point's third coordinate, shape ``(n,)``: prism angle [deg], or time in the window [ms]."""
     if axis is Axis.ANGLE:
         return np.asarray(np.degrees(shown.theta), np.float64)
     return np.asarray((shown.events.t - shown.span.start_us) * 1e-3, np.float64)

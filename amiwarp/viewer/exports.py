@@ -9,7 +9,7 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError
 
 MOST_CHARACTERS = 120
-"""Largest length of a file name."""
+"""Largest length of an exported file's name [characters]."""
 WINDOWS_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that Windows reserves for devices, with any extension."""
 

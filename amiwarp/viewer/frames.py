@@ -6,7 +6,7 @@ import asyncio
 from typing import Any
 
 MOST_IN_FLIGHT = 8
-"""Largest number of unsent messages; while more are waiting, nothing is drawn."""
+"""Largest number of messages to the page that are unsent; while more are waiting, no picture is drawn."""
 WAIT_S = 0.02
 """Interval between two checks of the number of unsent messages [s]."""
 FRAME_S = 1.0 / 30.0
@@ -43,7 +43,7 @@ class PictureThrottle:
         delivery.stop_view_animation = self._stop
 
     def close(self) -> None:
-        """Stop drawing, and remove VTK's observers and records of the page."""
+        """Stop drawing pictures, and remove VTK's observers and records of the page."""
         for timer in filter(None, (self._retry, self._next)):
             timer.cancel()
         delivery, self._animated_view = self._delivery, ""

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 ALL_INTERFACES = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "2001:db8::1")}
-"""Hosts that mean every address of this machine: address family, and a remote address reserved for documentation."""
+"""Hosts that mean every address of this machine, each with its address family and a remote address reserved for
+documentation."""
 LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 """Names under which a machine reaches itself."""
 
@@ -57,7 +58,7 @@ def address(host: str, port: int, token: str) -> str:
 
 
 def warning(host: str) -> str | None:
-    """Return a warning if other machines can connect to ``host``, else None."""
+    """Return a warning for the user if other machines can connect to ``host``, else None."""
     if is_local(host):
         return None
     return (
@@ -67,7 +68,7 @@ def warning(host: str) -> str | None:
 
 
 class HostNames:
-    """Names of the server.
+    """Host names under which the server may be called.
 
     A request with any other name in its ``Host`` header may come from a foreign page whose host name resolves to this
     machine (DNS rebinding).
@@ -91,9 +92,11 @@ class HostNames:
 
 
 def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
-    """Return the error to raise if the server cannot listen on ``host`` and ``port``."""
+    """Return the error to raise if the server cannot listen at ``host`` and ``port``."""
     if isinstance(error, socket.gaierror):
-        return AmiwarpError(f"--host {host!r}: unknown name or address; give one of this machine, such as 127.0.0.1")
+        return AmiwarpError(
+            f"--host {host!r}: unknown name or address; give an address of this machine, such as 127.0.0.1"
+        )
     if error.errno == errno.EADDRINUSE:
         return AmiwarpError(f"--port {port}: is in use on {host}; give another port, or 0 for a free one")
     if error.errno == errno.EADDRNOTAVAIL:
@@ -102,4 +105,6 @@ def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
         )
     if error.errno in (errno.EACCES, errno.EPERM):
         return AmiwarpError(f"--port {port}: permission denied; give a port above 1023, or 0 for a free one")
-    return AmiwarpError(f"--host {host!r} --port {port}: cannot listen: {error.strerror or error}; give others")
+    return AmiwarpError(
+        f"--host {host!r} --port {port}: cannot listen: {error.strerror or error}; give another host or port"
+    )

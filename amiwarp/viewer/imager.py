@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 SMOOTHING_PX = 1.0
-"""Smoothing of the image before its sharpness is measured, as in calibration [px]."""
+"""Standard deviation of the Gaussian that smooths the image before its sharpness is measured, as in calibration [px].
+"""
 
 
 class WindowImager:
@@ -51,24 +52,24 @@ class LoadedWindow:
     """Selected events of a window, in memory and on the device, and their image without compensation."""
 
     span: Span
-    """Window, with all events that were read."""
+    """Time window, with all events that were read from it."""
     drawn: Events
     """Selected events that are drawn as points."""
     truth: DrawnTruth
     """Ground truth of the drawn events."""
     xy: NDArray[np.float32]
-    """Pixels of the drawn events, shape ``(n, 2)``."""
+    """Pixels of the drawn events [px], shape ``(n, 2)``."""
     theta: NDArray[np.float64]
-    """Prism angles of the drawn events without the clock offset set on the page [rad], shape ``(n,)``."""
+    """Prism angles of the drawn events [rad], shape ``(n,)``, without the clock offset that is set on the page."""
     speed: NDArray[np.float64]
     """Speed of the prism at the drawn events [rad/us], shape ``(n,)``."""
     on_device: DeviceEvents
-    """All selected events."""
+    """All selected events, on the device."""
     curve_events: Events
-    """Selected events that the sharpness curve uses."""
+    """Selected events from which the sharpness curve is computed."""
     curve_events_on_device: DeviceEvents
-    """The same events on the device."""
+    """Events of the sharpness curve, on the device."""
     image: NDArray[np.float32]
     """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
     sharpness: float
-    """Sharpness of this image."""
+    """Sharpness of the image of the events as recorded."""

@@ -1,4 +1,4 @@
-"""State of the inspector without any user interface: recording, prism parameters, window and its images."""
+"""State of the inspector without any user interface: recording, prism parameters, time window and its images."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 MOST_EVENTS = 4_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 MOST_POINTS = 100_000
-"""Largest number of points of each cloud."""
+"""Largest number of points in each event cloud."""
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
 CURVE_POINTS, CURVE_EVENTS = 25, 200_000
 """Number of points of a sharpness curve, and largest number of events that it uses."""
 ORBIT_POINTS = 181
-"""Number of points of the drawn orbit."""
+"""Number of points of the drawn orbit of a scene point."""
 WINDOW_US = 100_000
-"""Length of the first window if the prism does not rotate [us]."""
+"""Length of the first time window if the prism does not rotate [us]."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Knobs:
     model: str = "exact"
     """Name of the optical model."""
     apex: float = 0.0
-    """Apex angle [rad]."""
+    """Apex angle of the prism [rad]."""
     phase: float = 0.0
     """Phase θ_b of the prism [rad]."""
     clock_offset: float = 0.0
@@ -68,7 +68,7 @@ CURVE_HALF_WIDTH = {
     "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "tilt_x": math.radians(5.0),
     "tilt_y": math.radians(5.0), "rpm": 6.0,
 }  # fmt: skip
-"""Half width of the sharpness curve over each parameter, in the parameter's unit."""
+"""Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
 
 
 @dataclass(frozen=True)
@@ -76,41 +76,41 @@ class Selection:
     """Conditions for the events that are shown."""
 
     polarity: int | None = None
-    """1: only ON events; 0: only OFF events; None: both."""
+    """Polarity of the shown events: 1 for only ON, 0 for only OFF, None for both."""
     region: tuple[int, int, int, int] | None = None
-    """Left, top, right and bottom [px]; right and bottom are exclusive. None: the whole image."""
+    """Region of the image: left, top, right and bottom [px], right and bottom exclusive. None: the whole image."""
     hide_hot: bool = False
     """Whether the events of hot pixels are left out."""
 
 
 @dataclass(frozen=True, eq=False)
 class DisplayedWindow:
-    """Window with the current parameters: images of all events, and points of evenly spaced ones."""
+    """Time window shown with the current parameters: images of all events, and points of evenly spaced events."""
 
     span: Span
-    """Window, with all events that were read."""
+    """Time window, with all events that were read from it."""
     region: tuple[int, int, int, int]
     """Part of the image that is shown: left, top, right and bottom [px]; right and bottom are exclusive."""
     selected: int
-    """Number of events in the images."""
+    """Number of selected events, which are all in the images."""
     events: Events
     """Events that are drawn as points."""
     truth: DrawnTruth
     """Ground truth of these events."""
     before: NDArray[np.float32]
-    """Pixels of these events as recorded, shape ``(n, 2)``."""
+    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
     after: NDArray[np.float32]
-    """Compensated positions of these events [px], shape ``(n, 2)``; NaN if the model has no solution."""
+    """Compensated positions of the drawn events [px], shape ``(n, 2)``; NaN if the model has no solution."""
     theta: NDArray[np.float64]
-    """Prism angles of these events [rad], from 0 to 2π, shape ``(n,)``."""
+    """Prism angles of the drawn events [rad], from 0 to 2π, shape ``(n,)``."""
     image_before: NDArray[np.float32]
     """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
     image_after: NDArray[np.float32]
     """Image of the compensated events [events per pixel], shape ``(height, width)``."""
     sharpness_before: float
-    """Sharpness of ``image_before``."""
+    """Sharpness of ``image_before``, the image before compensation."""
     sharpness_after: float
-    """Sharpness of ``image_after``."""
+    """Sharpness of ``image_after``, the image after compensation."""
 
 
 class Inspector:
@@ -127,9 +127,10 @@ class Inspector:
         device: Any = "cpu",
         latest: Callable[[], Recording] | None = None,
     ) -> None:
-        """``latest`` returns the current events of a live stream; see :meth:`renew`.
+        """Start with a recording; a calibration sets the prism's parameters.
 
-        Raises :class:`AmiwarpError` if there are no events, or if the calibration belongs to another camera.
+        ``latest`` is a function that returns the current events of a live stream; see :meth:`renew`. Raises
+        :class:`AmiwarpError` if there are no events, or if the calibration belongs to another camera.
         """
         source = recording.events
         if not len(source):
@@ -145,12 +146,12 @@ class Inspector:
             )
         self.recording, self.device, self.latest = recording, device, latest
         self.prism = nominal(recording.prism)
-        """Nominal prism."""
+        """Nominal prism of the recording, with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
         self.knobs = Knobs(apex=self.prism.apex, clock_offset=self._recorded_offset_us)
         self.window: tuple[int, int] | None = None
-        """Start and length of the window [us]; None: :meth:`first_window`."""
+        """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.selection = Selection()
         self._found: tuple[Knobs, Calibration] | None = None
         self._window: LoadedWindow | None = None
@@ -160,7 +161,7 @@ class Inspector:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the calibration or of the recording; if both lack it, the assumed one."""
+        """Camera of the calibration or of the recording; an assumed camera if both lack it."""
         assert self.recording.camera is not None
         return self.recording.camera
 
@@ -177,7 +178,10 @@ class Inspector:
 
     @property
     def encoder(self) -> Encoder:
-        """Encoder of the recording, or the constant speed that is set. It excludes the clock offset set on the page."""
+        """Encoder of the recording, or one of the constant speed set on the page.
+
+        The clock offset set on the page is not included.
+        """
         source = self.recording.events
         return self.recording.encoder or constant_speed(self.knobs.rpm, source.t_first, source.t_last, self.zero_us)
 
@@ -189,7 +193,7 @@ class Inspector:
 
     @property
     def model(self) -> Model:
-        """Optical model with the current parameters."""
+        """Optical model with the parameters that are set on the page."""
         return self._model(self.knobs)
 
     @cached_property
@@ -214,7 +218,10 @@ class Inspector:
         return source.t_first + (whole - length) // 2, length
 
     def renew(self) -> None:
-        """Take the current events of a live stream; open a window afterwards. Raises the errors of ``latest``."""
+        """Take the current events of a live stream; call :meth:`open` afterwards.
+
+        Raises the errors of the function ``latest``.
+        """
         if self.latest is not None:
             recording = self.latest()
             self.recording = replace(self.recording, events=recording.events, encoder=recording.encoder)
@@ -256,26 +263,29 @@ class Inspector:
         )  # fmt: skip
 
     def set(self, knobs: Knobs) -> None:
-        """Set the parameters."""
+        """Set the parameters of the prism."""
         speed_changed = not self.has_encoder and knobs.rpm != self.knobs.rpm
         self.knobs = knobs
         if speed_changed and self._window is not None:
             self._window = self._prepare(self._window.span)
 
     def open(self, start_us: int, length_us: int, selection: Selection | None = None) -> None:
-        """Read a window. Raises :class:`AmiwarpError` if it holds no events of the ``selection``."""
+        """Read a time window of events.
+
+        Raises :class:`AmiwarpError` if it has no events that meet the ``selection``.
+        """
         before, self.selection = self.selection, selection or self.selection
         try:
             self._window = self._prepare(
                 read_span(self.recording.events, start_us, max(1, length_us), most_events=MOST_EVENTS)
             )
         except BaseException:
-            self.selection = before  # the previous window is still shown
+            self.selection = before  # the page still shows the previous window
             raise
         self.window = start_us, length_us
 
     def show(self) -> DisplayedWindow:
-        """Return the window with the current parameters."""
+        """Return the time window's images and points with the current parameters."""
         w = self._loaded
         offset_us = self.knobs.clock_offset - self._recorded_offset_us
         image, sharpness = self._imager.measure(self.model, w.on_device, offset_us)
@@ -324,12 +334,15 @@ class Inspector:
 
     @property
     def _calibrated_only(self) -> dict[str, float]:
-        """Calibrated parameters that the page cannot change."""
+        """Return the calibrated parameters that the page cannot change."""
         found: Mapping[str, float] = {} if self._found is None else self._found[1].parameters
         return {n: x for n, x in found.items() if n in ("index", "focal_length")}
 
     def _values(self, knobs: Knobs) -> dict[str, float]:
-        """Return the parameters of every optical model. A prism that does not rotate gets apex 0: no compensation."""
+        """Return the parameters of every optical model.
+
+        A prism that does not rotate gets apex 0, so that nothing is compensated.
+        """
         apex = knobs.apex if self.has_encoder or knobs.rpm else 0.0
         prism = replace(self.prism, apex=apex, index=self._calibrated_only.get("index", self.prism.index))
         return {**self._calibrated_only, "apex": apex, "deflection": prism.deflection, "phase": knobs.phase,

@@ -1,4 +1,4 @@
-"""Long-running jobs of a page: calibration, playback of the recording, and films."""
+"""Long-running jobs of a page: calibration, playback of the recording, and writing of films."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FRAMES, FPS = 90, 25.0
 """Number of pictures of a film, and pictures per second."""
 PLAY_S, FOLLOW_S = 0.05, 0.25
-"""Shortest interval between two pictures of a recording that is played, and of a live stream [s]."""
+"""Shortest interval between two pictures while a recording is played, and while a live stream is followed [s]."""
 PROGRESS_S = 0.1
 """Shortest interval between two progress messages of a calibration [s].
 
@@ -41,7 +41,7 @@ class CalibrationJob:
     def __init__(self, panel: Panel) -> None:
         self._panel, self.cancelled = panel, False
         self.found: Calibration | None = None
-        """Result that waits to be accepted."""
+        """Result of the calibration that the user has not accepted yet; None if there is none."""
 
     def toggle(self) -> None:
         """Start a calibration, or cancel the running one."""
@@ -127,7 +127,7 @@ def _calibrate(*args: Any, **options: Any) -> Calibration | str:
 
 
 def summary(c: Calibration) -> str:
-    """Return a description of a calibration in one line."""
+    """Return a one-line description of a calibration."""
     p, exact = c.parameters, c.exact.parameters
     warnings = "".join(f"; {text}" for text in c.warnings)
     apex, phase = (math.degrees(x) for x in (exact.get("apex", 0.0), p["phase"]))
@@ -138,7 +138,7 @@ def summary(c: Calibration) -> str:
 
 
 class Playback:
-    """Playback: moves the panel's window through the recording, on the page or for a film."""
+    """Playback of the recording: moves the time window through it, on the page or for a film."""
 
     def __init__(self, panel: Panel) -> None:
         self._panel, self._ended = panel, False
@@ -146,7 +146,7 @@ class Playback:
         """Whether the playback task is running; after a stop it runs until it notices the stop."""
 
     def end(self) -> None:
-        """Stop for good; a film that is being written is stopped too."""
+        """Stop the playback for good, and also a film that is being written."""
         self._ended = True
 
     def toggle(self) -> None:

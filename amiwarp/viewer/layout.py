@@ -1,4 +1,4 @@
-"""Widgets of the page and their arrangement."""
+"""Widgets of the inspector's page and their arrangement."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNITS = {
 }  # fmt: skip
 """Conversion from the page's units (angles in degrees) to the parameters' units (radians): factor per parameter."""
 NAMES = tuple(UNITS)
-"""Names of the prism parameters with a slider."""
+"""Names of the prism parameters that have a slider."""
 SLIDERS = (
     ("apex", "apex", "°", ("0", "apex_most", 0.005), None),
     ("phase", "phase θ_b", "°", ("-180", "180", 0.25), None),
@@ -26,7 +26,7 @@ SLIDERS = (
     ("tilt_x", "tilt x", "°", ("-5", "5", 0.05), "model == 'exact' || model == 'ellipse'"),
     ("tilt_y", "tilt y", "°", ("-5", "5", 0.05), "model == 'exact' || model == 'ellipse'"),
 )
-"""Name, label, unit, (minimum, maximum, step) and condition for showing it, of each slider."""
+"""Sliders of the page: name, label, unit, (minimum, maximum, step), and the condition for showing the slider."""
 SPEEDS = (0.01, 0.1, 0.5, 1)
 """Choices of the playback speed, relative to real time."""
 KEYS = (
@@ -46,7 +46,7 @@ KEYS = (
     ("p", ("save_picture",), "save a picture of the clouds"),
     ("?", ("toggle", "help_shown"), "show or hide this help"),
 )
-"""Key, method of the panel with its arguments, and help text."""
+"""Keys of the page: name of the key, method of the panel with its arguments, and help text."""
 STYLE = """
 html { overflow: hidden !important; }
 .panel { display: grid; grid-template: 40px minmax(0, 1fr) 214px / minmax(0, 1fr) 318px; height: 100vh; outline: none; }

@@ -11,20 +11,22 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 
 MOST_BYTES = 64 * 1024
-"""Largest size of a message. The page's own messages have a few hundred bytes, and it never splits them into parts."""
+"""Largest accepted size of a message from a page [bytes]. The page's own messages have a few hundred bytes, and it
+never splits them into parts."""
 HEADER_BYTES = 12
-"""Header of each part: message number, start of the part and length of the message, 32 bits each."""
+"""Size of the header of each message part [bytes]: message number, start of the part and length of the message, 32 bits
+each."""
 MOST_PX, MOST_SIDE = 16_000_000, 8192
-"""Largest number of pixels and largest side [px] of the picture of the clouds."""
+"""Largest accepted number of pixels and largest side [px] of the picture of the event clouds."""
 LARGEST = 1e12
-"""Largest accepted number; in ms it is 30 years."""
+"""Largest accepted number in a message; in ms it is 30 years."""
 
 Check = Callable[[Any], bool]
 """Function that returns whether a value is allowed."""
 
 
 def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
-    """Return a check for numbers from ``low`` to ``high``; it rejects NaN and booleans."""
+    """Return a check that accepts numbers from ``low`` to ``high``; it rejects NaN and booleans."""
 
     def check(value: Any) -> bool:
         return type(value) in (int, float) and low <= value <= high  # comparisons with NaN are false
@@ -33,17 +35,17 @@ def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
 
 
 def text(most: int) -> Check:
-    """Return a check for strings of at most ``most`` characters."""
+    """Return a check that accepts strings of at most ``most`` characters."""
     return lambda value: isinstance(value, str) and len(value) <= most
 
 
 def one_of(*known: Any) -> Check:
-    """Return a check for the ``known`` values, types included."""
+    """Return a check that accepts the ``known`` values, types included."""
     return lambda value: any(type(value) is type(each) and value == each for each in known)
 
 
 def list_of(*checks: Check) -> Check:
-    """Return a check for lists with one item for each of ``checks``."""
+    """Return a check that accepts lists with one item for each of ``checks``."""
     return lambda value: (
         isinstance(value, list)
         and len(value) == len(checks)
@@ -52,7 +54,7 @@ def list_of(*checks: Check) -> Check:
 
 
 def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
-    """Return a check for dictionaries with all ``required`` keys and no keys besides these and ``optional``."""
+    """Return a check that accepts dictionaries with all ``required`` keys, and no others except ``optional`` ones."""
     known = {**required, **(optional or {})}
 
     def check(value: Any) -> bool:
@@ -79,10 +81,13 @@ _wheel = one_of(*(f"{when}{what}" for when in ("Start", "", "End") for what in (
 
 
 class MessageFilter:
-    """Filter for the messages of one page."""
+    """Filter for the messages that one page sends."""
 
     def __init__(self, server: Any, settable: Mapping[str, Check]) -> None:
-        """``settable`` maps each state variable that the page may set to the check of its values."""
+        """Allow the messages of a page on ``server``.
+
+        ``settable`` maps each state variable that the page may set to the check of its values.
+        """
         self._server, self._warned = server, False
         view = self._is_view
         change = self._change(settable)
@@ -147,7 +152,7 @@ def _unpacked(message: bytes) -> Any:
     """Decode a message in one part. Raises :class:`ValueError` for a message in several parts."""
     start, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
     if (start, length) != (0, len(message) - HEADER_BYTES):
-        raise ValueError("only a part of a message: expected the complete message")
+        raise ValueError("received a part of a message; expected the complete message")
     return msgpack.unpackb(message[HEADER_BYTES:])
 
 
@@ -157,7 +162,7 @@ def _is_size(view: Check) -> Check:
 
 
 def finite(given: str) -> float:
-    """Return the typed number, clipped to ±:data:`LARGEST`. Raises :class:`ValueError` for other text."""
+    """Return the typed text as a number, clipped to ±:data:`LARGEST`. Raises :class:`ValueError` for other text."""
 
     value = float(given or 0.0)
     if math.isnan(value):

@@ -30,7 +30,8 @@ SETTABLE: dict[str, Check] = {
     "view": one_of(*(each.value for each in View)), "out": text(200), "playing": one_of(False), "picked": one_of(""),
     "message": one_of(""), **dict.fromkeys(("hide_hot", "dark", "overlaid", "orbit_shown", "help_shown"), flag),
 }  # fmt: skip
-"""State variables that the page may set, with the check of their values. It changes all others through calls."""
+"""State variables that the page may set directly, with the check of their values. The page changes all others through
+calls."""
 
 
 def initial_state(inspector: Inspector) -> dict[str, Any]:
@@ -94,6 +95,6 @@ def polyline(x: NDArray[Any], y: NDArray[Any]) -> str:
 
 
 def percent_of_range(value: float, low: float, high: float) -> float:
-    """Return the position of a value between ``low`` and ``high``, from 0 to 100."""
+    """Return the position of ``value`` between ``low`` and ``high`` [%], from 0 to 100."""
 
     return min(max(100.0 * (value - low) / max(high - low, 1e-12), 0.0), 100.0)

@@ -1,7 +1,7 @@
-"""The inspector's page: passes input from the widgets to the inspector, and its results back to the page.
+"""Page of the inspector: passes input from the widgets to the inspector, and the inspector's results to the page.
 
-Each tab has one panel with its own inspector, scene and state. Slow work runs in threads. If a slider moves several
-times meanwhile, only its last position is used.
+Each browser tab has one panel with its own inspector, scene and state. Slow work runs in threads. If a slider moves
+several times meanwhile, only its last position is used.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _CUDA_LOCK = asyncio.Lock()
 
 
 class Panel:
-    """Page of one tab. Call :meth:`close` when the tab is closed."""
+    """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed."""
 
     def __init__(self, server: Any, inspector: Inspector, folder: Path) -> None:
         """Build the page on a new trame server; exports are written to ``folder``."""
@@ -77,7 +77,7 @@ class Panel:
             self.playback.toggle()
 
     def close(self) -> None:
-        """Stop all work of the tab. A thread ends when its current work is done."""
+        """Stop all work of the browser tab. A thread ends when its current work is done."""
         self.calibration_job.cancel()
         self.playback.end()
         for task in [*self._tasks, *filter(None, [self._quick, self._slow])]:
@@ -93,7 +93,7 @@ class Panel:
         self.request_slow("curve", "picture")
 
     def typed(self, name: str, text: str) -> None:
-        """Set the value of a number field."""
+        """Set the value that a user typed into a number field."""
         if name not in (*NAMES, "start_ms", "length_ms", "turns"):
             return
         try:
@@ -112,18 +112,18 @@ class Panel:
         self.slider_released()
 
     def select_curve(self, name: str) -> None:
-        """Draw the sharpness curve over this parameter from now on."""
+        """Select the parameter over which the sharpness curve is drawn."""
         if name in NAMES:
             self.state.knob = name
 
     def key(self, key: str) -> None:
-        """Run the action of a key that was pressed outside of a field."""
+        """Run the action of a key that was pressed outside of a text field."""
         for known, (name, *given), _ in KEYS:
             if key == known:
                 getattr(self, name)(*given)
 
     def toggle(self, name: str) -> None:
-        """Invert a boolean state variable."""
+        """Invert a state variable that is true or false."""
         self.state[name] = not self.state[name]
 
     def toggle_axis(self) -> None:
@@ -137,7 +137,10 @@ class Panel:
         self.request("view")
 
     def step(self, turns: float) -> None:
-        """Move the window by one turn, forward (1) or back (-1); by its own length if the prism does not rotate."""
+        """Move the time window by one turn, forward (1) or back (-1).
+
+        If the prism does not rotate, the window moves by its own length.
+        """
         if turns not in (-1, 1):
             return
         turn = self.inspector.turn_us * 1e-3
@@ -152,7 +155,7 @@ class Panel:
         self.calibration_job.toggle()
 
     def accept(self) -> None:
-        """Set the parameters to the result of the calibration."""
+        """Set the prism's parameters to the result of the calibration."""
         if self.calibration_job.found is not None:
             with self.errors_shown("knobs"):
                 self.inspector.accept(self.calibration_job.found)
@@ -172,7 +175,7 @@ class Panel:
             self.show_message(f"{path}: written", "success")
 
     def save_picture(self) -> None:
-        """Write a picture of the clouds."""
+        """Write a picture of the event clouds."""
         with self.errors_shown("export"):
             path = self.path("", ".png")
             self.scene.save(path)
@@ -181,13 +184,13 @@ class Panel:
     # called by jobs
 
     def request(self, *what: str) -> None:
-        """Request updates that are quick: "window", "knobs", "look" or "view"."""
+        """Request quick updates of the page: "window", "knobs", "look" or "view"."""
         self._quick_requests.update(what)
         if self._quick is None:
             self._quick = self._task(self._work())
 
     def request_slow(self, *what: str) -> None:
-        """Request updates that run in a thread once no quick update is pending: "curve" or "picture"."""
+        """Request updates that run in a thread after all quick updates: "curve" or "picture"."""
         self._slow_requests.update(what)
         if self._slow is None:
             self._slow = self._task(self._work_slowly())
@@ -198,12 +201,12 @@ class Panel:
             await asyncio.sleep(0.005)
 
     def start_job(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run a job until it ends or the tab is closed."""
+        """Run a job until it ends or the browser tab is closed."""
         self._tasks.add(task := self._task(work))
         task.add_done_callback(self._tasks.discard)
 
     async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        """Call ``work`` in one of this tab's threads, and return its result."""
+        """Call ``work`` in one of the browser tab's threads, and return its result."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
 
     def show_message(self, text: str, severity: str) -> None:
@@ -223,7 +226,7 @@ class Panel:
                 self.state.update({"message": "", "severity": "info"})
 
     def move(self, start_ms: float) -> bool:
-        """Set the window's start, limited to the recording. Return whether the window is at the end."""
+        """Move the time window to a start [ms], limited to the recording. Return whether the window is at the end."""
         last = max(0.0, float(self.state.whole_ms) - float(self.state.length_ms))
         self.state.start_ms = round(min(max(start_ms, 0.0), last), 3)
         return start_ms >= last
@@ -304,7 +307,7 @@ class Panel:
         try:
             while self._slow_requests:
                 await self.wait_until_drawn()
-                name = min(self._slow_requests)  # the curve first
+                name = min(self._slow_requests)  # the curve comes before the picture
                 self._slow_requests.discard(name)
                 async with self.device_lock:
                     with self.errors_shown(name):
@@ -314,7 +317,7 @@ class Panel:
             self._slow = None
 
     def _knobs(self) -> dict[str, float]:
-        """Return the parameters in the page's units, rounded as the page shows them."""
+        """Return the prism's parameters in the page's units, rounded as the page shows them."""
         return {name: round(getattr(self.inspector.knobs, name) / scale, 4) for name, scale in UNITS.items()}
 
     def _show_knobs(self) -> None:

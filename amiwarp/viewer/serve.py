@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from aiohttp.typedefs import Handler
 
 Closing = Callable[[], object] | None
-"""Function to call when a tab is closed, if any."""
+"""Function that is called when a browser tab is closed, or None."""
 Session = Callable[[Any], Closing]
 """Function that builds a page on a new ``trame_server.Server`` (vue3), in the event loop."""
 MOST_TABS = 16
-"""Largest number of open tabs. Each tab holds a scene, a window of the recording and threads."""
+"""Largest number of open browser tabs. Each tab holds a scene, a window of the recording and threads."""
 TOO_MANY_TABS = f"{MOST_TABS} tabs of this inspector are open, which is the maximum; close one, then reload this page"
 HEARTBEAT_S = 30.0
 """Interval between pings of a page [s]. A page that does not answer within half of it is closed."""
@@ -40,7 +40,7 @@ CLEANUP_S = 0.5
 LONGEST_CLEANUP_S = 30.0
 """Longest interval between two attempts to release closed tabs whose threads still run [s]."""
 HEADERS = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
-"""Headers of every answer. The first one keeps the page's address, which contains the token, from other sites."""
+"""Headers of every HTTP answer. The first one keeps the page's address, which contains the token, from other sites."""
 
 
 async def serve(
@@ -113,7 +113,7 @@ class Tabs:
         return socket
 
     async def close(self, _: web.Application) -> None:
-        """Close all tabs."""
+        """Close all browser tabs."""
         from aiohttp import WSCloseCode
 
         if self._cleanup is not None:
@@ -169,7 +169,7 @@ def _application(tabs: Tabs, token: str, names: HostNames) -> web.Application:
 
 
 def _guard(token: str, names: HostNames) -> Any:
-    """Return middleware that requires the token in the URL or in this server's cookie.
+    """Return HTTP middleware that requires the token in the URL or in this server's cookie.
 
     A request with the token in its URL sets the cookie.
     """
@@ -263,7 +263,7 @@ def _log_report(message: str) -> None:
 
 
 def _build(build: Session) -> tuple[Any, Closing]:
-    """Return a server with its page; if building the page fails, the page shows the reason."""
+    """Return a new server with its page; if building the page fails, the page shows the reason."""
     from trame.ui.vuetify3 import VAppLayout
     from trame.widgets import vuetify3
 

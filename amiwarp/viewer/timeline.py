@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 RUNS = 64
 """Number of evenly spaced runs of events that are read from a window with too many events."""
 RATE_POINTS = 128
-"""Largest number of points of the event rate."""
+"""Largest number of points at which the event rate is measured."""
 RATE_SECONDS = 0.5
 """Approximate time to measure the event rate [s]. If reading is slow, the rate has fewer points."""
 
@@ -31,11 +31,11 @@ class Span:
     """Events of a time window."""
 
     start_us: int
-    """Start of the window on the events' clock [us]."""
+    """Start of the time window on the events' clock [us]."""
     length_us: int
-    """Length of the window [us]."""
+    """Length of the time window [us]."""
     count: int
-    """Number of events in the window, including those that are not read."""
+    """Number of events in the time window, including those that are not read."""
     events: Events
     """All events of the window, or evenly spaced runs of them."""
     runs: tuple[slice, ...]
@@ -61,7 +61,7 @@ def read_span(source: EventSource, start_us: int, length_us: int, *, most_events
 
 
 def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:
-    """Yield runs of events. A file that can only be read from its beginning is read in one pass."""
+    """Yield runs of ``length`` events. A file that can only be read from its start is read in one pass."""
     if not isinstance(source, FileEvents):
         yield from (source.slice(k, k + length) for k in starts)
         return
@@ -77,7 +77,7 @@ def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Event
 def event_rate(source: EventSource) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the event rate over the recording.
 
-    Returns evenly spaced times [us], shape ``(n + 1,)``, and the rate in each interval between them [1/s], shape
+    The result is evenly spaced times [us], shape ``(n + 1,)``, and the rate in each interval between them [1/s], shape
     ``(n,)``.
     """
     start_s, n, (first, last) = time.perf_counter(), 1, (source.t_first, source.t_last + 1)

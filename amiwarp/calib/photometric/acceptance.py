@@ -1,24 +1,28 @@
 """Acceptance of the photometric stage's optimum.
 
-Each limit was set by failures that it prevents, see ``docs/explanation/stability.md``.
+Each limit was set by failures that it prevents; ``docs/explanation/stability.md`` describes them.
 """
 
 LARGEST_MOVE_PX = 1.5
-"""Largest distance from the sharpness optimum in any parameter of the prism [px]."""
+"""Largest accepted distance between the optima of the photometric and the sharpness stage, in the prism's parameters
+[px]."""
 PERTURBATION_PX, LEAST_COST_RISE = 0.3, 0.01
-"""Reject the result if changing the orbit by ``PERTURBATION_PX`` raises the cost by less than ``LEAST_COST_RISE``.
+"""Reject the photometric optimum if changing the prism's orbit by ``PERTURBATION_PX`` [px] raises the cost by less than
+``LEAST_COST_RISE``.
 
-Without such a rise there is no optimum, or a map of few events fits any orbit. The cost is relative to that without a
-map.
+Without such a rise there is no distinct optimum, or a brightness map of few events fits any orbit. The cost is relative
+to that without a brightness map.
 """
 LARGEST_NEXT_STEP_PX = 0.06
-"""Largest Gauss-Newton step that may remain at the end [px]. It is about 0.01 if the search converged."""
+"""Largest Gauss-Newton step that may remain when the search ends [px]. The step is about 0.01 px if the search
+converged."""
 LARGEST_COST = 0.75
-"""Largest cost relative to that without a map. Above it the equations explain nothing."""
+"""Largest accepted cost, relative to the cost without a brightness map. Above it the map explains too little of the
+events."""
 
 
 def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -> tuple[bool, str]:
-    """Return whether to accept an optimum, and the reason.
+    """Return whether to accept an optimum of the photometric stage, and the reason.
 
     Parameters
     ----------

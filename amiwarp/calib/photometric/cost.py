@@ -1,4 +1,4 @@
-"""Cost of the photometric stage: the robust residual that remains with the best brightness map."""
+"""Cost of the photometric stage: the robust residual of the equations after the best brightness map was fitted."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ if TYPE_CHECKING:
     from amiwarp.calib.parameters import ParameterSpace
 
 FIRST_SCALE = 1.0
-"""Scale of Cauchy's weights until the first map is solved [thresholds]."""
+"""Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
 SLOPE_PX = 0.02
-"""Step of the finite differences that give the residuals' slopes [px]."""
+"""Step of the finite differences that give the derivatives of the residuals [px]."""
 
 
 class Cost:
-    """Robust residual as a function of the search vector. Each call starts from the last brightness map."""
+    """Robust residual of the brightness equations as a function of the search vector.
+
+    Each evaluation starts from the previous brightness map.
+    """
 
     def __init__(self, space: ParameterSpace, brightness: BrightnessMap, steps: int) -> None:
         self.space, self.brightness, self.steps = space, brightness, steps
@@ -30,16 +33,16 @@ class Cost:
         self.evaluations = 0
         self._solved: NDArray[np.float64] | None = None
         self._changes: list[Any] = []
-        """Derivatives of the map by each parameter [1/px], kept as the start of the next solution."""
+        """Derivatives of the brightness map by each parameter [1/px], from which the next solution starts."""
 
     def warm_up(self, v: NDArray[np.float64]) -> None:
-        """Solve the first map at ``v``, and set the scale of the weights from its residuals."""
+        """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals."""
         self.residuals(v, rounds=3, steps=2 * self.steps)
         self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
 
     def renew(self, v: NDArray[np.float64]) -> None:
-        """Discard the map, which is biased to where it was fitted, and solve a new one at ``v``."""
+        """Discard the brightness map and solve a new one at ``v``: a map is biased to the parameters of its fit."""
         unknowns = self.brightness.unknowns
         unknowns[: self.brightness.tiles.nodes] = 0.0
         self.brightness.unknowns = unknowns
@@ -47,7 +50,7 @@ class Cost:
         self.brightness.solve(FIRST_SCALE, steps=2 * self.steps, rounds=3)
 
     def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
-        """Return the arguments of :meth:`BrightnessMap.place`."""
+        """Return the keyword arguments of :meth:`BrightnessMap.place` for the search vector ``v``."""
         values = self.space.to_values(v)
         space = self.space
         return {
@@ -57,27 +60,30 @@ class Cost:
         }
 
     def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> None:
-        """Solve the map at ``v``. The residuals stay on the device."""
+        """Solve the brightness map at the search vector ``v``. The residuals stay on the device."""
         self.brightness.place(**self.at(v))
         self.brightness.solve(self.scale, steps=steps or self.steps, rounds=rounds)
         self._solved = v
 
     def mean(self) -> float:
-        """Return the pairs' mean Cauchy cost, relative to that without a map. A pair off the map counts as without."""
+        """Return the mean Cauchy cost, relative to that without a map.
+
+        Pairs of events off the map keep their cost without a map.
+        """
         return self.brightness.residuals.mean_cost(self.scale, missing=1.0) / math.log1p(1.0 / self.scale**2)
 
     def __call__(self, v: NDArray[np.float64], *, steps: int | None = None) -> float:
-        """Return the negative cost at ``v``, a score to be maximised."""
+        """Return the negative cost at the search vector ``v``, a score to be maximised."""
         self.evaluations += 1
         self.residuals(v, steps=steps)
         return -self.mean()
 
     def settled(self, v: NDArray[np.float64]) -> float:
-        """Return the score with a better converged map: after a long step the last map would make it look worse."""
+        """Return the score at ``v`` with more solver steps: after a long step in ``v`` the map converges slowly."""
         return self(v, steps=3 * self.steps // 2)
 
     def slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Slopes:
-        """Return the slopes of the residuals at ``v``, minus their part that a change of the map can explain."""
+        """Return the residuals' derivatives at ``v``, minus the part that a change of the map can explain."""
         b, n = self.brightness, len(v)
         if self._solved is None or not np.array_equal(self._solved, v):
             self.residuals(v)

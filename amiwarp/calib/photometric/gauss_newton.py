@@ -1,4 +1,4 @@
-"""Gauss-Newton method for a least-squares problem with the map projected out, and the parameters' uncertainty."""
+"""Gauss-Newton search for parameters with the brightness map eliminated (variable projection), with uncertainty."""
 
 from __future__ import annotations
 
@@ -21,39 +21,44 @@ if TYPE_CHECKING:
     Vector = NDArray[np.float64]
 
 GAUSS_NEWTON = "gauss-newton"
-"""Name of the method in the settings."""
+"""Name of the Gauss-Newton method in the settings."""
 MOST_STEPS = 15
-"""Largest number of steps."""
+"""Largest number of Gauss-Newton steps."""
 LONGEST_STEP_PX = 1.0
-"""Largest change of any parameter in a step [px]."""
+"""Largest change of any parameter in one Gauss-Newton step [px]."""
 HALVINGS = 4
-"""Number of step lengths that are tried, each half of the previous one."""
+"""Number of step lengths that are tried along a Gauss-Newton direction, each half of the previous one."""
 UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
-"""A parameter is undetermined above this standard deviation [px], or below this share of the largest curvature."""
+"""A parameter is undetermined if its standard deviation exceeds the first value [px], or if its curvature is below the
+second, a share of the largest curvature."""
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives of a weighted least-squares problem with the map projected out (Kaufman 1975), summed over pairs."""
+    """Derivatives of the weighted least-squares problem with the brightness map eliminated (Kaufman 1975).
+
+    They are sums over the pairs of events.
+    """
 
     hessian: Vector
     """Gauss-Newton Hessian [thresholds²/px²], shape ``(parameters, parameters)``."""
     gradient: Vector
-    """Half the cost's gradient [thresholds²/px], shape ``(parameters,)``. The map is optimal, so it adds nothing."""
+    """Half the cost's gradient [thresholds²/px], shape ``(parameters,)``. The brightness map is optimal, so its change
+    adds nothing to the gradient."""
     parts: Vector
-    """Contribution of each cluster of pairs to the gradient, shape ``(parameters, clusters)``."""
+    """Contribution of each cluster of pairs of events to the gradient, shape ``(parameters, clusters)``."""
 
     def restricted_to(self, which: list[int]) -> Slopes:
-        """Return the slopes for some of the parameters."""
+        """Return the derivatives by some of the parameters only."""
         return Slopes(self.hessian[np.ix_(which, which)], self.gradient[which], self.parts[which])
 
     def step(self) -> Vector:
-        """Return the Gauss-Newton step [px]."""
+        """Return the change of the parameters by a Gauss-Newton step [px]."""
         ridge = 1e-6 * float(np.trace(self.hessian)) * np.eye(len(self.hessian))
         return np.asarray(-np.linalg.solve(self.hessian + ridge, self.gradient))
 
     def covariance(self) -> Vector:
-        """Return the covariance [px²], the sandwich estimate from the scatter of the gradient between clusters."""
+        """Return the parameters' covariance [px²]: the sandwich estimate from the clusters' gradients."""
         clusters = self.parts.shape[1]
         parts = self.parts - self.parts.mean(axis=1, keepdims=True)
         scatter = parts @ parts.T * clusters / max(1, clusters - 1 - len(parts))
@@ -63,7 +68,7 @@ class Slopes:
 
 
 def _inverse(hessian: Vector) -> Vector:
-    """Return the inverse, with very small eigenvalues raised."""
+    """Return the inverse of the Hessian, with very small eigenvalues raised."""
     values, vectors = np.linalg.eigh(hessian)
     return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
 

@@ -1,4 +1,4 @@
-"""Check that the photometric stage's answer is a minimum: orbits a little larger, smaller or rotated must cost more."""
+"""Check that the photometric stage's result is a minimum: slightly larger, smaller or rotated orbits must cost more."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
 
 FEW_PAIRS = 50_000
-"""Number of pairs below which a new map is solved for each point."""
+"""Number of pairs of events below which a new brightness map is solved for each tested point."""
 
 
 def cost_around_optimum(cost: Cost, best: NDArray[np.float64], final: float) -> list[tuple[NDArray[np.float64], float]]:
@@ -43,7 +43,7 @@ def cost_around_optimum(cost: Cost, best: NDArray[np.float64], final: float) -> 
 
 
 def size_and_phase_directions(space: ParameterSpace, best: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return unit vectors along size and phase, as far as these are free."""
+    """Return unit vectors of the search space along the prism's size and phase, if these are free."""
     if space.cartesian:
         x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)
         rest = np.zeros(len(best) - 2)

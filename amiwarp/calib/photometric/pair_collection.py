@@ -22,21 +22,22 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
 MARGIN_PX, ROTATION_MARGIN_PX = 3, 8
-"""Border of a tile's map, within which the parameters may move events [px]; the second if the camera rotates."""
+"""Border of a tile's brightness map for events that a change of the parameters moves [px]: for a still camera, and for
+a rotating one."""
 LONGEST_GAP_US = 60_000
-"""Longest time between the events of a pair [us]. Noise makes longer ones unreliable."""
+"""Longest time between the two events of a pair [us]. Noise makes longer gaps unreliable."""
 FEWEST_PAIRS = 1_500
-"""Smallest number of pairs."""
+"""Smallest number of pairs of events for the photometric stage."""
 PAIRS_PER_NODE = 1.5
-"""Smallest number of equations per unknown of the map. A map with fewer fits any parameters."""
+"""Smallest number of equations per unknown of the brightness map. A map with fewer fits any parameters."""
 FEWEST_TURNS = 2
-"""Number of turns that are always used, if the recording has them."""
+"""Number of turns of the prism that are always used, if the recording has them."""
 FEWEST_TILES = 6
-"""Number of tiles that are always used."""
+"""Number of tiles of the scene that are always used."""
 
 
 class _PairCollector:
-    """Collector of pairs of events that both fall on one tile of the scene, at the answer of the sharpness stage."""
+    """Collector of pairs of events that fall on the same tile, compensated by the result of the sharpness stage."""
 
     def __init__(self, recording: Recording, search: Search, tile_of: NDArray[np.int32], sensor: SensorTiming) -> None:
         from scipy import ndimage
@@ -49,7 +50,10 @@ class _PairCollector:
         self._done = 0
 
     def pairs_in(self, spans: list[tuple[int, int]]) -> PairSet:
-        """Return the pairs inside the time spans [us]. Spans that extend an earlier list cost only the new ones."""
+        """Return the pairs of events inside the time spans [us].
+
+        If ``spans`` extend those of an earlier call, only the new spans are read.
+        """
         if len(spans) > self._done:
             self._found.append(self._new_pairs(spans[self._done :]))
             self._done = len(spans)
@@ -72,7 +76,7 @@ class _PairCollector:
 
 
 def turn_length(recording: Recording, encoder: Encoder) -> float:
-    """Return the duration of a turn [us], or of the recording if that is shorter."""
+    """Return the duration of a turn of the prism [us]; the duration of the recording if it is shorter."""
     whole = float(recording.events.t_last - recording.events.t_first + 1)
     return min(60e6 / max(abs(encoder.rpm), 1e-6), whole)
 
@@ -108,14 +112,14 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
 
 
 def van_der_corput(n: int) -> list[int]:
-    """Return 0 … n-1 in van der Corput's order: the first numbers of the list are always spread evenly."""
+    """Return 0 … n-1 in van der Corput's order: the first k numbers are evenly spread for every k."""
     bits = max(1, (n - 1).bit_length())
     order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
     return [k for k in order if k < n]
 
 
 def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
-    """Return the share of equations beyond the map's unknowns; raise :class:`AmiwarpError` if they are too few."""
+    """Return 1 minus the ratio of map unknowns to pairs of events; raise :class:`AmiwarpError` for too few pairs."""
     touched = int((coverage > 0.5).sum())
     if pairs < max(FEWEST_PAIRS, PAIRS_PER_NODE * touched):
         raise AmiwarpError(

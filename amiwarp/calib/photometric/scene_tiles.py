@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 TILE = 32
 """Side of a tile of the scene [px]."""
 GRID = (4, 3)
-"""Number of columns and rows of the image from each of which one tile is chosen, the one with most events."""
+"""Number of columns and rows into which the image is divided. The tile with most events is chosen from each part."""
 
 
 def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:

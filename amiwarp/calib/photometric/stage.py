@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from amiwarp.progress import Progress
 
 LARGEST_ROTATION_MOVE_PX = 4.0
-"""Largest distance from the sharpness optimum in the parameters of the camera's rotation [px]."""
+"""Largest distance from the sharpness optimum that is searched in the parameters of the camera's rotation [px]."""
 RESTARTS = 3
-"""Largest number of new searches from a nearby point with a lower cost than the result."""
+"""Largest number of further searches, each from a point near the previous result that has a lower cost."""
 FIRST_STEP_PX = 0.2
 """First step of an NLopt algorithm's first run [px]."""
 POLISH_STEP_PX = 0.05
-"""First step of its second run [px]."""
+"""First step of an NLopt algorithm's second run, which starts at the result of the first run [px]."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,15 @@ class PhotometricSettings:
     evaluations: int = 80
     """Largest number of evaluations in each of the two runs of an NLopt algorithm."""
     tolerance_px: float = 0.002
-    """The search ends when its steps move events by less than this [px]."""
+    """Length below which the search's steps end it, as displacement of events [px]."""
     steps: int = 20
-    """Number of conjugate-gradient steps per evaluation; each evaluation starts from the last map."""
+    """Number of conjugate-gradient steps that solve the brightness map in each evaluation, starting from the previous
+    map."""
     density: float = 1.0
-    """Nodes of the map per pixel along each axis."""
+    """Nodes of the brightness map per pixel along each axis."""
     sensor: SensorTiming = field(default_factory=SensorTiming)
-    """Known latency and refractory period. Unknown parts of them become part of the phase."""
+    """Known latency and refractory period of the sensor. If they are unknown, the calibrated phase contains their
+    effect."""
 
     def check(self) -> None:
         """Check the settings.
@@ -90,7 +92,7 @@ class PhotometricSettings:
 def refine(
     recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
 ) -> tuple[PhotometricSummary, StageSummary]:
-    """Run the stage from the answer of the sharpness stage and return its result.
+    """Run the photometric stage, which starts at the result of the sharpness stage, and return its result.
 
     ``linear`` names the free ones of ``off_ratio`` and ``leak``. Raises :class:`AmiwarpError` for too few pairs.
     """
@@ -128,7 +130,7 @@ def refine(
 
 
 def search_box(space: ParameterSpace, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of the box about the answer ``v`` of the sharpness stage in which this stage searches."""
+    """Return the corners of the box about the sharpness stage's result ``v`` in which this stage searches."""
 
     def largest_move(name: str) -> float:
         if name in DEGENERATE_WITH_APEX:
@@ -143,7 +145,7 @@ def search_box(space: ParameterSpace, v: NDArray[np.float64]) -> tuple[NDArray[n
 def _search_with_restarts(
     cost: Cost, v: NDArray[np.float64], left: float, settings: PhotometricSettings, report: Callable[[float], None]
 ) -> tuple[SearchStage, PhotometricSummary]:
-    """Search from the answer of the sharpness stage, and again from any point near the result with a lower cost.
+    """Search from the sharpness stage's result, and again from any point near the new result with a lower cost.
 
     If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost.
     """
@@ -166,7 +168,7 @@ def _search(
     settings: PhotometricSettings,
     report: Callable[[float], None],
 ) -> SearchStage:
-    """Run one search from ``start``, in the box about the answer ``v`` of the sharpness stage."""
+    """Run one search from ``start``, in the box about the sharpness stage's result ``v``."""
     low, high = search_box(cost.space, v)
 
     def report_steps(done: int, budget: int) -> None:
@@ -194,7 +196,10 @@ def _search(
 
 
 def join_runs(first: SearchStage, second: SearchStage) -> SearchStage:
-    """Return two runs as one. The answer is that of the second run, whose map was better converged."""
+    """Return two successive runs as one.
+
+    The result is that of the second run, whose brightness map was better converged.
+    """
     return replace(
         second,
         evaluations=first.evaluations + second.evaluations,

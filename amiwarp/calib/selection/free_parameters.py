@@ -1,4 +1,4 @@
-"""Decision whether to free clock offset, tilt and index: only if the recording separates them from size and phase."""
+"""Decision which of clock offset, tilt and index to calibrate: those that size and phase cannot imitate."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
 GROUPS = {"clock_offset": ("clock_offset",), "tilt": ("tilt_x", "tilt_y"), "index": ("index",)}
-"""Parameters that can be freed, in groups that are freed together."""
+"""Parameters that the automatic calibration may free, in groups that are freed together."""
 REMEDY = {
     "clock_offset": "record at two speeds, or while the prism speeds up: at one speed it is part of the phase",
     "tilt": "record through a wider lens or a stronger prism, with edges near the image's border",
     "index": "give it: through this lens its effect is the same as that of the apex",
     "rpm": "record more turns of a still scene, or use an encoder",
 }
-"""Advice for each group that a recording does not determine."""
+"""Advice to the user for each group of parameters that a recording does not determine."""
 
 
 def candidate_names(recording: Recording, exact: Calibration) -> tuple[str, ...]:
-    """Return the parameters that might be freed.
+    """Return the names of the parameters that the automatic calibration may free.
 
     These are none if the camera rotated, which blurs the image. Without an encoder the clock offset is part of the
     phase.
@@ -59,7 +59,7 @@ def judge_parameters(trial: Trial) -> tuple[FreedParameter, ...]:
 
 
 def _judge(trial: Trial, group: str) -> FreedParameter:
-    """Free a group if it is determined and held-out turns gain by it."""
+    """Decide whether to free a group: it must be determined, and held-out turns must become sharper with it."""
     space, members = trial.space, GROUPS[group]
     if not set(members) <= set(trial.tested):
         most = min(trial.motion_range(n) for n in members)
@@ -91,12 +91,12 @@ def _undetermined(group: str, std_px: float | None, why: str) -> FreedParameter:
 
 
 def freed_names(parameters: tuple[FreedParameter, ...]) -> tuple[str, ...]:
-    """Return the names to free in a second calibration."""
+    """Return the names of the parameters to free in a second calibration."""
     return tuple(n for p in parameters if p.freed and p.name in GROUPS for n in GROUPS[p.name])
 
 
 def freed_settings(exact: Calibration, settings: Settings, names: tuple[str, ...]) -> Settings:
-    """Return the settings of a second calibration, which starts at the first answer with more parameters free."""
+    """Return the settings of a second calibration with more free parameters, started at the first one's values."""
     start = {**settings.start, **exact.parameters}
     return replace(settings, free=(*exact.free, *names), start=start, global_algorithm=None)
 
@@ -104,12 +104,12 @@ def freed_settings(exact: Calibration, settings: Settings, names: tuple[str, ...
 def confirm_freed(
     trial: Trial, parameters: tuple[FreedParameter, ...], again: Calibration
 ) -> tuple[FreedParameter, ...]:
-    """Keep a parameter free only if the second calibration moved it significantly, and by more than the budget."""
+    """Keep a parameter free only if the second calibration changed it significantly and beyond the error budget."""
     return tuple(p if p.name not in GROUPS or not p.freed else _confirmed(trial, p, again) for p in parameters)
 
 
 def hold_all(parameters: tuple[FreedParameter, ...], why: str) -> tuple[FreedParameter, ...]:
-    """Hold all parameters, because the second calibration failed for the reason ``why``."""
+    """Mark all parameters as not freed, because the second calibration failed for the reason ``why``."""
     held = (replace(p, freed=False, verdict=f"held: the calibration fails with it free: {why}") for p in parameters)
     return tuple(h if p.name in GROUPS and p.freed else p for p, h in zip(parameters, held, strict=True))
 

@@ -46,7 +46,7 @@ def calibrate_auto(
     progress: Progress | None = None,
     budget_px: float | None = None,
 ) -> Calibration:
-    """Calibrate the exact model, then express the answer by the smallest model that keeps the error budget.
+    """Calibrate the exact model, then express its result by the smallest model that keeps the error budget.
 
     ``budget_px`` is the largest tolerated model error where the scene has events [px rms]; None: a tenth of the blur
     by quantisation and timing. Raises :class:`AmiwarpError` if the recording cannot determine the exact model.
@@ -92,7 +92,7 @@ def _free_parameters(
     progress: Progress | None,
     budget_px: float | None,
 ) -> tuple[Trial, tuple[FreedParameter, ...]]:
-    """Free the parameters that the recording determines and calibrate the exact model again with them.
+    """Free the parameters that the recording determines, and calibrate the exact model again with them free.
 
     Return the trial of the final exact answer, and the decision for each parameter.
     """
@@ -113,7 +113,7 @@ def _free_parameters(
 
 
 def _whole_image_warning(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
-    """Return a warning if the model keeps the budget only where this recording has events."""
+    """Return a warning if the chosen model keeps the error budget at this recording's events only."""
     away = predicted_error(chosen.model, trial.exact.model).rms
     if away <= CONVERSION_FACTOR * trial.budget_px:
         return ()
@@ -125,12 +125,12 @@ def _whole_image_warning(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class FittedCandidate:
-    """A candidate with the parameters of its best fit to the exact answer."""
+    """Candidate model with the parameter values of its best fit to the calibrated exact model."""
 
     candidate: ModelCandidate
-    """The candidate and its evidence."""
+    """Summary of the candidate model and the evidence for and against it."""
     values: Mapping[str, float]
-    """Parameter values by name, in their units."""
+    """Parameter values by name, in the parameters' units (rad, us, 1/min, px)."""
 
 
 def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
@@ -153,7 +153,7 @@ def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
 
 
 def _refined(trial: Trial, space: ParameterSpace, sharp: Vector) -> Vector:
-    """Return the held-out sharpness of a smaller model, moved from its fit to its sharpest on the training turns."""
+    """Return the held-out sharpness of a smaller model, with the parameters that are sharpest on the training turns."""
     values, _ = fit(space, sharp, trial.sample)
     v = space.to_vector(values)
     step = trial.quadratic.restricted_to([0, 1]).step_to_maximum(gradient(trial.train, space, v))
@@ -161,7 +161,10 @@ def _refined(trial: Trial, space: ParameterSpace, sharp: Vector) -> Vector:
 
 
 def _as_ellipse(trial: Trial, sharpest: Mapping[str, float]) -> tuple[dict[str, float], float, Vector]:
-    """Return the ellipse's parameters, those of the exact model, its predicted error and its held-out sharpness."""
+    """Return the ellipse model's parameters, predicted error [px rms] and held-out sharpness.
+
+    Its parameters are those of the exact model.
+    """
     space = replace(trial.space, model="ellipse")
     model = space.build(sharpest)
     predicted = trial.sample.distance(model, trial.space.build(sharpest))
@@ -172,7 +175,7 @@ def _as_ellipse(trial: Trial, sharpest: Mapping[str, float]) -> tuple[dict[str, 
 def _candidate(
     trial: Trial, name: str, predicted: float, reference: Vector, held_out: Vector, *, found: bool
 ) -> ModelCandidate:
-    """Return a candidate with its evidence; ``found``: a smaller model was chosen already."""
+    """Return the summary of a candidate model; ``found``: whether a smaller model was chosen already."""
     mean, std, seen = trial.as_motion(reference - held_out)
     chosen = predicted <= trial.budget_px and seen[0] <= trial.rejection_px and not found
     verdict = _verdict(trial, name, predicted, seen)
@@ -189,7 +192,7 @@ def _candidate(
 
 
 def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float]) -> str:
-    """Return what prediction and held-out turns say about a model, in words."""
+    """Return a sentence that compares a model's predicted error with its error on held-out turns."""
     budget = trial.budget_px
     if name == "exact":
         return "the reference for the others"
@@ -206,7 +209,7 @@ def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float
 
 
 def _agree(trial: Trial, candidate: ModelCandidate) -> bool:
-    """Return whether held-out turns do not contradict the predicted error."""
+    """Return whether the held-out turns are consistent with the candidate's predicted error."""
     low, high = candidate.seen_px
     if candidate.predicted_px <= trial.budget_px:
         return -trial.rejection_px <= high and low <= trial.rejection_px
@@ -214,9 +217,9 @@ def _agree(trial: Trial, candidate: ModelCandidate) -> bool:
 
 
 def express(trial: Trial, fitted: FittedCandidate, settings: Settings, device: Any) -> Calibration:
-    """Return the exact answer in the parameters of a smaller model: deflection instead of apex, with uncertainty.
+    """Express the exact model's calibration in the parameters of a smaller model, with uncertainty.
 
-    The sharpness is measured like that of the exact model.
+    The deflection replaces the apex. The sharpness is measured like that of the exact model.
     """
     exact, name, values = trial.exact, fitted.candidate.model, fitted.values
     if name in ("exact", "ellipse"):
@@ -237,7 +240,7 @@ def express(trial: Trial, fitted: FittedCandidate, settings: Settings, device: A
 def _sharpness(
     trial: Trial, space: ParameterSpace, values: Mapping[str, float], settings: Settings, device: Any
 ) -> float:
-    """Return the sharpness of all events, on an image as large as that of the search, so that both compare."""
+    """Return the sharpness of all events, on a canvas as large as the search's, so that both values are comparable."""
     like = trial.space_of("exact", trial.exact)
     largest = settings.bounds.get("apex", (0.0, 2.0 * trial.exact.prism.apex))[1]
     camera, kind = space.camera, settings.sharpness

@@ -1,6 +1,7 @@
 """Fit of the models with fewer parameters to the exact model, at the events of a scene.
 
-Also the blur that remains even with the exact model: by encoder noise, clock resolution and latency jitter.
+The module also estimates the blur that remains even with the exact model: by encoder noise, clock resolution and
+latency jitter.
 """
 
 from __future__ import annotations
@@ -23,45 +24,53 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 SAMPLED = 5_000
-"""Number of sampled events: enough for an rms error accurate to 1 %."""
+"""Number of events at which models are compared: enough for an rms error accurate to 1 %."""
 SLOPE_PX = 0.25
-"""Step of the finite differences [px]."""
+"""Step of the finite differences in the search vector [px]."""
 STEPS = 2
-"""Number of Gauss-Newton steps. The displacement is nearly linear: one step is accurate to 0.00001 px."""
+"""Number of Gauss-Newton steps that fit a model. The displacement is nearly linear: one step is accurate to 0.00001 px.
+"""
 QUANTISATION_PX = 1.0 / math.sqrt(12.0)
-"""Standard deviation of the rounding to whole pixels [px]."""
+"""Standard deviation of the error from rounding coordinates to whole pixels [px]."""
 CLOCK_US = 1.0 / math.sqrt(12.0)
-"""Standard deviation of the rounding to whole microseconds [us]."""
+"""Standard deviation of the error from rounding times to whole microseconds [us]."""
 LATENCY_JITTER_US = 30.0
-"""Assumed latency jitter of a good sensor in good light [us]. It cannot be measured from a recording."""
+"""Assumed standard deviation of the latency of a good sensor in good light [us]. It cannot be measured from a
+recording."""
 SHARE = 0.1
-"""Default budget for the model error, as a share of the blur by quantisation and timing."""
+"""Default limit of the model error, as a share of the blur by quantisation and timing."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Evenly thinned events, at which models are compared: models count where and when the scene has events."""
+    """Evenly thinned events at which models are compared.
+
+    A difference between models therefore counts where and when the scene has events.
+    """
 
     xy: NDArray[np.float64]
-    """Pixels [px], shape ``(n, 2)``."""
+    """Pixel coordinates of the events [px], shape ``(n, 2)``."""
     theta: NDArray[np.float64]
-    """Prism angle by the encoder [rad], shape ``(n,)``."""
+    """Prism angle of each event according to the encoder [rad], shape ``(n,)``."""
     speed: NDArray[np.float64]
-    """Speed of the prism [rad/us], shape ``(n,)``."""
+    """Speed of the prism at each event [rad/us], shape ``(n,)``."""
 
     @classmethod
     def of(cls, events: Events, encoder: Encoder) -> Places:
-        """Return a sample of the events."""
+        """Return about :data:`SAMPLED` evenly thinned events with their prism angles and speeds."""
         some = events[:: max(1, len(events) // SAMPLED)]
         xy = np.stack([some.x, some.y], axis=1).astype(np.float64)
         return cls(xy, encoder.angle_at(some.t), encoder.speed_at(some.t) * 1e-6)
 
     def compensated(self, model: Model, ahead: float | NDArray[np.float64] = 0.0) -> NDArray[np.float64]:
-        """Return the compensated pixels [px], shape (n, 2), with the prism ``ahead`` of the encoder [rad]."""
+        """Return the events' compensated coordinates [px], shape (n, 2), with ``ahead`` [rad] added to the angles."""
         return model.compensate_points(self.xy, self.theta + ahead)
 
     def distance(self, model: Model, other: Model, *, remove_lag: bool = False) -> float:
-        """Return the distance of two models [px rms]; ``remove_lag`` excludes a constant angle between them."""
+        """Return the rms distance of two models at the events [px].
+
+        With ``remove_lag``, a constant angle between the models does not count.
+        """
         away = self.compensated(model) - self.compensated(other)
         if remove_lag:
             h = 0.01
@@ -70,7 +79,7 @@ class Places:
         return _rms(away)
 
     def motion_per_angle(self, model: Model) -> float:
-        """Return the motion of the events per angle of the prism [px rms per rad]."""
+        """Return how far compensated events move per change of the prism angle [px rms per rad]."""
         h = 0.01
         return _rms(self.compensated(model, h) - self.compensated(model, -h)) / (2.0 * h)
 
@@ -104,7 +113,7 @@ def encoder_noise(encoder: Encoder) -> float:
 def candidate_space(
     model: str, exact: Calibration, free: tuple[str, ...], *, rad_per_us: float, duration_us: float
 ) -> ParameterSpace:
-    """Return the parameter space of a model about the exact answer: size, phase and ``free`` are free.
+    """Return the parameter space of ``model`` about the exact calibration: size, phase and ``free`` are free.
 
     ``rad_per_us`` is the mean speed of the prism [rad/us], ``duration_us`` the duration of the events [us].
     """
@@ -121,7 +130,7 @@ def candidate_space(
 
 
 def fit(space: ParameterSpace, target: NDArray[np.float64], sample: Places) -> tuple[dict[str, float], float]:
-    """Fit a model to compensated pixels ``target`` [px], shape (n, 2).
+    """Fit a model's parameters to the compensated coordinates ``target`` [px], shape (n, 2).
 
     Return the parameters and the remaining distance [px rms]. The phase is fitted too, which removes a constant lag.
     """
@@ -141,7 +150,7 @@ def fit(space: ParameterSpace, target: NDArray[np.float64], sample: Places) -> t
 
 
 def independent_directions(space: ParameterSpace, v: NDArray[np.float64], sample: Places) -> NDArray[np.float64]:
-    """Return directions in which every parameter moves events by one pixel that size and phase cannot reproduce.
+    """Return search directions along which each parameter moves events by 1 px in ways that size and phase cannot.
 
     The rows are search vectors, shape (n, n). The first two are unit vectors along size and phase. Each other row is a
     unit vector, minus the size and phase that best reproduce its motion of events, scaled so that the remaining motion

@@ -1,4 +1,4 @@
-"""Trial of models on held-out turns: the two halves of the events, and the parameters that might be freed."""
+"""Data for the choice of a model: training and held-out events, and the parameters that might be freed."""
 
 from __future__ import annotations
 
@@ -34,75 +34,79 @@ if TYPE_CHECKING:
     Vector = NDArray[np.float64]
 
 SIGNIFICANT_STD = 2.0
-"""Number of standard deviations by which a larger model, or a freed parameter, must be better on held-out turns."""
+"""Number of standard deviations by which a larger model, or a freed parameter, must be sharper on held-out turns."""
 CONVERSION_FACTOR = 2.0
-"""Accuracy, as a factor, with which sharpness measures displacements: it sees them only at edges and across them."""
+"""Factor by which a displacement inferred from a loss of sharpness may be wrong: sharpness sees displacements only at
+edges and across them."""
 BIAS_PX = 0.1
-"""Bias of the sharpest parameters [px]. Smaller displacements are not significant in sharpness."""
+"""Typical distance of the sharpest parameters from the true ones [px]. Smaller displacements are not significant in
+sharpness."""
 LARGEST_MOTION_PX = 3.0
-"""Largest displacement to which a loss of sharpness is converted: the quadratic holds only near the optimum [px]."""
+"""Largest displacement to which a loss of sharpness is converted [px]: the quadratic approximation of sharpness holds
+only near the optimum."""
 SEARCH_RANGE = {"clock_offset": 20_000.0, "tilt_x": math.radians(15.0), "tilt_y": math.radians(15.0), "index": 0.4}
-"""Half width of the range that is tested of each parameter that might be freed, in its unit."""
+"""Half width of the tested range of each parameter that might be freed, in its unit (us, rad, 1)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Exact answer with the two halves of the events on which models are fitted and compared."""
+    """Calibrated exact model, with the two halves of the events on which models are fitted and compared."""
 
     exact: Calibration
-    """Calibration of the exact model."""
+    """Calibration of the exact model, with which smaller models are compared."""
     calibration_events: CalibrationEvents
-    """All events."""
+    """All events of the trial with their encoder."""
     sample: Places
-    """Sample of the events for the comparison of models."""
+    """Evenly thinned events at which the displacements of models are compared."""
     rad_per_us: float
     """Mean speed of the prism [rad/us]."""
     duration_us: float
     """Duration of the events [us]."""
     budget_px: float
-    """Largest tolerated model error [px rms]."""
+    """Largest tolerated error of a smaller model relative to the exact one [px rms]."""
     timing_px: float
-    """Estimated blur by timing [px rms]."""
+    """Estimated blur from encoder noise, clock resolution and latency jitter [px rms]."""
     train: HalfSharpness
-    """Sharpness of the turns to which models are fitted."""
+    """Sharpness of the training turns, on which models are fitted."""
     test: HalfSharpness
-    """Sharpness of the held-out turns."""
+    """Sharpness of the held-out turns, on which models are compared."""
     space: ParameterSpace
-    """Space of the exact model with all parameters that might be freed."""
+    """Parameter space of the exact model in which all parameters that might be freed are free."""
     start: Vector
-    """Answer of the sharpness stage as a vector of the space [px], shape ``(n,)``."""
+    """Parameters found by the sharpness stage, as a vector of ``space`` [px], shape ``(n,)``."""
     directions: Vector
-    """One direction per parameter, see :func:`independent_directions`, shape ``(n, n)``."""
+    """One search direction per parameter (see :func:`independent_directions`), shape ``(n, n)``."""
     tested: tuple[str, ...]
-    """Parameters with a measurable effect within their range: size, phase and possibly others."""
+    """Parameters that move events measurably within their tested range: size, phase and possibly others."""
     quadratic: Quadratic
-    """Sharpness of the exact model about the start along the directions of ``tested``, on the training turns."""
+    """Quadratic approximation of the exact model's sharpness on the training turns, along the directions of ``tested``.
+    """
 
     @property
     def rejection_px(self) -> float:
-        """Displacement on held-out turns from which a model is rejected though its predicted error is small [px]."""
+        """Error shown by held-out turns above which a model is rejected even if its predicted error is small [px]."""
         return max(CONVERSION_FACTOR * self.budget_px, BIAS_PX)
 
     def space_of(self, model: str, exact: Calibration) -> ParameterSpace:
-        """Return the parameter space of a model about an exact answer, with size and phase free."""
+        """Return the parameter space of ``model`` about the calibration ``exact``, with only size and phase free."""
         return candidate_space(model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us)
 
     def motion_range(self, name: str) -> float:
-        """Return the motion of events by a parameter over its range, beyond that of size and phase [px rms]."""
+        """Return how far a parameter moves events in its tested range [px rms], beyond what size and phase can do."""
         return _motion_range(self.space, self.directions, name)
 
     def shift_along(self, which: list[int], steps: Vector) -> Vector:
-        """Return the shift of the search vector for steps along some of the tested directions [px]."""
+        """Return the change of the search vector [px] for ``steps`` along the directions numbered in ``which``."""
         rows = [self.directions[self.space.names.index(self.tested[k])] for k in which]
         return np.asarray(steps @ np.array(rows))
 
     def sharpest(self, which: list[int]) -> dict[str, float]:
-        """Return the parameters of the sharpest exact model on the training turns, free along some directions."""
+        """Return the exact model's sharpest parameters on the training turns along the directions in ``which``."""
         step = self.quadratic.restricted_to(which).step_to_maximum()
         return self.space.to_values(self.start + self.shift_along(which, step))
 
     def as_motion(self, loss: Vector) -> tuple[float, float, tuple[float, float]]:
-        """Return the mean and standard deviation of a loss of sharpness, and the equivalent displacements [px rms].
+        """Return the mean and standard deviation of losses of sharpness, and the equivalent displacements [px rms].
 
         ``loss`` holds the losses of disjoint parts. The curvature of sharpness converts the mean minus and plus
         :data:`SIGNIFICANT_STD` standard deviations to displacements, negative for a gain, limited to
@@ -120,7 +124,7 @@ class Trial:
 
 
 def in_pixels(px: float) -> str:
-    """Return a displacement as text: its size, or that it is above the largest measurable one."""
+    """Return a displacement as text; above the largest measurable displacement only that limit is given."""
     return f"{px:.3f} px" if px < LARGEST_MOTION_PX else f"more than {LARGEST_MOTION_PX:g} px"
 
 
@@ -133,7 +137,7 @@ def make_trial(
     device: Any,
     budget_px: float | None,
 ) -> Trial:
-    """Return a trial of an exact answer: both halves of the events on the device, and the sharpness about the answer.
+    """Prepare the choice of a model: copy both halves of the events to the device, measure sharpness near ``exact``.
 
     ``names`` are the parameters that might be freed. ``budget_px`` is the largest tolerated model error [px rms]; None:
     :data:`SHARE` of the blur by quantisation and timing.
@@ -166,7 +170,7 @@ def make_trial(
 
 
 def sharpness_answer(exact: Calibration) -> Calibration:
-    """Return the calibration with the parameters of the sharpness stage: the photometric ones are less sharp."""
+    """Return the calibration with the sharpness stage's parameters, which are sharper than the photometric stage's."""
     p = exact.photometric
     if p is None or not p.accepted:
         return exact
@@ -184,6 +188,6 @@ def _with_search_range(space: ParameterSpace) -> ParameterSpace:
 
 
 def _motion_range(space: ParameterSpace, directions: Vector, name: str) -> float:
-    """Return :meth:`Trial.motion_range`; infinite for parameters without a range."""
+    """Return the value of :meth:`Trial.motion_range`; infinite for parameters without a range."""
     k = space.names.index(name)
     return SEARCH_RANGE[name] * space.pixels[name] / abs(float(directions[k, k])) if name in SEARCH_RANGE else math.inf

@@ -29,9 +29,10 @@ class CalibrationEvents:
     encoder: Encoder
     """The encoder that gives their prism angles."""
     slope_of: SlopeOf | None
-    """Change of the angle at times [us] per unit of a free clock offset or rpm; None if neither is free."""
+    """Function that returns the change of the prism angle at given times [us] per unit of a free clock offset or rpm;
+    None if neither is free."""
     fold: int = 0
-    """Number of angle bins per turn into which a pixel's events are folded; 0: none."""
+    """Number of angle bins per turn into which a pixel's events are merged; 0: events are not merged."""
     _uploaded: dict[tuple[str, int | None], DeviceEvents] = field(default_factory=dict, repr=False, init=False)
 
     def on(self, device: Any, middle_us: int | None) -> DeviceEvents:
@@ -43,7 +44,7 @@ class CalibrationEvents:
         return self._uploaded[str(device), middle_us]
 
     def every(self, step: int) -> CalibrationEvents:
-        """Return every ``step``-th event."""
+        """Return every ``step``-th event, with the same encoder."""
         return self if step == 1 else self._cut(slice(0, None, step))
 
     def central(self, share: float) -> CalibrationEvents:

@@ -17,7 +17,7 @@ STEP_PX = 0.25
 
 
 def finite_differences(at: Callable[[Vector], Vector], directions: Vector) -> tuple[Vector, Vector]:
-    """Return each part's gradient [1/px], shape (n, parts), and the Hessian of their mean [1/px²], shape (n, n).
+    """Return the parts' gradients of sharpness [1/px], shape (n, parts), and the mean Hessian [1/px²], shape (n, n).
 
     ``at`` returns the sharpness of each part, shape (parts,), at a shift from the point. Each row of ``directions`` is
     a shift that moves events by one pixel, shape (n, entries of the shift).

@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     Vector = NDArray[np.float64]
 
 FEWEST_TURNS = 2.0
-"""Number of turns from which whole turns are held out."""
+"""Number of turns in a recording from which whole turns are held out."""
 SPANS = 32
-"""Number of angle spans into which fewer turns are divided; every other span is held out."""
+"""Number of angle spans into which a recording of fewer than two turns is divided; every other span is held out."""
 SMOOTHING_PX = 0.6
 """Standard deviation of the Gaussian that smooths the images [px]: small, to resolve differences of good models."""
 LONGEST_STEP_PX = 0.5
-"""Largest step towards a maximum [px]."""
+"""Largest step towards the maximum of sharpness [px]."""
 LEAST_CURVATURE_RATIO = 1e-2
-"""No step is taken along directions with less curvature than this share of the largest."""
+"""Smallest curvature of sharpness, as a share of the largest, at which a step is taken along a direction."""
 PARTS = 8
-"""Number of disjoint parts of each half, whose scatter measures the uncertainty."""
+"""Number of disjoint parts of each half of the events, whose scatter measures the uncertainty."""
 
 
 def split_turns(calibration_events: CalibrationEvents) -> tuple[Events, Events]:
@@ -60,7 +60,7 @@ class HalfSharpness:
     def __init__(
         self, events: Events, calibration_events: CalibrationEvents, space: ParameterSpace, device: Any
     ) -> None:
-        """Upload the events; ``space`` must allow the largest displacements that will be measured."""
+        """Upload the events. The canvas holds the displacements that the bounds of ``space`` allow."""
         slope = None if calibration_events.slope_of is None else calibration_events.slope_of(events.t)
         middle = space.middle_us if space.moving else None
         uploaded = upload_events(events, calibration_events.encoder, device, slope=slope, middle_us=middle)
@@ -70,7 +70,7 @@ class HalfSharpness:
         self._votes = Votes(canvas, device)
         self._meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device)
         self.fastest: dict[str, float] = {}
-        """Shortest time for one event's angle, displacement and vote, by name of the model [s]."""
+        """Shortest measured time for one event's angle, displacement and vote [s], by name of the model."""
 
     def each(self, space: ParameterSpace, values: Mapping[str, float], model: Model | None = None) -> Vector:
         """Return the sharpness of each part, shape (PARTS,). ``model`` may give the already built model."""
@@ -103,7 +103,7 @@ class Quadratic:
     """Quadratic approximation of sharpness about a point along n directions."""
 
     slopes: Vector
-    """Gradient of each part's sharpness [1/px], shape ``(n, parts)``."""
+    """Gradient of the sharpness of each part of the events [1/px], shape ``(n, parts)``."""
     hessian: Vector
     """Hessian of the mean sharpness [1/px²], shape ``(n, n)``."""
 
@@ -116,13 +116,13 @@ class Quadratic:
         return cls(*finite_differences(lambda shift: half.each(space, space.to_values(v + shift)), directions))
 
     def restricted_to(self, which: list[int]) -> Quadratic:
-        """Return the approximation along some of the directions."""
+        """Return the approximation along the directions whose numbers are in ``which``."""
         return Quadratic(self.slopes[which], self.hessian[np.ix_(which, which)])
 
     def step_to_maximum(self, gradient: Vector | None = None) -> Vector:
-        """Return the step to the sharpest point [px], at most :data:`LONGEST_STEP_PX` long, 0 along flat directions.
+        """Return the step to the sharpest point [px]: 0 along flat directions, at most :data:`LONGEST_STEP_PX` long.
 
-        ``gradient`` replaces the own one, for another model with about the same Hessian.
+        ``gradient`` [1/px] replaces the approximation's own gradient, for another model with about the same Hessian.
         """
         values, vectors = np.linalg.eigh(-self.hessian)
         along = vectors.T @ (self.slopes.mean(axis=1) if gradient is None else gradient)
@@ -132,11 +132,11 @@ class Quadratic:
 
     @property
     def curvature(self) -> float:
-        """Mean curvature [1/px²], positive at a maximum."""
+        """Mean curvature of sharpness over the directions [1/px²], positive at a maximum."""
         return -float(np.trace(self.hessian)) / len(self.hessian)
 
     def deviations(self) -> Vector:
-        """Return the standard deviation along each direction [px], all others being free: the sandwich estimate."""
+        """Return the standard deviation of the maximum along each direction [px], by the sandwich estimate."""
         values, vectors = np.linalg.eigh(-self.hessian)
         floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
         inverse = vectors @ np.diag(1.0 / np.maximum(values, floor)) @ vectors.T

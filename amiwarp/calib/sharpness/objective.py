@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 ROTATION_MARGIN_PX = 16.0
-"""Extra border of the canvas if the camera's rotation is free [px]."""
+"""Extra border of the image of events if the camera's rotation is free [px]."""
 
 
 class Objective:
@@ -47,7 +47,7 @@ class Objective:
         parts: int = 1,
         device: Any = "cpu",
     ) -> None:
-        """Allocate the buffers.
+        """Allocate the buffers and copy the parameters of the image of events to the device.
 
         Parameters
         ----------
@@ -85,9 +85,9 @@ class Objective:
             self._image = _DirectImage(canvas, events, self._meter)
 
     def _model(self, values: Mapping[str, float]) -> Model:
-        """Return the model to evaluate. The ellipse, the exact model's first harmonic, has the same optimum.
+        """Return the model to evaluate: the exact model instead of the ellipse, which is its first harmonic.
 
-        The exact model stands in for it, because the ellipse would need new tables at every point.
+        Both have the same optimum, but the ellipse would need new tables at every point.
         """
         kind = "exact" if self.space.model == "ellipse" else self.space.model
         return build_model(kind, self.space.camera, self.space.prism, values)
@@ -98,7 +98,7 @@ class Objective:
         return self._meter.results()
 
     def values(self, values: Mapping[str, float]) -> float:
-        """Return the sharpness at parameter values."""
+        """Return the sharpness of the image of warped events at parameter values, in their units."""
         return self._measure(values)[0]
 
     def __call__(self, v: NDArray[np.float64]) -> float:
@@ -110,13 +110,13 @@ class Objective:
         return np.array(self._measure(values))
 
     def image(self, values: Mapping[str, float]) -> NDArray[np.float32]:
-        """Return the IWE at parameter values with its padding, shape (layers, rows, columns)."""
+        """Return the IWE at parameter values, with the border outside the sensor, shape (layers, rows, columns)."""
         self._measure(values)
         return self._meter.image.numpy()
 
 
 class _DirectImage:
-    """Image of events by one pass over the events in their order."""
+    """Image of warped events that is voted in one pass over the events in the order of time."""
 
     def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter) -> None:
         self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
@@ -129,7 +129,7 @@ class _DirectImage:
 
 
 class _TiledImage:
-    """Image of events by tiles, launched as one CUDA graph."""
+    """Image of warped events that is voted tile by tile, launched as one CUDA graph."""
 
     def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter, like: Model) -> None:
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
@@ -140,7 +140,7 @@ class _TiledImage:
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
-        self._launch()  # without capture first, because modules cannot be loaded during a capture
+        self._launch()  # the first launch is not captured: it may load modules, which a capture forbids
         wp.synchronize_stream(self._meter.device)
         with wp.ScopedCapture(self._meter.device) as capture:
             self._launch()

@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 CANDIDATES = 3
 """Largest number of optima of the coarse image from which the local search starts."""
 PARTS = 8
-"""Number of disjoint parts of the events, whose scatter measures the uncertainty."""
+"""Number of disjoint parts of the events, whose scatter measures the uncertainty of the parameters."""
 LARGEST_BUDGET = 10**12
-"""Upper limit of the numbers of evaluations and events."""
+"""Upper limit of the settings that give numbers of evaluations and of events."""
 LARGEST_FOLD = 1 << 20
-"""Upper limit of the number of angle bins."""
+"""Upper limit of the setting ``fold``, a number of angle bins per turn."""
 AUTO = "auto"
-"""Model name in the settings for the automatic choice."""
+"""Name in the settings for the automatic choice of the model."""
 STAGES = ("sharpness", "photometric")
-"""Stages of a calibration."""
+"""Names of the stages of a calibration, in order."""
 
 
 @dataclass(frozen=True)
@@ -58,35 +58,37 @@ class Settings:
     model: str = AUTO
     """Model: ``circle``, ``radial``, ``ellipse``, ``exact``, or ``auto`` for the smallest with a tolerable error."""
     budget_px: float | None = None
-    """Largest tolerated model error for ``auto`` [px rms]; None: a tenth of the blur by quantisation and timing."""
+    """Largest tolerated error of a smaller model for ``auto``, relative to the exact model [px rms]; None: a tenth of
+    the blur by quantisation and timing."""
     sharpness: Sharpness = Sharpness.VARIANCE
     """Measure of sharpness that the search maximises."""
     global_algorithm: str | None = "GN_DIRECT_L"
     """NLopt algorithm of the global search; None: no global search, the local search starts at ``start``."""
     local_algorithm: str = "LN_BOBYQA"
-    """NLopt algorithm of the local search."""
+    """NLopt algorithm of the local search that follows the global search."""
     free: tuple[str, ...] | None = None
     """Names of the free parameters; None: size and phase, and without an encoder ``rpm``."""
     start: Mapping[str, float] = field(default_factory=dict)
-    """Known or start values by parameter name [rad, us, 1/min]."""
+    """Known or start values by parameter name, in rad, us, 1/min or px. A value of a parameter that is not free stays
+    fixed."""
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Lower and upper bounds of free parameters by name, in the same units."""
+    """Lower and upper bounds of free parameters by name, in the units of ``start``."""
     global_evaluations: int = 120
     """Number of evaluations of the global search."""
     local_evaluations: int = 200
-    """Largest number of evaluations of a local search."""
+    """Largest number of evaluations of each local search."""
     tolerance_px: float = 0.002
-    """The local search ends when its steps move events by less than this [px]."""
+    """Length below which the steps of the local search end it, as displacement of events [px]."""
     smoothing_px: float = 1.0
     """Standard deviation of the Gaussian that smooths the fine image [px]; 4 px are used for the coarse image."""
     per_polarity: bool = False
     """Whether ON and OFF events form separate images."""
     events: int = 300_000
-    """Largest number of events, thinned evenly; the global search uses a third of them."""
+    """Largest number of events that are used, thinned evenly; the global search uses a third of them."""
     fold: int = 0
     """Number of angle bins per turn into which each pixel's events are folded as weighted points; 0: no folding."""
     seed: int = 0
-    """Seed of random algorithms."""
+    """Seed of the algorithms that use random numbers."""
     stages: tuple[str, ...] = STAGES
     """Stages to run: ``("sharpness",)`` or ``("sharpness", "photometric")``."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
@@ -120,7 +122,7 @@ class Settings:
 
 
 class Search:
-    """One search for the parameters that make the image of events sharpest.
+    """Search for the parameters that make the image of warped events sharpest.
 
     :meth:`run` sets ``best``, the values of all parameters, and ``score``, the sharpness there.
     """
@@ -134,9 +136,9 @@ class Search:
         progress: Progress | None,
     ) -> None:
         self.full_space = space
-        """Space of the photometric stage."""
+        """Parameter space of the photometric stage: all free parameters."""
         self.space = space.without(DEGENERATE_WITH_APEX) if "photometric" in settings.stages else space
-        """Space of the sharpness search."""
+        """Parameter space of the sharpness search: without the parameters that are left to the photometric stage."""
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
         self.progress = progress
         self.stages: list[StageSummary] = []
@@ -184,7 +186,10 @@ class Search:
         return self._objective(events.every(step), scale=0.5, smoothing=4.0, space=space)
 
     def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
-        """Return the starts for the local search. The camera's rotation stays at its start."""
+        """Run the global search and return the starts of the local search.
+
+        The camera's rotation stays at its start values.
+        """
         space = self.space.without(MOTION)
         if not space.names:
             return [self.space.to_vector(self.space.start)]
@@ -195,7 +200,7 @@ class Search:
         return [self.space.to_vector(space.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
 
     def _track_rotation(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a better start for a rotating camera, by a local search on the coarse image.
+        """Improve the start values of a rotating camera by a local search on the coarse image.
 
         Without a prism there is no estimate of the rotation. Then the events come from windows that grow about the
         middle: in a short window the blur is smaller than the smoothing, whatever the speed.
@@ -232,7 +237,7 @@ class Search:
         )  # fmt: skip
 
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
-        """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the answer."""
+        """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
         best = self.best
         parts = self._objective_by_parts(self.settings.sharpness)
         if self.space.sized:
@@ -252,7 +257,7 @@ class Search:
         checks.check_directions(self.image(), name)
 
     def image(self) -> NDArray[np.float32]:
-        """Return the IWE at the answer, cut to the sensor's size, summed over polarities."""
+        """Return the IWE at the calibrated parameters, cut to the sensor's size, summed over polarities."""
         image = self.fine.image(self.best).sum(axis=0)
         pad = (image.shape[1] - self.space.camera.width) // 2
         return np.asarray(image[pad:-pad, pad:-pad])
@@ -267,7 +272,7 @@ class Search:
 
 
 def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
-    """Return the best points of a stage, at most ``most``, each at least ``apart`` px away from all better ones."""
+    """Return at most ``most`` best points of a stage, each at least ``apart`` px away from all better points."""
     chosen: list[NDArray[np.float64]] = []
     for k in np.argsort(-stage.scores, kind="stable"):
         if all(np.linalg.norm(stage.points[k] - other) >= apart for other in chosen):

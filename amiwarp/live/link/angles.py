@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from amiwarp.errors import AmiwarpError
 
 INDEX_TOLERANCE_TURNS = 0.01
-"""Largest error of the count at an index pulse that is not a slip [turns]. The pulse has a width and a latch delay."""
+"""Largest disagreement between an index pulse and the encoder count that is not reported as a slip [turns]. A pulse has
+a width and a latch delay."""
 REVERSAL_TURNS = 0.1
-"""Distance that counts must run backwards to be a reversal [turns]. Less is a slip or an encoder on an edge."""
+"""Distance that counts must run backwards before it is reported as a reversal [turns]. A shorter one is a slip, or an
+encoder resting on an edge."""
 UNSEEN_TURNS = 0.5
-"""Step between two counts beyond which an index pulse may have passed unseen [turns]."""
+"""Step between two counts above which an index pulse between them may have been missed [turns]."""
 MISSED_INDEX_TURNS = 1.5
-"""Distance from the last index pulse at which the next one counts as missed [turns]."""
+"""Distance from the last index pulse at which the next pulse is reported as missed [turns]."""
 
 
 class EncoderFault(enum.StrEnum):
@@ -24,20 +26,21 @@ class EncoderFault(enum.StrEnum):
     SLIP = "slip"
     """The index pulse and the count disagree: counts were lost, or the encoder disc moved."""
     MISSED_INDEX = "missed index"
-    """No index pulse for :data:`MISSED_INDEX_TURNS`."""
+    """No index pulse came within :data:`MISSED_INDEX_TURNS` turns after the last one."""
     REVERSED = "reversed"
     """The prism changed its direction of rotation."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultReport:
-    """One fault, with its time and size."""
+    """Encoder fault with its time and size."""
 
     fault: EncoderFault
     t_us: int
-    """Time of the fault [us], on the clock of the counts."""
+    """Time of the fault on the controller's clock [us]."""
     counts: int
-    """Slip: surplus counts, negative if lost. Missed index: counts since the last pulse. Reversal: 0."""
+    """Size of the fault [counts]. For a slip: surplus counts, negative if counts were lost. For a missed index: counts
+    since the last pulse. For a reversal: 0."""
 
 
 class AngleTracker:
@@ -50,10 +53,10 @@ class AngleTracker:
     def __init__(self, counts_per_turn: int) -> None:
         """Raise :class:`AmiwarpError` if ``counts_per_turn`` is below 1."""
         if counts_per_turn < 1:
-            raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; give 1 or more")
+            raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; give the encoder's counts per turn, 1 or more")
         self.counts_per_turn = counts_per_turn
         self.absolute = False
-        """Whether an index pulse has defined the zero of the angle."""
+        """Whether an index pulse has defined the zero of the angle, so that angles are absolute."""
         self._zero: int | None = None
         self._index: int | None = None
         self._extreme: int | None = None
@@ -62,7 +65,7 @@ class AngleTracker:
         self._missed = False
 
     def count(self, t_us: int, count: int) -> tuple[float, tuple[FaultReport, ...]]:
-        """Return the angle at a count [rad], and the faults that this count reveals."""
+        """Return the prism angle at an encoder count [rad], and the faults that this count reveals."""
         if self._zero is None:
             self._zero = count
         if self._index is not None and abs(count - self._last) > UNSEEN_TURNS * self.counts_per_turn:
@@ -85,7 +88,10 @@ class AngleTracker:
         return self.angle(count), tuple(reports)
 
     def index(self, t_us: int, count: int) -> tuple[FaultReport, ...]:
-        """Set or check the zero by an index pulse at a count. After a slip, later angles use the corrected zero."""
+        """Set or check the zero of the angle by an index pulse at an encoder count.
+
+        After a slip, later angles use the corrected zero.
+        """
         self._index, self._last, self._missed = count, count, False
         was_absolute, self.absolute = self.absolute, True
         if self._zero is None:
@@ -97,6 +103,9 @@ class AngleTracker:
         return (FaultReport(EncoderFault.SLIP, t_us, error),) if was_absolute else ()
 
     def angle(self, count: int) -> float:
-        """Return the angle at a count [rad] for the present zero. Needs an earlier count or index pulse."""
+        """Return the prism angle at an encoder count [rad] for the present zero.
+
+        Needs an earlier count or index pulse.
+        """
         assert self._zero is not None
         return math.tau * (count - self._zero) / self.counts_per_turn

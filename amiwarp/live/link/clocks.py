@@ -1,4 +1,7 @@
-"""Clocks: a 32-bit clock unwrapped, and linear maps between two clocks, fitted to common pulses or to round trips."""
+"""Clocks: unwrapping of a 32-bit clock, and linear maps between two clocks.
+
+A map is fitted to pulses that both clocks recorded, or to round trips of messages.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +20,12 @@ if TYPE_CHECKING:
 WRAP = 1 << 32
 """Period of the controller's 32-bit clock [us]."""
 FEWEST_PAIRS = 3
-"""Smallest number of pairs of times for a fit."""
+"""Smallest number of pairs of times to which a clock map is fitted."""
 OUTLIER_STD = 4.0
-"""Robust standard deviations beyond which a pair is rejected: it may combine two different pulses."""
+"""Distance from the fitted line beyond which a pair of times is rejected [robust standard deviations]. Such a pair may
+combine two different pulses."""
 SHORT_TRIP = 2.0
-"""Round trips longer than this multiple of the shortest are ignored: their messages were delayed."""
+"""Longest used round trip, as a multiple of the shortest one. The messages of longer round trips were delayed."""
 
 
 def monotonic_us() -> int:
@@ -30,18 +34,18 @@ def monotonic_us() -> int:
 
 
 class UnwrappedClock:
-    """Unwraps the times of a 32-bit clock [us]."""
+    """Converts the times of a 32-bit clock [us] to times without wrap."""
 
     def __init__(self) -> None:
         self.last: int | None = None
         """Latest unwrapped time so far [us]."""
 
     def difference(self, t: int) -> int:
-        """Return the signed distance from the last time to ``t`` [us], across a wrap if that is shorter."""
+        """Return the signed distance from the latest time to ``t`` [us], across a wrap if that is shorter."""
         return 0 if self.last is None else (t - self.last + WRAP // 2) % WRAP - WRAP // 2
 
     def __call__(self, t: int) -> int:
-        """Return the unwrapped time that is closest to the last one; it may be earlier."""
+        """Return the unwrapped time of ``t`` that is closest to the latest one; it may be earlier [us]."""
         now = t if self.last is None else self.last + self.difference(t)
         self.last = now if self.last is None else max(self.last, now)
         return now
@@ -49,28 +53,28 @@ class UnwrappedClock:
 
 @dataclass(frozen=True, slots=True)
 class ClockMap:
-    """Linear map from one clock (own) to another: other = own + offset + drift · (own − ``at_us``)."""
+    """Linear map from one clock ("own") to another one: other = own + offset + drift · (own − ``at_us``)."""
 
     at_us: int
-    """Reference time on the own clock [us]: the mean time of the fitted pairs."""
+    """Reference time of the map on the own clock [us]: the mean time of the fitted pairs."""
     offset_us: float
-    """Offset of the other clock at :attr:`at_us` [us]."""
+    """Time of the other clock minus that of the own clock at :attr:`at_us` [us]."""
     drift: float
-    """Relative rate difference: 1e-6 is one microsecond per second."""
+    """Relative difference between the rates of the clocks: 1e-6 is one microsecond per second."""
     offset_std_us: float
-    """Standard deviation of the offset [us]."""
+    """Standard deviation of the offset at :attr:`at_us` [us]."""
     drift_std: float
-    """Standard deviation of the drift."""
+    """Standard deviation of the relative rate difference."""
     pairs: int
     """Number of pairs used by the fit, outliers excluded."""
 
     def __call__(self, own_us: ArrayLike) -> NDArray[np.int64]:
-        """Return the other clock's times [us], rounded, same shape as ``own_us``."""
+        """Return the other clock's times for times ``own_us`` of the own clock [us], rounded, same shape."""
         own = np.asarray(own_us, np.int64)
         return own + np.rint(self.offset_us + self.drift * (own - self.at_us)).astype(np.int64)
 
     def std_us(self, own_us: float) -> float:
-        """Return the standard deviation of the mapped time [us]. It grows with the distance from :attr:`at_us`."""
+        """Return the standard deviation of a mapped time [us]. It grows with the distance from :attr:`at_us`."""
         return math.hypot(self.offset_std_us, self.drift_std * (own_us - self.at_us))
 
 
@@ -84,7 +88,7 @@ def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0)
     own, other = (np.asarray(t, np.int64) for t in (own_us, other_us))
     if own.shape != other.shape or own.ndim != 1 or len(own) < FEWEST_PAIRS:
         expected = f"give the times of the same pulses on both clocks, at least {FEWEST_PAIRS}"
-        raise AmiwarpError(f"{own.size} and {other.size} pulses; {expected}")
+        raise AmiwarpError(f"clock map: {own.size} and {other.size} pulses; {expected}")
     return _fit_line(own, other, np.full(len(own), sigma_us))
 
 
@@ -108,7 +112,7 @@ def fit_to_round_trips(sent_us: ArrayLike, other_us: ArrayLike, received_us: Arr
 
 
 def _fit_line(own: NDArray[np.int64], other: NDArray[np.int64], sigma: NDArray[np.float64]) -> ClockMap:
-    """Fit a weighted line with iterative rejection of outliers; ``sigma``: standard deviation of each pair [us]."""
+    """Fit a line to pairs of times, weighted by ``sigma`` [us], and reject outliers iteratively."""
     difference = (other - own).astype(np.float64)
     kept = np.ones(len(own), np.bool_)
     for _ in range(10):

@@ -1,4 +1,4 @@
-"""Rotations for the emulated controller: a simulated motor, or the rotation of a recording."""
+"""Rotation of the emulated prism: by a simulated motor, or as in a recording."""
 
 from __future__ import annotations
 
@@ -15,46 +15,49 @@ if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
 
 MOST_SEGMENTS = 1024
-"""Largest number of motor segments in memory. The oldest kept segment also describes all earlier times."""
+"""Largest number of motor segments in memory. The oldest segment then also describes all earlier times."""
 RPM = math.tau / 60.0
-"""One turn per minute in rad/s."""
+"""Factor from turns per minute to rad/s."""
 
 
 class Rotor(Protocol):
-    """Rotation of the emulated prism, with the index pulse at whole turns. All times are emulation times [us]."""
+    """Rotation of the emulated prism, with an index pulse at every whole turn. All times are emulation times [us]."""
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Return unwrapped angles [rad], same shape as ``t_us``. Future angles assume no further command."""
+        """Return the unwrapped prism angles [rad] at times ``t_us``, same shape.
+
+        Angles of future times assume that no further command comes.
+        """
 
     def target_rpm(self, t_us: int) -> float:
-        """Return the commanded speed [turns/min]."""
+        """Return the commanded speed at a time [turns/min]."""
 
     def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
-        """Ramp from now on to a speed, at ``ramp`` [rpm/s]; return False if the rotor takes no commands."""
+        """Change to the speed ``rpm`` at ``ramp`` [rpm/s] from ``t_us`` on; return False if commands are not taken."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Segment:
-    """Motor state from ``start`` on: the target speed changes linearly, the motor follows it with a lag."""
+    """Motion of the motor from ``start`` on: the target speed changes linearly, and the speed follows with a lag."""
 
     start: float
-    """Time [s]."""
+    """Time at which the segment starts [s]."""
     angle: float
-    """Angle at the start [rad]."""
+    """Prism angle at the start of the segment [rad]."""
     speed: float
-    """Speed at the start [rad/s]."""
+    """Speed of the prism at the start of the segment [rad/s]."""
     target: float
-    """Target speed at the start [rad/s]."""
+    """Target speed at the start of the segment [rad/s]."""
     slope: float
     """Rate of change of the target speed [rad/s²]."""
 
 
 class Motor:
-    """Motor whose speed follows the ramped target with time constant ``inertia_s`` [s]; its angle is 0 at t = 0.
+    """Simulated motor whose speed follows the ramped target speed with the time constant ``inertia_s`` [s].
 
-    ``ripple``: relative speed variation at once and six times per turn, as from magnet poles. ``noise``: relative rms
-    speed variation by random friction, from ``seed``. Both are functions of the angle, so a motor at rest stays at
-    rest. The angle is a closed formula: angles can be computed for any times, in any order.
+    The angle is 0 at time 0. ``ripple``: relative speed variation once and six times per turn, as caused by magnet
+    poles. ``noise``: relative rms speed variation by random friction, from ``seed``. Both are functions of the angle,
+    so a motor at rest stays at rest. The angle is a closed formula: angles can be computed for any times, in any order.
     """
 
     def __init__(
@@ -68,7 +71,7 @@ class Motor:
         self._segments = [_Segment(start=0.0, angle=0.0, speed=rpm * RPM, target=rpm * RPM, slope=0.0)]
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Return unwrapped angles [rad], see :class:`Rotor`. The speed is constant before t = 0."""
+        """Return the unwrapped prism angles [rad], see :class:`Rotor`. The speed is constant before time 0."""
         t = np.asarray(t_us, np.float64) * 1e-6
         smooth = np.empty(t.shape)
         index = np.maximum(np.searchsorted([p.start for p in self._segments], t, side="right") - 1, 0)
@@ -83,7 +86,7 @@ class Motor:
         return last.target / RPM
 
     def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
-        """Ramp from now on to a speed, see :class:`Rotor`."""
+        """Change to a speed at a constant rate from now on, see :class:`Rotor`."""
         t = t_us * 1e-6
         current = self._segments[max(bisect.bisect_right([p.start for p in self._segments], t) - 1, 0)]
         self._segments = [p for p in self._segments if p.start <= t][-MOST_SEGMENTS:]
@@ -108,7 +111,10 @@ class Motor:
 
 
 class Played:
-    """Rotation of a recording. Its first sample is at ``start_us``; the prism is at rest before and after it."""
+    """Rotation played from a recording.
+
+    The first sample is at ``start_us``; the prism is at rest before and after it.
+    """
 
     def __init__(self, encoder: Encoder, start_us: int = 0) -> None:
         self._elapsed = (encoder.t - encoder.t[0]).astype(np.float64)
@@ -116,11 +122,11 @@ class Played:
         self.begin(start_us)
 
     def begin(self, start_us: int) -> None:
-        """Set another start time [us]. Only valid before the rotation has begun."""
+        """Set another start time of the recorded rotation [us]. Only valid before the rotation has begun."""
         self._t = self._elapsed + start_us
 
     def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Return unwrapped angles [rad], see :class:`Rotor`."""
+        """Return the unwrapped prism angles of the recording [rad], see :class:`Rotor`."""
         return np.asarray(np.interp(np.asarray(t_us, np.float64), self._t, self._angle))
 
     def target_rpm(self, t_us: int) -> float:

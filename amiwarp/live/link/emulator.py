@@ -41,44 +41,48 @@ LASTING_FAULTS = {
     "garbage": 0.5, "truncate": 0.5, "crc": 0.5, "drop": 0.5, "missed-index": 0.5, "stall": 2.0, "reverse": 1.0,
     "unplug": 1.0,
 }  # fmt: skip
-"""Faults with a duration, and their default duration [s].
+"""Faults of the emulated controller that last, with their default duration [s].
 
 ``garbage``, ``truncate``, ``crc`` and ``drop`` insert bytes, cut frames, flip a bit and remove a byte, each in half of
 the frames at random. ``missed-index`` suppresses index pulses, ``stall`` freezes the count, ``reverse`` reverses the
 motor and ``unplug`` pulls out the cable.
 """
 INSTANT_FAULTS = ("slip", "reset", "clock-jump")
-"""Faults without a duration: lost counts, a reboot, and a jump of the clock."""
+"""Faults of the emulated controller without a duration: lost counts, a reboot, and a jump of the clock."""
 SLIP_TURNS, JUMP_US = 0.05, 60_000_000
-"""Counts lost by ``slip`` [turns], and size of ``clock-jump`` [us]."""
+"""Counts that the fault ``slip`` loses [turns], and jump of the clock by the fault ``clock-jump`` [us]."""
 STEP_US = 10_000
-"""Interval between checks of the status [us]."""
+"""Interval between checks of whether the status must be sent [us]."""
 BATCH_US = 5_000
-"""Longest time that samples wait before they are sent [us]."""
+"""Longest time for which encoder samples are collected before they are sent [us]."""
 MOST_RPM = 6000.0
-"""Largest speed that a command may set [turns/min]."""
+"""Largest speed that a command may set [turns/min]; higher speeds are refused."""
 HOST_TIMEOUT_US = 3_000_000
-"""Time without a frame from the host until the host counts as lost [us]."""
+"""Time without a frame from the host after which the controller reports that the host is lost [us]."""
 MOST_OUT_BYTES = 1 << 20
-"""Largest output that waits to be fetched. More is lost, as on any serial line without flow control."""
+"""Largest number of bytes that wait to be fetched. Further output is lost, as on any serial line without flow control.
+"""
 STOP_RAMP = 2000.0
-"""Deceleration of a stop, and acceleration of a reversal [rpm/s]."""
+"""Deceleration of a stop command, and acceleration of the fault ``reverse`` [rpm/s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class EmulatedFault:
-    """One of :data:`LASTING_FAULTS` or :data:`INSTANT_FAULTS`, scheduled at an emulation time."""
+    """Fault of the emulated controller (a name in :data:`LASTING_FAULTS` or :data:`INSTANT_FAULTS`) at a given time."""
 
     name: str
-    """Name of the fault."""
+    """Name of the fault, from :data:`LASTING_FAULTS` or :data:`INSTANT_FAULTS`."""
     start_s: float
     """Emulation time at which it begins [s]."""
     duration_s: float = 0.0
-    """Duration [s]; 0 for instant faults."""
+    """Duration of the fault [s]; 0 for instant faults."""
 
     @classmethod
     def parse(cls, text: str) -> EmulatedFault:
-        """Parse ``NAME@SECONDS`` or ``NAME@SECONDS+DURATION``. Raises :class:`AmiwarpError` for anything else."""
+        """Parse a fault given as ``NAME@SECONDS`` or ``NAME@SECONDS+DURATION``.
+
+        Raises :class:`AmiwarpError` for any other text.
+        """
         match = re.fullmatch(r"([a-z-]+)@(\d+(?:\.\d*)?)(?:\+(\d+(?:\.\d*)?))?", text)
         if match is None or match[1] not in (*LASTING_FAULTS, *INSTANT_FAULTS):
             names = ", ".join((*LASTING_FAULTS, *INSTANT_FAULTS))
@@ -114,9 +118,9 @@ class Controller:
         self.rotor = rotor
         self.counts_per_turn = counts_per_turn
         self.plugged = True
-        """Whether the cable is plugged in. The controller keeps running without it."""
+        """Whether the cable is plugged in. The controller keeps running while it is unplugged."""
         self.pulses: deque[tuple[int, int]] = deque(maxlen=1000)
-        """Latest sync pulses: number and emulation time [us]."""
+        """Latest sync pulses, each with its number and emulation time [us]."""
         self._rate = 1.0 + drift_ppm * 1e-6
         self._sample_us, self._sync_us = 1e6 / sample_hz, 1e6 / sync_hz
         self._batch_size = min(max(int(BATCH_US / self._sample_us), 1), MOST_SAMPLES)
@@ -131,14 +135,17 @@ class Controller:
         self._apply_faults()
 
     def advance(self, now_us: int) -> bytes:
-        """Run until an emulation time [us] and return the bytes sent; none while the cable is unplugged."""
+        """Run the controller until an emulation time [us] and return the bytes that it sends; none while unplugged."""
         self._advance_to(now_us)
         out = bytes(self._out)
         self._out.clear()
         return out
 
     def feed(self, data: bytes, now_us: int) -> None:
-        """Receive bytes at an emulation time [us]. The next :meth:`advance` returns the answers."""
+        """Give received bytes to the controller at an emulation time [us].
+
+        The next :meth:`advance` returns the answers.
+        """
         self._advance_to(now_us)
         for sequence, message in self._decoder.feed(data) if self.plugged else ():
             if sequence is not None:
@@ -150,14 +157,14 @@ class Controller:
         return self._clock_start + math.floor((now_us - self._boot_us) * self._rate)
 
     def time_at(self, clock_us: ArrayLike) -> NDArray[np.float64]:
-        """Return the emulation times [us] of readings of the controller's clock without wrap [us], same shape."""
+        """Return the emulation times [us] of readings of the controller's clock (without wrap) [us], same shape."""
         return self._boot_us + (np.asarray(clock_us) - self._clock_start) / self._rate
 
     def _boot(self, clock_start: int) -> None:
         self._boot_us, self._clock_start, self._sequence = self._now, clock_start, 0
         self._batch: list[tuple[int, int]] = []
         self._before = self._now, float(self.rotor.angle(self._now))
-        self._count_offset = math.floor(self._position())  # reported count: position minus this offset
+        self._count_offset = math.floor(self._position())  # the reported count is the position minus this offset
         self._frozen_count: int | None = None
         self._sent_status: tuple[int, int, float, int] | None = None
         self._checked_us = self._now
@@ -179,7 +186,7 @@ class Controller:
                 self._send_status()
 
     def _emit(self, until: int) -> None:
-        """Send what is due between now and ``until``, in order of time."""
+        """Send the samples, pulses and status that are due between now and ``until``, in order of time."""
         first, last = ((t - self._boot_us) * self._rate for t in (self._now, until))
         sampled = np.arange(math.floor(first / self._sample_us) + 1, math.floor(last / self._sample_us) + 1)
         elapsed = sampled * self._sample_us
@@ -221,7 +228,7 @@ class Controller:
         return (self._clock_start + math.floor(elapsed)) % WRAP
 
     def _apply_faults(self) -> None:
-        """Begin and end the faults that are due."""
+        """Begin and end the faults whose times have come."""
         while self._fault_edges and self._fault_edges[0][0] <= self._now:
             _, fault, on = self._fault_edges.pop(0)
             if fault.name in LASTING_FAULTS:
@@ -294,7 +301,7 @@ class Controller:
             self._out += self._corrupt(bytearray(frame))
 
     def _corrupt(self, frame: bytearray) -> bytearray:
-        """Apply the active transmission faults to a frame."""
+        """Damage a frame as the active transmission faults demand."""
         for name in self._active_faults:
             if name in ("garbage", "truncate", "crc", "drop") and self._rng.random() < 0.5:
                 at = self._rng.randrange(1, len(frame))

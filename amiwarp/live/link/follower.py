@@ -15,17 +15,18 @@ from amiwarp.live.link.protocol import FAULTS, Answer, ControllerStatus, Index, 
 from amiwarp.live.link.updates import LinkUpdate, UpdateQueue
 
 LATE_US = 100_000
-"""Step backwards of the controller's clock beyond which it counts as reset [us]."""
+"""Step backwards of the controller's clock beyond which the clock is considered reset [us]."""
 AHEAD_US = 2_000_000
-"""Sudden advance of the controller's clock over the host's beyond which the clock counts as changed [us]."""
+"""Sudden advance of the controller's clock relative to the host's beyond which the clock is considered changed [us]."""
 SILENT_US = 1_800_000_000
-"""Silence after which the number of wraps of the controller's clock is unknown [us]."""
+"""Time without data after which the number of wraps of the controller's clock is unknown [us]."""
 FASTEST = 200.0
-"""Speed that no prism exceeds [turns/s]. A faster change of the count, by more than a turn, is a restart."""
+"""Speed that no prism exceeds [turns/s]. A faster change of the count, by more than a turn, is taken for a restart."""
 HOLD_TURNS = 2
-"""Longest wait for the first index pulse [turns]."""
+"""Number of turns for which samples wait for the first index pulse."""
 STATUS_US = 2_000_000
-"""Longest wait for the controller's own counts per turn [us]. It sends its status once per second."""
+"""Longest time for which samples wait until the controller's status gives the counts per turn [us]. The status is sent
+once per second."""
 FROM_FIRST = "angles are relative to the first encoder count"
 HOST_LOST = 1 << FAULTS.index("host lost")
 
@@ -41,17 +42,17 @@ class Follower:
     def __init__(self, name: str, counts_per_turn: int | None = None) -> None:
         self.name = name
         self.status: ControllerStatus | None = None
-        """Latest status of the controller."""
+        """Latest status that the controller sent; None before the first."""
         self.trips: deque[tuple[int, int, int]] = deque(maxlen=TRIPS)
         """Round trips of pings: time sent (host), answered (controller), received (host) [us]."""
         self.updates = UpdateQueue()
-        """Updates that wait to be fetched."""
+        """Updates that wait to be fetched by the user of the link."""
         self._given_per_turn = counts_per_turn
         self._per_turn: int | None = None
         self._connection, self._epoch = Connection(0), Epoch(None)
 
     def opened(self, host_us: int) -> None:
-        """Note that the port was opened, or reopened. Only the state of the connection is reset."""
+        """Reset the state of the connection, because the port was opened or reopened."""
         self._connection = Connection(host_us)
 
     @property
@@ -61,11 +62,11 @@ class Follower:
 
     @property
     def text(self) -> bool:
-        """Whether text lines have arrived: their sender answers nothing."""
+        """Whether text lines have arrived. A controller that sends text lines answers neither pings nor commands."""
         return self._connection.decoder.received.lines > 0
 
     def pinged(self, number: int, host_us: int) -> None:
-        """Note that a ping was sent."""
+        """Store the host time of a ping that was sent."""
         self._epoch.pings[number] = host_us
         self._epoch.pings.pop(number - TRIPS, None)
 
@@ -83,11 +84,11 @@ class Follower:
         return replace(clock, offset_std_us=math.hypot(clock.offset_std_us, shared))
 
     def say(self, sentence: str) -> None:
-        """Add a message, in order with the samples."""
+        """Add a message for the user, in order with the samples."""
         self.updates.say(sentence)
 
     def take(self) -> LinkUpdate:
-        """Return the oldest update; after a restart of the controller, first the data from before it."""
+        """Return the oldest update. After a restart of the controller, data from before the restart come first."""
         return self.updates.take()
 
     def feed(self, data: bytes, host_us: int) -> list[Answer]:
@@ -123,7 +124,7 @@ class Follower:
             self._take_status(message, self._unwrap_time(message.t_us, host_us))
 
     def _sample(self, raw_t: int, raw_count: int, host_us: int, *, text: bool) -> None:
-        """Process a sample. An implausible text line is accepted only once the next line continues it."""
+        """Convert a sample. An implausible text line is accepted only once the next line continues it."""
         if text and self._per_turn is None:
             self._decide_counts(self._given_per_turn)
         suspect, self._epoch.suspect = self._epoch.suspect, None
@@ -143,16 +144,16 @@ class Follower:
         self._convert(t, count, pulse=False)
 
     def _continues(self, suspect: tuple[int, int], raw_t: int, raw_count: int) -> bool:
-        """Return whether a text line plausibly continues an implausible one."""
+        """Return whether a text line plausibly continues the implausible line ``suspect``."""
         step = (raw_t - suspect[0]) % WRAP
         return 0 < step < AHEAD_US and abs(raw_count - suspect[1]) <= self._largest_step(step)
 
     def _largest_step(self, step_us: int) -> float:
-        """Return the largest plausible change of the count over a time."""
+        """Return the largest plausible change of the count during a time step [us]."""
         return (self._per_turn or math.inf) * (1.0 + FASTEST * max(step_us, 0) * 1e-6)
 
     def _discontinuity(self, raw_t: int, raw_count: int | None, host_us: int) -> str:
-        """Return why a sample does not continue the previous ones; an empty string if it does."""
+        """Return why a sample does not continue the previous samples; an empty string if it continues them."""
         epoch = self._epoch
         if epoch.clock.last is None:
             return ""
@@ -170,7 +171,7 @@ class Follower:
         return ""
 
     def _unwrap_time(self, raw_t: int, host_us: int) -> int:
-        """Return the unwrapped time [us]; restart at a discontinuity."""
+        """Return the unwrapped time of a reading of the controller's clock [us]; restart at a discontinuity."""
         why = self._discontinuity(raw_t, None, host_us)
         if why:
             self._restart(why)
@@ -179,7 +180,7 @@ class Follower:
         return t
 
     def _unwrap(self, raw_t: int, raw_count: int, host_us: int) -> tuple[int, int]:
-        """Return unwrapped time [us] and count; restart at a discontinuity."""
+        """Return the unwrapped time [us] and the unwrapped count; restart at a discontinuity."""
         why = self._discontinuity(raw_t, raw_count, host_us)
         if why:
             self._restart(why)
@@ -187,7 +188,7 @@ class Follower:
         return t, self._epoch.note_count(t, raw_count)
 
     def _restart(self, why: str) -> None:
-        """Begin a new epoch: the controller's clock or counts restarted."""
+        """Start new angles and times, because the controller's clock or counts restarted."""
         self._release()
         self.updates.restart()
         self.say(f"{self.name}: {why}; angles restart")
@@ -196,7 +197,10 @@ class Follower:
         self.trips.clear()
 
     def _decide_counts(self, per_turn: int | None) -> None:
-        """Use these counts per turn and convert what waited for them; None: no source knows them."""
+        """Set the counts per turn and convert the data that waited for them.
+
+        ``per_turn``: None if no source gives them.
+        """
         if per_turn is None:
             if not self._connection.unusable:
                 self.say(f"{self.name}: the controller does not report its counts per turn; give counts_per_turn")
@@ -211,7 +215,7 @@ class Follower:
                 self._convert(t, count, pulse=pulse)
 
     def _convert(self, t: int, count: int, *, pulse: bool) -> None:
-        """Convert the count of a sample or index pulse to an angle, once the counts per turn are known."""
+        """Convert the count of a sample or index pulse to a prism angle, once the counts per turn are known."""
         angles = self._epoch.angles
         if angles is None:
             self._epoch.unscaled.append((t, count, pulse))
@@ -246,14 +250,14 @@ class Follower:
         self._release()
 
     def _release(self) -> None:
-        """Give out the samples that waited for the first index pulse."""
+        """Give the samples that waited for the first index pulse to the caller's updates."""
         waiting, self._epoch.unreferenced = self._epoch.unreferenced or (), None
         for t, count in waiting:
             assert self._epoch.angles is not None
             self._give(t, self._epoch.angles.angle(count))
 
     def _give(self, t: int, angle: float) -> None:
-        """Give out a sample with the index pulses before it; drop it if it is out of order."""
+        """Add a sample, and the index pulses before it, to the caller's updates; drop it if it is out of order."""
         epoch = self._epoch
         if epoch.given_us is not None and t <= epoch.given_us:
             self._connection.losses.out_of_order += 1
@@ -282,7 +286,7 @@ class Follower:
         self._epoch.faults = faults
 
     def _report_losses(self, host_us: int) -> None:
-        """Report losses and noise, at a limited rate; once if nothing is understood at all."""
+        """Report lost and damaged data, at a limited rate; report once if no data can be decoded at all."""
         connection = self._connection
         if self.speaks or self.text:
             for sentence in connection.losses.check(connection.decoder.received, host_us):

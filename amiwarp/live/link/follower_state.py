@@ -1,4 +1,4 @@
-"""State of a :class:`~amiwarp.live.link.follower.Follower`, grouped by what resets it."""
+"""State of a :class:`~amiwarp.live.link.follower.Follower`, in one class for each occasion on which it is reset."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ from amiwarp.live.link.clocks import WRAP, UnwrappedClock
 from amiwarp.live.link.protocol import ControllerStatus, FrameCounters, FrameDecoder
 
 TRIPS = 60
-"""Number of round trips in memory."""
+"""Number of latest round trips of pings in memory."""
 REPORT_US = 1_000_000
 """Shortest interval between messages about losses, and between those about noise [us]."""
 STALL_US, STALL_COUNTS = 300_000, 5.0
-"""A count is stalled once it is constant for this time [us], and for the time of this many counts at the speed."""
+"""Time for which a count must be constant to be reported as stalled [us], and number of counts that the motor must move
+in that time at its speed."""
 
 
 @dataclass(slots=True)
 class LossReporter:
-    """Turns the decoder's statistics into messages, at a limited rate."""
+    """Turns the frame decoder's statistics into messages for the user, at a limited rate."""
 
     out_of_order: int = 0
-    """Samples dropped because they were out of order, not yet reported."""
+    """Number of samples that were dropped because they were out of order, and are not yet reported."""
     _damaged: int | None = None
-    """Damaged frames so far; None at first, because opening the port cuts a frame."""
+    """Number of damaged frames so far; None at first, because opening the port cuts a frame."""
     _lost: int = 0
-    """Lost frames already reported."""
+    """Number of lost frames that were already reported."""
     _noise_us: int = -REPORT_US
     _lost_us: int = -REPORT_US
 
     def forget_lost(self, received: FrameCounters) -> None:
-        """Do not report the frames lost so far."""
+        """Mark the frames lost so far as reported."""
         self._lost = received.lost
 
     def check(self, received: FrameCounters, host_us: int) -> Iterator[str]:
-        """Yield the messages that are due."""
+        """Yield the messages about losses and noise that are due."""
         if self._damaged is not None and received.damaged > self._damaged:
             if host_us - self._noise_us > REPORT_US:
                 yield "dropped damaged frames or lines; is the cable noisy?"
@@ -54,23 +55,23 @@ class LossReporter:
 
 @dataclass(slots=True)
 class Connection:
-    """State since the port was opened."""
+    """State that is reset when the port is opened."""
 
     opened_us: int
-    """Host time of the opening [us]."""
+    """Host time at which the port was opened [us]."""
     decoder: FrameDecoder = field(default_factory=FrameDecoder)
     losses: LossReporter = field(default_factory=LossReporter)
     received_bytes: int = 0
     unusable: bool = False
-    """Whether a message already said that the data cannot be used."""
+    """Whether the user was told that the data cannot be used."""
     ping_answered: bool = False
     unread: bool = True
-    """Whether no time of the controller has arrived yet."""
+    """Whether no time of the controller has arrived since the port was opened."""
     _sequence: int | None = None
-    """Latest sequence number."""
+    """Latest sequence number of a frame."""
 
     def runs_back(self, sequence: int) -> bool:
-        """Note a frame's sequence number; return whether it went backwards."""
+        """Store a frame's sequence number; return whether it went backwards."""
         before, self._sequence = self._sequence, sequence
         return before is not None and (sequence - before) & 0xFFFF >= 1 << 15
 
@@ -80,14 +81,14 @@ class StallDetector:
     """Finds counts that stay constant while the controller reports that the motor turns."""
 
     status_us: int = -1
-    """Time of the latest status [us]; -1 before the first."""
+    """Time of the controller's latest status [us]; -1 before the first status."""
     _since_us: int = 0
-    """Time since which the count is constant [us]; 0 before the first sample."""
+    """Time from which the count has been constant [us]; 0 before the first sample."""
     _count: int = 0
     _reported: bool = False
 
     def check(self, t: int, count: int, status: ControllerStatus | None, counts_per_turn: int) -> str | None:
-        """Process a sample; return a message at the beginning of a stall."""
+        """Process a sample; return a message when a stall begins."""
         if self._since_us == 0 or count != self._count:
             self._since_us, self._count, self._reported = t, count, False
             return None
@@ -102,41 +103,41 @@ class StallDetector:
 
 
 class Epoch:
-    """State since the controller's clock and counts last restarted."""
+    """State that is reset when the controller's clock or counts restart."""
 
     def __init__(self, counts_per_turn: int | None) -> None:
         self.clock = UnwrappedClock()
         self.largest_lead_us = -math.inf
-        """Largest lead of the controller's clock over the host's at the arrival of data [us]."""
+        """Largest amount by which the controller's clock was ahead of the host's when data arrived [us]."""
         self.heard_us = 0
         """Host time of the latest data [us]."""
         self.counted: tuple[int, int] | None = None
-        """Latest unwrapped time [us] and count."""
+        """Latest unwrapped time [us] and unwrapped count."""
         self.suspect: tuple[int, int] | None = None
-        """Raw time and count of a text line that did not continue the previous ones."""
+        """Raw time and raw count of a text line that did not continue the previous lines."""
         self.angles = None if counts_per_turn is None else AngleTracker(counts_per_turn)
         self.unscaled: deque[tuple[int, int, bool]] = deque(maxlen=updates.MOST_WAITING_SAMPLES)
-        """Time, count, and whether an index pulse, of data that wait for the counts per turn."""
+        """Data that wait for the counts per turn: time, count, and whether they are an index pulse."""
         self.unreferenced: deque[tuple[int, int]] | None = deque(maxlen=updates.MOST_WAITING_SAMPLES)
-        """Time and count of samples that wait for the first index pulse; None once none has to wait."""
+        """Samples that wait for the first index pulse: time and count; None once samples no longer have to wait."""
         self.pulses: deque[int] = deque(maxlen=updates.MOST_PULSES)
         """Times of index pulses that wait for the next sample [us]."""
         self.given_us: int | None = None
-        """Time of the latest sample given out [us]."""
+        """Time of the latest sample that was added to the updates [us]."""
         self.stall = StallDetector()
         self.faults = 0
-        """Fault bits of the latest status."""
+        """Fault bits of the controller's latest status, see ``protocol.FAULTS``."""
         self.pings: dict[int, int] = {}
-        """Host times of unanswered pings by their number [us]."""
+        """Host times at which unanswered pings were sent [us], by number of the ping."""
 
     def note_time(self, raw_t: int, host_us: int) -> int:
-        """Return the unwrapped time of data that arrived at ``host_us`` [us]."""
+        """Store the time of data that arrived at ``host_us`` [us], and return it unwrapped."""
         t = self.clock(raw_t)
         self.largest_lead_us, self.heard_us = max(self.largest_lead_us, t - host_us), host_us
         return t
 
     def note_count(self, t: int, raw_count: int) -> int:
-        """Return the unwrapped count at an unwrapped time."""
+        """Store the count of a sample at an unwrapped time, and return it unwrapped."""
         count = raw_count if self.counted is None else self.counted[1] + self.count_step(raw_count)
         self.counted = t, count
         return count

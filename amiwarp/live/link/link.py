@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from amiwarp.live.link.updates import LinkUpdate
 
 READ_BYTES = 1 << 16
-"""Largest number of bytes read at once."""
+"""Largest number of bytes read from the port at once."""
 RETRY_S = 0.2
 """Interval between attempts to reopen a lost port [s]."""
 ANSWER_S = 1.0
 """Longest wait for the answer to a command [s]."""
 QUICK_PINGS, QUICK_PING_US, PING_US = 10, 50_000, 1_000_000
-"""Number of the first, quick pings, their interval [us], and the interval of later pings [us]."""
+"""Number of quick pings after the port is opened, interval of the quick pings [us], and interval of later pings [us].
+"""
 
 
 class Link:
@@ -42,15 +43,15 @@ class Link:
         self, port: str | None = None, *, counts_per_turn: int | None = None, host_us: Callable[[], int] = monotonic_us
     ) -> None:
         if counts_per_turn is not None and counts_per_turn < 1:
-            raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; give 1 or more")
+            raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; give the encoder's counts per turn, 1 or more")
         self._port: Any = open_port(port)
         self.name = str(self._port.port)
         self._where = port or usb_id(self.name) or self.name
         self._host_us = host_us
         self._follower = Follower(self.name, counts_per_turn)
         self._follower.opened(host_us())
-        self._changed = threading.Condition()  # guards the follower and the answers
-        self._writing = threading.Lock()  # guards the port and the sequence
+        self._changed = threading.Condition()  # held while the follower or the answers are used
+        self._writing = threading.Lock()  # held while the port or the sequence number is used
         self._answers: dict[int, int | None] = {}  # by the command's sequence number; None: not yet received
         self._sequence = self._number = 0
         self._ping_us = host_us()
@@ -73,12 +74,12 @@ class Link:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open."""
+        """Whether the serial port is open."""
         return self._port is not None
 
     @property
     def status(self) -> ControllerStatus | None:
-        """Latest status of the controller, None before the first."""
+        """Latest status of the controller; None before the first status."""
         return self._follower.status
 
     def poll(self) -> LinkUpdate:
@@ -87,7 +88,7 @@ class Link:
             return self._follower.take()
 
     def clock(self) -> ClockMap | None:
-        """Return the map from the host's clock to the controller's (that of :attr:`LinkUpdate.t_us`).
+        """Return the map from the host's clock to the controller's clock (that of :attr:`LinkUpdate.t_us`).
 
         Returns None until three pings are answered.
         """
@@ -95,19 +96,25 @@ class Link:
             return self._follower.clock()
 
     def set_speed(self, rpm: float, ramp: float) -> None:
-        """Ramp to ``rpm`` (negative: backwards) at ``ramp`` [rpm/s]. Raises :class:`AmiwarpError` if refused."""
+        """Change the motor's speed to ``rpm`` (negative: backwards) at the rate ``ramp`` [rpm/s].
+
+        Raises :class:`AmiwarpError` if the controller refuses the command.
+        """
         self._command(SetSpeed(rpm, ramp), f"set speed {rpm:g} rpm")
 
     def stop(self) -> None:
-        """Stop the motor. Raises :class:`AmiwarpError` if refused."""
+        """Stop the motor. Raises :class:`AmiwarpError` if the controller refuses the command."""
         self._command(Stop(), "stop")
 
     def set_counts(self, per_turn: int) -> None:
-        """Set the encoder's counts per turn in the controller. Raises :class:`AmiwarpError` if refused."""
+        """Set the encoder's counts per turn in the controller.
+
+        Raises :class:`AmiwarpError` if it refuses the command.
+        """
         self._command(SetCounts(per_turn), f"set {per_turn} counts per turn")
 
     def _command(self, message: Message, what: str) -> None:
-        """Send a command and wait for its answer."""
+        """Send a command and wait for its answer. ``what``: name of the command in messages."""
         if self._follower.text:
             raise AmiwarpError(f"{self.name}: {what}: the controller sends lines of text, which take no commands")
         try:
@@ -120,7 +127,9 @@ class Link:
             self._changed.wait_for(lambda: self._answers[sequence] is not None, ANSWER_S)
             refused = self._answers.pop(sequence)
         if refused is None:
-            raise AmiwarpError(f"{self.name}: {what}: no answer in {ANSWER_S:g} s; see 'amiwarp motor status'")
+            raise AmiwarpError(
+                f"{self.name}: {what}: no answer in {ANSWER_S:g} s; check the controller by 'amiwarp motor status'"
+            )
         if refused:
             why = REFUSALS[refused] if refused < len(REFUSALS) else f"reason {refused}"
             raise AmiwarpError(f"{self.name}: {what}: refused by the controller, {why}")
@@ -159,7 +168,7 @@ class Link:
                 return
 
     def _read_port(self) -> None:
-        """Read what has arrived, for a short time; ping if due."""
+        """Read the bytes that have arrived, for a short time, and send a ping if one is due."""
         data = self._port.read(1)
         if data:
             data += self._port.read(min(self._port.in_waiting, READ_BYTES))

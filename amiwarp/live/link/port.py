@@ -11,11 +11,11 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.protocol import FrameDecoder
 
 BAUD = 460_800
-"""Baud rate of a UART. USB CDC ports ignore it."""
+"""Baud rate of the serial port [bit/s]. USB CDC ports ignore it."""
 READ_S, WRITE_S = 0.05, 0.5
-"""Time-outs of a read and of a write [s]."""
+"""Time-outs of a read and of a write on the port [s]."""
 LISTEN_S = 1.0
-"""Time to wait for controller data during detection, per port [s]."""
+"""Time for which each port is read when the controller is searched for [s]."""
 _USB = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
 
 
@@ -33,7 +33,7 @@ def open_port(where: str | None) -> Any:
     wanted = int(match[1], 16), int(match[2], 16)
     names = [p.device for p in _ports() if (p.vid, p.pid) == wanted]
     if len(names) != 1:
-        raise AmiwarpError(f"USB id {where}: {len(names)} ports have it; {_available()}")
+        raise AmiwarpError(f"USB id {where}: {len(names)} ports have this id; {_available()}")
     return _open(names[0])
 
 
@@ -67,13 +67,15 @@ def _open(name: str) -> Any:
         if number in (errno.EAGAIN, errno.EBUSY):
             raise AmiwarpError(f"{name}: another program has this port open; close that program first") from error
         if number == errno.EACCES:
-            raise AmiwarpError(f"{name}: no permission; on Linux join the port's group (see ls -l {name})") from error
+            raise AmiwarpError(
+                f"{name}: no permission to open this port; on Linux join the port's group (see ls -l {name})"
+            ) from error
         why = "no such port" if number == errno.ENOENT else f"cannot be opened ({error})"
         raise AmiwarpError(f"{name}: {why}; {_available()}") from error
 
 
 def _find() -> Any:
-    """Return the first port that sends controller frames or lines, opened."""
+    """Open the first port on which controller frames or lines arrive, and return it."""
     errors = []
     for candidate in _ports():
         try:

@@ -15,9 +15,9 @@ from typing import ClassVar
 
 VERSION = 1
 LONGEST = 512
-"""Longest frame, zero byte included [bytes]. More bytes without a zero are garbage."""
+"""Longest frame, including the zero byte [bytes]. A longer run of bytes without a zero is discarded as garbage."""
 MOST_SAMPLES = 32
-"""Largest number of samples in one message."""
+"""Largest number of encoder samples in one message."""
 STATES = ("stopped", "at speed", "on the way to its speed", "fault")
 """Meaning of each value of :attr:`ControllerStatus.state`."""
 FAULTS = ("stall", "over-current", "encoder lost", "index missed", "host lost")
@@ -32,98 +32,98 @@ _LINE = re.compile(rb"(\d{1,10}),(-?\d{1,10})\r?")
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Encoder counts, with the times when they were latched."""
+    """Message: encoder counts with the times at which they were latched."""
 
     KIND: ClassVar[int] = 0x01
     t_us: tuple[int, ...]
-    """Controller's clock [us], modulo 2**32."""
+    """Times of the counts on the controller's clock [us], modulo 2**32."""
     count: tuple[int, ...]
     """Encoder counts, wrapped to 32 bits, signed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Index:
-    """Index pulse of the encoder, once per turn."""
+    """Message: index pulse of the encoder, which comes once per turn."""
 
     KIND: ClassVar[int] = 0x02
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<Ii")
     t_us: int
-    """Controller's clock [us], modulo 2**32."""
+    """Time of the pulse on the controller's clock [us], modulo 2**32."""
     count: int
-    """Encoder count at the pulse."""
+    """Encoder count at the index pulse."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """Sync pulse, which the camera also records as a trigger event."""
+    """Message: sync pulse that the controller sent to the camera, which records it as a trigger event."""
 
     KIND: ClassVar[int] = 0x03
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<II")
     t_us: int
-    """Controller's clock [us], modulo 2**32."""
+    """Time of the pulse on the controller's clock [us], modulo 2**32."""
     number: int
     """Sequence number of the pulse, starting at 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerStatus:
-    """State of the motor. The controller sends it at least once per second."""
+    """Message: state of the motor. The controller sends it at least once per second."""
 
     KIND: ClassVar[int] = 0x04
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<IBHffI")
     t_us: int
-    """Controller's clock [us], modulo 2**32."""
+    """Time of the status on the controller's clock [us], modulo 2**32."""
     state: int
-    """Index into :data:`STATES`."""
+    """State of the motor, as an index into :data:`STATES`."""
     faults: int
-    """Bit field, see :data:`FAULTS`."""
+    """Faults as a bit field; :data:`FAULTS` gives the meaning of the bits."""
     rpm: float
     """Measured speed [turns/min], negative backwards."""
     target_rpm: float
-    """Commanded speed [turns/min]."""
+    """Commanded speed [turns/min], negative backwards."""
     counts_per_turn: int
     """Encoder counts per turn; 0 if the controller does not know them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pong:
-    """Answer to a :class:`Ping`."""
+    """Message: answer to a :class:`Ping`."""
 
     KIND: ClassVar[int] = 0x05
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<II")
     number: int
-    """Number of the ping."""
+    """Number of the ping that is answered."""
     t_us: int
-    """Controller's clock [us], modulo 2**32."""
+    """Time of the answer on the controller's clock [us], modulo 2**32."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Answer to a command: accepted or refused."""
+    """Message: answer to a command, which the controller accepted or refused."""
 
     KIND: ClassVar[int] = 0x06
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<HB")
     sequence: int
-    """Sequence number of the command."""
+    """Sequence number of the command that is answered."""
     refused: int
-    """Index into :data:`REFUSALS`; 0 if accepted."""
+    """Reason for a refusal, as an index into :data:`REFUSALS`; 0 if the command was accepted."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetSpeed:
-    """Command to ramp to a speed."""
+    """Command to change the motor's speed at a constant rate."""
 
     KIND: ClassVar[int] = 0x81
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<ff")
     rpm: float
-    """Target speed [turns/min], negative backwards."""
+    """Target speed of the motor [turns/min], negative backwards."""
     ramp: float
-    """Acceleration [rpm/s]."""
+    """Rate of change of the speed [rpm/s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Command to stop the motor."""
+    """Command to stop the prism's motor."""
 
     KIND: ClassVar[int] = 0x82
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<")
@@ -136,7 +136,7 @@ class SetCounts:
     KIND: ClassVar[int] = 0x83
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<I")
     per_turn: int
-    """Counts per turn."""
+    """Counts of the encoder per turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class Ping:
     KIND: ClassVar[int] = 0x84
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<I")
     number: int
-    """Number that the pong repeats."""
+    """Number of the ping, which the pong repeats."""
 
 
 Plain = Index | Sync | ControllerStatus | Pong | Answer | SetSpeed | Stop | SetCounts | Ping
@@ -157,7 +157,7 @@ _PLAIN: dict[int, type[Plain]] = {
 
 
 def encode(message: Message, sequence: int) -> bytes:
-    """Encode a message as a frame.
+    """Encode a message as the bytes of a frame.
 
     Raises ValueError for numbers outside a field's range, or for other than 1 to :data:`MOST_SAMPLES` samples.
     """
@@ -165,7 +165,9 @@ def encode(message: Message, sequence: int) -> bytes:
 
     if isinstance(message, Samples):
         if not 0 < len(message.t_us) == len(message.count) <= MOST_SAMPLES:
-            raise ValueError(f"{len(message.t_us)} times and {len(message.count)} counts; send 1 to {MOST_SAMPLES}")
+            raise ValueError(
+                f"{len(message.t_us)} times and {len(message.count)} counts; send 1 to {MOST_SAMPLES} of both"
+            )
         fields = zip(message.t_us, message.count, strict=True)
     try:
         if isinstance(message, Samples):
@@ -180,20 +182,20 @@ def encode(message: Message, sequence: int) -> bytes:
 
 @dataclass(slots=True)
 class FrameCounters:
-    """Statistics of a :class:`FrameDecoder`."""
+    """Statistics of the frames and lines that a :class:`FrameDecoder` received."""
 
     frames: int = 0
-    """Complete frames with a valid checksum and a known message."""
+    """Number of complete frames with a valid checksum and a known message."""
     damaged: int = 0
-    """Frames or lines that were too short, too long, not COBS, or had a wrong checksum."""
+    """Number of frames or lines that were too short, too long, not COBS, or had a wrong checksum."""
     unknown: int = 0
-    """Frames of another version or an unknown type, or whose payload has a wrong size."""
+    """Number of frames of another version or an unknown type, or with a payload of the wrong size."""
     lost: int = 0
-    """Frames that are missing by their sequence numbers."""
+    """Number of lost frames, from gaps in the sequence numbers."""
     restarts: int = 0
-    """Sequence numbers that went backwards, which means that the controller was reset."""
+    """Number of sequence numbers that went backwards, which means that the controller was reset."""
     lines: int = 0
-    """Text lines with a sample."""
+    """Number of text lines that contain a sample."""
 
 
 class FrameDecoder:
@@ -272,7 +274,7 @@ class FrameDecoder:
 
 
 def _checked(held: bytes) -> bytes | None:
-    """Decode COBS and verify the checksum; return the packet without its checksum, or None if damaged."""
+    """Decode a COBS frame and verify its checksum; return the packet without the checksum, or None if it is damaged."""
     from cobs import cobs
 
     try:
@@ -286,7 +288,7 @@ def _checked(held: bytes) -> bytes | None:
 
 
 def _message(kind: int, payload: bytes) -> Message | None:
-    """Return the decoded message, or None for an unknown type or a wrong payload size."""
+    """Decode the payload of a message of type ``kind``; return None for an unknown type or a wrong payload size."""
     if kind == Samples.KIND:
         if not payload or len(payload) % _SAMPLE.size or len(payload) > MOST_SAMPLES * _SAMPLE.size:
             return None

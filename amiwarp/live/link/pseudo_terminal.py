@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from amiwarp.live.link.emulator import Controller
 
 STEP_S = 1e-3
-"""Interval between updates of the controller [s]."""
+"""Interval between updates of the emulated controller [s]."""
 RETRY_S = 0.2
 """Interval between attempts to open a pseudo-terminal after a failure [s]."""
 
 
 class PseudoTerminal:
-    """Runs a controller in real time, in a background thread, until closed.
+    """Pseudo-terminal that runs an emulated controller in real time, in a background thread, until closed.
 
     ``path``: symbolic link to the port. It exists while the emulated cable is plugged in, and points to the new port
     after a reconnection, so that programs find it under the same name. ``now_us``: emulation time [us]; default: time
@@ -42,7 +42,9 @@ class PseudoTerminal:
         self._path = None if path is None else Path(path)
         # A dangling link is the remnant of a killed process and may be replaced.
         if self._path is not None and self._path.exists():
-            raise AmiwarpError(f"{path}: already exists; give another path for the link, or remove it")
+            raise AmiwarpError(
+                f"{path}: this file already exists; give another path for the link to the port, or remove the file"
+            )
         origin = monotonic_us()
         self._now_us = now_us or (lambda: monotonic_us() - origin)
         self._controller = controller
@@ -54,7 +56,7 @@ class PseudoTerminal:
 
     @property
     def name(self) -> str:
-        """Name to open: the link if there is one, else the port."""
+        """Name under which programs open the port: the symbolic link if there is one, else the pseudo-terminal."""
         return self._port if self._path is None else str(self._path)
 
     def __enter__(self) -> PseudoTerminal:
@@ -66,7 +68,7 @@ class PseudoTerminal:
         self.close()
 
     def close(self) -> None:
-        """Stop the thread, and remove the port and the link."""
+        """Stop the background thread, and remove the port and the symbolic link."""
         self._ended.set()
         self._thread.join()
         self._close()
@@ -90,7 +92,7 @@ class PseudoTerminal:
                     os.write(self._master, out)
 
     def _read(self, master: int | None) -> bytes:
-        """Return the bytes that the peer sent, after waiting for them for at most one step."""
+        """Return the bytes that the program at the other end sent, after waiting for at most :data:`STEP_S`."""
         if master is None or self._without_peer(master):
             self._ended.wait(STEP_S)
             return b""

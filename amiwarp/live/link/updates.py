@@ -16,31 +16,33 @@ if TYPE_CHECKING:
 MOST_WAITING_SAMPLES = 100_000
 """Largest number of samples that wait to be fetched: more than 90 s at 1 kHz. Then the oldest are dropped."""
 MOST_PULSES, MOST_UPDATES = 10_000, 64
-"""Largest number of index or sync pulses in an update that waits, and of such updates."""
+"""Largest number of index or sync pulses in an update that waits to be fetched, and largest number of such updates."""
 MOST_MESSAGES = 1000
-"""Largest number of messages in an update that waits."""
+"""Largest number of messages in an update that waits to be fetched."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LinkUpdate:
-    """Data received since the last fetch, or until the controller's clock or counts restarted."""
+    """Data received from the controller since the last fetch, or until its clock or counts restarted."""
 
     t_us: NDArray[np.int64]
     """Times of the encoder samples [us] on the controller's unwrapped clock, strictly increasing, shape ``(n,)``."""
     angle: NDArray[np.float64]
-    """Unwrapped prism angle [rad], shape ``(n,)``. Whole turns at the index once an index pulse was seen."""
+    """Unwrapped prism angle of each sample [rad], shape ``(n,)``. After the first index pulse, the angle is a whole
+    number of turns at each index pulse."""
     index_t_us: NDArray[np.int64]
-    """Times of the index pulses among these samples, or between the samples before and these [us]."""
+    """Times of the index pulses from the previous update's last sample to this update's last sample [us]."""
     sync: tuple[tuple[int, int, int], ...]
-    """Sync pulses: number, controller's time [us], host's time of arrival [us]."""
+    """Sync pulses, each with its number, the controller's time [us], and the host's time of arrival [us]."""
     restarted: bool
-    """Whether the controller's clock or counts restarted before these samples. Older clock maps are then void."""
+    """Whether the controller's clock or counts restarted before these samples. Maps fitted to the earlier clock are
+    then void."""
     messages: tuple[str, ...]
-    """Sentences for the user, about encoder faults, losses, resets, and the port."""
+    """Messages for the user about encoder faults, losses, resets and the port."""
 
 
 class _PendingUpdate:
-    """Update under construction; :class:`UpdateQueue` bounds its samples."""
+    """Update that is being filled; :class:`UpdateQueue` limits the number of its samples."""
 
     def __init__(self, *, restarted: bool) -> None:
         self.restarted = restarted
@@ -65,20 +67,20 @@ class UpdateQueue:
 
     def __init__(self) -> None:
         self.samples = 0
-        """Number of samples that wait."""
+        """Number of samples that wait to be fetched."""
         self._updates = deque([_PendingUpdate(restarted=False)])
         self._dropped = 0
 
     def __len__(self) -> int:
-        """Number of updates that wait."""
+        """Number of updates that wait to be fetched."""
         return len(self._updates)
 
     def say(self, sentence: str) -> None:
-        """Add a message, in order with the samples."""
+        """Add a message for the user, in order with the samples."""
         self._updates[-1].messages.append(sentence)
 
     def add_sync(self, number: int, t_us: int, host_us: int) -> None:
-        """Add a sync pulse, see :attr:`LinkUpdate.sync`."""
+        """Add a sync pulse: its number, the controller's time and the host's time of arrival [us]."""
         self._updates[-1].sync.append((number, t_us, host_us))
 
     def add_sample(self, t_us: int, angle: float, index_t_us: Iterable[int]) -> None:
@@ -96,7 +98,7 @@ class UpdateQueue:
                 self._merge_first()
 
     def restart(self) -> None:
-        """Begin an update after a restart of the controller's clock or counts."""
+        """Begin a new update, because the controller's clock or counts restarted."""
         if self._updates[-1].samples:
             self._updates.append(_PendingUpdate(restarted=True))
         if len(self._updates) > MOST_UPDATES:
@@ -104,7 +106,7 @@ class UpdateQueue:
             self.samples, self._dropped = self.samples - dropped, self._dropped + dropped
             self._merge_first()
         self._updates[-1].restarted = True
-        self._updates[-1].sync.clear()  # their times are on the clock before the restart
+        self._updates[-1].sync.clear()  # the times of these pulses are on the clock before the restart
 
     def take(self) -> LinkUpdate:
         """Remove and return the oldest update."""

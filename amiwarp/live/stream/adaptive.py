@@ -23,49 +23,58 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 DIRECTIONS = 18
-"""Number of bins of edge directions over 180 deg."""
+"""Number of bins of edge directions over 180 degrees."""
 _BINS = (np.arange(DIRECTIONS) + 0.5) * (math.pi / DIRECTIONS)
 NORMALS = np.stack([np.cos(_BINS), np.sin(_BINS)])
-"""Normals of edges at the bin centres, shape (2, DIRECTIONS)."""
+"""Unit vectors across the edges of each direction bin, shape (2, DIRECTIONS)."""
 SEEN_TRAVEL = 0.25
-"""Scale of the travel of an edge along its normal [px]. After a travel s the edge is seen with probability
-1 - exp(-s / SEEN_TRAVEL), as found in simulations."""
+"""Scale of the distance that an edge must move across itself to be seen [px].
+
+An edge that moves by s is seen with probability 1 - exp(-s / SEEN_TRAVEL), as found in simulations.
+"""
 TEXTURE_TRAVEL = 1.0
-"""Travel from which a window gives the amount of texture in a direction [px]."""
+"""Distance that edges of a direction must move across themselves in a window before it updates the amount of such edges
+[px]."""
 PATCH_SIDE = 192
 """Side of the central image patch that is analysed [px]."""
 BLOCK = 4
-"""Side of the blocks that have one edge direction each [px]."""
+"""Side of the square blocks of pixels in each of which one edge direction is found [px]."""
 SLICE_US = 4_000
-"""Duration of the slice at a window's end [us]. It is short enough to avoid motion blur by the camera, and long enough
-for two slices to be similar."""
+"""Duration of the slice of events at a window's end [us].
+
+It is short enough to avoid motion blur by the camera, and long enough for two slices to be similar.
+"""
 SLICE_GAP_US = 100_000
-"""Longest time between two slices that are compared [us]."""
+"""Longest time between two slices whose shift is measured [us]."""
 SLICE_EVENTS, WINDOW_EVENTS = 1 << 14, 1 << 15
-"""Largest number of events used of a slice and of a window. More are thinned evenly."""
+"""Largest number of events of a slice and of a window that are used. Events above these numbers are thinned evenly."""
 CLEAR_STD = 8.0
-"""Height of the correlation peak of two slices, in standard deviations. Below it the camera counts as still."""
+"""Height of the correlation peak of two slices below which the camera is considered still [standard deviations]."""
 TEXTURE_S = 0.5
-"""Time constant of the memory of the scene's edge directions [s]."""
+"""Time constant with which the amounts of edges in each direction are averaged [s]."""
 ANGLES = 17
-"""Number of samples of the prism's path over a window."""
+"""Number of points of the prism's path that are computed per window."""
 PHASES, ORBIT = 8, 1024
-"""Number of prism phases at which a predicted window may begin, and number of samples of the prism's orbit."""
+"""Number of prism phases at which a predicted window may begin, and number of points of the prism's orbit."""
 SPEEDS = 32
-"""Number of speeds between the limits for which coverage is predicted."""
+"""Number of prism speeds between the lowest and the highest for which the coverage is predicted."""
 MEMORY_S = 0.25
-"""Time constant of the average of predictions and of the event rate [s]. Edge directions vary between windows."""
+"""Time constant of the average of coverage predictions and of the event rate [s]. Edge directions vary between windows.
+"""
 FOLLOW_S, LIMITED_S = 0.2, 1.5
-"""Time constants [s] of the speed's approach to the sufficient speed, and to the limit set by the event rate."""
+"""Time constants of the speed's approach to the sufficient speed, and to the speed that the event rate allows [s]."""
 SPEED_TOLERANCE = 0.01
-"""Relative difference from the sufficient speed at which it counts as reached."""
+"""Relative difference from the sufficient speed below which the speed is not changed further."""
 NEAR_LIMIT, BELOW_LIMIT = 0.9, 0.8
-"""Shares of the largest event rate. A speed that was too fast is lowered until the first; below the second it may
-rise."""
+"""Shares of the largest event rate at which its limitation of the prism speed ends, and below which the speed may rise.
+
+Once the event rate exceeds the largest rate, the speed is lowered until the event rate falls to the first share. The
+speed may rise only while the event rate is below the second share.
+"""
 
 
 def prism_path(model: Model, encoder: Encoder, start_us: int, end_us: int) -> NDArray[np.float64]:
-    """Return the positions of the image centre behind the prism, at regular times of a window, shape (m, 2) [px].
+    """Return where the prism moves the image centre, at regular times of a window, shape (m, 2) [px].
 
     Both ends are included. Raises :class:`AmiwarpError` if the encoder does not cover the window, or if the image
     centre has no ray.
@@ -75,7 +84,7 @@ def prism_path(model: Model, encoder: Encoder, start_us: int, end_us: int) -> ND
 
 
 def prism_orbit(model: Model) -> NDArray[np.float64]:
-    """Return the positions of the image centre behind the prism, at regular angles of a turn, shape (n, 2) [px].
+    """Return where the prism moves the image centre, at regular angles of a turn, shape (n, 2) [px].
 
     Raises :class:`AmiwarpError` if the image centre has no ray.
     """
@@ -91,13 +100,13 @@ def _middle(model: Model, angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _drift_path(drift: NDArray[np.float64], drift_change: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
-    """Return the image's path during a window for a linearly changing drift, shape (ANGLES, 2) [px]."""
+    """Return the image's displacement over a window by a linearly changing drift, shape (ANGLES, 2) [px]."""
     along = np.linspace(0.0, 1.0, ANGLES)[:, None]
     return np.asarray(seconds * (along * drift + 0.5 * (along * along - along) * drift_change))
 
 
 def _seen_share(travel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the share of edges that are seen after a travel [px]."""
+    """Return the share of edges that are seen after a displacement across themselves [px]."""
     return np.asarray(-np.expm1(-travel / SEEN_TRAVEL))
 
 
@@ -111,16 +120,16 @@ class Coverage:
     share: float
     """Share of the scene's edges that the window shows, 0 .. 1."""
     drift: NDArray[np.float64]
-    """Image velocity by the camera's motion alone, shape (2,) [px/s]; 0 if there is no clear estimate."""
+    """Image velocity caused by the camera's motion alone, shape (2,) [px/s]; 0 if there is no clear estimate."""
     drift_change: NDArray[np.float64]
     """Change of the drift over the window, shape (2,) [px/s]; 0 if unknown."""
     travel: NDArray[np.float64]
-    """Travel of edges along their normal, for each edge direction, shape (n,) [px]."""
+    """Displacement of edges across themselves during the window, for each edge direction, shape (n,) [px]."""
     texture: NDArray[np.float64]
-    """Share of the scene's recent edges in each direction, shape (n,), sum 1; uniform without any edges."""
+    """Share of the scene's recent edges in each direction, shape (n,), sum 1; all equal if there are no edges."""
 
     def predict(self, rpm: NDArray[np.float64], orbit: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
-        """Return the share that a window would show at other speeds, for the worst prism phase, shape (n,).
+        """Return the coverage that a window would have at other prism speeds, for the worst prism phase, shape (n,).
 
         ``rpm``: speeds [turns/min], shape (n,). ``orbit``: see :func:`prism_orbit`. ``seconds``: length of the window.
         """
@@ -143,21 +152,22 @@ class SpeedController:
     """
 
     orbit: NDArray[np.float64]
-    """Orbit of the image centre, see :func:`prism_orbit`."""
+    """Path of the image centre over a turn of the prism, see :func:`prism_orbit`."""
     rpm: float = 720.0
-    """Present speed: the initial one, then the last one commanded [turns/min]."""
+    """Present prism speed: the initial speed, later the last commanded one [turns/min]."""
     least_rpm: float = 120.0
-    """Lowest speed [turns/min]."""
+    """Lowest prism speed that is commanded [turns/min]."""
     most_rpm: float = 1440.0
-    """Highest speed [turns/min]."""
+    """Highest prism speed that is commanded [turns/min]."""
     ramp_rpm_s: float = 600.0
-    """Acceleration that the motor can follow [turns/min/s]."""
+    """Rate at which the motor can change its speed [turns/min/s]."""
     most_mev_s: float = math.inf
-    """Largest event rate of sensor, cable and computer [million events/s]. It has priority over coverage."""
+    """Largest event rate that sensor, cable and computer can handle [million events/s]. It has priority over coverage.
+    """
     low: float = 0.9988
-    """Coverage below which the speed changes."""
+    """Lower limit of the predicted coverage. Below it, the speed changes."""
     high: float = 0.9996
-    """Coverage above which the speed changes."""
+    """Upper limit of the predicted coverage. Above it, the speed changes."""
     _t_us: int | None = field(default=None, init=False)
     _speeds: NDArray[np.float64] = field(init=False)
     _unseen: NDArray[np.float64] = field(init=False)
@@ -174,11 +184,11 @@ class SpeedController:
             raise AmiwarpError(f"adaptive speed: {given}; give 0 < low < high < 1")
         for name in ("ramp_rpm_s", "most_mev_s"):
             if not getattr(self, name) > 0.0:
-                raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give more than 0")
+                raise AmiwarpError(f"adaptive speed: {name} = {getattr(self, name):g}; give a number above 0")
         self._unseen, self._speeds = np.zeros(SPEEDS), np.geomspace(self.least_rpm, self.most_rpm, SPEEDS)
 
     def update(self, start_us: int, end_us: int, coverage: Coverage, rate_mev_s: float) -> float | None:
-        """Return the speed to command after a window [turns/min]; None to keep the speed.
+        """Return the prism speed to command after a window of events [turns/min]; None to keep the speed.
 
         ``start_us``, ``end_us``: window [us]; ``rate_mev_s``: event rate [million events/s]. Raises
         :class:`AmiwarpError` for windows out of order, or for a rate that is negative or not finite.
@@ -198,7 +208,7 @@ class SpeedController:
         return None if first else self._step(seconds)
 
     def _step(self, seconds: float) -> float | None:
-        """Move the speed one step towards the sufficient speed."""
+        """Move the present speed one step of ``seconds`` towards the sufficient speed."""
         rate, time_constant = self._rate / self.most_mev_s, FOLLOW_S
         self._limited = rate > (NEAR_LIMIT if self._limited else 1.0)
         logs = np.log(np.maximum(self._unseen, 1e-12))  # interpolate geometrically between speeds
@@ -218,7 +228,7 @@ class SpeedController:
         return self.rpm if self.rpm != previous else None
 
     def _sufficient_speed(self, logs: NDArray[np.float64]) -> float:
-        """Return the lowest speed with an acceptable unseen share, interpolated; the best speed if there is none."""
+        """Return the lowest speed with an acceptable unseen share, interpolated; if there is none, the best speed."""
         aim = 0.5 * math.log((1.0 - self.low) * (1.0 - self.high))
         good = np.flatnonzero(logs <= aim)
         k = int(good[0]) if len(good) else int(logs.argmin())
@@ -249,7 +259,7 @@ class CoverageMeter:
         """
         if not self._end_us <= start_us < end_us:
             given = f"window {start_us} .. {end_us} us after one that ended at {self._end_us} us"
-            raise AmiwarpError(f"coverage: {given}; give windows in order of time")
+            raise AmiwarpError(f"coverage: {given}; pass the windows of events in order of time")
         seconds, follows = (end_us - start_us) * 1e-6, start_us - self._end_us < SLICE_US
         previous, found = self._last_drift, self._drift(events, end_us)
         drift_change = found - previous if follows and previous is not None and found is not None else np.zeros(2)
@@ -299,7 +309,10 @@ class CoverageMeter:
     def _update_texture(
         self, events: Events, middle_us: int, drift: NDArray[np.float64], seconds: float, across: NDArray[np.float64]
     ) -> None:
-        """Update the amount of edges in each direction; directions without travel keep their value."""
+        """Update the amount of edges in each direction.
+
+        Directions in which edges did not move across themselves keep their value.
+        """
         step = 1 + len(events) // WINDOW_EVENTS
         thinned = events[::step]
         later = (thinned.t - middle_us).astype(np.float32) * np.float32(1e-6)
@@ -339,7 +352,7 @@ def _edge_directions(image: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _block_sums(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the sums over blocks."""
+    """Return the sums over square blocks of :data:`BLOCK` × :data:`BLOCK` pixels."""
     rows = np.add.reduce([image[k::BLOCK] for k in range(BLOCK)])
     return np.asarray(np.add.reduce([rows[:, k::BLOCK] for k in range(BLOCK)]))
 
@@ -352,5 +365,5 @@ def _peak_offset(values: NDArray[np.float32]) -> float:
 
 
 def _wrapped_shift(shift: float) -> float:
-    """Return the shortest equivalent of a shift modulo PATCH_SIDE."""
+    """Return the shortest shift equivalent to ``shift`` modulo PATCH_SIDE [px]."""
     return (shift + PATCH_SIDE / 2) % PATCH_SIDE - PATCH_SIDE / 2

@@ -9,16 +9,16 @@ from collections.abc import Callable
 from amiwarp.compensation.streams import OVERHEAD
 
 QUEUE_BYTES = 1 << 27
-"""Memory bound of the queue before the compensator, and of each consumer's queue [bytes]: about 8 million events."""
+"""Memory limit of the queue before the compensator, and of each consumer's queue [bytes]: about 8 million events."""
 LAST_JOB_S = 5.0
-"""Longest wait for the running job when the others are dropped [s]."""
+"""Longest wait for the running job after the waiting jobs were dropped [s]."""
 
 
 class BackgroundWorker:
-    """Runs jobs in order in a background thread. :meth:`put` blocks while the jobs hold ``most_bytes``.
+    """Runs jobs in order in a background thread. :meth:`put` blocks while the jobs hold ``most_bytes`` of memory.
 
-    A job counts with its given memory plus :data:`~amiwarp.compensation.streams.OVERHEAD`, so that jobs without events
-    are bounded too. A single job larger than the bound runs alone.
+    A job's memory is the given number plus :data:`~amiwarp.compensation.streams.OVERHEAD`, so that the number of jobs
+    without events is limited too. A single job larger than the limit runs alone.
     """
 
     def __init__(self, most_bytes: int = QUEUE_BYTES) -> None:
@@ -33,7 +33,10 @@ class BackgroundWorker:
         self._thread.start()
 
     def put(self, job: Callable[[], object], held_bytes: int = 0) -> None:
-        """Add a job as soon as memory allows. Raises the error of an earlier job; after an error no job runs."""
+        """Add a job once memory allows.
+
+        Raises the error of an earlier job; after an error no job runs.
+        """
         count = OVERHEAD + held_bytes
         with self._changed:
             self._changed.wait_for(
@@ -46,7 +49,7 @@ class BackgroundWorker:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Run all jobs and stop."""
+        """Run all waiting jobs and stop the thread."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -61,7 +64,7 @@ class BackgroundWorker:
         self._thread.join(LAST_JOB_S)
 
     def close(self) -> None:
-        """Run all jobs and stop. Raises the error of a job."""
+        """Run all waiting jobs and stop the thread. Raises the error of a job that failed."""
         self.end()
         if self._error is not None:
             raise self._error

@@ -18,56 +18,59 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Source
 
 MOST_PAIRS = 100
-"""Number of latest pulse pairs in memory."""
+"""Number of latest pulse pairs in memory, each one pulse with its times on both clocks."""
 MOST_UNPAIRED = 16
-"""Largest number of unpaired pulses in memory, on either side."""
+"""Largest number of pulses in memory that have a time on one clock only, for each clock."""
 MATCH_US = 300.0
-"""Tolerance between the shifts of two pairs [us]: a pulse's delay varies, and clocks drift by 1e-4 per second."""
+"""Largest difference between the clock shifts of two pulse pairs that belong together [us]. A pulse's delay varies, and
+clocks drift by 1e-4 per second."""
 REPORTS_US = 5_000_000
-"""Longest time between the two reports of a pulse at the host [us]. Half the interval of the pulses also bounds it."""
+"""Longest time at the host between the controller's and the camera's report of the same pulse [us]. Half the interval
+of the pulses is a limit too."""
 MOST_DELAYS = 2000
 """Number of latest packets whose delays are in memory. The shortest delay relates the camera's clock to the host's."""
 
 
 def clock_offset(source: Source, link: Link | None) -> float:
-    """Return the clock offset of a file's own encoder [us], so that a new recording has the same one; 0 with a link."""
+    """Return the clock offset of a file's own encoder [us], which a new recording of it shall keep; 0 with a link."""
     return 0.0 if link is not None else float(getattr(source, "clock_offset_us", 0.0))
 
 
 class CameraClock:
-    """Relates the clocks of controller and camera."""
+    """Relates the clocks of controller and camera by pulses that both recorded."""
 
     def __init__(self) -> None:
-        self._sync: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)  # controller's time, host's time
-        self._trigger: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)  # camera's time, host's time
+        # of each sync pulse the controller's and the host's time, of each trigger the camera's and the host's time
+        self._sync: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)
+        self._trigger: deque[tuple[int, int]] = deque(maxlen=MOST_UNPAIRED)
         self._pairs: deque[tuple[int, int]] = deque(maxlen=MOST_PAIRS)
         self._delays: deque[int] = deque(maxlen=MOST_DELAYS)
         self._map: ClockMap | None = None
 
     @property
     def pulses(self) -> int:
-        """Number of pulse pairs in memory."""
+        """Number of pulse pairs with a time on both clocks that are in memory."""
         return len(self._pairs)
 
     def restart(self) -> None:
-        """Forget everything about the controller's clock, because it restarted."""
+        """Discard all times of the controller's clock, because that clock restarted."""
         self._sync.clear()
         self._pairs.clear()
         self._map = None
 
     def returned(self) -> None:
-        """Forget everything about the camera's clock too, because the camera was lost and returned."""
+        """Discard all times of the camera's clock too, because the camera was lost and returned."""
         self.restart()
         self._trigger.clear()
         self._delays.clear()
 
     def sync(self, t_us: int, host_us: int) -> None:
-        """Add a pulse that the controller sent at its time ``t_us`` and reported to the host at ``host_us`` [us]."""
+        """Add a sync pulse that the controller sent at its time ``t_us`` and reported at host time ``host_us`` [us]."""
         self._sync.append((t_us, host_us))
         self._match()
 
     def triggers(self, t_us: ArrayLike, host_us: int) -> None:
-        """Add pulses that the camera recorded at its times ``t_us`` and reported to the host at ``host_us`` [us].
+        """Add triggers that the camera recorded at its times ``t_us`` and reported at host time ``host_us`` [us].
 
         Only the last :data:`MOST_UNPAIRED` of them are used.
         """
@@ -76,11 +79,11 @@ class CameraClock:
             self._match()
 
     def packet(self, t_last: int, host_us: int) -> None:
-        """Note that camera events up to ``t_last`` arrived at ``host_us`` [us]."""
+        """Store the delay of a packet: its last event has camera time ``t_last``; it arrived at ``host_us`` [us]."""
         self._delays.append(host_us - t_last)
 
     def clock(self, host: ClockMap | None) -> ClockMap | None:
-        """Return the map from the controller's clock to the camera's, by pulses if possible; None while unknown.
+        """Return the map from the controller's clock to the camera's, by pulses if possible; None while it is unknown.
 
         ``host``: map from the host's clock to the controller's, used without pulses. The result then has an unknown
         error: the shortest delay of the camera's packets.
@@ -97,7 +100,7 @@ class CameraClock:
         )  # fmt: skip
 
     def _match(self) -> None:
-        """Find the common shift between the two clocks, and move the pulses that match under it to the pairs."""
+        """Find the shift between the clocks under which most pulses match, and store the matching pulses as pairs."""
         if not (self._sync and self._trigger):
             return
         t, s = (np.array(pulses, np.int64) for pulses in (self._trigger, self._sync))

@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 POLL_S = 0.0005
-"""Pause between two requests for events [s]."""
+"""Pause between two requests to the camera's library for events [s]."""
 IDLE_S = 0.05
-"""Longest time without a packet [s]. After it, an empty packet is delivered."""
+"""Longest time without a packet [s]. After this time, an empty packet is delivered."""
 
 
 def _library(name: str, camera: str, remedy: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise AmiwarpError(f"{camera}: needs {name.partition('.')[0]} ({error}); {remedy}") from error
+        raise AmiwarpError(f"{camera}: needs the library {name.partition('.')[0]} ({error}); {remedy}") from error
 
 
 @contextlib.contextmanager
@@ -52,7 +52,7 @@ def _named(camera: str, doing: str) -> Iterator[None]:
 
 class _CameraSource:
     camera: Camera | None = None
-    """Unknown: the device does not store its calibration."""
+    """Camera intrinsics: None, because the device does not store its calibration."""
     prism: NominalPrism | None = None
     has_encoder = False
     size: tuple[int, int]
@@ -60,9 +60,10 @@ class _CameraSource:
 
 
 class DvSource(_CameraSource):
-    """iniVation camera (DVXplorer, DAVIS) through dv-processing 2; serial number None: the first camera found.
+    """Source of events from an iniVation camera (DVXplorer, DAVIS), read through dv-processing 2.
 
-    Rising edges at its signal input become triggers. Raises :class:`AmiwarpError` if library or camera is missing.
+    A serial number of None means the first camera found. Rising edges at its signal input become triggers. Raises
+    :class:`AmiwarpError` if library or camera is missing.
     """
 
     def __init__(self, serial: str | None = None, *, packet_us: int = 1000) -> None:
@@ -71,7 +72,9 @@ class DvSource(_CameraSource):
         with _named(self.name, "cannot be opened"):
             found = [str(camera.serialNumber) for camera in dv.io.camera.discover()]
             if serial not in found and (serial is not None or not found):
-                raise AmiwarpError(f"{self.name}: no such camera (found: {', '.join(found) or 'none'}); plug it in")
+                raise AmiwarpError(
+                    f"{self.name}: no such camera (found: {', '.join(found) or 'none'}); plug the camera in"
+                )
             self._camera = dv.io.camera.open(serial or found[0])
             self.size = tuple(int(side) for side in self._camera.getEventResolution())  # type: ignore[assignment]
             self._camera.setTimeInterval(timedelta(microseconds=packet_us))
@@ -115,15 +118,15 @@ def _dv_events(store: Any) -> Events | None:
 
 
 def _events(x: Any, y: Any, t: Any, p: Any) -> Events:
-    """Copy the columns of a library's rows into events, because the library reuses its memory."""
+    """Copy the columns of a library's rows into new events, because the library reuses its memory."""
     return Events(x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), (p > 0).astype(np.uint8))
 
 
 class PropheseeSource(_CameraSource):
-    """Prophesee camera through Metavision's or OpenEB's Python binding; serial number None: the first camera found.
+    """Source of events from a Prophesee camera, read through Metavision's or OpenEB's Python binding.
 
-    Rising edges at its main trigger input become triggers. While the camera sends nothing at all, the library blocks.
-    Raises :class:`AmiwarpError` if library or camera is missing.
+    A serial number of None means the first camera found. Rising edges at its main trigger input become triggers. While
+    the camera sends nothing at all, the library blocks. Raises :class:`AmiwarpError` if library or camera is missing.
     """
 
     def __init__(self, serial: str | None = None, *, packet_us: int = 1000) -> None:
@@ -135,7 +138,7 @@ class PropheseeSource(_CameraSource):
         with _named(self.name, "cannot be opened"):
             device = raw_reader.initiate_device(path=serial or "")
             if device is None:
-                raise AmiwarpError(f"{self.name}: no such camera; plug it in")
+                raise AmiwarpError(f"{self.name}: no such camera; plug the camera in")
             trigger_in = device.get_i_trigger_in()
             if trigger_in is not None:
                 trigger_in.enable(hal.I_TriggerIn.Channel.MAIN)

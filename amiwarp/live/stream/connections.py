@@ -14,15 +14,15 @@ from typing import Any
 from amiwarp.errors import AmiwarpError
 
 CONNECT_S = 10.0
-"""Longest wait for a connection to a sender [s]."""
+"""Longest wait for a connection to a sender of events [s]."""
 RETRY_S = 1.0
-"""Longest single attempt to reach a lost sender [s]."""
+"""Longest single attempt to reach a sender of events that was lost [s]."""
 IDLE_S = 0.05
-"""Longest single wait for a connection [s]."""
+"""Longest single wait for an incoming connection [s]."""
 
 
 class Unreachable(AmiwarpError):
-    """No sender or client is there now; a later attempt may succeed."""
+    """Raised if no sender or client is reachable now; a later attempt may succeed."""
 
 
 def ready(file: Any, timeout_s: float, *, to_write: bool = False) -> bool:
@@ -38,7 +38,7 @@ def ready(file: Any, timeout_s: float, *, to_write: bool = False) -> bool:
 
 
 def _parse(address: str) -> str | tuple[str, int]:
-    """Return the path of a Unix socket, or host and port."""
+    """Return the path of a Unix socket, or the host and the port of a TCP address."""
     kind, _, rest = address.partition(":")
     if kind == "unix" and rest:
         return rest
@@ -87,7 +87,7 @@ def listen(address: str) -> tuple[socket.socket, str]:
         server = socket.create_server(target, family=family)
     except OSError as error:
         why = error.strerror or error
-        raise AmiwarpError(f"{address}: cannot listen there: {why}; choose another address") from error
+        raise AmiwarpError(f"{address}: cannot listen at this address: {why}; choose another address") from error
     if isinstance(target, str):
         return server, address
     host = f"[{target[0]}]" if ":" in target[0] else target[0]
@@ -95,7 +95,7 @@ def listen(address: str) -> tuple[socket.socket, str]:
 
 
 def _remove_stale(path: str) -> None:
-    """Remove the socket of a process that no longer exists."""
+    """Remove the socket file of a process that no longer exists."""
     with contextlib.suppress(FileNotFoundError):
         if stat.S_ISSOCK(os.stat(path).st_mode):
             with socket.socket(socket.AF_UNIX) as probe:
@@ -106,12 +106,15 @@ def _remove_stale(path: str) -> None:
 
 
 def accept(address: str) -> socket.socket:
-    """Wait without limit for a sender that connects to ``address``."""
+    """Wait without limit for a sender that connects to ``address``, and return the connection."""
     return next(connection for connection in iter_accepted(address) if connection is not None)
 
 
 def iter_accepted(address: str) -> Generator[socket.socket | None, None, None]:
-    """Listen at ``address`` and yield connections; None at least every :data:`IDLE_S` while nobody connects."""
+    """Listen at ``address`` and yield connections.
+
+    While nobody connects, None is yielded at least every :data:`IDLE_S`.
+    """
     server, _ = listen(address)
     try:
         server.setblocking(False)
@@ -128,7 +131,10 @@ def iter_accepted(address: str) -> Generator[socket.socket | None, None, None]:
 
 
 def iter_connected(address: str) -> Generator[socket.socket | None, None, None]:
-    """Connect to ``address`` repeatedly and yield each connection; None at least every second without one."""
+    """Connect to ``address`` repeatedly and yield each connection.
+
+    While no connection is possible, None is yielded at least every second.
+    """
     while True:
         try:
             yield connect(address, RETRY_S)

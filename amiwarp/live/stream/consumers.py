@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class RawConsumer(Protocol):
-    """Consumer of the sensor's events in order of time, and of encoder samples on their clock."""
+    """Consumer (protocol) of the sensor's events in order of time, and of encoder samples on the events' clock."""
 
     def append(self, events: Events, /) -> None: ...
 
@@ -36,17 +36,17 @@ Consumer = TypeVar("Consumer", bound="RawConsumer | LiveWriter", covariant=True)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Served(Generic[Consumer]):
-    """Consumer with the background thread that calls it."""
+    """Consumer together with the background thread that calls it."""
 
     consumer: Consumer
     worker: BackgroundWorker
 
 
 class Consumers:
-    """Consumers of a session. A consumer that fails is removed; the others continue.
+    """Consumers of a session's data. A consumer that fails is removed; the others continue.
 
-    ``raw`` get the sensor's events, ``out`` gets the compensated events, and all get the encoder samples. ``fail`` gets
-    the errors of consumers.
+    The consumers ``raw`` get the sensor's events, ``out`` gets the compensated events, and all get the encoder samples.
+    The function ``fail`` is called with the errors of consumers.
     """
 
     def __init__(self, raw: Iterable[RawConsumer], out: LiveWriter | None, fail: Callable[[Exception], None]) -> None:
@@ -55,18 +55,18 @@ class Consumers:
         self._fail = fail
 
     def append(self, events: Events) -> None:
-        """Give the sensor's events to the raw consumers."""
+        """Pass the sensor's events to the consumers of raw events."""
         for served in list(self.raw):
             self._put(served, partial(served.consumer.append, events), held_bytes(events))
 
     def append_encoder(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
-        """Give encoder samples and index pulses to all consumers."""
+        """Pass encoder samples and index pulses to all consumers."""
         for served in self._all():
             append = partial(served.consumer.append_encoder, t, angle, index_t)
             self._put(served, append, t.nbytes + angle.nbytes + index_t.nbytes)
 
     def append_compensated(self, packet: Compensated) -> None:
-        """Give compensated events to the consumer of these."""
+        """Pass compensated events to the consumer of compensated events."""
         if self.out is None:
             return
         flags = packet.flags
@@ -75,12 +75,12 @@ class Consumers:
         self._put(self.out, append, held_bytes(packet.events) + flags.nbytes)
 
     def tick(self) -> None:
-        """Let all consumers work, even without new data."""
+        """Let all consumers continue pending work, even without new data."""
         for served in self._all():
             self._put(served, served.consumer.tick)
 
     def finish(self) -> None:
-        """Wait until the consumers have processed everything, and collect their errors."""
+        """Wait until the consumers have processed all data, and collect their errors."""
         for served in self._all():
             try:
                 served.worker.close()
@@ -88,7 +88,7 @@ class Consumers:
                 self._fail(error)
 
     def end(self) -> None:
-        """Wait for all threads."""
+        """Wait for the end of all background threads."""
         for served in self._all():
             served.worker.end()
 
@@ -101,7 +101,7 @@ class Consumers:
         return [*self.raw, *([] if self.out is None else [self.out])]
 
     def _put(self, served: Served[RawConsumer | LiveWriter], job: Callable[[], object], held: int = 0) -> None:
-        """Give a job to a consumer's thread; remove a consumer that failed."""
+        """Pass a job to a consumer's thread; remove the consumer if it has failed."""
         try:
             served.worker.put(job, held)
         except Exception as error:

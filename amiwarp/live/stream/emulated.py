@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 STEP_US, RETRY_S = 2000, 2e-4
 """Duration of an event packet [us], and interval between attempts to send while a client is slow [s]."""
 LEAD_US = 1_000_000
-"""Time from the first client to the first event [us], for sync pulses that relate the clocks."""
+"""Time from the first client's connection to the first event [us], in which sync pulses relate the clocks."""
 NEVER_US = 1 << 60
 """Start time of an emulation that has not begun [us]."""
 
@@ -49,12 +49,12 @@ class EmulatedCamera:
         rotor.begin(NEVER_US)
         self._start, self._pulses_until_us = NEVER_US, -1
         self.late_us = 0
-        """Largest delay of events so far [us]."""
+        """Largest delay of sent events so far [us]."""
         self._sink = SocketSink(address, encode_hello(*events.size, recording.camera, recording.prism))
         self.address = self._sink.address
         self._ended = threading.Event()
         self.done = threading.Event()
-        """Set when everything was sent, or the recording cannot be read further."""
+        """Event that is set when all events were sent, or the recording cannot be read further."""
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="amiwarp-camera", daemon=True)
         self._thread.start()
@@ -102,7 +102,7 @@ class EmulatedCamera:
         self.done.set()
 
     def _pause(self, seconds: float) -> bool:
-        """Wait, then send the new triggers and the waiting packets; return True if the camera was closed."""
+        """Wait, then send the new triggers and the waiting packets; return True if the camera was closed meanwhile."""
         if self._ended.wait(seconds):
             return True
         # Select pulses by time, not by number: after a reset the controller numbers them from 0 again.
@@ -113,5 +113,5 @@ class EmulatedCamera:
         return False
 
     def _time(self, world_us: int) -> int:
-        """Return a time on the camera's clock [us]."""
+        """Return the time on the camera's clock [us] for an emulation time [us]."""
         return world_us - self._start + self._origin

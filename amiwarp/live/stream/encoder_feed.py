@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Packet
 
 MOST_WAITING = 1 << 20
-"""Largest number of samples and index pulses that wait for the camera's clock. Then the oldest are dropped."""
+"""Largest number of samples and index pulses that wait until the camera's clock is known. Beyond it, the oldest are
+dropped."""
 
 
 class EncoderFeed:
@@ -36,9 +37,12 @@ class EncoderFeed:
         give: Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]], None],
         say: Callable[[str], None],
     ) -> None:
-        """``give`` gets samples and index pulses on the events' clock; ``say`` gets messages."""
+        """Set up the feed.
+
+        ``give`` is called with samples and index pulses on the events' clock, ``say`` with messages.
+        """
         self.clock: ClockMap | None = None
-        """Map from the controller's clock to the camera's; None while unknown."""
+        """Map from the controller's clock to the camera's; None while it is unknown."""
         self._link, self._encoder, self._give, self._say = link, encoder, give, say
         self._camera_clock = CameraClock()
         self._waiting: deque[LinkUpdate] = deque()
@@ -46,7 +50,7 @@ class EncoderFeed:
         self._warned = False
 
     def poll(self) -> None:
-        """Process what the controller has sent."""
+        """Process the data that the controller has sent since the last call."""
         if self._link is None:
             return
         update = self._link.poll()
@@ -70,7 +74,7 @@ class EncoderFeed:
         self._clear()
 
     def take(self, packet: Packet) -> None:
-        """Process a source's packet: its times of arrival and triggers, or its own encoder samples."""
+        """Process a source's packet: its arrival time and triggers with a link, else its own encoder samples."""
         if packet.returned:
             self._camera_clock.returned()
             self._encoder.restart()
@@ -86,7 +90,7 @@ class EncoderFeed:
         self._give(t, angle, index_t)
 
     def _drop_oldest(self) -> None:
-        """Bound the samples that wait; warn the user once."""
+        """Drop the oldest waiting samples if there are too many; warn the user once."""
         if self._waiting_samples > MOST_WAITING and not self._warned:
             self._warned = True
             self._say("the camera's clock is not known yet: dropping the oldest encoder samples that wait for it")

@@ -1,4 +1,4 @@
-"""Ordering of events across packets."""
+"""Sorting of events by time across packets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class EventSorter:
     """
 
     CALM_US = 1_000_000
-    """Event time without disorder after which events pass at once again [us]."""
+    """Event time without disorder after which events are no longer held back [us]."""
 
     def __init__(self, *, most_us: int = 10_000, most_events: int = 1 << 18) -> None:
         self._most_us, self._most_events = most_us, most_events
@@ -26,10 +26,10 @@ class EventSorter:
         self._disorder_us = 0
         self._held: Events | None = None
         self.late = 0
-        """Number of events whose time was raised."""
+        """Number of events that were too late to be sorted and got a later time stamp."""
 
     def put(self, events: Events) -> Events:
-        """Add a packet's events; return the events that are ready, in order."""
+        """Add a packet's events; return the events that are ready, in order of time."""
         t = events.t
         if not len(events):
             return events
@@ -45,11 +45,11 @@ class EventSorter:
         return self._release(events, self._newest_us - self._hold_us)
 
     def flush(self) -> Events:
-        """Return all events that are still held."""
+        """Return all events that are still held back."""
         return self._release(Events.empty(), self._newest_us)
 
     def _release(self, events: Events, until: int) -> Events:
-        """Return the events up to a time, and hold the others."""
+        """Return the events up to the time ``until`` [us], and hold back the later events."""
         joined = events if self._held is None else Events.concatenate([self._held, events])
         joined = joined[np.argsort(joined.t, kind="stable")]
         late = int(np.searchsorted(joined.t, self._last_out_us))

@@ -21,11 +21,11 @@ class Forward:
         self._sink = sink
 
     def append(self, events: Events) -> None:
-        """Send a sensor's events."""
+        """Send events of a sensor to the sink."""
         self._sink.send(encode_events(events))
 
     def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
-        """Send samples on the events' clock. The angles already include the index pulses."""
+        """Send encoder samples on the events' clock to the sink. The angles already include the index pulses."""
         self._sink.send(encode_encoder(t_us, angle))
 
     def tick(self) -> None:

@@ -1,4 +1,7 @@
-"""Validation of the JSON of a hello message. Its sender is not trusted, so every field is checked."""
+"""Validation of the JSON of a hello message, the first message of a stream.
+
+Its sender is not trusted, so every field is checked.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +11,28 @@ from typing import Any, NoReturn
 from amiwarp.errors import AmiwarpError
 
 LARGEST_PX = 65536
-"""Largest width or height of a sensor [px]."""
+"""Largest accepted width or height of a sensor [px]."""
 LARGEST = 1e9
-"""Largest absolute value of any other number."""
+"""Largest accepted absolute value of all numbers other than sizes."""
 MOST_COEFFICIENTS = 5
-"""Largest number of distortion coefficients."""
+"""Largest accepted number of distortion coefficients."""
 SHOWN = 60
-"""Largest number of characters of a wrong value in a message."""
+"""Largest number of characters of a wrong value that are shown in a message."""
 
 
 def read_fields(payload: bytes | bytearray) -> dict[str, Any]:
-    """Return the fields of a hello, with the known fields checked for type and range.
+    """Return the fields of a hello message; the known fields are checked for type and range.
 
     Raises :class:`AmiwarpError` for text that is not JSON or too deeply nested, and for missing or wrong fields.
     """
     try:
         fields = json.loads(payload, parse_constant=_refuse)
     except RecursionError as error:
-        raise AmiwarpError("its hello is nested too deeply; send one object with 'camera' and 'prism' in it") from error
+        raise AmiwarpError(
+            "its hello message is nested too deeply; send one JSON object with 'camera' and 'prism' in it"
+        ) from error
     except ValueError as error:
-        raise AmiwarpError(f"its hello is not JSON: {error}; send one object") from error
+        raise AmiwarpError(f"its hello message is not JSON: {error}; send one JSON object") from error
     _check_object("its hello", fields)
     _check_size("its hello", fields)
     for name in ("camera", "prism"):
@@ -95,12 +100,12 @@ def _refuse(constant: str) -> NoReturn:
 
 def _raise_wrong(where: str, name: str, value: Any, expected: str) -> NoReturn:
     if value is None:
-        raise AmiwarpError(f"{where} has no attribute '{name}'; add it: {expected}")
+        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute: {expected}")
     raise AmiwarpError(f"{where} attribute '{name}' is {_shown(value)}; expected {expected}")
 
 
 def _shown(value: Any) -> str:
-    """Return the value as JSON, shortened if it is long."""
+    """Return the value as JSON text, shortened if it is long."""
     try:
         text = json.dumps(value)
     except RecursionError:

@@ -25,38 +25,38 @@ if TYPE_CHECKING:
 MAGIC = b"AMIS"
 VERSION = 1
 MOST = 1 << 18
-"""Largest number of rows in an encoded packet."""
+"""Largest number of rows (events, triggers or samples) in an encoded packet."""
 LONGEST_HELLO = 1 << 16
 """Largest payload of a hello packet [bytes]."""
 HEADER = struct.Struct("<4sBBHIII")
-"""Packet header: magic, version, kind, 0, rows, payload size [bytes], CRC-32 of the payload."""
+"""Header of an encoded packet: magic, version, kind, 0, number of rows, payload size [bytes], CRC-32 of the payload."""
 HELLO, EVENTS, COMPENSATED, TRIGGERS, ENCODER, END = range(1, 7)
-"""Kinds of packets."""
+"""Kinds of encoded packets, as numbers in the header."""
 COLUMNS: Mapping[int, tuple[str, ...]] = {
     EVENTS: ("<i8", "<u2", "<u2", "u1"),
     COMPENSATED: ("<i8", "<f4", "<f4", "u1", "u1"),
     TRIGGERS: ("<i8",),
     ENCODER: ("<i8", "<f8"),
 }
-"""Types of a packet's columns, by its kind."""
+"""Data types of the columns of an encoded packet, by the packet's kind."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packet:
-    """Data that a source delivers at a time. Any part may be empty."""
+    """Data that a source delivers in one step. Any part may be empty."""
 
     events: Events
     """Events with uint16 pixels, on the camera's clock."""
     triggers: NDArray[np.int64]
     """Rising edges at the camera's trigger input, on the camera's clock [us], shape ``(n,)``."""
     encoder_t: NDArray[np.int64]
-    """Times of encoder samples from a file or socket, on the events' clock [us], shape ``(m,)``."""
+    """Times of encoder samples that came in a file or stream, on the events' clock [us], shape ``(m,)``."""
     encoder_angle: NDArray[np.float64]
-    """Their unwrapped angles [rad], shape ``(m,)``."""
+    """Unwrapped prism angles of the encoder samples [rad], shape ``(m,)``."""
     arrived_us: int
-    """Time of arrival on the host's monotonic clock [us]."""
+    """Time at which the packet arrived, on the host's monotonic clock [us]."""
     returned: bool = False
-    """Whether this is the first packet after a lost source returned, see :class:`ReturningSource`."""
+    """Whether this is the first packet after a lost sender returned, see :class:`ReturningSource`."""
 
     @property
     def held_bytes(self) -> int:
@@ -66,14 +66,14 @@ class Packet:
 
     @property
     def empty(self) -> bool:
-        """Whether the packet carries nothing."""
+        """Whether the packet carries no events, triggers or samples."""
         return not (len(self.events) or self.triggers.size or self.encoder_t.size or self.returned)
 
 
 NO_TIMES = np.zeros(0, np.int64)
-"""Empty array of times."""
+"""Empty array of times, for packets without triggers or encoder samples."""
 NO_ANGLES = np.zeros(0)
-"""Empty array of angles."""
+"""Empty array of angles, for packets without encoder samples."""
 
 
 def make_packet(
@@ -83,23 +83,23 @@ def make_packet(
     encoder_t: NDArray[np.int64] = NO_TIMES,
     encoder_angle: NDArray[np.float64] = NO_ANGLES,
 ) -> Packet:
-    """Build a packet from the parts given; the others are empty."""
+    """Build a packet from the given parts; parts that are not given are empty."""
     return Packet(Events.empty() if events is None else events, triggers, encoder_t, encoder_angle, arrived_us)
 
 
 class Source(Protocol):
-    """Source of live events."""
+    """Source of live events (protocol)."""
 
     size: tuple[int, int]
-    """Sensor's (width, height) [px]."""
+    """Width and height of the sensor [px]."""
     camera: Camera | None
-    """Camera, if the source knows it."""
+    """Camera intrinsics; None if the source does not know them."""
     prism: NominalPrism | None
-    """Prism, if the source knows it."""
+    """Prism of the camera; None if the source does not know it."""
     has_encoder: bool
     """Whether the source may deliver encoder samples."""
     name: str
-    """Name for messages."""
+    """Name of the source in messages."""
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets until the stream ends; while nothing arrives, an empty packet at least every 50 ms."""
@@ -110,7 +110,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """First message of a stream: sensor size [px], and optionally camera and prism."""
+    """First message of a stream: size of the sensor [px], and optionally camera and prism."""
 
     width: int
     height: int
@@ -120,25 +120,25 @@ class Hello:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Triggers:
-    """Rising edges at the camera's trigger input."""
+    """Message: rising edges at the camera's trigger input."""
 
     t: NDArray[np.int64]
-    """Times [us], shape ``(n,)``."""
+    """Times of the edges on the camera's clock [us], shape ``(n,)``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncoderSamples:
-    """Encoder samples on the events' clock."""
+    """Message: encoder samples on the events' clock."""
 
     t: NDArray[np.int64]
-    """Times [us], shape ``(n,)``."""
+    """Times of the samples [us], shape ``(n,)``."""
     angle: NDArray[np.float64]
-    """Unwrapped angles [rad], shape ``(n,)``."""
+    """Unwrapped prism angles [rad], shape ``(n,)``."""
 
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """Last message of a complete stream."""
+    """Message: end of a complete stream."""
 
 
 Message: TypeAlias = Hello | Events | Compensated | Triggers | EncoderSamples | End
@@ -155,7 +155,7 @@ def encode_hello(width: int, height: int, camera: Camera | None = None, prism: N
 
 
 def encode_events(events: Events) -> bytes:
-    """Encode a sensor's events. This and the functions below split more than :data:`MOST` rows into several packets."""
+    """Encode a sensor's events; more than :data:`MOST` of them as several packets."""
     return _pack_columns(EVENTS, events.t, events.x, events.y, events.p)
 
 
@@ -193,10 +193,10 @@ def _pack(kind: int, count: int, payload: bytes) -> bytes:
 
 
 class PacketDecoder:
-    """Decodes bytes into messages; buffers at most one packet.
+    """Decodes the bytes of a stream into messages; buffers at most one packet.
 
-    Skips packets of unknown kinds. Raises :class:`AmiwarpError` for an invalid packet, with ``where`` and the offset of
-    the packet, after all earlier messages were returned.
+    Packets of unknown kinds are skipped. An invalid packet raises :class:`AmiwarpError` with the stream's name
+    ``where`` and the offset of the packet, after all earlier messages were returned.
     """
 
     def __init__(self, where: str) -> None:
@@ -208,15 +208,18 @@ class PacketDecoder:
 
     @property
     def unfinished_at(self) -> int | None:
-        """Offset of a packet that is incomplete so far; None between packets."""
+        """Offset of the packet that is still incomplete [bytes]; None between packets."""
         return self._offset if self._filled or self._header is not None else None
 
     def free_buffer(self) -> memoryview:
-        """Return the memory for the next bytes: not empty, never beyond the packet. Then call :meth:`commit`."""
+        """Return the memory for the next bytes: not empty, at most to the end of the packet.
+
+        Then call :meth:`commit`.
+        """
         return memoryview(self._buffer)[self._filled :]
 
     def commit(self, count: int) -> Message | None:
-        """Process ``count`` bytes written to :meth:`free_buffer`; return the message that they complete, if any."""
+        """Process ``count`` bytes that were written to :meth:`free_buffer`; return the message that they complete."""
         self._filled += count
         if self._filled < len(self._buffer):
             return None
@@ -236,7 +239,7 @@ class PacketDecoder:
         return message
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Yield the messages that ``data`` completes."""
+        """Decode the bytes ``data``, and yield the messages that they complete."""
         start = 0
         while start < len(data):
             free_buffer = self.free_buffer()
@@ -248,7 +251,7 @@ class PacketDecoder:
                 yield message
 
     def _read_header(self, buffer: bytearray) -> tuple[int, int, int]:
-        """Return kind, payload size and checksum of a valid header."""
+        """Check a packet's header; return kind, payload size and checksum."""
         magic, version, kind, _, count, length, check = HEADER.unpack(buffer)
         if magic != MAGIC:
             raise self._error(f"it begins with {bytes(magic)!r}, not {MAGIC!r}")

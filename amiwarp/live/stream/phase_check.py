@@ -23,42 +23,49 @@ if TYPE_CHECKING:
     from amiwarp.events.encoder_stream import EncoderStream
 
 SEARCH_RAD = math.radians(20.0)
-"""Range of the search around the calibrated phase [rad]. A phase beyond it is found at its edge and reported anyway."""
+"""Half width of the search about the calibrated phase [rad]. A phase outside is found at the edge of this range, and
+reported."""
 CHANGE_RAD, OFFSET_RAD = math.radians(1.5), math.radians(5.0)
-"""Change since the first estimate, and offset from the calibrated phase, that are reported [rad]. The bias of the
-estimate is up to 3 deg."""
+"""Smallest reported change of the phase since the first estimate, and smallest reported offset from the calibrated
+phase [rad].
+
+The bias of the estimate is up to 3 deg.
+"""
 FEWEST_EVENTS = 20_000
-"""Smallest number of events for an estimate. They must also cover half a turn."""
+"""Smallest number of events for an estimate of the phase. The events must also cover half a turn."""
 MOST_BYTES = 1 << 24
-"""Memory bound of the latest events [bytes]: about a million events."""
+"""Memory limit of the latest events, from which the phase is estimated [bytes]: about a million events."""
 EVALUATIONS = 40
-"""Number of evaluations of the sharpness."""
+"""Number of evaluations of the sharpness per estimate of the phase."""
 
 
 @dataclass(frozen=True, slots=True)
 class PhaseEstimate:
-    """Estimate of the prism's phase."""
+    """Estimate of the prism's phase by sharpness."""
 
     offset: float
-    """Offset from the calibrated phase [rad]."""
+    """Difference between the estimated and the calibrated phase [rad]."""
     std: float
-    """Standard deviation [rad]."""
+    """Standard deviation of the estimated phase [rad]."""
 
 
 class PhaseCheck:
-    """Estimates the phase repeatedly by sharpness, on the CPU in a background thread.
+    """Estimates the prism's phase repeatedly by sharpness, on the CPU in a background thread.
 
-    It needs the events that the compensator gets. The sharpness has a bias that depends on the sensor. Therefore the
-    change since the first estimate is judged.
+    The check needs the events that the compensator gets. The sharpness has a bias that depends on the sensor. Therefore
+    the change since the first estimate is judged.
     """
 
     def __init__(self, calibration: Calibration, every_s: float, say: Callable[[str], None]) -> None:
-        """``every_s``: interval between estimates [s]; ``say`` gets a sentence when the phase has changed."""
+        """Set up the check.
+
+        ``every_s``: interval between estimates [s]; ``say`` is called with a message if the phase changed.
+        """
         self._calibration, self._every_s, self._say = calibration, every_s, say
         self._due, self._closed = 0.0, False
         self._recent: deque[Events] = deque()
         self.held_bytes = 0
-        """Memory of the latest events [bytes]."""
+        """Memory of the latest events that are kept for an estimate [bytes]."""
         self._thread: threading.Thread | None = None
         self._estimated: PhaseEstimate | None = None
         self._first_estimate: PhaseEstimate | None = None
@@ -66,7 +73,7 @@ class PhaseCheck:
         self._reported: float | None = None
 
     def update(self, encoder: EncoderStream) -> float | None:
-        """Start an estimate if one is due. Return the latest offset from the calibrated phase [rad], None at first."""
+        """Start an estimate if one is due; return the latest offset from the calibrated phase [rad], at first None."""
         estimate = self.result()
         if estimate is not None:
             self._first_estimate = self._first_estimate or estimate
@@ -92,14 +99,17 @@ class PhaseCheck:
             self._say(f"the phase has moved by {math.degrees(changed):+.1f} deg {since}: has the index pulse slipped?")
 
     def put(self, events: Events) -> None:
-        """Add events of the sensor."""
+        """Add events of the sensor, from which the next estimate is made."""
         self._recent.append(events)
         self.held_bytes += held_bytes(events)
         while self.held_bytes - held_bytes(self._recent[0]) > MOST_BYTES:
             self.held_bytes -= held_bytes(self._recent.popleft())
 
     def start_check(self, encoder: EncoderStream) -> bool:
-        """Start an estimate from the last turn. Return False if one is running or the data do not suffice."""
+        """Start an estimate from the events of the last turn.
+
+        Returns False if an estimate is running or the data do not suffice.
+        """
         last = encoder.last
         if self._closed or self._thread is not None or last is None or not self._recent:
             return False
@@ -121,7 +131,7 @@ class PhaseCheck:
         return True
 
     def result(self) -> PhaseEstimate | None:
-        """Return a new estimate once; None if there is none."""
+        """Return each new estimate once; None if there is no new one."""
         if self._thread is None or self._thread.is_alive():
             return None
         self._thread.join()
@@ -130,13 +140,13 @@ class PhaseCheck:
         return estimate
 
     def close(self) -> None:
-        """Wait for a running estimate; start no other."""
+        """Wait for a running estimate, and start no further one."""
         self._closed = True
         if self._thread is not None:
             self._thread.join()
 
     def _estimate(self, events: Events, encoder: Encoder) -> None:
-        """Estimate the phase by a calibration in which everything else is fixed."""
+        """Estimate the phase by a calibration in which all other parameters are fixed."""
         known = self._calibration
         phase = known.parameters["phase"]
         recording = Recording(MemoryEvents(events, known.camera.width, known.camera.height), known.camera, encoder,

@@ -1,4 +1,4 @@
-"""Policies for a full queue."""
+"""Policies of a full queue of events."""
 
 import enum
 
@@ -7,7 +7,7 @@ class Policy(enum.StrEnum):
     """What a full queue does with further events."""
 
     BLOCK = "block"
-    """Make the source and its sender wait. No event is lost here."""
+    """Make the source and its sender wait until the queue has room. No event is lost in the queue."""
     DROP_OLDEST = "drop-oldest"
     """Drop the oldest events. The size of the queue then bounds the delay."""
     THIN = "thin"

@@ -1,4 +1,4 @@
-"""Queue of packets between a source and a consumer, bounded in events and in memory."""
+"""Queue of packets between a source and a consumer, with limits for its number of events and its memory."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Packet
 
 THIN_FROM = 0.5
-"""Fill level above which :attr:`Policy.THIN` drops events; it drops more as the queue fills."""
+"""Share of the queue's capacity above which :attr:`Policy.THIN` drops events; it drops more as the queue fills."""
 
 
 class PacketQueue:
-    """Bounded queue of packets: at most ``most_events`` events and ``most_bytes`` bytes.
+    """Queue of packets that holds at most ``most_events`` events and ``most_bytes`` bytes.
 
     The policy applies to events only: triggers and encoder samples are never dropped. If these alone fill the memory,
-    the source waits under every policy. A single packet larger than the bounds passes alone.
-    One thread may put and one may get. Raises :class:`AmiwarpError` for a size below 1.
+    the source waits under every policy. A single packet larger than the limits passes alone. One thread may put packets
+    and one may get them. Raises :class:`AmiwarpError` for a size below 1.
     """
 
     def __init__(self, most_events: int, policy: Policy, most_bytes: int = QUEUE_BYTES) -> None:
@@ -38,21 +38,21 @@ class PacketQueue:
         self._packets: deque[Packet] = deque()
         self._held = 0
         self._emptied = 0
-        """Number of packets at the front whose events were dropped."""
+        """Number of packets at the front of the queue whose events were dropped."""
         self.held_bytes = 0
-        """Memory of the packets [bytes], see :attr:`Packet.held_bytes`."""
+        """Memory of the packets in the queue [bytes], see :attr:`Packet.held_bytes`."""
         self._phase = 0.0
         self._closed = False
         self._changed = threading.Condition()
 
     @property
     def held(self) -> int:
-        """Number of waiting events."""
+        """Number of events in the queue."""
         return self._held
 
     @property
     def fill(self) -> float:
-        """Fill level, 0 .. 1; above 1 while a single packet is larger than the bounds."""
+        """Fill level of the queue, 0 .. 1; above 1 while a single packet is larger than the limits."""
         return self._share(self._held, self.held_bytes)
 
     @property
@@ -91,7 +91,7 @@ class PacketQueue:
             return packet
 
     def close(self) -> None:
-        """Close the queue: no more packets are expected. Those held can still be taken."""
+        """Close the queue to further packets. The packets in it can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

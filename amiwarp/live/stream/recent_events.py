@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
 SECONDS, MOST_BYTES = 2.0, 1 << 27
-"""Bounds of the events kept: their duration [s] and their memory, about eight million events. Encoder samples have a
-memory bound of the same size."""
+"""Limits of the latest events that are kept: their duration [s] and their memory [bytes], about eight million events.
+
+Encoder samples have a memory limit of the same size.
+"""
 FIRST_S = 15.0
-"""Longest wait for the first turn of the prism [s]."""
+"""Longest wait for the first turn of the prism when a stream starts [s]."""
 
 
 class RecentEvents:
@@ -43,7 +45,7 @@ class RecentEvents:
         self._events: deque[Events] = deque()
         self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self.event_bytes = self.sample_bytes = 0
-        """Memory of the events and of the encoder samples [bytes]."""
+        """Memory of the kept events and of the kept encoder samples [bytes]."""
         self._lock = threading.Lock()
 
     def append(self, events: Events) -> None:
@@ -56,7 +58,10 @@ class RecentEvents:
                 self.event_bytes -= held_bytes(self._events.popleft())
 
     def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
-        """Append samples in order of time, on the events' clock. The angles already include the index pulses."""
+        """Append encoder samples in order of time, on the events' clock.
+
+        The angles already include the index pulses.
+        """
         if len(t_us):
             with self._lock:
                 self._samples.append((t_us, angle))
@@ -67,10 +72,10 @@ class RecentEvents:
                     self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
 
     def tick(self) -> None:
-        """Do nothing: no data wait here."""
+        """Do nothing, because no data wait to be written."""
 
     def recording(self) -> Recording | None:
-        """Return the part that the encoder covers; None if it is shorter than one turn."""
+        """Return the kept events that the encoder covers, as a recording; None if they are shorter than one turn."""
         with self._lock:
             events, samples = list(self._events), list(self._samples)
         if not samples or not events:
@@ -91,7 +96,7 @@ class RecentEvents:
 
 @contextlib.contextmanager
 def followed(source: Source, link: Link | None, recent: RecentEvents, say: Callable[[str], None]) -> Iterator[None]:
-    """Fill ``recent`` from a source, in a background thread, during the ``with`` block.
+    """Fill ``recent`` from a source, in a background thread, while the ``with`` block runs.
 
     Waits for the first turn of the prism. Raises :class:`AmiwarpError` if it does not come in time, or the error of the
     source.

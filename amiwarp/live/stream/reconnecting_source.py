@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Packet
 
 LATE_US = 10_000
-"""Largest step backwards of the event time when a sender returns [us]: events within it are sorted."""
+"""Largest step backwards of the event time when a sender returns [us]: events are sorted across a smaller step."""
 CLOCK_US = 2_000_000
 """After a reconnection, the length of the gap by the camera's clock is compared with that by the host's clock. A larger
 difference than this warns the user [us]."""
@@ -28,12 +28,12 @@ SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
 
 
 class ReturningSource:
-    """Stream that is opened again after a break, if its sender returns within ``wait_s`` [s].
+    """Source for a stream that is opened again after a break, if its sender returns within ``wait_s`` [s].
 
     The sender must be the same camera, and its clock must have continued. Otherwise events of the two parts could not
-    be ordered, and :class:`AmiwarpError` is raised. ``say`` gets a sentence when the stream breaks off, when it
-    returns, and when the durations of the gap on the camera's and the host's clock disagree.
-    Raises :class:`AmiwarpError` for a source other than a socket, or if no sender is there at first.
+    be ordered, and :class:`AmiwarpError` is raised. ``say`` is called with a message when the stream breaks off, when
+    it returns, and when the durations of the gap on the camera's and the host's clock disagree. Raises
+    :class:`AmiwarpError` for a source other than a socket, or if no sender is there at first.
     """
 
     def __init__(self, spec: str, wait_s: float, say: Callable[[str], None]) -> None:
@@ -48,7 +48,7 @@ class ReturningSource:
         self.name, self.size, self.camera, self.prism = spec, source.size, source.camera, source.prism
         self.has_encoder = source.has_encoder
         self.problem: str | None = None
-        """How the stream ended, in one line; None if it ended properly."""
+        """How the stream ended, in one line; None if it ended with its end message."""
         self.returns = 0
         """Number of times that the sender returned."""
         self._events = 0
@@ -78,7 +78,7 @@ class ReturningSource:
         self._source.close()
 
     def _part(self) -> Iterator[Packet]:
-        """Yield packets until the stream ends or breaks off."""
+        """Yield packets of one connection until the stream ends or breaks off."""
         fresh = unchecked = self.returns > 0
         for packet in self._source.packets():
             if len(packet.events):
@@ -104,7 +104,10 @@ class ReturningSource:
             self._say(f"{self.name}: {what}: its clock may have restarted, times across the gap may be wrong")
 
     def _wait(self, until: float) -> Iterator[Packet]:
-        """Yield empty packets until the sender returns (:attr:`problem` is then None) or the time is over."""
+        """Yield empty packets until the sender returns or the time ``until`` is over.
+
+        :attr:`problem` is None if the sender returned.
+        """
         address = self.name.replace("-listen", "", 1)
         attempts = (iter_accepted if self._listens else iter_connected)(address)
         try:
@@ -114,7 +117,7 @@ class ReturningSource:
                         left = max(until - time.monotonic(), 1.0)
                         self._continue_with(open_connection(self.name, connection, hello_s=min(HELLO_S, left)))
                         return
-                    except Unreachable:  # it left before its hello: wait for the next one
+                    except Unreachable:  # the sender left before its hello message: wait for its next connection
                         pass
                 if time.monotonic() >= until:
                     return
@@ -123,14 +126,14 @@ class ReturningSource:
             attempts.close()
 
     def _continue_with(self, source: StreamSource) -> None:
-        """Continue with a new connection, if it is from the same camera."""
+        """Continue with a new connection, if it comes from the same camera."""
         if source.size != self.size:
             source.close()
             sizes = f"{source.size[0]}x{source.size[1]} pixels, before it had {self.size[0]}x{self.size[1]}"
-            raise AmiwarpError(f"{self.name}: is back with a camera of {sizes}; record it to another file")
+            raise AmiwarpError(f"{self.name}: is back with a camera of {sizes}; record this camera to another file")
         if (source.camera, source.prism) != (self.camera, self.prism):
             source.close()
-            raise AmiwarpError(f"{self.name}: is back with another camera or prism; record it to another file")
+            raise AmiwarpError(f"{self.name}: is back with another camera or prism; record this camera to another file")
         self._source.close()
         self._source, self.problem = source, None
         self.returns += 1

@@ -29,23 +29,24 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.speed_control import SpeedKeeper
 
 PATIENCE_S = 1.0
-"""Longest wait, at the end, for the source's thread and for encoder samples of the last events [s]."""
+"""Longest wait at the end of a session for the source's thread and for encoder samples of the last events [s]."""
 POLL_S = 0.001
 """Longest wait for a packet between two polls of the encoder [s]."""
 QUEUE_EVENTS = 1 << 23
-"""Size of the queue before the compensator [events]: most of a second of the fastest sensor."""
+"""Capacity of the queue before the compensator [events]: most of a second of the fastest sensor."""
 STEP_BYTES = 1 << 22
-"""Memory of the packets processed at once, before controller and stop event are checked again [bytes]."""
+"""Memory of the packets that are processed before controller and stop event are checked again [bytes]."""
 
 
 class Session:
-    """Processes a source until it ends or is stopped. The caller opens and closes all that it is given.
+    """Takes events from a source, compensates them and distributes them until the source ends or a stop is requested.
 
-    ``calibration``: None to compensate nothing, for example to record. ``link``: its encoder samples replace those of
-    the source. ``raw`` get the sensor's events, ``out`` gets the compensated events, and both get encoder samples;
-    ``sinks`` get compensated packets. ``watch_s``: interval between checks of the phase [s]; None: no checks.
-    ``keeper``: adaptive speed. ``wait_us``: longest wait of an event for its encoder samples [us]. ``policy`` and
-    ``queue_events``: for the queue before the compensator. ``say`` gets messages.
+    The caller opens and closes all objects that the session gets. ``calibration``: None to compensate nothing, for
+    example to record. ``link``: its encoder samples replace those of the source. The consumers ``raw`` get the sensor's
+    events, ``out`` gets the compensated events, and both get encoder samples; ``sinks`` get compensated packets.
+    ``watch_s``: interval between checks of the phase [s]; None: no checks. ``keeper``: adaptive speed. ``wait_us``:
+    longest wait of an event for its encoder samples [us]. ``policy`` and ``queue_events``: for the queue before the
+    compensator. ``say`` is called with messages.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class Session:
         return self.status
 
     def _process(self, stop: threading.Event, on_status: Callable[[SessionStatus], None], every_s: float) -> None:
-        """Process packets until the queue has ended."""
+        """Process packets until the queue is closed and empty."""
         due, stopped = 0.0, math.inf
         while not self._queue.ended:
             self._step()
@@ -132,7 +133,7 @@ class Session:
                     self._queue.close()
 
     def _end(self, reader: threading.Thread) -> None:
-        """Wait for the threads."""
+        """Wait for the threads at the end of the session."""
         reader.join(PATIENCE_S)
         if not reader.is_alive():
             self._source.close()
@@ -142,7 +143,7 @@ class Session:
         self._consumers.end()
 
     def _abandon(self) -> None:
-        """Drop the data that wait for the consumers, so that the caller can finish their files at once."""
+        """Drop the data that wait for the consumers, so that the caller can close their files at once."""
         self._hasty = True
         self._consumers.abandon()
 
@@ -155,7 +156,7 @@ class Session:
         return (monotonic_us() - self._began_us) * 1e-6
 
     def _read(self, stop: threading.Event) -> None:
-        """Move packets from the source to the queue, in a background thread."""
+        """Move packets from the source to the queue; runs in a background thread."""
         try:
             for packet in self._source.packets():
                 self._queue.put(packet)
@@ -167,7 +168,7 @@ class Session:
             self._queue.close()
 
     def _step(self) -> None:
-        """Process the waiting packets and give out what is ready."""
+        """Process the waiting packets, and distribute the compensated events that are ready."""
         self._poll_encoder()
         packet, events, held = self._queue.get(POLL_S), 0, 0
         most = 1 if self._compensator is None else self._compensator.batch
@@ -187,7 +188,7 @@ class Session:
         self._take_events(self._sorter.put(packet.events), packet.arrived_us)
 
     def _take_events(self, events: Events, arrived_us: int) -> None:
-        """Give sorted events to all that use the sensor's events."""
+        """Pass the sorted events to all consumers of the sensor's events."""
         if not len(events):
             return
         self.status.events += len(events)
@@ -199,7 +200,7 @@ class Session:
             self._compensator.put(events, monotonic_us(), arrived_us=arrived_us)
 
     def _give(self, packets: list[Compensated]) -> None:
-        """Give compensated packets to all that use them."""
+        """Pass compensated packets to all their consumers."""
         now = monotonic_us()
         for packet in packets:
             self._figures.add(packet, now, self.status)
@@ -233,13 +234,13 @@ class Session:
         on_status(status)
 
     def _finish(self) -> None:
-        """Process everything that is held anywhere."""
+        """Process all data that are still held back, at the end of the session."""
         self._take_events(self._sorter.flush(), monotonic_us())
         end = monotonic_us() + 1e6 * PATIENCE_S
         while self._link is not None and monotonic_us() < end:
             self._poll_encoder()
             last = self.encoder.last
-            if last is not None and last > self._last_us:  # the samples cover the last events
+            if last is not None and last > self._last_us:  # the encoder samples cover the last events
                 break
             time.sleep(POLL_S)
         if self._compensator is not None:

@@ -22,24 +22,25 @@ from amiwarp.live.stream.connections import IDLE_S, close_listener, listen, read
 from amiwarp.live.stream.packets import encode_end
 
 MOST_BYTES = 1 << 24
-"""Memory of the packets that wait for a client before it loses packets [bytes]."""
+"""Memory of the packets that may wait for a client; a client that is slower loses packets [bytes]."""
 PACKET_OVERHEAD = 256
 """Memory of a waiting packet beyond its data, for its Python objects [bytes]."""
 MOST_CLIENTS = 32
-"""Largest number of clients. With :data:`MOST_BYTES` each, at most half a GiB waits."""
+"""Largest number of clients at a time. With :data:`MOST_BYTES` each, at most half a GiB waits."""
 EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-"""Errors of a process or machine without resources for another connection. The client waits in the system's queue."""
+"""Error numbers of a process or machine without resources for another connection. The client then waits in the system's
+queue."""
 REST_S = 0.5
-"""Pause after such an error before connections are accepted again [s]."""
+"""Pause after an error of :data:`EXHAUSTED` before connections are accepted again [s]."""
 PIPE_BYTES = getattr(select, "PIPE_BUF", 512)
-"""Number of bytes that a writable pipe accepts without blocking."""
+"""Number of bytes that a pipe accepts without blocking once it is writable."""
 DRAIN_S = 2.0
-"""Longest time for sending the last packets [s]."""
+"""Longest time for sending the last packets when the stream ends [s]."""
 
 
 @dataclass(slots=True, eq=False)
 class _Client:
-    """Connected client with the packets that wait for it."""
+    """Client that is connected, with the packets that wait for it."""
 
     connection: socket.socket
     waiting: deque[memoryview] = field(default_factory=deque)
@@ -50,7 +51,7 @@ class _Client:
         self.waiting_bytes += len(data) + PACKET_OVERHEAD
 
     def push(self) -> bool:
-        """Send as much as possible without blocking; return False if the client is gone."""
+        """Send as much as possible to the client without blocking; return False if the client is gone."""
         try:
             while self.waiting:
                 sent = self.connection.send(self.waiting[0])
@@ -95,7 +96,7 @@ class SocketSink:
         self._last_message = ""
         self._clients: list[_Client] = []
         self.lost = 0
-        """Number of packets not sent to a client, summed over all clients."""
+        """Number of packets that were dropped for a slow client, summed over all clients."""
 
     def __enter__(self) -> SocketSink:
         return self
@@ -130,7 +131,7 @@ class SocketSink:
         self.send(b"")
 
     def close(self) -> None:
-        """Send the end of the stream, wait at most :data:`DRAIN_S` for waiting packets, and disconnect."""
+        """Send the end message, wait at most :data:`DRAIN_S` until the waiting packets are sent, and disconnect."""
         if self._server.fileno() < 0:
             return
         close_listener(self._server)
@@ -146,7 +147,7 @@ class SocketSink:
         self._clients = []
 
     def _accept(self) -> None:
-        """Accept the connections that wait, at most :data:`MOST_CLIENTS` at a time."""
+        """Accept the clients that wait for a connection, at most :data:`MOST_CLIENTS` at a time."""
         if time.monotonic() < self._resume_s:
             return
         for _ in range(MOST_CLIENTS):
@@ -206,7 +207,7 @@ class PipeSink:
         self._stop = stop or threading.Event()
         self._may_block_long = _may_block(self._file)
         self.lost = 0
-        """Number of lost packets: always 0."""
+        """Number of lost packets: always 0, because a pipe waits for its reader."""
         self.send(hello)
 
     def __enter__(self) -> PipeSink:
@@ -228,27 +229,30 @@ class PipeSink:
                 self._file.write(data[start : start + step])
                 self._file.flush()
         except OSError as error:
-            raise AmiwarpError(f"standard output: {error.strerror}; has its reader ended?") from error
+            raise AmiwarpError(f"standard output: {error.strerror}; start the program that reads it again") from error
 
     def _wait_for_reader(self) -> None:
-        """Wait until the reader accepts data."""
+        """Wait until the pipe's reader accepts data."""
         until = math.inf
         while not ready(self._file, IDLE_S, to_write=True):
             if self._stop.is_set():
                 until = min(until, time.monotonic() + DRAIN_S)
             if time.monotonic() > until:
-                raise AmiwarpError("standard output: its reader accepts no more data; the stream is cut off there")
+                raise AmiwarpError(
+                    "standard output: its reader accepts no more data, so the end of the stream is lost; check the "
+                    "program that reads it"
+                )
 
     def tick(self) -> None:
-        """Do nothing: no data wait here."""
+        """Do nothing, because no data wait to be sent."""
 
     def close(self) -> None:
-        """Write the end of the stream; the file stays open."""
+        """Write the end message; the file stays open."""
         self.send(encode_end())
 
 
 def _may_block(file: Any) -> bool:
-    """Return whether a write may block for long, as to a pipe, unlike to a file on a disk."""
+    """Return whether a write to ``file`` may block for long, as to a pipe, unlike to a file on a disk."""
     try:
         return not stat.S_ISREG(os.fstat(file.fileno()).st_mode)
     except OSError:  # a substitute for standard output, without a file descriptor

@@ -18,7 +18,7 @@ def open_source(
     wait_s: float = 0.0,
     say: Callable[[str], None] = lambda _: None,
 ) -> Source:
-    """Open a source by its name.
+    """Open a source of live events by its name.
 
     The name of a file replays a recording at ``pace`` times its speed (None: as fast as possible), in packets of
     ``packet_us`` [us]. ``-``, ``tcp:HOST:PORT`` and ``unix:PATH`` read a stream (``docs/reference/stream-format.md``);

@@ -28,25 +28,28 @@ from amiwarp.live.stream.packets import (
 )
 
 IDLE_S = 0.05
-"""Longest time without a packet [s]. After it, an empty packet is delivered."""
+"""Longest time without a packet [s]. After this time, an empty packet is delivered."""
 LARGEST_US, LARGEST_RAD = 1 << 60, 1e12
-"""Largest magnitude of a time [us] and of an angle [rad] in a stream.
+"""Largest accepted magnitude of a time [us] and of an angle [rad] in a stream.
 
 The difference of two such times fits int64, and float64 resolves such an angle to 0.00012 rad.
 """
 HELLO_S = 10.0
-"""Longest wait for the hello of a sender [s]."""
+"""Longest wait for the first message (hello) of a sender [s]."""
 
 
 def open_stream(spec: str) -> StreamSource:
-    """Open the stream at ``tcp:`` or ``unix:`` (connect) or ``tcp-listen:`` or ``unix-listen:`` (wait for a sender)."""
+    """Open the stream at an address.
+
+    ``tcp:`` and ``unix:`` connect to the sender; ``tcp-listen:`` and ``unix-listen:`` wait for the sender to connect.
+    """
     kind = spec.partition(":")[0]
     connection = accept(spec.replace("-listen", "", 1)) if kind.endswith("-listen") else connect(spec)
     return open_connection(spec, connection)
 
 
 def open_connection(spec: str, connection: socket.socket, *, hello_s: float | None = None) -> StreamSource:
-    """Read the stream from a connection. The source closes it."""
+    """Open the stream of a connection. The returned source closes the connection."""
     with connection:
         connection.settimeout(None)
         return StreamSource(spec, connection.makefile("rb", buffering=0), hello_s=hello_s)
@@ -69,9 +72,11 @@ class FileSource:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         if pace is not None and not 0.0 < pace < float("inf"):
-            raise AmiwarpError(f"pace = {pace}; give a positive number, or None for as fast as possible")
+            raise AmiwarpError(
+                f"pace = {pace}; give a positive number (1: the recorded speed), or None for as fast as possible"
+            )
         if packet_us < 1:
-            raise AmiwarpError(f"packet_us = {packet_us}; give 1 or more")
+            raise AmiwarpError(f"packet_us = {packet_us}; give the duration of a packet, 1 us or more")
         self.name = str(path)
         recording = open_recording(path)
         self._events, encoder = recording.events, recording.encoder
@@ -81,7 +86,7 @@ class FileSource:
         self.has_encoder = encoder is not None
         self._encoder_t, self._encoder_angle = np.zeros(0, np.int64), np.zeros(0)
         self.clock_offset_us = 0.0 if encoder is None else encoder.clock_offset_us
-        """Clock offset subtracted from the encoder's times to put them on the events' clock [us]."""
+        """Clock offset subtracted from the times of the file's encoder to put them on the events' clock [us]."""
         if encoder is not None:
             # A rounding error of half a microsecond is less than 0.01 deg at 3000 rpm.
             self._encoder_t, self._encoder_angle = encoder.t - round(encoder.clock_offset_us), encoder.angle
@@ -134,7 +139,7 @@ class StreamSource:
         self._decoder = PacketDecoder(name)
         self._ended = False
         self.problem: str | None = None
-        """How the stream ended, in one line; None if it ended properly."""
+        """How the stream ended, in one line; None if it ended with its end message."""
         try:
             self._first_hello = hello = self._hello()
         except BaseException:
@@ -149,7 +154,10 @@ class StreamSource:
         while not self._ended:
             message = self._next(IDLE_S)
             if isinstance(message, Hello) and message != self._first_hello:
-                raise AmiwarpError(f"{self.name}: a second hello describes another camera; correct its sender")
+                raise AmiwarpError(
+                    f"{self.name}: a second hello message describes another camera; correct the program that sends the "
+                    "stream"
+                )
             if message is not None and not isinstance(message, (Hello, End)):
                 yield self._packet(message)
                 yielded_s = time.monotonic()
@@ -162,14 +170,14 @@ class StreamSource:
         self._file.close()
 
     def _hello(self) -> Hello:
-        """Return the first message, which must be a hello."""
+        """Return the first message of the stream, which must be a hello."""
         until = time.monotonic() + self._hello_s
         while time.monotonic() < until and not self._ended:
             message = self._next(IDLE_S)
             if isinstance(message, Hello):
                 return message
             if message is not None:
-                raise AmiwarpError(f"{self.name}: begins without a hello; see docs/reference/stream-format.md")
+                raise AmiwarpError(f"{self.name}: begins without a hello message; see docs/reference/stream-format.md")
         raise Unreachable(f"{self.name}: {self.problem or 'sent no hello'}; see docs/reference/stream-format.md")
 
     def _next(self, timeout_s: float) -> Message | None:
@@ -201,16 +209,16 @@ class StreamSource:
             raise AmiwarpError(f"{self.name}: sends compensated events; give the stream of a sensor")
         if len(message.t) and not (message.t.min() >= -LARGEST_US and message.t.max() <= LARGEST_US):
             what = f"times of {message.t.min()} .. {message.t.max()} us, not in +-{LARGEST_US}"
-            raise AmiwarpError(f"{self.name}: {what}; correct its sender")
+            raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
         if isinstance(message, Triggers):
             return make_packet(now, triggers=message.t)
         if isinstance(message, EncoderSamples):
             if not (np.abs(message.angle) <= LARGEST_RAD).all():
                 what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
-                raise AmiwarpError(f"{self.name}: {what}; correct its sender")
+                raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
             return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
         width, height = self.size
         if len(message) and (message.x.max() >= width or message.y.max() >= height or message.p.max() > 1):
             what = f"an event outside the {width}x{height} frame, or with a polarity that is neither 0 nor 1"
-            raise AmiwarpError(f"{self.name}: {what}; correct its sender")
+            raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
         return make_packet(now, message)

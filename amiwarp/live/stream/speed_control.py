@@ -20,15 +20,17 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 WINDOW_US, MOST_WINDOWS = 33_333, 10
-"""Length of a window [us], and largest number of windows measured at once. Older windows are skipped as outdated."""
+"""Length of a window of events [us], and largest number of windows measured at once. Older windows are skipped as
+outdated."""
 MOST_BYTES = 1 << 26
-"""Memory bound of the unfinished window's packets [bytes]. Beyond it, its oldest packets are left out."""
+"""Memory limit of the unfinished window's packets [bytes]. Beyond it, the window's oldest packets are left out."""
 
 
 class SpeedKeeper:
-    """Measures the coverage of each window and commands a new speed if needed. A thread waits for the answer.
+    """Measures the coverage of each window of events and commands a new prism speed if needed.
 
-    ``set_speed``: called with speed [rpm] and ramp [rpm/s], as :meth:`Link.set_speed`. ``say`` gets its errors.
+    A background thread waits for the controller's answer. ``set_speed`` is called with speed [rpm] and ramp [rpm/s],
+    like :meth:`Link.set_speed`. ``say`` is called with the messages of its errors.
     """
 
     def __init__(
@@ -48,10 +50,10 @@ class SpeedKeeper:
         self._command_thread: threading.Thread | None = None
         self._commanded_rpm = controller.rpm
         self.coverage: float | None = None
-        """Share of the scene's edges that the last window showed."""
+        """Share of the scene's edges that the last window showed, 0 to 1; None before the first window."""
 
     def put(self, packets: list[Compensated], encoder: EncoderStream) -> None:
-        """Add compensated packets, in order of time."""
+        """Add compensated packets, in order of time, and measure the windows that are complete."""
         self._window_start_us = int(packets[0].events.t[0]) if self._window_start_us is None else self._window_start_us
         for packet in packets:
             self._packets.append(packet.events)
@@ -97,6 +99,6 @@ class SpeedKeeper:
             self._say(str(error))
 
     def close(self) -> None:
-        """Wait for the answer to the last command."""
+        """Wait for the controller's answer to the last command."""
         if self._command_thread is not None:
             self._command_thread.join()

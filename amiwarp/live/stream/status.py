@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from amiwarp.live.link.clocks import ClockMap
 
 IMAGE_US = 33_333
-"""Window of the image whose sharpness is reported [us]."""
+"""Length of the time window whose image gives the reported sharpness [us]."""
 
 
 @dataclass(slots=True)
@@ -27,48 +27,49 @@ class SessionStatus:
     seconds: float = 0.0
     """Duration of the session [s]."""
     events: int = 0
-    """Number of events received."""
+    """Number of events received so far."""
     done: int = 0
-    """Number of events compensated."""
+    """Number of events compensated so far."""
     outside: int = 0
     """Number of events displaced out of the image."""
     guessed: int = 0
-    """Number of events with an extrapolated angle."""
+    """Number of events compensated with an extrapolated prism angle."""
     unknown: int = 0
-    """Number of events without any angle."""
+    """Number of events without a prism angle."""
     dropped: int = 0
     """Number of events dropped by the queue, see :class:`Policy`."""
     late: int = 0
     """Number of events that were out of order and got a later time."""
     waiting: int = 0
-    """Number of events in the queue, or waiting for the encoder."""
+    """Number of events that wait in the queue or for encoder samples."""
     rate_mev_s: float = 0.0
-    """Event rate [million events/s]."""
+    """Rate of the received events since the last report [million events/s]."""
     covered: float = 1.0
-    """Share of events whose angle was interpolated between encoder samples."""
+    """Share of events since the last report whose prism angle was interpolated between encoder samples."""
     latency_ms: tuple[float, float] = (0.0, 0.0)
-    """Time from a packet's arrival to its output, median and 99th percentile [ms]."""
+    """Median and 99th percentile of the time from a packet's arrival to its output [ms]."""
     sharpness: float | None = None
-    """Sharpness of the latest image, over :data:`IMAGE_US`."""
+    """Sharpness of the latest image of compensated events, over :data:`IMAGE_US`; None before the first."""
     rpm: float | None = None
-    """Speed of the prism [turns/min]."""
+    """Speed of the prism [turns/min]; None if it is unknown."""
     clock: ClockMap | None = None
-    """Map from the controller's clock to the camera's, with a link."""
+    """Map from the controller's clock to the camera's; None without a link."""
     coverage: float | None = None
-    """Share of the scene's edges that the last window showed, with adaptive speed."""
+    """Share of the scene's edges that the last window showed, 0 to 1; None without adaptive speed."""
     phase_away: float | None = None
-    """Latest estimate of the phase relative to the calibrated one [rad]."""
+    """Difference between the latest estimated and the calibrated phase [rad]; None without an estimate."""
 
 
 class IntervalFigures:
-    """Rate, latency and coverage by the encoder since the last report."""
+    """Event rate, latency, and coverage by encoder samples, all since the last report."""
 
     def __init__(self, began_us: int) -> None:
-        self._reported = (began_us, 0, 0, 0)  # time [us]; events received, compensated, without a measured angle
+        # at the last report: time [us]; numbers of events received, compensated, without a measured angle
+        self._reported = (began_us, 0, 0, 0)
         self._latencies: list[int] = []
 
     def add(self, packet: Compensated, now_us: int, status: SessionStatus) -> None:
-        """Count a compensated packet."""
+        """Count a compensated packet in the figures of the interval."""
         flags = packet.flags
         status.done += len(flags)
         if flags.any():
@@ -78,7 +79,7 @@ class IntervalFigures:
         self._latencies.append(now_us - packet.arrived_us)
 
     def report(self, now_us: int, status: SessionStatus) -> None:
-        """Enter the figures of the interval into the status, and begin the next interval."""
+        """Write the figures since the last report into the status, and start the next interval."""
         then_us, events, done, unsure_then = self._reported
         unsure = status.guessed + status.unknown
         status.rate_mev_s = (status.events - events) / max(now_us - then_us, 1)
@@ -91,7 +92,7 @@ class IntervalFigures:
 
 
 class WindowSharpness:
-    """Sharpness of the compensated image of one window per report."""
+    """Measures the sharpness of the compensated image of one time window per report."""
 
     def __init__(self, compensator: Compensator, size: tuple[int, int], device: str) -> None:
         self._compensator = compensator
@@ -100,7 +101,7 @@ class WindowSharpness:
         self._wanted = True
 
     def update(self, t: int) -> float | None:
-        """Return the sharpness once the window is complete, for compensated events up to ``t`` [us]."""
+        """Return the sharpness once the window is complete; ``t``: time up to which events are compensated [us]."""
         if self._start_us is None:
             self._compensator.image()  # discards the events before the window
             self._start_us = t
@@ -111,5 +112,5 @@ class WindowSharpness:
         return None
 
     def restart(self) -> None:
-        """Begin a new window."""
+        """Begin a new time window."""
         self._start_us, self._wanted = None, True

@@ -1,7 +1,7 @@
-"""Rows of the calibration chart: models, algorithms, numbers of events, folding of turns and the photometric stage.
+"""Measurement of the calibration chart: models, algorithms, numbers of events, folding of turns, photometric stage.
 
-Folding merges the events of all turns that have the same pixel, polarity and bin of the prism angle.
-Each result is compared with the ground truth.
+Each measured setting is a row of the chart. Folding merges the events of all turns that have the same pixel, polarity
+and bin of the prism angle. Each result is compared with the ground truth.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from amiwarp.studies.chart.rows import Row, Task, Timed, measure, near_front
 from amiwarp.studies.chart.truth import KnownRecording
 
 JOB = "calibration"
-"""Job of all rows."""
+"""Name of the job to which all rows of the calibration chart belong."""
 SHARP = STAGES[:1]
-"""Stages of a calibration by sharpness alone."""
+"""Stages of a calibration that uses sharpness alone."""
 EVENTS = (100_000, 300_000, 1_000_000, 10**9)
-"""Numbers of events; the last one means all."""
+"""Numbers of events with which the calibration is measured; the last one means all events."""
 FOLDS = (1024, 512, 256)
-"""Numbers of angle bins per turn to which the events are folded."""
+"""Numbers of prism angles per turn to which the events are folded."""
 PAIRS = (150_000, 300_000, 600_000, 1_200_000)
-"""Numbers of event pairs of the photometric stage."""
+"""Numbers of event pairs with which the photometric stage is measured."""
 GUESS = math.radians(10.0)
-"""Phase error of the guess from which the search without a global stage starts [rad]."""
+"""Phase error [rad] of the start phase that is given to a search without a global stage."""
 PAIRS_OF_ALGORITHMS = (
     ("GN_DIRECT_L", "LN_SBPLX"),
     ("GN_DIRECT_L", "LN_COBYLA"),
@@ -44,24 +44,24 @@ PAIRS_OF_ALGORITHMS = (
     ("GN_CRS2_LM", "LN_BOBYQA"),
     ("GN_MLSL_LDS", "LN_BOBYQA"),
 )
-"""Global and local algorithm."""
+"""Pairs of global and local search algorithm that are measured."""
 
 
 @dataclass(frozen=True)
 class CalibrationSetting:
-    """Setting of the calibration chart."""
+    """Setting of a calibration that the chart measures."""
 
     label: str
-    """Name for people."""
+    """Name of the setting in the chart."""
     family: str
-    """Family, which sets the colour."""
+    """Family of the setting, which determines its colour in the chart."""
     settings: Settings
     """Settings of the calibration."""
     comparable: bool = True
-    """False if it needs a guess."""
+    """False if the calibration needs a guess of the phase, so that it cannot be compared with the others."""
 
     def fields(self, device: str) -> dict[str, Any]:
-        """Return the fixed fields of the row."""
+        """Return the fields of the setting's row that do not depend on the measurement."""
         both = "both stages" if self.settings.stages == STAGES else "sharpness alone"
         plain = settings_to(self.settings)
         return {"chart": "calibration", "job": JOB, "label": self.label, "family": self.family,
@@ -70,7 +70,7 @@ class CalibrationSetting:
 
 
 def settings(known: KnownRecording, *, quick: bool) -> list[CalibrationSetting]:
-    """Return the settings of the chart, the default first."""
+    """Return the calibration settings that the chart measures, the default first."""
     if quick:
         few = Settings(events=50_000, global_evaluations=60)
         return [
@@ -82,13 +82,13 @@ def settings(known: KnownRecording, *, quick: bool) -> list[CalibrationSetting]:
 
 
 def _both(label: str, family: str, s: Settings) -> Iterator[CalibrationSetting]:
-    """Yield a setting with both stages, and the same by sharpness alone."""
+    """Yield a setting with both stages of the calibration, and the same setting with sharpness alone."""
     yield CalibrationSetting(label, family, s)
     yield CalibrationSetting(f"{label}, sharpness", family, replace(s, stages=SHARP))
 
 
 def _stages(known: KnownRecording) -> Iterator[CalibrationSetting]:
-    """Yield the default, every model, and the local search from a guess."""
+    """Yield the default setting, every model, and the local search that starts from a guess."""
     yield from _both("default", "default", Settings())
     for model in MODELS:
         yield from _both(model, "model", Settings(model=model))
@@ -98,7 +98,7 @@ def _stages(known: KnownRecording) -> Iterator[CalibrationSetting]:
 
 
 def _events() -> Iterator[CalibrationSetting]:
-    """Yield other numbers of events."""
+    """Yield settings with other numbers of events than the default."""
     for n in EVENTS[:-1]:
         if n != Settings().events:
             name = f"{n // 1000} k" if n < 1_000_000 else f"{n // 1_000_000} M"
@@ -108,7 +108,10 @@ def _events() -> Iterator[CalibrationSetting]:
 
 
 def _folds() -> Iterator[CalibrationSetting]:
-    """Yield other foldings. Folded, all events may cost little more than a part of them."""
+    """Yield settings with other numbers of angles for folding.
+
+    Folded, all events may cost little more than a part of them.
+    """
     for bins in (0, *FOLDS):
         if bins != Settings().fold:
             yield CalibrationSetting(f"{_folded(bins)}, sharpness", "folding", Settings(fold=bins, stages=SHARP))
@@ -120,12 +123,12 @@ def _folds() -> Iterator[CalibrationSetting]:
 
 
 def _folded(bins: int) -> str:
-    """Return the text of a folding."""
+    """Return the label of a setting that folds events to ``bins`` angles; 0: no folding."""
     return f"folded to {bins} angles" if bins else "not folded"
 
 
 def _algorithms() -> Iterator[CalibrationSetting]:
-    """Yield other algorithms and numbers of steps."""
+    """Yield settings with other search algorithms and numbers of search steps."""
     for first, second in PAIRS_OF_ALGORITHMS:
         s = Settings(global_algorithm=first, local_algorithm=second, stages=SHARP)
         yield CalibrationSetting(f"{first[3:]} + {second[3:]}, sharpness", "algorithms", s)
@@ -135,7 +138,7 @@ def _algorithms() -> Iterator[CalibrationSetting]:
 
 
 def _photometric() -> Iterator[CalibrationSetting]:
-    """Yield other settings of the photometric stage."""
+    """Yield settings with other algorithms and numbers of pairs for the photometric stage."""
     for pairs in PAIRS:
         if pairs != PhotometricSettings().pairs:
             yield CalibrationSetting(
@@ -146,7 +149,7 @@ def _photometric() -> Iterator[CalibrationSetting]:
 
 
 def _mixed() -> Iterator[CalibrationSetting]:
-    """Yield few events for the first stage, whose error the photometric stage corrects."""
+    """Yield settings with few events for the first stage, whose error the photometric stage corrects."""
     for events, pairs in itertools.product(EVENTS[:2], PAIRS[:2]):
         if events != Settings().events and pairs != PhotometricSettings().pairs:
             s = Settings(events=events, photometric=PhotometricSettings(pairs=pairs))
@@ -156,7 +159,7 @@ def _mixed() -> Iterator[CalibrationSetting]:
 def rows(
     known: KnownRecording, device: str, *, repeats: int, quick: bool, seed: int, progress: Progress
 ) -> tuple[list[Row], list[str]]:
-    """Measure all rows; return them with notes on settings that the calibration refuses on this recording."""
+    """Measure all settings; return their rows, and notes on settings that the calibration refuses on this recording."""
     ways = settings(known, quick=quick)
 
     def run(s: Settings) -> Calibration | AmiwarpError:
@@ -188,12 +191,12 @@ def rows(
 
 
 def _kinds(ways: list[CalibrationSetting]) -> list[Settings]:
-    """Return one setting of each kind; they run before the measurement, so that their kernels are compiled."""
+    """Return one setting of each kind. They run before the measurement, so that their kernels are compiled."""
     every = (way.settings for way in ways)
     return list({(s.model, s.stages, s.fold > 0, s.photometric.algorithm): s for s in every}.values())
 
 
 def _shortened(s: Settings) -> Settings:
-    """Return the settings of a short run."""
+    """Return a setting with few events and steps, for a short run."""
     few = PhotometricSettings(pairs=20_000, algorithm=s.photometric.algorithm)
     return replace(s, events=20_000, global_evaluations=20, local_evaluations=10, photometric=few)

@@ -1,4 +1,4 @@
-"""Both charts of a recording: measured, drawn, and written as figures, JSON and CSV."""
+"""Speed-error charts of compensation and calibration: measured on one recording, written as figures, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -29,31 +29,32 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
 PACKAGES = ("warp-lang", "numpy", "nlopt", "numba", "torch", "cupy-cuda12x", "cupy-cuda13x")
-"""Packages whose versions are recorded."""
+"""Packages whose versions are recorded with a chart."""
 ABOUT = ("format", "version", "date", "machine", "device", "processor", "versions", "recording")
-"""Keys of the description in ``chart.json``."""
+"""Keys of the description of machine and recording in ``chart.json``."""
 USUAL, QUICK = (640, 480, 2.0), (320, 240, 0.2)
-"""Width [px], height [px] and length [s] of the simulated recording; of a quick run."""
+"""Width [px], height [px] and length [s] of the simulated recording: usual size, and size for a quick run."""
 CONTRAST = 0.54
-"""Contrast threshold [log intensity] at which the map of the earth gives ten million events in two seconds."""
+"""Contrast threshold [log intensity] of the simulated sensor. With it the map of the earth gives ten million events in
+two seconds."""
 REPEATS = {"compensation": 5, "calibration": 3}
-"""Number of repeats per chart."""
+"""Number of repeated measurements of each setting, by chart."""
 
 
 @dataclass(frozen=True)
 class Charts:
-    """Rows of both charts, and the written files."""
+    """Measured settings (rows) of both charts, and the written files."""
 
     compensation: tuple[Row, ...]
-    """Rows of the compensation chart."""
+    """Measured settings of the compensation chart."""
     calibration: tuple[Row, ...]
-    """Rows of the calibration chart."""
+    """Measured settings of the calibration chart."""
     files: dict[str, Path]
-    """Paths of the written files by name."""
+    """Paths of the written files, by name."""
     notes: tuple[str, ...]
-    """Notes on missing rows and refused settings."""
+    """Notes on settings that could not be measured or were refused."""
     about: dict[str, Any]
-    """Machine, versions, date and recording."""
+    """Description of the machine, the versions, the date and the recording."""
 
     @classmethod
     def load(cls, data: Path) -> Charts:
@@ -89,8 +90,7 @@ class Charts:
     def answer(
         self, folder: Path, *, budget_px: float | None = None, budget_ms: float | None = None
     ) -> dict[str, Row | None]:
-        """Return for each command the best row within a budget, None if there is none, and write it as a preset to
-        ``folder``.
+        """Return for each command the best row within a budget (or None), and write it as a preset to ``folder``.
 
         ``budget_px`` selects the fastest rows of both commands; ``budget_ms`` the most accurate calibration.
         """
@@ -109,13 +109,13 @@ class Charts:
 
 
 def _as_files(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of images that use all events, all angles and bilinear votes."""
+    """Return the rows of images of events that use all events, all angles and bilinear votes."""
     whole = {"vote": "bilinear", "angles": TURNS, "share": 1.0}
     return [r for r in rows if "library" not in r.settings and all(r.settings[n] == v for n, v in whole.items())]
 
 
 def _preset(kind: str, row: Row) -> Preset:
-    """Return a row as a preset of a command."""
+    """Return a measured setting as a preset of a command."""
     settings = {n: v for n, v in row.settings.items() if n != "device"}
     if kind == "compensation":
         settings = {"model": settings["model"]}
@@ -123,7 +123,7 @@ def _preset(kind: str, row: Row) -> Preset:
 
 
 def _measured(row: Row) -> dict[str, float]:
-    """Return speed and error of a row."""
+    """Return speed and error of a row by name, for its preset."""
     speed = {"ms": row.seconds * 1e3} if row.chart == "calibration" else {"mev_per_s": row.mev_per_s}
     return {**speed, "error_px": row.error_px}
 
@@ -134,7 +134,7 @@ def simulated(
 ) -> Recording:  # fmt: skip
     """Simulate the recording of ``amiwarp demo`` in memory, with 24 turns.
 
-    ``picture`` None stands for the map of the earth.
+    ``picture``: picture of the scene; None for the map of the earth.
     """
     width, height, seconds = QUICK if quick else USUAL
     simulated_scene = simulation(Demo(Path(), picture, width, height, seconds, seed, device))
@@ -192,7 +192,7 @@ def _drawn(chart: str, out: Path) -> dict[str, Path]:
 
 
 def _share_note(rows: Sequence[Row]) -> str:
-    """Return the note below the compensation chart."""
+    """Return the note that is printed below the compensation chart."""
     errors = [f"{100 * r.image_error:.0f} % of its contrast for 1/{round(1 / r.settings['share'])}"
               for r in rows if not r.comparable and r.image_error is not None]  # fmt: skip
     small = "Small markers: fewer angles per turn. " if any(r.settings.get("angles", 0) < TURNS
@@ -201,7 +201,7 @@ def _share_note(rows: Sequence[Row]) -> str:
 
 
 def _guess_note(rows: Sequence[Row]) -> str:
-    """Return the note below the calibration chart."""
+    """Return the note that is printed below the calibration chart."""
     text = "Model error: rms over image and turn, without the constant lag."
     guess = round(math.degrees(calibration.GUESS))
     if any(not r.comparable for r in rows):
@@ -210,7 +210,7 @@ def _guess_note(rows: Sequence[Row]) -> str:
 
 
 def _about(known: KnownRecording, device: str) -> dict[str, Any]:
-    """Return the description of machine and recording."""
+    """Return the description of the machine and the recording by name."""
     return {
         "format": "amiwarp-chart",
         "version": 1,
@@ -226,7 +226,7 @@ def _about(known: KnownRecording, device: str) -> dict[str, Any]:
 
 
 def _data(charts: Charts) -> dict[str, Any]:
-    """Return the rows, their fronts, and the rows that beat a default, as JSON data."""
+    """Return as JSON data the rows, those on the Pareto fronts, and rows that are better than a default."""
     out: dict[str, Any] = {"notes": list(charts.notes)}
     for name in ("compensation", "calibration"):
         rows: tuple[Row, ...] = getattr(charts, name)
@@ -239,7 +239,7 @@ def _data(charts: Charts) -> dict[str, Any]:
 
 
 def _csv(rows: Sequence[Row]) -> str:
-    """Return the rows as CSV, one line per row; settings that a row lacks are empty."""
+    """Return the rows as CSV, one line per measured setting. Settings that a row lacks are empty."""
     fixed = ("chart", "job", "label", "default", "on_front", "error_px", "mev_per_s", "ms", "spread",
              "repeats", "image_error")  # fmt: skip
     on = {id(r) for name in REPEATS for _, chosen in fronts([r for r in rows if r.chart == name]) for r in chosen}

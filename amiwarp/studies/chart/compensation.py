@@ -1,7 +1,7 @@
-"""Rows of the compensation chart.
+"""Measurement of the compensation chart. Each measured setting is a row of the chart.
 
-They measure images of events with every model, vote, number of angles and share of events; other libraries; and whole
-files.
+Three kinds of work are measured: images of events with every model, vote, number of angles and share of events; the
+same images by other libraries; and the compensation of whole files.
 """
 
 from __future__ import annotations
@@ -37,61 +37,65 @@ if TYPE_CHECKING:
     from amiwarp.calib import Calibration
 
 IMAGE, FILE = "image of events", "file to file"
-"""Names of the jobs."""
+"""Names of the jobs: rows of one job do the same work and share a Pareto front."""
 ANGLES = (TURNS, 4096, 1024, 256)
-"""Numbers of distinct prism angles per turn."""
+"""Numbers of distinct prism angles per turn with which images are measured."""
 SHARES = (4, 16)
-"""The image uses every n-th event, for each n here."""
+"""Divisors n of the number of events: an image is measured with every n-th event."""
 SAMPLE = 200_000
-"""Largest number of events that an error is measured on; more are thinned evenly."""
+"""Largest number of events on which an error is measured; larger numbers are thinned evenly."""
 MANY = 64_000_000
-"""On CUDA the recording is repeated to about this number of events; with fewer, launch times would dominate."""
+"""Number of events to which a recording is repeated on CUDA. With fewer events, launch times would dominate."""
 REST_S = 0.02
-"""Pause after a run [s], because threads of other libraries stay busy for a while."""
+"""Pause after a run of another library [s], whose threads stay busy for a while."""
 WRONG = 0.02
-"""Largest difference of the exact model's bilinear image from the float64 image; above it something is broken."""
+"""Largest difference of the exact model's bilinear image from the float64 image, relative to the contrast; a larger one
+is an error of the device."""
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorSample:
-    """Sample of the recording's events with their exact compensated positions."""
+    """Evenly thinned events of the recording with their exact compensated positions."""
 
     known: KnownRecording
-    """Recording with ground truth."""
+    """Recording with ground truth from which the sample is taken."""
     step: int
-    """The sample holds every ``step``-th event."""
+    """Interval of the sampled events: every ``step``-th event of the recording."""
     xy: NDArray[np.float64]
-    """Recorded positions [px], shape ``(n, 2)``."""
+    """Recorded positions of the sampled events [px], shape ``(n, 2)``."""
     theta: NDArray[np.float64]
-    """Prism angles [rad], shape ``(n,)``."""
+    """Prism angles of the sampled events [rad], shape ``(n,)``."""
     exact: NDArray[np.float64]
     """Exact compensated positions [px], shape ``(n, 2)``."""
 
     @classmethod
     def of(cls, known: KnownRecording) -> ErrorSample:
-        """Draw the sample of a recording."""
+        """Take a sample of the events of a recording."""
         step = -(-len(known.events) // SAMPLE)
         some = known.events[::step]
         xy, theta = raw_places(some), known.encoder.angle_at(some.t)
         return cls(known, step, xy, theta, exact_places(known.model, xy, theta))
 
     def error(self, places: NDArray[np.floating[Any]], vote: Vote) -> float:
-        """Return the rms distance [px] of positions ``(n, 2)`` from the exact ones.
+        """Return the rms distance [px] of positions ``(n, 2)`` from the exact positions.
 
-        A nearest vote adds its rounding.
+        For a nearest vote, the error of its rounding to whole pixels is added.
         """
         voted = np.rint(places) if vote is Vote.NEAREST else places
         return rms(voted - self.exact)
 
 
 def coarse(theta: NDArray[np.float64], angles: int) -> NDArray[np.float64]:
-    """Return angles [rad] rounded to ``angles`` steps per turn."""
+    """Round prism angles [rad] to ``angles`` steps per turn."""
     step = 2.0 * math.pi / angles
     return np.asarray(np.rint(theta / step) * step)
 
 
 class Uploads:
-    """Events of the recording on the device, at several numbers of angles and shares; each is uploaded once."""
+    """Events of the recording on the device, for each number of angles and each share.
+
+    Each version is uploaded once.
+    """
 
     def __init__(self, known: KnownRecording, device: str) -> None:
         self.known, self.device = known, device
@@ -102,7 +106,7 @@ class Uploads:
         self._made: dict[tuple[int, int], Any] = {}
 
     def get(self, angles: int, share: int) -> Any:
-        """Return the uploaded events."""
+        """Return the uploaded events with ``angles`` distinct angles per turn, every ``share``-th event."""
         if (angles, share) not in self._made:
             theta = coarse(self.theta[::share], angles)
             self._made[angles, share] = upload_events(self.events[::share], theta, self.device)
@@ -117,27 +121,27 @@ def _repeated(known: KnownRecording, copies: int) -> Any:
 
 @dataclass(frozen=True)
 class ImageSetting:
-    """Setting of an image of events."""
+    """Setting of an image of warped events that the chart measures."""
 
     model: str
-    """Refraction model."""
+    """Name of the optical model."""
     vote: Vote
-    """Vote."""
+    """How a vote is shared among pixels."""
     angles: int = TURNS
-    """Number of angles per turn."""
+    """Number of distinct prism angles per turn."""
     share: int = 1
-    """The image uses every ``share``-th event."""
+    """Interval of the used events: every ``share``-th event."""
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Name of the setting in the chart."""
         words = [self.model, self.vote.value]
         words += [] if self.angles == TURNS else [f"{self.angles} angles"]
         words += [] if self.share == 1 else [f"1/{self.share} of events"]
         return ", ".join(words)
 
     def fields(self, device: str) -> dict[str, Any]:
-        """Return the fixed fields of the row."""
+        """Return the fields of the setting's row that do not depend on the measurement."""
         settings = {"model": self.model, "vote": self.vote.value, "angles": self.angles, "share": 1.0 / self.share,
                     "device": device}  # fmt: skip
         default = self == ImageSetting("exact", Vote.BILINEAR)
@@ -146,12 +150,12 @@ class ImageSetting:
 
     @property
     def _mark(self) -> str:
-        """Kind of the row, shown by the marker."""
+        """Kind of the row, which determines its marker in the chart."""
         return self.vote.value if self.share == 1 else "share of events"
 
 
 def settings(*, quick: bool) -> list[ImageSetting]:
-    """Return the settings of the chart."""
+    """Return the image settings that the chart measures."""
     angles, models = (ANGLES[::2], ("circle", "exact")) if quick else (ANGLES, tuple(MODELS))
     # a nearest vote hides the error of coarse angles
     whole = [
@@ -162,16 +166,17 @@ def settings(*, quick: bool) -> list[ImageSetting]:
 
 @dataclass(frozen=True, eq=False)
 class LibraryTask:
-    """Task of another library, which makes the same image."""
+    """Task of another library that makes the same image of events."""
 
     task: Task
-    """Task."""
+    """Function to measure, with the fields of its row."""
     places: Callable[[slice], NDArray[np.float32]]
     """Function that returns the positions [px], shape ``(n, 2)``, to which the library moves the events of a slice."""
 
 
 Libraries: TypeAlias = Callable[["ErrorSample", "Uploads", str], tuple[list[LibraryTask], list[str]]]
-"""Function that returns tasks of other libraries for a sample, its uploads and a device, and notes on missing ones."""
+"""Function that returns tasks of other libraries for a sample, its uploads and a device, and notes on libraries that
+are not installed."""
 
 
 def rows(
@@ -184,9 +189,10 @@ def rows(
     folder: Path,
     libraries: Libraries | None = None,
 ) -> tuple[list[Row], list[str]]:
-    """Measure all rows; return them with notes on missing ones. Temporary files go to ``folder``.
+    """Measure all settings and return their rows, with notes on settings that could not be measured.
 
-    Raises :class:`AmiwarpError` if the exact model's image differs from the float64 image.
+    Temporary files go to ``folder``. Raises :class:`AmiwarpError` if the exact model's image differs from the float64
+    image.
     """
     progress("measuring images of events: the truth", 0.0)
     sample, truth = ErrorSample.of(known), exact_image(known)
@@ -210,7 +216,7 @@ def rows(
 
 
 def _image_tasks(ways: list[ImageSetting], models: dict[str, Model], uploads: Uploads, device: str) -> Iterator[Task]:
-    """Yield the tasks of the images."""
+    """Yield the measurements of the images of events."""
     camera = uploads.known.camera
     buffers = {}
     for vote in Vote:
@@ -238,14 +244,12 @@ def _places(model: Model, sample: ErrorSample, angles: int, device: str) -> NDAr
 
 
 def _image_error(image: NDArray[Any], truth: NDArray[np.float64], times: float) -> float:
-    """Return the rms difference of an image of ``times`` the events from the truth, relative to the contrast of the
-    truth.
-    """
+    """Return the rms difference of ``image`` / ``times`` from ``truth``, relative to the contrast of ``truth``."""
     return float(np.sqrt(np.mean((image / times - truth) ** 2)) / np.std(truth))
 
 
 def _check(rows: list[Row]) -> None:
-    """Raise an error if the default's image is wrong."""
+    """Raise :class:`AmiwarpError` if the image by the default setting is wrong."""
     default = next(row for row in rows if row.default)
     if default.image_error is None or not default.image_error < WRONG:
         raise AmiwarpError(
@@ -264,7 +268,10 @@ def circle(sample: ErrorSample) -> tuple[float, float]:
 def _file_rows(
     sample: ErrorSample, device: str, repeats: int, quick: bool, progress: Progress, folder: Path
 ) -> tuple[list[Row], list[str]]:
-    """Measure whole files with each model, reading and writing included; the error is that of the written file."""
+    """Measure the compensation of whole files with each model, reading and writing included.
+
+    The error is that of the events in the written file.
+    """
     if missing := [name for name in ("h5py", "hdf5plugin") if find_spec(name) is None]:
         return [], [f"files: not measured, because {' and '.join(missing)} is not installed"]
     known = sample.known

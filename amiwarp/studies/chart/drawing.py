@@ -1,4 +1,7 @@
-"""Drawing of the two charts as PNG and SVG: a point per row; the rows of the fronts are numbered and listed below."""
+"""Drawing of the speed-error charts as PNG and SVG.
+
+Each measured setting (row) is a point. The rows on the Pareto fronts are numbered and listed below.
+"""
 
 from __future__ import annotations
 
@@ -18,44 +21,45 @@ from amiwarp.studies.chart.rows import Row, beaten_by, fronts, told_apart
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 11.0, 4.4, 0.85, 0.3, 0.3
 """Figure width, panel height, left and right margins, and gap between panels [inch]."""
 TITLE, AXIS, LINE, KEY, NOTE = 0.42, 0.82, 0.225, 0.2, 0.42
-"""Heights above and below a panel, of a list line, of a legend line, and of the note [inch]."""
+"""Heights of the title above a panel, of the axis below it, of a line of the list, of a line of the legend, and of the
+note [inch]."""
 COLUMNS = 5
 """Number of columns of the legend."""
 LETTERS, SMALL, TINY = 12.5, 10.5, 9.5
-"""Font sizes [point], legible when the figure is shown at two thirds of its size."""
+"""Font sizes of the chart [point], legible when the figure is shown at two thirds of its size."""
 QUANTISATION, PAPER = 0.29, (1.5, 2.0)
-"""Rounding error of a pixel along one axis, and error that the paper reports [px]."""
+"""Rounding error of a pixel along one axis, and range of the error that the paper reports [px]."""
 REFERENCES = ((f"quantisation {QUANTISATION} px", QUANTISATION), (f"paper {PAPER[0]} to {PAPER[1]} px", PAPER[0]))
-"""Text and error [px] of the reference lines."""
+"""Text and error [px] of each horizontal reference line."""
 COLOURS = {
     "circle": ORANGE, "radial": GREEN, "ellipse": BLUE, "exact": VERMILION, "other libraries": "#6b6b6b",
     "default": BLACK, "model": ORANGE, "algorithms": BLUE, "events": GREEN, "folding": PINK, "pairs": SKY_BLUE,
     "events and pairs": VERMILION,
 }  # fmt: skip
-"""Colour of each family."""
+"""Colour of each family of settings in the charts."""
 WORDS = {"ellipse": "ellipse (table)", "exact": "exact (closed form)", "default": "all settings default",
          "other libraries": "other libraries (circle)"}  # fmt: skip
-"""Legend text of a family if it differs from its name."""
+"""Legend text of the families whose text differs from the name."""
 MARKS = {
     "bilinear": "o", "nearest": "s", "share of events": "^", "file to file": "D", "NumPy": "x", "Numba": "+",
     "PyTorch": "*", "CuPy": "P", "both stages": "o", "sharpness alone": "s", "with a guess": "^",
 }  # fmt: skip
-"""Marker of each kind of row."""
+"""Marker of each kind of measured setting."""
 HOLLOW, THIN = ("share of events", "with a guess"), "x+"
-"""Kinds with hollow markers, and markers without area."""
+"""Kinds of settings with hollow markers, and markers without area."""
 LINES = ("-", (0, (5, 2)))
-"""Line styles of the fronts."""
+"""Line styles of the Pareto fronts."""
 NAMED = "other libraries"
-"""Family whose points are labelled with their names."""
+"""Family of settings whose points are labelled with their names."""
 DIRECTIONS = ((1, 1), (1, -1), (-1, 1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0), (0.5, 1), (0.5, -1), (-0.5, 1),
               (-0.5, -1), (2, 1), (2, -1), (-2, 1), (-2, -1))  # fmt: skip
-"""Directions in which a label may be placed, in order of preference."""
+"""Directions from a point in which its label may be placed, in order of preference."""
 DIGITS = ((1, 2, 3, 4, 5, 6, 7, 8, 9), (1, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,))
-"""Digits of the numbers on an axis, from finest to coarsest."""
+"""Leading digits of the numbers on an axis, from the finest to the coarsest choice."""
 
 
 class ChartPanel:
-    """Axes with points and labels, and the boxes [screen px] that they occupy."""
+    """Axes of a chart with its points and labels, and the boxes that these occupy [screen px]."""
 
     def __init__(self, ax: Any, rows: Sequence[Row], limits: tuple[float, float], errors: tuple[float, float]) -> None:
         self.ax, self.timed = ax, rows[0].chart == "calibration"
@@ -98,7 +102,7 @@ class ChartPanel:
         ax.set_xlabel("time of a calibration [ms]" if self.timed else "speed [million events/s]", fontsize=LETTERS)
 
     def _point(self, row: Row) -> None:
-        """Draw the point of a row."""
+        """Draw the point of a measured setting."""
         colour, mark = COLOURS[row.family], MARKS[row.mark]
         size = 5.0 if row.settings.get("angles", TURNS) < TURNS else 12.0 if mark == "*" else 8.5
         lines = row.mark in HOLLOW or mark in THIN
@@ -111,7 +115,7 @@ class ChartPanel:
                          markeredgewidth=1.6, zorder=4)  # fmt: skip
 
     def step(self, chosen: list[Row], style: Any) -> None:
-        """Draw a front as steps: the error that each budget allows."""
+        """Draw a Pareto front as steps: the smallest error that each time budget allows."""
         low, high = self.ax.get_xlim()
         top = self.ax.get_ylim()[1]
         x, y = [self.x(row) for row in chosen], [row.error_px for row in chosen]
@@ -150,18 +154,18 @@ class ChartPanel:
         )  # fmt: skip
 
     def free(self, low: Any, high: Any, *, letters: bool = False) -> bool:
-        """Return whether a box [screen px] covers nothing; with ``letters``, no other label."""
+        """Return whether a box [screen px] covers no point or label; with ``letters``, whether it covers no label."""
         boxes = self.letters if letters else self.taken
         return all(low[0] >= b[2] or high[0] <= b[0] or low[1] >= b[3] or high[1] <= b[1] for b in boxes)
 
     def open(self, here: Any, there: Any) -> bool:
-        """Return whether the line from a point to its label [screen px] crosses neither labels nor other points."""
+        """Return whether the line between a point and its label [screen px] crosses neither labels nor other points."""
         others = [b for b in self.points if not (b[0] < here[0] < b[2] and b[1] < here[1] < b[3])]
         boxes = [*self.letters, *others]
         return not any(b[0] < x < b[2] and b[1] < y < b[3] for x, y in along(here, there) for b in boxes)
 
     def describe(self, text: str, error: float, *, anyhow: bool) -> bool:
-        """Write the text of a reference line if there is room, or ``anyhow``; return whether it was written."""
+        """Write the text of a reference line if there is room, or if ``anyhow``; return whether it was written."""
         ax, box = self.ax, self.ax.get_window_extent()
         size = np.array([0.56 * TINY * len(text), 1.15 * TINY]) * self.unit
         at = ax.transData.transform((ax.get_xlim()[0], error))[1]
@@ -178,12 +182,12 @@ class ChartPanel:
 
 
 def along(here: Any, there: Any) -> list[Any]:
-    """Return points on the line between two points."""
+    """Return points on the line between two points [screen px]."""
     return [here + share * (there - here) for share in np.linspace(0.05, 0.95, 19)]
 
 
 def numbers(limits: tuple[float, float], length: float, *, upright: bool) -> list[tuple[float, str]]:
-    """Return values and texts of the ticks of a logarithmic axis of ``length`` [point], as many as fit."""
+    """Return values and texts of the ticks of a logarithmic axis of ``length`` [point]: as many as fit."""
     low, high = limits
     found: list[tuple[float, str]] = []
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
@@ -202,7 +206,7 @@ def numbers(limits: tuple[float, float], length: float, *, upright: bool) -> lis
 
 
 def word(value: float) -> str:
-    """Return a number as text, such as 10,000 or 0.0001."""
+    """Return a number as plain text, such as 10,000 or 0.0001."""
     if value >= 1.0:
         return f"{value:,.10g}"
     return np.format_float_positional(value, precision=3, fractional=False, trim="-")
@@ -284,7 +288,10 @@ def _panels(figure: Any, rows: Sequence[Row], height: float, top: float) -> list
 
 
 def _numbered(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) -> list[list[tuple[str, Any]]]:
-    """Return two lists for two columns: headings, numbered rows of the fronts, and the default if it is on no front."""
+    """Return two columns of list lines: headings, numbered rows of the Pareto fronts, and the default.
+
+    The default is listed separately if it is on no front.
+    """
     lists: list[list[tuple[str, Any]]] = []
     number = 0
     for job, chosen, _ in lines:
@@ -304,7 +311,7 @@ def _numbered(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) 
 
 
 def _list(figure: Any, listed: list[tuple[str, Any]], column: int, timed: bool, top: float) -> None:
-    """Write one list below the panels."""
+    """Write one column of the list below the panels."""
     width = (WIDTH - LEFT - RIGHT - BETWEEN) / 2.0
     left = LEFT + column * (width + BETWEEN)
     for k, (number, row) in enumerate(listed):
@@ -329,7 +336,7 @@ def _pixels(error: float) -> str:
 
 
 def _keys(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) -> list[Any]:
-    """Return the handles of the legend."""
+    """Return the entries of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -1,4 +1,4 @@
-"""Rows of a chart: setting, time and error of a run; the Pareto front, and the best row within a budget."""
+"""Measured settings (rows) of a chart with time and error; the Pareto front, and the best row within a budget."""
 
 from __future__ import annotations
 
@@ -11,47 +11,51 @@ from typing import Any
 from amiwarp.progress import Progress
 
 EQUAL_TIME_SHARE = 0.05
-"""Times that differ by a smaller share count as equal, because times vary this much between runs."""
+"""Relative difference of times below which they are considered equal, because times vary this much between runs."""
 CLEARLY_FASTER = 0.7
-"""A row cannot reach the front by repeats if another row takes less than this share of its time and has no larger
+"""Ratio of times that decides whether to repeat a measurement.
+
+A row cannot reach the Pareto front by repeats if another row takes less than this share of its time and has no larger
 error.
 """
 EQUAL_ERROR_PX = 0.003
-"""Errors that differ by less count as equal [px], because another seed of the noise could reverse their order."""
+"""Difference of errors below which they are considered equal [px], because another seed of the noise could reverse
+their order."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One setting, with speed and error of the same run."""
+    """One measured setting, with speed and error of the same run."""
 
     chart: str
-    """Chart: compensation or calibration."""
+    """Name of the chart: compensation or calibration."""
     job: str
     """Name of the job. Rows of one job do the same work and share one front."""
     label: str
-    """Name of the setting."""
+    """Name of the setting in the chart."""
     family: str
-    """Family, shown by the colour."""
+    """Family of the setting, shown by the colour of its point."""
     mark: str
-    """Kind, shown by the marker."""
+    """Kind of the setting, shown by the marker of its point."""
     settings: Mapping[str, Any]
     """Settings of the run, as JSON data."""
     events: int
     """Number of events of the recording, whichever share of them the setting uses."""
     seconds: float
-    """Median time of the repeats [s]."""
+    """Median time of the repeated runs [s]."""
     spread: float
     """Difference of longest and shortest repeat, relative to the median."""
     repeats: int
-    """Number of repeats."""
+    """Number of repeated runs."""
     error_px: float
-    """Error [px rms]."""
+    """Error of the result [px rms]."""
     image_error: float | None = None
-    """Rms difference of the run's image from the float64 image, relative to the standard deviation of the latter."""
+    """Rms difference of the run's image from the float64 image, relative to the standard deviation of the float64
+    image; None if the run makes no image."""
     default: bool = False
     """Whether the commands use this setting by default."""
     comparable: bool = True
-    """False for rows that add noise or need a guess; these are not part of a front."""
+    """False for settings that add noise or need a guess. These are not part of a Pareto front."""
 
     @property
     def mev_per_s(self) -> float:
@@ -60,20 +64,20 @@ class Row:
 
     @property
     def cost(self) -> float:
-        """Time per event [s]."""
+        """Run time per event [s]."""
         return self.seconds / self.events
 
 
 @dataclass(frozen=True)
 class Task:
-    """Task of a row: the function to measure, and the fixed fields of the row."""
+    """Setting to measure: the function that runs it, and the fields of its row."""
 
     run: Callable[[], Any]
     """Function to measure; it returns when the device has finished."""
     events: int
     """Number of events that one run processes."""
     fields: Mapping[str, Any] = field(default_factory=dict)
-    """Fixed fields of the row."""
+    """Fields of the row that do not depend on the measurement."""
     keep: Callable[[Any], Any] = lambda result: result
     """Function that returns the part of a result to keep; its time does not count."""
 
@@ -85,12 +89,12 @@ class Timed:
     task: Task
     """The compensation or calibration that was timed."""
     times: tuple[float, ...]
-    """Times of the repeats [s]."""
+    """Times of the repeated runs [s]."""
     result: Any
-    """Kept result."""
+    """Part of the first timed run's result that was kept."""
 
     def row(self, error_px: float, **more: Any) -> Row:
-        """Return the row, with the error and further fields."""
+        """Return the row of the measured setting, with its error and further fields."""
         median = statistics.median(self.times)
         spread = (max(self.times) - min(self.times)) / median
         return Row(**self.task.fields, events=self.task.events, seconds=median, spread=spread,
@@ -138,12 +142,12 @@ def measure(
 
 
 def _timed(tasks: Sequence[Task], times: list[list[float]], results: list[Any]) -> list[Timed]:
-    """Return the timed tasks."""
+    """Return the tasks together with their times and results."""
     return [Timed(task, tuple(each), result) for task, each, result in zip(tasks, times, results, strict=True)]
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
-    """Return the Pareto front, fastest first: no other row is faster and at least as accurate."""
+    """Return the rows of the Pareto front, fastest first: no other row is faster and at least as accurate."""
     best, chosen = float("inf"), []
     for row in sorted((r for r in rows if r.comparable), key=lambda r: (r.cost, r.error_px)):
         if row.error_px < best:
@@ -153,14 +157,15 @@ def front(rows: Sequence[Row]) -> list[Row]:
 
 
 def fronts(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """Yield each job with its front."""
+    """Yield the name of each job with the rows on its Pareto front."""
     for job in dict.fromkeys(row.job for row in rows):
         yield job, front([row for row in rows if row.job == job])
 
 
 def told_apart(chosen: Sequence[Row]) -> list[Row]:
-    """Return the rows of a front, fastest first, that are clearly faster than the next more accurate row, and the
-    default.
+    """Return the rows of a Pareto front that are clearly faster than the next more accurate row, and the default.
+
+    The fastest row comes first.
     """
     kept: list[Row] = []
     for row in reversed(chosen):
@@ -170,7 +175,7 @@ def told_apart(chosen: Sequence[Row]) -> list[Row]:
 
 
 def beaten_by(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """Return rows of the same job that are clearly better in time or error and no worse in the other."""
+    """Return rows of the same job that are clearly better than ``row`` in time or error and no worse in the other."""
     out = []
     for other in rows:
         if other.job != row.job or not other.comparable:
@@ -183,7 +188,7 @@ def beaten_by(row: Row, rows: Sequence[Row]) -> list[Row]:
 
 
 def near_front(rows: Sequence[Row | None]) -> list[bool]:
-    """Return for each row whether better timing may put it on the front; always True for the default."""
+    """Return for each row whether repeated timing may put it on the Pareto front; always True for the default."""
     known = [row for row in rows if row is not None]
 
     def hopeful(row: Row) -> bool:
@@ -197,7 +202,7 @@ def near_front(rows: Sequence[Row | None]) -> list[bool]:
 
 
 def fastest_within(rows: Sequence[Row], error_px: float) -> Row | None:
-    """Return the fastest row within an error; of rows of equal time, the most accurate."""
+    """Return the fastest row with an error of at most ``error_px`` [px]; of rows of equal time, the most accurate."""
     within = [r for r in rows if r.comparable and r.error_px <= error_px]
     if not within:
         return None
@@ -206,7 +211,7 @@ def fastest_within(rows: Sequence[Row], error_px: float) -> Row | None:
 
 
 def most_accurate_within(rows: Sequence[Row], seconds: float) -> Row | None:
-    """Return the most accurate row within a time; of rows of equal error, the fastest."""
+    """Return the most accurate row with a time of at most ``seconds`` [s]; of rows of equal error, the fastest."""
     within = [r for r in rows if r.comparable and r.seconds <= seconds]
     if not within:
         return None

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.exact_model import ExactModel
 
 MOST_EVENTS = 20_000_000
-"""Largest number of events, taken from the beginning of the recording, because they are held in memory."""
+"""Largest number of events that are taken from the start of the recording, because they are held in memory."""
 NEEDED = ("apex", "index", "phase")
 """Parameters that the ground truth must contain."""
 PIECE = 1 << 20
@@ -37,15 +37,15 @@ class KnownRecording:
     """Recording in memory with its ground truth."""
 
     recording: Recording
-    """Recording in memory."""
+    """Recording, which is held in memory."""
     events: Events
     """Events of the recording."""
     camera: Camera
-    """Camera."""
+    """Camera intrinsics."""
     encoder: Encoder
     """Encoder with the true clock offset."""
     model: ExactModel
-    """True model."""
+    """Optical model with the true parameters."""
 
     @classmethod
     def of(cls, recording: Recording) -> KnownRecording:
@@ -84,7 +84,7 @@ class KnownRecording:
 
 
 def exact_places(model: ExactModel, xy: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the compensated positions of events [px], in float64; NaN if there are none.
+    """Return the compensated positions of events [px], in float64; NaN for events without a position.
 
     ``xy`` (n, 2) [px] are the recorded positions, ``theta`` (n,) [rad] the prism angles. The closed form is that of
     ``docs/explanation/optics.md``. Lens distortion is computed in float32, within 3e-4 px.
@@ -108,7 +108,7 @@ def exact_places(model: ExactModel, xy: NDArray[np.float64], theta: NDArray[np.f
 
 
 def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit bearings of pixels."""
+    """Return the unit bearing vectors of pixels."""
     if camera.distortion is not None:
         return camera.pixels_to_rays(xy)
     ray = np.column_stack([(xy - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(xy))])
@@ -116,7 +116,7 @@ def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _pixels(camera: Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pixels of bearings."""
+    """Return the pixels of bearing vectors."""
     if camera.distortion is not None:
         return camera.rays_to_pixels(rays)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -130,8 +130,9 @@ def raw_places(events: Events) -> NDArray[np.float64]:
 
 
 def exact_image(known: KnownRecording) -> NDArray[np.float64]:
-    """Return the image of all events with bilinear votes at their exact positions, in float64 [events], shape
-    ``(height, width)``.
+    """Return the image of all events with bilinear votes at their exact positions, computed in float64.
+
+    The values are numbers of events, shape ``(height, width)``.
     """
     width, height = known.camera.width, known.camera.height
     image = np.zeros((height + 1) * (width + 1) + 1)

@@ -1,4 +1,4 @@
-"""Choice of the prism and its speed for a camera, before either is bought."""
+"""Design study: choice of a prism and its speed for a camera, before either is bought."""
 
 from amiwarp.studies.design.choice import Choice, Design, Limits, Timing, design
 from amiwarp.studies.design.event_volume import Volume

@@ -28,7 +28,7 @@ ACROSS = math.sqrt(2.0 / 3.0)
 It is √⟨cos²⟩, weighted by |cos|, the rate at which the edges of each direction fire.
 """
 LEAST_SWING = 1.0
-"""Smallest useful swing [px]: displacement across an edge in a quarter turn.
+"""Smallest useful displacement across an edge in a quarter turn [px].
 
 An edge that moves less may not cross any pixel.
 """
@@ -36,12 +36,13 @@ An edge that moves less may not cross any pixel.
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Errors of times and angles, as standard deviations."""
+    """Errors of event times and encoder angles, as standard deviations."""
 
     clock_us: float = 60.0
-    """Error of an event's time against the encoder's [us]; 58 is a readout in scans of 200 us."""
+    """Error of an event's time relative to the encoder's clock [us]; 58 us results from a readout in scans of 200 us.
+    """
     encoder: float = math.radians(0.1)
-    """Error of the encoder's angle [rad]."""
+    """Standard deviation of the encoder's angle [rad]."""
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.clock_us <= 1e6 and 0.0 <= self.encoder <= math.pi):
@@ -56,7 +57,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Requirements on a choice."""
+    """Requirements that a prism and its speed must meet."""
 
     tolerance_px: float = 0.5
     """Largest compensation error: standard deviation across an edge [px]."""
@@ -76,27 +77,27 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One apex angle at one speed."""
+    """Properties of one prism at one speed, and the limits that it violates."""
 
     orbit: Orbit
-    """Effect of the prism on the image."""
+    """Effect of the prism on the image: sizes of orbits, and errors of models."""
     rpm: float
-    """Speed [turns/min]."""
+    """Speed of the prism [turns/min]."""
     events_per_s: float
-    """Event rate [events/s]."""
+    """Predicted event rate [events/s]."""
     clock_px: float
-    """Blur across an edge from the clock error [px]."""
+    """Blur across an edge caused by the clock error [px]."""
     encoder_px: float
-    """Blur across an edge from the encoder error [px]."""
+    """Blur across an edge caused by the encoder error [px]."""
     model: str
-    """Smallest refraction model whose error is within the budget."""
+    """Name of the smallest refraction model whose error is within the budget."""
     budget_px: float
-    """Largest allowed error of the refraction model [px]."""
+    """Largest tolerated error of the refraction model [px rms]."""
     misses: tuple[str, ...]
-    """Names of the violated limits, out of :data:`LIMITS`."""
+    """Names of the violated limits, from :data:`LIMITS`."""
 
     LIMITS: ClassVar[tuple[str, ...]] = ("edges", "window", "blur", "bandwidth")
-    """Names of all limits."""
+    """Names of all limits that a choice can violate."""
 
     @property
     def blur_px(self) -> float:
@@ -116,25 +117,25 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """All choices of a grid, and the recommended one.
+    """Predicted properties of all combinations of apex angle and speed, and the recommended combination.
 
     ``dataclasses.replace`` changes the limits without new simulations.
     """
 
     camera: Camera
-    """Camera."""
+    """Camera intrinsics."""
     glass: Prism
     """Refractive index and flat side of all prisms."""
     orbits: tuple[Orbit, ...]
-    """One orbit per apex angle, in rising order."""
+    """Effects of the prisms on the image, one per apex angle, in increasing order of apex."""
     rpms: tuple[float, ...]
-    """Speeds in rising order [turns/min]."""
+    """Speeds of the prism, in increasing order [turns/min]."""
     volume: Volume
-    """Measured event volume."""
+    """Measured law that gives the event rate."""
     timing: Timing
-    """Errors of times and angles."""
+    """Errors of event times and encoder angles."""
     limits: Limits
-    """Requirements."""
+    """Requirements on prism and speed."""
 
     @cached_property
     def choices(self) -> tuple[Choice, ...]:
@@ -142,7 +143,7 @@ class Design:
         return tuple(self._choice(orbit, rpm) for orbit in self.orbits for rpm in self.rpms)
 
     def _choice(self, orbit: Orbit, rpm: float) -> Choice:
-        """Return the choice of an orbit and a speed."""
+        """Return the properties of a prism, given by its orbit, at a speed [turns/min]."""
         limits, blurs = self.limits, self.timing.blur(orbit.radius, rpm)
         budget = limits.budget_px or SHARE * math.hypot(QUANTISATION_PX, *blurs)
         model = next(name for name in MODELS if orbit.errors[name] <= budget)
@@ -157,11 +158,14 @@ class Design:
 
     @cached_property
     def chosen(self) -> Choice | None:
-        """Choice with the fewest events that keeps all limits; ties go to the smaller error. None if there is none."""
+        """Choice with the fewest events that keeps all limits; None if there is none.
+
+        Of choices with equal numbers of events, it is the choice with the smallest error.
+        """
         return min((c for c in self.choices if not c.misses), key=lambda c: (c.events_per_s, c.error_px), default=None)
 
     def at(self, apex: float, rpm: float) -> Choice:
-        """Return the choice of this apex angle [rad] and speed [turns/min]."""
+        """Return the properties at this apex angle [rad] and speed [turns/min]."""
         return next(c for c in self.choices if c.orbit.apex == apex and c.rpm == rpm)
 
     def range_at(self, rpm: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Chart of a design: error and event volume over the apex angle, and a table of all choices."""
+"""Chart of a design study: error and event rate over the apex angle, and a table of all apex angles and speeds."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ if TYPE_CHECKING:
     from amiwarp.studies.design.choice import Choice, Design
 
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 12.0, 3.9, 0.85, 1.15, 2.1
-"""Figure width, panel height, left and right margins, and gap between panels with the line names in it [inch]."""
+"""Figure width, panel height, left and right margins, and gap between panels, which contains the names of the lines
+[inch]."""
 TITLE, AXIS, HEAD, CELL, NOTE = 0.85, 0.7, 0.95, 0.55, 0.8
-"""Heights above and below a panel, of the table head, of a table row, and of the note [inch]."""
+"""Heights of the title above a panel, of the axis below it, of the table head, of a table row, and of the note [inch].
+"""
 EDGE, TABLE, FIRST = 0.3, 11.4, 1.05
 """Margin of text and table, width of the table, and width of its first column [inch]."""
 LETTERS, SMALL, TINY = 12.0, 10.5, 9.5
-"""Font sizes [point]."""
+"""Font sizes of the chart [point]."""
 COLOURS = {"circle": ORANGE, "radial": GREEN, "ellipse": BLUE}
-"""Colour of each model, as in the other charts; the exact model has no error to draw."""
+"""Colour of each refraction model. The exact model has no error, so it is not drawn."""
 MARKS = {"circle": "o", "radial": "s", "ellipse": "^"}
-"""Marker of each model."""
+"""Marker of each refraction model."""
 SHORT, GOOD, BAD, CHOSEN = "#e3e3e3", "#d3e8f4", "#f3f3f3", VERMILION
-"""Colours: apex angles that are too small, cells that keep and that violate limits, and frame of the recommended
-choice.
-"""
+"""Colours of apex angles that are too small, of table cells that keep the limits, of cells that violate them, and of
+the recommended cell's frame."""
 HIGHEST = 0.77
 """Height of the largest value in a panel, as a share of the panel; text stands above it."""
 LOWEST_ERROR = 1e-3
-"""Smallest error that is drawn [px]."""
+"""Smallest error that is drawn [px]; smaller errors are drawn at this value."""
 
 
 def draw(path: Path, design: Design) -> None:
@@ -71,7 +72,7 @@ def chart(design: Design) -> Any:
 
 
 def _words(figure: Any, design: Design, height: float) -> None:
-    """Write headline and note."""
+    """Write headline and note of the chart."""
     camera, volume = design.camera, design.volume
     fov = 2.0 * math.degrees(math.atan(camera.width / 2.0 / camera.fx))
     figure.text(EDGE / WIDTH, (height - 0.3) / height, f"{camera.width}×{camera.height}, field of view {fov:.0f}°: "
@@ -117,7 +118,7 @@ def _errors(ax: Any, design: Design) -> None:
 
 
 def _volume(ax: Any, design: Design) -> None:
-    """Draw the panel of event volumes over the apex angle."""
+    """Draw the panel of event rates over the apex angle."""
     from matplotlib import colormaps
 
     apex, rpms, low = _degrees(design), design.rpms, math.inf
@@ -225,7 +226,7 @@ def _table(ax: Any, design: Design) -> None:
 
 
 def _cell(ax: Any, choice: Choice, at: tuple[float, float, float], size: float, *, chosen: bool) -> None:
-    """Draw the cell of one choice."""
+    """Draw the table cell of one combination of apex angle and speed."""
     from matplotlib.patches import Rectangle
 
     x, y, wide = at
@@ -246,5 +247,5 @@ def _fitting(size: float, wide: float, texts: Sequence[str]) -> float:
 
 
 def _degrees(design: Design) -> list[float]:
-    """Return the apex angles [deg]."""
+    """Return the apex angles of a design [deg]."""
     return [math.degrees(orbit.apex) for orbit in design.orbits]

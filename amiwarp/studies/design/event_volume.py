@@ -1,6 +1,6 @@
-"""Event volume: a law measured on small parts of the image.
+"""Event volume: a law for the event rate, measured by simulating small parts of the image.
 
-It holds for every apex angle, speed and image size of a grid.
+The law holds for every apex angle, speed and image size of a design study.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
 
 TILE, ACROSS_TILES, DOWN_TILES = 16, 12, 9
-"""Size [px] and number, across and down, of the tiles of the image that are simulated."""
+"""Side [px] and number, across and down, of the tiles of the image that are simulated."""
 NODES = 4
-"""Largest number of apex angles that are simulated; between them the yield is interpolated."""
+"""Largest number of apex angles that are simulated; between them the events per turn are interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +40,11 @@ class Volume:
     """
 
     apexes: NDArray[np.float64]
-    """Simulated apex angles [rad], shape ``(n,)``."""
+    """Apex angles that were simulated [rad], shape ``(n,)``."""
     rpms: NDArray[np.float64]
     """Simulated speeds, one or two [turns/min], shape ``(m,)``."""
     yields: NDArray[np.float64]
-    """Simulated events relative to expected events, shape ``(n, m)``."""
+    """Ratio of simulated events to events expected from the scene's gradients, shape ``(n, m)``."""
     uncertainty: float
     """Relative standard error of the yields, from the scatter of the tiles."""
     texture: float
@@ -54,9 +54,9 @@ class Volume:
     pixels: int
     """Number of pixels of the image."""
     noise_hz: float
-    """Noise rate of a pixel [events/s]."""
+    """Noise rate of each pixel [events/s]."""
     simulated: int
-    """Number of simulated pixels."""
+    """Number of pixels that were simulated, summed over the tiles."""
 
     def events_per_s(self, orbit: Orbit, rpm: float) -> float:
         """Return the event rate of the whole image [events/s]."""
@@ -64,7 +64,7 @@ class Volume:
         return self.pixels * (per_turn * rpm / 60.0 + self.noise_hz)
 
     def _yield(self, apex: float, rpm: float) -> float:
-        """Return the yield at an apex angle and a speed.
+        """Return the ratio of simulated to expected events at an apex angle [rad] and a speed [turns/min].
 
         It is a power law between simulated apexes; between speeds its reciprocal is linear, as for a dead time.
         """
@@ -126,7 +126,7 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
 
 
 def tiles(camera: Camera, seed: int = 0) -> list[Camera]:
-    """Return small cameras that see parts of the image, one at a random position in each cell of a grid.
+    """Return small cameras that each see a tile of the image, at a random position in each cell of a grid.
 
     The positions are random so that a repeating texture cannot align with the grid.
     """
@@ -144,7 +144,7 @@ def tiles(camera: Camera, seed: int = 0) -> list[Camera]:
 
 
 def _per_turn(case: Simulation, tile: Camera, number: int) -> float:
-    """Return the number of events per pixel in the second turn."""
+    """Simulate a tile and return its number of events per pixel in the second turn."""
     half = case.duration_us // 2
     seeded = replace(case, camera=tile, seed=(case.seed + number) % (1 << 31))
     blocks = seeded.blocks(chunk_us=case.duration_us)  # one chunk, because there are few pixels
@@ -152,7 +152,7 @@ def _per_turn(case: Simulation, tile: Camera, number: int) -> float:
 
 
 def _texture_of(gradient: NDArray[Any], radius: float, camera: Camera, parts: Sequence[Camera]) -> NDArray[np.float64]:
-    """Return the mean gradient along the orbits of each tile's pixels [1/px], shape ``(tiles,)``."""
+    """Return the mean gradient of log intensity along the orbits of each tile's pixels [1/px], shape ``(tiles,)``."""
     from scipy.ndimage import gaussian_filter
 
     met = gaussian_filter(gradient, radius / math.sqrt(2.0))  # as wide as a ring of that radius

@@ -1,4 +1,4 @@
-"""Effect of a prism on a camera's image: radii of the orbits, and error of each refraction model."""
+"""Effect of a prism on a camera's image: radii of the pixels' orbits, and error of each refraction model."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ QUARTER_SWING = 1.0 - math.sqrt(0.5)
 The minimum is over all edge directions and all start angles.
 """
 GRID = 12
-"""Rows of pixels on which the circle models are fitted."""
+"""Number of rows of the grid of pixels on which the circle models are fitted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Orbit:
-    """Effect of a prism on the image, independent of its speed."""
+    """Effect of a prism on a camera's image, independent of its speed."""
 
     apex: float
-    """Apex angle [rad]."""
+    """Apex angle of the prism [rad]."""
     deflection: float
     """Deflection of the ray on the optical axis [rad]."""
     radius: float
@@ -77,7 +77,7 @@ def orbit_radii(camera: Camera, prism: Prism) -> tuple[float, float]:
 
 
 def _model_errors(exact: ExactModel, device: str) -> dict[str, float]:
-    """Return the error of the best fit of each model [px rms]; circle models get the best deflection for the image."""
+    """Return the error of each refraction model's best fit [px rms]; circle models get the best deflection."""
     fitted = {
         "circle": _fitted(CircleModel, exact),
         "radial": _fitted(RadialCircleModel, exact),

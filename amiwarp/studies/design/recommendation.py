@@ -1,4 +1,4 @@
-"""Recommendation in words: the choice, and why the other choices are rejected."""
+"""Recommendation of a design study in words: the chosen prism and speed, and why others are rejected."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def headline(design: Design) -> str:
-    """Return one line: the choice, or that no choice keeps all limits."""
+    """Return one line of text: the recommended prism and speed, or that no combination keeps all limits."""
     chosen = design.chosen
     if chosen is None:
         return f"none of {len(design.choices)} choices keeps all limits"
@@ -21,7 +21,7 @@ def headline(design: Design) -> str:
 
 
 def reasons(design: Design) -> list[str]:
-    """Return the reasons for this choice, or for having none: one line per limit."""
+    """Return the reasons for the recommendation, or for having none: one line of text per limit."""
     chosen = design.chosen
     if chosen is None:
         return _refusals(design)
@@ -44,7 +44,7 @@ def reasons(design: Design) -> list[str]:
 
 
 def _dearer(design: Design, chosen: Choice) -> str:
-    """Return the event volume of the next larger apex."""
+    """Return text about the event rate with the next larger apex."""
     larger = [c for c in design.choices if c.rpm == chosen.rpm and c.orbit.apex > chosen.orbit.apex]
     if not larger:
         return ""
@@ -53,25 +53,25 @@ def _dearer(design: Design, chosen: Choice) -> str:
 
 
 def _smaller(design: Design, chosen: Choice) -> str:
-    """Return the swing of the largest apex that is too small."""
+    """Return text about the displacement across edges by the largest apex that is too small."""
     short = [o for o in design.orbits if o.swing < LEAST_SWING]
     return f"; {degrees(short[-1].apex)} displaces them by only {short[-1].swing:.2f} px" if short else ""
 
 
 def _slower(design: Design, chosen: Choice) -> str:
-    """Return the quarter turn at the next lower speed."""
+    """Return text about the duration of a quarter turn at the next lower speed."""
     slow = [rpm for rpm in design.rpms if rpm < chosen.rpm]
     return f"; at {slow[-1]:g} rpm it takes {15e3 / slow[-1]:.1f} ms" if slow else ""
 
 
 def _simpler(chosen: Choice) -> str:
-    """Return the errors of the models that exceed the budget."""
+    """Return text about the errors of the models that exceed the error budget."""
     worse = {n: e for n, e in chosen.orbit.errors.items() if e > chosen.budget_px}
     return "".join(f"; {name} has {_px(error)}" for name, error in worse.items())
 
 
 def _range(design: Design, chosen: Choice) -> str:
-    """Return the range of apex angles that keep edges and blur."""
+    """Return text about the range of apex angles that keep the limits of edges and blur."""
     low, high = design.range_at(chosen.rpm)
     largest = design.orbits[-1].apex
     ends = f"from {degrees(low)}" + (f" to {degrees(high)}" if high <= largest else " upwards")
@@ -79,7 +79,7 @@ def _range(design: Design, chosen: Choice) -> str:
 
 
 def _refusals(design: Design) -> list[str]:
-    """Return what each limit rules out, and what would help."""
+    """Return text for each limit: how many combinations it rules out, and what would help."""
     limits, count = design.limits, len(design.choices)
     best = max(design.orbits, key=lambda o: o.swing)
     least = min(c.error_px for c in design.choices)

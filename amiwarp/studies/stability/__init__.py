@@ -1,4 +1,4 @@
-"""Atlas of failures: recordings simulated along every axis that breaks calibration, and the results of each method."""
+"""Stability study (atlas of failures): recordings under ever harder conditions, calibrated by several methods."""
 
 from amiwarp.studies.stability.cells import METHODS, Cell, Method, Outcome, Result, Store, Stored, identity, run_cell
 from amiwarp.studies.stability.conditions import AXES, Axis, Condition, make, sensible

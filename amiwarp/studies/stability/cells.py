@@ -1,4 +1,4 @@
-"""One cell of the atlas: a condition, a seed, and the result of each method on that recording."""
+"""Cell of the stability study: a condition, a seed, and the result of each calibration method on that recording."""
 
 from __future__ import annotations
 
@@ -35,21 +35,22 @@ if TYPE_CHECKING:
     from amiwarp.calib import Calibration
 
 LIMIT_PX = 0.1
-"""Largest model error of a success [px rms], unless the best fit of the model to the truth has a large error."""
+"""Largest model error of a successful calibration [px rms], unless the model's best fit to the truth has a large error
+itself."""
 BEST_FIT = 1.5
-"""A success may also have this multiple of the error of the best fit of the same model to the truth."""
+"""Multiple of the error of the model's best fit to the truth that a successful calibration may have."""
 FORMAT = 1
-"""Format version of a stored cell; part of its identity."""
+"""Version of the file format of a stored cell, which is part of the cell's identity."""
 
 
 class Outcome(enum.StrEnum):
-    """Outcome of a calibration."""
+    """Outcome of one calibration."""
 
     SUCCESS = "success"
     REFUSAL = "refusal"
-    """The method raised a clear error."""
+    """Refusal: the method raised an error that names the cause."""
     SILENT = "silent failure"
-    """The result is wrong and there was no error. A crash counts as a silent failure."""
+    """Silent failure: the result is wrong and there was no error. A crash counts as a silent failure too."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,13 @@ class Method:
     """Calibration method. Without settings it is the paper's method."""
 
     name: str
-    """Name for people."""
+    """Name of the method in reports."""
     settings: Settings | None
     """Settings of the calibration; None for the paper's method."""
 
     @property
     def model(self) -> str:
-        """Largest refraction model that the result can have."""
+        """Name of the largest refraction model that the result can have."""
         if self.settings is None:
             return "circle"
         return "exact" if self.settings.model == AUTO else self.settings.model
@@ -96,7 +97,7 @@ METHODS = (
     Method("J by DIRECT", replace(_SHARP, sharpness=Sharpness.PAPER_J)),
     Method("CRS + Sbplx", replace(_SHARP, global_algorithm="GN_CRS2_LM", local_algorithm="LN_SBPLX")),
 )
-"""All methods: sharpness measures, models and algorithms; sharpness alone and with the photometric stage.
+"""All methods of the study: sharpness measures, models and algorithms, with and without the photometric stage.
 
 The paper's method and the default are always run.
 """
@@ -104,20 +105,20 @@ The paper's method and the default are always run.
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a method on a recording."""
+    """Result of one calibration method on one recording."""
 
     outcome: Outcome
-    """Success, refusal or silent failure."""
+    """Outcome: success, refusal or silent failure."""
     error_px: float | None
-    """Model error against the ground truth [px rms]; None without a result."""
+    """Model error relative to the ground truth [px rms]; None if the method refused the recording."""
     limit_px: float
-    """Largest model error of a success [px rms]."""
+    """Largest model error with which this calibration counts as a success [px rms]."""
     seconds: float
-    """Time of the calibration [s]."""
+    """Run time of the calibration [s]."""
     message: str = ""
     """Error message of a refusal, or warnings of the calibration."""
     machine: str = ""
-    """Machine that ran the calibration."""
+    """Description of the machine that ran the calibration."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as JSON data."""
@@ -131,12 +132,12 @@ class Result:
 
 @dataclass(frozen=True)
 class Cell:
-    """Condition and seed."""
+    """Condition and seed of one recording of the study."""
 
     condition: Condition
-    """Condition of the recording."""
+    """Condition under which the recording is simulated."""
     seed: int
-    """Seed of the recording and of the search."""
+    """Seed of the simulated recording and of the search."""
 
     @property
     def name(self) -> str:
@@ -146,24 +147,24 @@ class Cell:
 
 @dataclass
 class Stored:
-    """Known results of a cell."""
+    """Known results of the calibration methods for one cell."""
 
     cell: Cell
-    """Cell."""
+    """Cell (condition and seed) to which the results belong."""
     events: int = 0
-    """Number of events of the recording."""
+    """Number of events of the cell's recording."""
     results: dict[str, Result] = field(default_factory=dict)
     """Results by :func:`identity` of the method."""
 
 
 def identity(method: Method) -> str:
-    """Return a text that identifies a method by its settings and by the package version."""
+    """Return a text that identifies a method's results by its settings and the package version."""
     text = json.dumps([FORMAT, __version__, method.identity], sort_keys=True, default=str)
     return f"{method.name} {hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
-    """Make the recording of a cell and run the methods on it."""
+    """Simulate the recording of a cell, run the methods on it, and return their results."""
     sample = make(cell.condition, cell.seed, device)
     done = Stored(cell, len(sample.recording.events))
     where = machine(device)
@@ -173,7 +174,7 @@ def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
 
 
 def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> Result:
-    """Run one method, and compare its result with the ground truth."""
+    """Run one method on a recording, and compare its result with the ground truth."""
     truth = _truth(cell.condition, sample)
     limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
     began = time.perf_counter()
@@ -206,7 +207,7 @@ def _error_px(found: Calibration, sample: SimulatedSample, truth: ExactModel) ->
 
 
 def _truth(condition: Condition, sample: SimulatedSample) -> ExactModel:
-    """Return the true model of a sample."""
+    """Return the optical model with the true parameters of a simulated recording."""
     assert sample.recording.truth is not None
     return ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
 
@@ -235,7 +236,7 @@ def best_fit(condition: Condition, model: str) -> float:
 
 
 class Store:
-    """Folder of cells, one file each. A cell is written when it finishes, and is not run again."""
+    """Folder of stored cells, one file each. A cell is written when it finishes, and is not run again."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -253,7 +254,7 @@ class Store:
             results = {name: Result.from_json(r) for name, r in data["results"].items()}
             return Stored(cell, data["events"], results)
         except (ValueError, KeyError, TypeError) as error:
-            raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to run the cell again") from error
+            raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
 
     def save(self, known: Stored) -> None:
         """Write all known results of a cell."""

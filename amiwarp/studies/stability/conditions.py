@@ -1,7 +1,7 @@
-"""Conditions and axes of the atlas.
+"""Conditions and axes of the stability study.
 
-A condition holds everything that determines a simulated recording. An axis varies one of its fields from harmless to
-hopeless.
+A condition holds everything that determines a simulated recording. An axis varies one field of the condition from
+harmless to hopeless.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.stability.scenes import Lamp, PassingObject, SceneKind, draw
 
 TEXELS = 2.0
-"""Texels of the picture per camera pixel, in the middle of the image."""
+"""Texels of the scene's picture per camera pixel, in the middle of the image."""
 HARDWARE_DEG = 10.0
-"""Standard deviation of the phase that the hardware states [deg]."""
+"""Standard deviation of the phase that the simulated hardware states [deg]."""
 HARDWARE_APEX = 0.05
-"""Relative standard deviation of the nominal apex angle."""
+"""Relative standard deviation of the nominal apex angle that the simulated hardware states."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Settings of a simulated recording. The defaults are harmless.
+    """Condition under which a recording is simulated. The defaults are harmless.
 
     Equal conditions and equal seeds give equal recordings.
     """
 
     scene: str = SceneKind.TEXTURE.value
-    """Name of a :class:`SceneKind`."""
+    """Kind of scene: a value of :class:`SceneKind`."""
     width: int = 320
-    """Width of the image [px]."""
+    """Width of the camera's image [px]."""
     height: int = 240
-    """Height of the image [px]."""
+    """Height of the camera's image [px]."""
     fov_deg: float = 60.0
-    """Horizontal field of view [deg]."""
+    """Horizontal field of view of the camera [deg]."""
     apex_deg: float = 1.0
-    """Apex angle [deg]."""
+    """Apex angle of the prism [deg]."""
     rpm: float = 720.0
     """Speed of the prism [turns/min]."""
     turns: float = 4.0
-    """Length of the recording [turns]."""
+    """Duration of the recording [turns of the prism]."""
     contrast: float = 0.25
-    """Contrast threshold [log intensity]."""
+    """Contrast threshold of the sensor [log intensity]."""
     window_events: int = 0
     """Number of events in the sensor's readout window; 0 for the whole sensor.
 
@@ -65,15 +65,15 @@ class Condition:
     lost: float = 0.0
     """Share of the events that are lost in the sensor, at random."""
     noise: float = 0.0
-    """Share of background noise among all events."""
+    """Share of background noise among all events, 0 to 1."""
     hot: float = 0.0
     """Share of hot pixels, each with 500 events/s."""
     mismatch: float = 0.03
-    """Relative standard deviation of the contrast thresholds."""
+    """Relative standard deviation of the contrast thresholds between pixels."""
     latency_us: float = 100.0
-    """Latency of the sensor [us]."""
+    """Latency of the sensor's pixels [us]."""
     refractory_us: float = 100.0
-    """Refractory period [us]."""
+    """Refractory period of the pixels [us]."""
     readout_us: float = 0.0
     """Interval of readout scans [us]; time stamps are moved to the end of their scan. 0 for none."""
     cutoff_hz: float = 0.0
@@ -81,13 +81,13 @@ class Condition:
     bus_rate_mev_s: float = 0.0
     """Largest rate of events on the sensor's bus [million events/s]; 0 for unlimited."""
     counts_per_turn: int = 8192
-    """Encoder counts per turn."""
+    """Resolution of the encoder [counts/turn]."""
     jitter_deg: float = 0.0
     """Standard deviation of the angle of an encoder sample [deg]."""
     clock_offset_us: float = 0.0
-    """Offset of the encoder's clock [us]."""
+    """Offset between the clocks of encoder and camera [us]."""
     dropouts_hz: float = 0.0
-    """Rate of encoder drop-outs [1/s]."""
+    """Rate of drop-outs, in which encoder samples are lost [1/s]."""
     slip_deg: float = 0.0
     """Angle that the encoder loses per second [deg], in two steps per turn."""
     backwards: bool = False
@@ -99,15 +99,15 @@ class Condition:
     focal_error: float = 0.0
     """Relative error of the focal length that the recording states."""
     distortion: float = 0.0
-    """k1 of the camera's distortion, which the recording does not state."""
+    """Distortion coefficient k1 of the true camera, which the recording does not state."""
     start: str = "none"
-    """Phase that is given to the calibration: none, right, or wrong (by 90 degrees)."""
+    """Phase that is given to the calibration: ``none``, ``right``, or ``wrong`` (by 90 degrees)."""
     lamp: float = 0.0
     """Share of the picture that flickers at 100 Hz."""
     passing: float = 0.0
     """Share of the picture that a passing object hides; its speed is half the picture's width per second."""
     camera_deg_s: float = 0.0
-    """Speed of the camera rotation [deg/s], about a tilted axis."""
+    """Speed of the camera's rotation [deg/s], about a tilted axis."""
     cancelled: float = 0.0
     """Share of the prism's motion in the image that a rotation of the camera cancels."""
 
@@ -122,42 +122,42 @@ class Condition:
 
     @property
     def camera(self) -> Camera:
-        """True camera."""
+        """Camera with the true intrinsics."""
         camera = Camera.from_fov(self.width, self.height, math.radians(self.fov_deg))
         return replace(camera, distortion=RadialTangential(k1=self.distortion)) if self.distortion else camera
 
     @property
     def stated_camera(self) -> Camera:
-        """Camera that the recording states."""
+        """Camera with the intrinsics that the recording states."""
         scale = 1.0 + self.focal_error
         return replace(self.camera, fx=self.camera.fx * scale, fy=self.camera.fy * scale, distortion=None)
 
     @property
     def stated_side(self) -> FlatSide:
-        """Flat side that the recording states."""
+        """Flat side of the prism that the recording states."""
         return FlatSide.CAMERA if self.flat_side_wrong else FlatSide.SCENE
 
     @property
     def prism(self) -> Prism:
-        """True prism."""
+        """Prism with the true parameters."""
         return Prism(math.radians(self.apex_deg))
 
     @property
     def duration_s(self) -> float:
-        """Length of the recording [s]."""
+        """Duration of the recording [s]."""
         return self.turns * 60.0 / self.rpm
 
 
 _LATER_FIELDS = ("cutoff_hz", "bus_rate_mev_s")
-"""Fields of :class:`Condition`, with the default 0, that the first atlases did not have."""
+"""Fields of :class:`Condition` with default 0 that did not exist when the first cells were stored."""
 
 
 @dataclass(frozen=True)
 class SimulatedSample:
-    """Recording of the atlas, and the parameters that its hardware states."""
+    """Simulated recording of the study, and the parameters that its hardware states."""
 
     recording: Recording
-    """Recording with ground truth."""
+    """Simulated recording with its ground truth."""
     hardware: dict[str, float]
     """Approximate phase that the hardware states [rad]."""
 
@@ -191,7 +191,7 @@ def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSampl
 
 
 def _simulation(c: Condition, seed: int, rng: np.random.Generator, device: str) -> Simulation:
-    """Return the simulation of a condition, without noise."""
+    """Return the simulation of a condition without background noise."""
     phase = rng.uniform(-math.pi, math.pi)
     sensor = SensorModel(
         contrast_on=c.contrast, contrast_off=c.contrast, mismatch=c.mismatch, latency_us=c.latency_us,
@@ -227,7 +227,7 @@ def _scene(c: Condition, seed: int) -> Scene:
 
 
 def _prism_motion(c: Condition, phase: float) -> PrismMotion:
-    """Return the motion of the prism."""
+    """Return the prism's motion under a condition."""
     if not c.ripple:
         return PrismMotion(c.rpm, phase)
     hz = 3.0 * c.rpm / 60.0
@@ -237,7 +237,7 @@ def _prism_motion(c: Condition, phase: float) -> PrismMotion:
 
 
 def _camera_motion(c: Condition, motion: PrismMotion, rng: np.random.Generator) -> CameraMotion:
-    """Return the motion of the camera."""
+    """Return the camera's motion under a condition."""
     if c.cancelled:
         return _cancelling(c, motion)
     axis = rng.standard_normal(3)
@@ -259,7 +259,10 @@ def _cancelling(c: Condition, motion: PrismMotion) -> CameraMotion:
 
 
 def _noisy(c: Condition, simulation: Simulation, clean: int) -> SensorModel:
-    """Return the sensor with the noise rate that gives the share; ``clean`` is the number of events without noise."""
+    """Return the sensor with the noise rate that gives the condition's share of noise.
+
+    ``clean`` is the number of events without noise.
+    """
     hz = clean * c.noise / (1.0 - c.noise) / (c.width * c.height * c.duration_s)
     return replace(simulation.sensor, shot_noise_hz=hz)
 
@@ -276,14 +279,14 @@ def windowed(events: Events, width: int, height: int, count: int) -> Events:
 
 
 def scanned(events: Events, interval_us: float) -> Events:
-    """Return events as read out in scans: time stamps are those of the end of the scan, rows in order."""
+    """Return events as read out in scans: each gets the time stamp of the end of its scan; rows are in order."""
     t = (np.ceil(events.t / interval_us) * interval_us).astype(np.int64)
     order = np.lexsort((events.x, events.y, t))
     return Events(events.x[order], events.y[order], t[order], events.p[order])
 
 
 def distorted_encoder(encoder: Encoder, c: Condition, rng: np.random.Generator) -> Encoder:
-    """Return the encoder with the errors of the condition."""
+    """Return the encoder with the errors that the condition demands."""
     angle = encoder.angle + math.radians(c.jitter_deg) * rng.standard_normal(len(encoder.angle))
     if c.slip_deg:
         half_turns = np.floor(angle / math.pi)
@@ -295,26 +298,26 @@ def distorted_encoder(encoder: Encoder, c: Condition, rng: np.random.Generator) 
 
 @dataclass(frozen=True)
 class Axis:
-    """Axis of the atlas: values of one field, from harmless to hopeless."""
+    """Axis of the study: values of one condition field, from harmless to hopeless."""
 
     name: str
-    """Name for people."""
+    """Name of the axis in reports."""
     field: str
-    """Field of :class:`Condition`."""
+    """Name of the field of :class:`Condition` that the axis varies."""
     values: tuple[Any, ...]
-    """Values of the field."""
+    """Values of the field along the axis."""
     unit: str = ""
-    """Unit of the values, for people."""
+    """Unit of the values, as shown in reports."""
     also: tuple[tuple[str, Any], ...] = ()
-    """Other fields that differ from the default along the whole axis."""
+    """Other fields of the condition, with values that differ from their defaults along the whole axis."""
 
     def conditions(self) -> list[Condition]:
-        """Return the condition of each value."""
+        """Return the condition at each value of the axis."""
         return [replace(Condition(), **dict(self.also), **{self.field: value}) for value in self.values]
 
 
 def _scene_values(*kinds: SceneKind) -> tuple[str, ...]:
-    """Return the names of kinds of scenes."""
+    """Return the names of kinds of scenes, as values of an axis."""
     return tuple(kind.value for kind in kinds)
 
 
@@ -352,7 +355,7 @@ AXES = (
     Axis("passing object", "passing", (0.0, 0.02, 0.1, 0.3, 0.6), "of the picture"),
     Axis("motion cancelled", "cancelled", (0.0, 0.3, 0.6, 0.9, 1.0), "of the prism's"),
 )
-"""All axes of the atlas."""
+"""All axes of the stability study."""
 
 
 _LARGEST: dict[str, float] = {
@@ -361,19 +364,24 @@ _LARGEST: dict[str, float] = {
     "readout_us": 500.0, "clock_offset_us": 1000.0, "dropouts_hz": 10.0, "slip_deg": 0.0, "backwards": 0.0,
     "ripple": 0.2, "focal_error": 0.01, "lamp": 0.05, "passing": 0.02, "cancelled": 0.0, "flat_side_wrong": 0.0,
 }  # fmt: skip
-"""Largest values of the sensible region."""
+"""Largest values of the condition fields for which a calibration is expected to work."""
 _SMALLEST: dict[str, float] = {"turns": 0.5, "counts_per_turn": 64, "distortion": -0.03, "apex_deg": 0.5}
-"""Smallest values of the sensible region. An apex of 0.5 degrees gives an orbit of 1.2 px; at 0.25 degrees the orbit
-lies within a pixel.
+"""Smallest values of the condition fields for which a calibration is expected to work.
+
+An apex of 0.5 degrees gives an orbit of 1.2 px; at 0.25 degrees the orbit lies within a pixel.
 """
 _SMALLEST_OR_NONE: dict[str, float] = {"cutoff_hz": 300.0, "bus_rate_mev_s": 3.0}
-"""Smallest values of the sensible region, in which 0 stands for no limit, too."""
+"""Smallest values of condition fields for which a calibration is expected to work, where 0 also does, because it means
+no limit."""
 FEWEST_EVENTS = 20_000
-"""Smallest number of events of the sensible region."""
+"""Smallest number of events for which a calibration is expected to work."""
 
 
 def sensible(c: Condition, events: int) -> bool:
-    """Return whether a condition belongs to the sensible region: a working rig and a scene that the aims cover."""
+    """Return whether a calibration is expected to work under a condition (the sensible region).
+
+    That is a working rig, and a scene that the aims cover.
+    """
     return (
         events >= FEWEST_EVENTS
         and c.scene in _scene_values(SceneKind.TEXTURE, SceneKind.EDGES)

@@ -1,4 +1,4 @@
-"""Figures of an atlas: a page per axis, all pages as one PDF, and an overview of every axis on one sheet."""
+"""Figures of the stability study: a page per axis, all pages as one PDF, and an overview of every axis on one sheet."""
 
 from __future__ import annotations
 
@@ -24,19 +24,18 @@ COLOURS = {Outcome.SUCCESS: SKY_BLUE, Outcome.REFUSAL: "#d0d0d0", Outcome.SILENT
 MARKS = {DEFAULT: ("o", BLACK, -0.17), PAPER: ("D", PINK, 0.17)}
 """Marker, colour and horizontal offset of the errors of each method."""
 LEAST_PX = 1e-4
-"""Smaller errors are drawn at this value [px]."""
+"""Smallest error that is drawn [px]; smaller errors are drawn at this value."""
 OVERVIEW = (DEFAULT, PAPER, "sharpness")
-"""Methods of the overview."""
+"""Names of the methods that the overview shows."""
 WIDTH, LEFT, RIGHT, TOP = 11.0, 1.45, 0.25, 1.05
 """Width of a page, and its margins left, right and top [inch]."""
 ROW, ERRORS, BETWEEN, BOTTOM = 0.52, 2.7, 0.32, 0.85
 """Heights of a method's row, of the error panel, of the gap between them, and of the bottom margin [inch]."""
 SHEET, COLUMNS, STRIP, HEAD, HEADLINE = 12.4, 2, 0.23, 0.58, 0.66
-"""Overview: width, number of columns, heights of a method's strip, of an axis heading and of the sheet's heading
-[inch].
-"""
+"""Sizes of the overview [inch]: width, number of columns, heights of a method's strip, of an axis heading and of the
+sheet's heading."""
 LARGE, NORMAL, SMALL = 14.0, 11.0, 9.0
-"""Font sizes [point]; bold digits below 9 are illegible."""
+"""Font sizes of the figures [point]; bold digits below 9 points are illegible."""
 
 
 def draw(atlas: Atlas, folder: Path) -> dict[str, Path]:
@@ -65,7 +64,7 @@ def _save_pdf(figures: Sequence[Any], path: Path) -> None:
 
 
 def _figure(width: float, height: float) -> Any:
-    """Return an empty figure."""
+    """Return an empty Matplotlib figure of a width and height [inch]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -132,7 +131,7 @@ def _headline(atlas: Atlas) -> str:
 
 
 def _strips(ax: Any, axis: Axis, spots: dict[tuple[str, Any], AxisPoint], methods: Sequence[str]) -> None:
-    """Draw the block of one axis."""
+    """Draw the overview's block of one axis: a strip per method."""
     values = _values(axis, spots)
     _shares(ax, spots, values, methods)
     for (method, value), spot in spots.items():
@@ -149,7 +148,7 @@ def _strips(ax: Any, axis: Axis, spots: dict[tuple[str, Any], AxisPoint], method
 
 
 def _values(axis: Axis, spots: dict[tuple[str, Any], AxisPoint]) -> list[Any]:
-    """Return the values of an axis that have results."""
+    """Return the values of an axis for which there are results."""
     there = [value for _, value in spots]
     return [v for v in axis.values if v in there]
 
@@ -170,12 +169,12 @@ def _shares(ax: Any, spots: dict[tuple[str, Any], AxisPoint], values: Sequence[A
 
 
 def _share(spot: AxisPoint) -> str:
-    """Return the share of successes in per cent, as text."""
+    """Return the share of successful calibrations in per cent, as text."""
     return f"{100 * spot.rate(Outcome.SUCCESS).share:.0f}"
 
 
 def _count(spot: AxisPoint) -> str:
-    """Return number of successes, total, and median time, as text."""
+    """Return the number of successes, the total, and the median time, as text."""
     success = spot.rate(Outcome.SUCCESS)
     return f"{success.count}/{success.total}, {spot.seconds:.2g} s"
 
@@ -247,7 +246,7 @@ def _legend(figure: Any, width: float, height: float, down: float, *, left: floa
 
 
 def _broken(text: str) -> str:
-    """Return a long text in two lines."""
+    """Return a long text broken into two lines."""
     words = text.split()
     half = (len(words) + 1) // 2
     return "\n".join([" ".join(words[:half]), " ".join(words[half:])]) if len(text) > 12 else text

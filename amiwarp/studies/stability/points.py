@@ -1,4 +1,4 @@
-"""Points of the atlas: rates and errors of one method at one value of an axis, and their text."""
+"""Points of the stability study: rates and errors of one method at one value of an axis, and their text."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from amiwarp.studies.stability.cells import Outcome, Result
 from amiwarp.studies.stability.conditions import Axis
 
 QUANTILES = (5, 25, 50, 75, 95)
-"""Reported quantiles of the model error [%]."""
+"""Quantiles of the model error that are reported [%]."""
 
 
 @dataclass(frozen=True)
 class Rate:
-    """Number of cases out of a total."""
+    """Number of calibrations with some outcome, out of a total."""
 
     count: int
-    """Number of cases."""
+    """Number of calibrations with the outcome."""
     total: int
-    """Total number of recordings."""
+    """Total number of calibrations."""
 
     @property
     def share(self) -> float:
-        """Share of the total; NaN for a total of 0."""
+        """Share of the calibrations with the outcome; NaN for a total of 0."""
         return self.count / self.total if self.total else math.nan
 
     @property
@@ -46,7 +46,7 @@ class Rate:
         return f"{percent(self.share)} ({percent(low)} to {percent(high)}; {self.count:,} of {self.total:,})"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the rate as JSON data."""
+        """Return count, total, share and confidence interval as JSON data."""
         low, high = self.interval
         share = round(self.share, 5) if self.total else None
         return {"count": self.count, "total": self.total, "share": share, "low": round(low, 5), "high": round(high, 5)}
@@ -54,7 +54,7 @@ class Rate:
 
 @cache
 def _wilson(count: int, total: int) -> tuple[float, float]:
-    """Return Wilson's 95 % confidence interval."""
+    """Return Wilson's 95 % confidence interval of ``count / total``."""
     if not total:
         return 0.0, 1.0
     found = binomtest(count, total).proportion_ci(confidence_level=0.95, method="wilson")
@@ -63,25 +63,25 @@ def _wilson(count: int, total: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class AxisPoint:
-    """Results of one method at one value of an axis, over all seeds."""
+    """Results of one method at one value of an axis of the study, over all seeds."""
 
     axis: Axis
-    """Axis."""
+    """Axis of the study to which the point belongs."""
     value: Any
-    """Value of the field."""
+    """Value of the condition field that the axis varies."""
     method: str
-    """Name of the method."""
+    """Name of the calibration method."""
     results: tuple[Result, ...]
-    """Results of all seeds."""
+    """Results of the method for all seeds."""
 
     @property
     def errors(self) -> list[float]:
-        """Model errors of all answers, without the refusals [px rms]."""
+        """Model errors of all calibrations that were not refused [px rms]."""
         return [r.error_px for r in self.results if r.error_px is not None]
 
     @property
     def limit_px(self) -> float:
-        """Median of the largest model error of a success [px rms]."""
+        """Median over the seeds of the largest model error that counts as a success [px rms]."""
         return float(np.median([r.limit_px for r in self.results]))
 
     @property
@@ -96,11 +96,11 @@ class AxisPoint:
         return dict(zip(QUANTILES, map(float, np.percentile(errors, QUANTILES)), strict=True)) if errors else {}
 
     def common_message(self, *outcomes: Outcome) -> str:
-        """Return the most frequent message of these outcomes; empty if there is none."""
+        """Return the most frequent message of the results with an outcome; empty if there is none."""
         return most_common_message(r.message for r in self.results if r.outcome in outcomes)
 
     def rate(self, outcome: Outcome) -> Rate:
-        """Return the rate of an outcome."""
+        """Return how many of the results have an outcome."""
         return Rate(sum(r.outcome is outcome for r in self.results), len(self.results))
 
     def to_json(self) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def most_common_message(messages: Iterable[str]) -> str:
 
 
 def value_label(axis: Axis, value: Any) -> str:
-    """Return a value as text; shares in per cent."""
+    """Return a value of an axis as text; shares in per cent."""
     if isinstance(value, bool):
         return "wrong" if value else "right"
     if isinstance(value, str):

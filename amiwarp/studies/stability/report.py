@@ -1,4 +1,4 @@
-"""Evaluation of the cells of an atlas: rates along each axis, aims, and a summary."""
+"""Evaluation of the stability study: rates along each axis, aims, and a summary."""
 
 from __future__ import annotations
 
@@ -21,27 +21,26 @@ from amiwarp.studies.stability.points import AxisPoint, Rate, axis_label, percen
 DEFAULT, PAPER = "default", "paper"
 """Names of the default method and of the paper's method."""
 AIM_SUCCESS, AIM_SILENT = 0.99, 0.01
-"""Aims for the default: smallest share of successes inside the sensible region, largest share of silent failures
-outside.
-"""
+"""Aims for the default method: smallest share of successes where a calibration is expected to work, and largest share
+of silent failures elsewhere."""
 WORKS = 0.9
-"""A method works at a value if its share of successes is at least this."""
+"""Share of successes from which a method is said to work at a value of an axis."""
 SIGNIFICANT = 0.05
-"""Significance level of the comparison with the paper."""
+"""Significance level of the comparison of the default with the paper's method."""
 
 
 @dataclass(frozen=True)
 class WorseThanPaper:
-    """Value at which the default succeeds less often than the paper's method."""
+    """Value of an axis at which the default method succeeds less often than the paper's method."""
 
     axis: Axis
-    """Axis."""
+    """Axis of the study that the value belongs to."""
     value: Any
-    """Value of the field."""
+    """Value of the condition field that the axis varies."""
     default: Rate
-    """Successes of the default."""
+    """Number of successes of the default method."""
     paper: Rate
-    """Successes of the paper's method."""
+    """Number of successes of the paper's method."""
     p_value: float
     """One-sided p-value of the exact McNemar test; both methods ran on the same recordings."""
 
@@ -58,18 +57,18 @@ class WorseThanPaper:
 
 @dataclass(frozen=True)
 class Aims:
-    """Aims for the default, and the measured rates. A cell shared by several axes counts once."""
+    """Aims for the default method, and the measured rates. A cell that several axes share counts once."""
 
     inside: Rate
-    """Successes inside the sensible region."""
+    """Rate of successes where a calibration is expected to work."""
     outside: Rate
-    """Silent failures outside of the sensible region."""
+    """Rate of silent failures where a calibration is not expected to work."""
     worse: tuple[WorseThanPaper, ...]
-    """Values at which the default succeeds less often than the paper's method, by rising p-value."""
+    """Values at which the default method succeeds less often than the paper's method, by increasing p-value."""
 
     @property
     def holds(self) -> dict[str, bool]:
-        """Whether each aim holds."""
+        """Whether each aim is reached, by name."""
         return {
             "success inside": self.inside.total > 0 and self.inside.share >= AIM_SUCCESS,
             "silent failures outside": not self.outside.total or self.outside.share <= AIM_SILENT,
@@ -82,7 +81,7 @@ class Aims:
                 "worse than the paper": [w.to_json() for w in self.worse], "holds": self.holds}  # fmt: skip
 
     def lines(self) -> list[str]:
-        """Return the aims as text."""
+        """Return the aims and the measured rates as lines of text."""
         words = {True: "holds", False: "MISSED"}
         held = list(self.holds.values())
         bad = [f"{w.axis.name} {value_label(w.axis, w.value)}" for w in self.worse if w.significant]
@@ -97,29 +96,32 @@ class Aims:
 
 @dataclass(frozen=True)
 class Atlas:
-    """All points of some axes and methods, in the order of axes and values; points without results are left out."""
+    """Results of the study as points, one per axis, method and value, in the order of axes and values.
+
+    Points without results are left out.
+    """
 
     spots: tuple[AxisPoint, ...]
-    """Points of the axes."""
+    """Points of all axes: results of one method at one value each."""
     aims: Aims
-    """Aims for the default."""
+    """Aims for the default method, and the measured rates."""
     cells: int
-    """Number of cells."""
+    """Number of cells (single recordings) that were evaluated."""
     about: dict[str, Any]
-    """Machine, versions and date."""
+    """Description of the machine, the versions and the date."""
 
     @property
     def axes(self) -> list[Axis]:
-        """Axes with results."""
+        """Axes of the study for which there are results."""
         return list(dict.fromkeys(s.axis for s in self.spots))
 
     @property
     def methods(self) -> list[str]:
-        """Names of the methods with results."""
+        """Names of the methods for which there are results."""
         return list(dict.fromkeys(s.method for s in self.spots))
 
     def of(self, axis: Axis) -> dict[tuple[str, Any], AxisPoint]:
-        """Return the points of an axis by method and value."""
+        """Return the points of an axis, by method and value."""
         return {(s.method, s.value): s for s in self.spots if s.axis == axis}
 
     def works(self, axis: Axis, method: str) -> str:
@@ -137,7 +139,7 @@ class Atlas:
         return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(run) for run in named)
 
     def failing(self, outcome: Outcome) -> list[AxisPoint]:
-        """Return the points at which the default has this outcome, the highest rate first."""
+        """Return the points at which the default method has this outcome, the highest rate first."""
         found = [s for s in self.spots if s.method == DEFAULT and s.rate(outcome).count]
         return sorted(found, key=lambda s: -s.rate(outcome).share)
 
@@ -151,7 +153,7 @@ class Atlas:
 
 
 def aggregate(cells: Sequence[Stored], axes: Sequence[Axis], methods: Sequence[Method], about: dict[str, Any]) -> Atlas:
-    """Evaluate ``cells`` along the ``axes``.
+    """Evaluate stored cells along the axes of the study.
 
     Raises :class:`AmiwarpError` if there are no results of these axes and methods.
     """
@@ -177,7 +179,7 @@ def aggregate(cells: Sequence[Stored], axes: Sequence[Axis], methods: Sequence[M
 
 
 def _aims(cells: Iterable[Stored], default: str | None, worse: Sequence[WorseThanPaper]) -> Aims:
-    """Return the aims for the default."""
+    """Return the aims for the default method with the measured rates."""
     inside: list[Outcome] = []
     outside: list[Outcome] = []
     for stored in cells:
@@ -192,9 +194,9 @@ def _aims(cells: Iterable[Stored], default: str | None, worse: Sequence[WorseTha
 
 
 def _worse(axis: Axis, value: Any, stored_cells: Sequence[Stored], names: dict[str, str]) -> list[WorseThanPaper]:
-    """Compare the default with the paper's method at one value, by McNemar's test.
+    """Compare the default with the paper's method at one value of an axis, by McNemar's test.
 
-    McNemar, "Note on the sampling error of the difference between correlated proportions", Psychometrika 1947.
+    Source: McNemar, "Note on the sampling error of the difference between correlated proportions", Psychometrika 1947.
     """
     if not {DEFAULT, PAPER} <= names.keys():
         return []
@@ -209,7 +211,7 @@ def _worse(axis: Axis, value: Any, stored_cells: Sequence[Stored], names: dict[s
 
 
 def _json(atlas: Atlas) -> str:
-    """Return the atlas as JSON, one line per point."""
+    """Return the study's results as JSON, one line per point."""
     data = {"format": "amiwarp-atlas", "version": 1, **atlas.about, "cells": atlas.cells, "aims": atlas.aims.to_json()}
     head = json.dumps(data, indent=1, allow_nan=False).removesuffix("\n}")
     lines = (json.dumps(s.to_json(), allow_nan=False, ensure_ascii=False) for s in atlas.spots)
@@ -217,7 +219,7 @@ def _json(atlas: Atlas) -> str:
 
 
 def _csv(spots: Sequence[AxisPoint]) -> str:
-    """Return the points as CSV, one line per point."""
+    """Return the points of the study as CSV, one line per point."""
 
     def line(s: AxisPoint) -> dict[str, Any]:
         out: dict[str, Any] = {"axis": s.axis.name, "field": s.axis.field, "value": s.value, "unit": s.axis.unit,
@@ -270,12 +272,12 @@ def _markdown(atlas: Atlas) -> str:
 
 
 def summary(atlas: Atlas) -> list[tuple[str, ...]]:
-    """Return for each axis its name, and where each method works."""
+    """Return for each axis its name, and the values at which each method works."""
     return [(axis_label(axis), *(atlas.works(axis, m) for m in atlas.methods)) for axis in atlas.axes]
 
 
 def _grid(headings: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
-    """Return a Markdown table."""
+    """Return headings and rows as a Markdown table."""
     if not rows:
         return "None."
     lines = [headings, ["---"] * len(headings), *rows]
@@ -301,7 +303,7 @@ def _cell(path: Path) -> Cell | None:
         data = json.loads(path.read_text())
         cell = Cell(Condition(**data["condition"]), int(data["seed"]))
     except TypeError:
-        return None  # written by a version with other fields
+        return None  # the file was written by a version with other fields
     except (OSError, ValueError, KeyError) as error:
-        raise AmiwarpError(f"{path}: damaged cell: {error}; delete it to run the cell again") from error
+        raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
     return cell if cell.name == path.stem else None

@@ -1,5 +1,6 @@
-"""Run of the cells through any executor, such as a Dask cluster or a process pool; each cell is stored when it
-finishes.
+"""Run of the stability study by any executor, such as a Dask cluster or a process pool.
+
+Each cell (one recording with its results) is stored when it finishes.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
 QUICK_METHODS = ("default", "paper", "sharpness")
-"""Methods of a quick run."""
+"""Names of the methods of a quick run."""
 
 
 def quick_axes() -> tuple[Axis, ...]:
-    """Return each axis with at most three values: its ends and its middle."""
+    """Return each axis with at most three values: both ends and the middle."""
     return tuple(
         replace(a, values=tuple(dict.fromkeys(a.values[i] for i in (0, len(a.values) // 2, -1))))
         for a in AXES
@@ -31,7 +32,7 @@ def quick_axes() -> tuple[Axis, ...]:
 
 
 def conditions(axes: Sequence[Axis]) -> list[Condition]:
-    """Return every condition of the axes once; all axes share the harmless condition."""
+    """Return every condition of the axes once; all axes share the condition with default values."""
     return list(dict.fromkeys(c for axis in axes for c in axis.conditions()))
 
 
@@ -47,7 +48,7 @@ def run(
     progress: Progress | None = None,
     until: Callable[[], bool] | None = None,
 ) -> list[Stored]:
-    """Run all cells of the axes, and return their results.
+    """Run all cells (conditions and seeds) of the axes, and return their results.
 
     Cells in the folder are reused; if a cell lacks a method, only that method is run. Seeds begin at ``first``. The
     seed is the outer loop: an interrupted run covers every condition, with fewer seeds. No new cell starts after
@@ -78,10 +79,10 @@ def run(
 
 
 def _missing(stored: Stored, methods: Sequence[Method]) -> tuple[Method, ...]:
-    """Return the methods without a result."""
+    """Return the methods for which a cell has no result."""
     return tuple(m for m in methods if identity(m) not in stored.results)
 
 
 def chosen(names: Sequence[str] = ()) -> tuple[Method, ...]:
-    """Return methods by name; the default and the paper's method are always included."""
+    """Return methods by their names; the default and the paper's method are always included."""
     return tuple(m for m in METHODS if not names or m.name in (*names, "default", "paper"))

@@ -1,4 +1,4 @@
-"""Scenes of the atlas, drawn from a seed: from a dense texture to a blank wall."""
+"""Scenes of the stability study, drawn from a seed: from a dense texture to a blank wall."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 DARK, BRIGHT = 0.2, 1.0
-"""Range of the scenes' luminance."""
+"""Smallest and largest luminance of the scenes, relative to white."""
 LAMP_HZ = 100.0
 """Frequency of the flickering lamp [Hz]."""
 FRAME_US = 1000
@@ -22,7 +22,7 @@ FRAME_US = 1000
 
 
 class SceneKind(enum.StrEnum):
-    """Kind of scene."""
+    """Kind of scene of the stability study."""
 
     TEXTURE = "dense texture"
     EDGES = "sparse edges"
@@ -32,7 +32,10 @@ class SceneKind(enum.StrEnum):
 
 
 def draw(kind: SceneKind, width: int, height: int, *, period: float, seed: int) -> NDArray[np.float32]:
-    """Return linear luminance, shape ``(height, width)``; ``period`` is that of the repeating texture [texels]."""
+    """Draw a scene of a kind, and return its linear luminance, shape ``(height, width)``.
+
+    ``period`` is the period of the repeating texture [texels].
+    """
     rng = np.random.default_rng([seed, 0x5CE7E])
     if kind is SceneKind.TEXTURE:
         return leaves(rng, width, height)
@@ -67,7 +70,7 @@ def leaves(rng: np.random.Generator, width: int, height: int, count: int = 4000)
 
 
 def _disc(out: NDArray[np.float64], y: float, x: float, radius: float, value: float) -> None:
-    """Draw a disc."""
+    """Draw a disc of one luminance into the picture ``out``."""
     top, left = max(0, int(y - radius)), max(0, int(x - radius))
     part = out[top : int(y + radius) + 2, left : int(x + radius) + 2]
     rows, cols = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
@@ -95,20 +98,20 @@ def _triangle(angle: float) -> NDArray[np.float64]:
 
 
 def _levels(share: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the luminance of shares of the range, 0 .. 1, on a logarithmic scale."""
+    """Return the luminance at shares 0 .. 1 of the scenes' range, on a logarithmic scale."""
     return (DARK * (BRIGHT / DARK) ** np.clip(share, 0.0, 1.0)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ChangingStill:
-    """Still picture that changes over time."""
+    """Still picture that changes with time (base class)."""
 
     light: NDArray[np.float32]
-    """Linear luminance of the still, shape ``(height, width)``."""
+    """Linear luminance of the still picture, shape ``(height, width)``."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height [texels]."""
+        """Width and height of the picture [texels]."""
         return self.light.shape[1], self.light.shape[0]
 
     @property
@@ -119,7 +122,7 @@ class _ChangingStill:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lamp(_ChangingStill):
-    """Still with a flickering square.
+    """Still picture with a flickering square.
 
     The square's luminance falls by ``depth`` and rises again :data:`LAMP_HZ` times per second. Satisfies
     :class:`amiwarp.simulation.simulator.Frames`.
@@ -128,12 +131,12 @@ class Lamp(_ChangingStill):
     share: float
     """Share of the picture's area that the lamp lights."""
     duration_us: int
-    """Length [us]."""
+    """Duration for which pictures are given [us]."""
     depth: float = 0.7
-    """Relative fall of the luminance."""
+    """Relative decrease of the square's luminance when the lamp is dark."""
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield time [us] and picture."""
+        """Yield the time [us] and the picture with the square."""
         height, width = self.light.shape
         half = 0.5 * math.sqrt(self.share)
         rows = slice(round((0.5 - half) * height), round((0.5 + half) * height))
@@ -146,19 +149,19 @@ class Lamp(_ChangingStill):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassingObject(_ChangingStill):
-    """Still in front of which a textured disc passes. Satisfies :class:`amiwarp.simulation.simulator.Frames`."""
+    """Still picture in front of which a textured disc passes."""
 
     share: float
     """Share of the picture's area that the disc hides."""
     widths_per_s: float
     """Speed of the disc [picture widths/s]."""
     duration_us: int
-    """Length [us]."""
+    """Duration for which pictures are given [us]."""
     seed: int
     """Seed of the disc's texture."""
 
     def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield time [us] and picture."""
+        """Yield the time [us] and the picture with the disc."""
         height, width = self.light.shape
         radius = math.sqrt(self.share * width * height / math.pi)
         side = 2 * math.ceil(radius) + 1
