@@ -194,7 +194,7 @@ def test_a_stream_refuses_what_is_no_angle():
         stream.append([0, 1], [0.0])
     with pytest.raises(AmiwarpError, match="two samples"):
         stream.over(0, 1)
-    with pytest.raises(AmiwarpError, match="16 or more"):
+    with pytest.raises(AmiwarpError, match="16 samples or more"):
         EncoderStream(capacity=3)
 
 
