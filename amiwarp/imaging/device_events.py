@@ -41,7 +41,7 @@ LARGEST_WEIGHT = 63
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceEvents:
+class UploadedEvents:
     """Events with their prism angles on a device; made by :func:`upload_events`."""
 
     arrays: Any
@@ -60,7 +60,7 @@ class DeviceEvents:
         """Set the prism angles to those at the value ``value`` of the drifting parameter."""
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
 
-    def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:
+    def in_parts(self, parts: int, *, per_polarity: bool) -> UploadedEvents:
         """Return the same events split over ``parts`` images, or over ``parts`` pairs (OFF, ON) of images."""
         a, e = self.arrays, EventArrays()
         e.x, e.y, e.turn, e.azimuths, e.time, e.weight = a.x, a.y, a.turn, a.azimuths, a.time, a.weight
@@ -78,7 +78,7 @@ def upload_events(
     slope: NDArray[np.float64] | None = None,
     middle_us: int | None = None,
     fold: int = 0,
-) -> DeviceEvents:
+) -> UploadedEvents:
     """Copy events to ``device`` and attach a prism angle to each.
 
     Parameters
@@ -100,7 +100,7 @@ def upload_events(
 
     Returns
     -------
-    DeviceEvents
+    UploadedEvents
         The events on the device.
 
     Raises
@@ -135,8 +135,8 @@ def upload_events(
     if fold:
         return _folded(e, n, fold)
     if slope is None:
-        return DeviceEvents(e, n, None, None)
-    return DeviceEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
+        return UploadedEvents(e, n, None, None)
+    return UploadedEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
 
 
 def _padded(n: int, device: Any) -> int:
@@ -154,7 +154,7 @@ def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
     return array
 
 
-def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
+def _folded(e: Any, n: int, bins: int) -> UploadedEvents:
     """Merge events of equal pixel, polarity and angle bin into weighted points, sorted and counted on the device.
 
     Keys are sorted by bin first, so that neighbouring points share an angle.
@@ -178,4 +178,4 @@ def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
     out.layer = wp.zeros(_padded(m, device), dtype=wp.uint8, device=device)
     out.weight, out.azimuths, out.time = _put(weight, wp.uint8, device), e.azimuths, e.time
     launch(unfold_keys, m, [wp.array(key, dtype=wp.int64, device=device), bins], [out], device=device)
-    return DeviceEvents(out, m, None, None)
+    return UploadedEvents(out, m, None, None)

@@ -11,7 +11,7 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.device_events import DeviceEvents, upload_events
+from amiwarp.imaging.device_events import UploadedEvents, upload_events
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_totals, empty_words, read_votes
 from amiwarp.kernels.launch import RecordedLaunch, launch, launch_slices, slice_count
 from amiwarp.kernels.votes import (
@@ -195,7 +195,7 @@ class Votes:
         return bool(self.device.is_cuda or self._spilled.numpy().any())
 
     def add_events(
-        self, model: Model, events: DeviceEvents, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None
+        self, model: Model, events: UploadedEvents, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None
     ) -> None:
         """Compensate events on the same device by ``model`` and vote them.
 

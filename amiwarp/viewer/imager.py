@@ -9,7 +9,7 @@ import numpy as np
 
 from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.device_events import DeviceEvents
+from amiwarp.imaging.device_events import UploadedEvents
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.viewer.timeline import Span
@@ -34,7 +34,7 @@ class WindowImager:
         self._votes = Votes(canvas, device)
         self._meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device)
 
-    def measure(self, model: Model, events: DeviceEvents, offset_us: float) -> tuple[NDArray[np.float32], float]:
+    def measure(self, model: Model, events: UploadedEvents, offset_us: float) -> tuple[NDArray[np.float32], float]:
         """Return the image [events per pixel], shape ``(height, width)``, and its sharpness.
 
         ``offset_us`` is added to the encoder's clock offset [us].
@@ -59,11 +59,11 @@ class LoadedWindow:
     """Prism angles of the drawn events without the clock offset set on the page [rad], shape ``(n,)``."""
     speed: NDArray[np.float64]
     """Speed of the prism at the drawn events [rad/us], shape ``(n,)``."""
-    on_device: DeviceEvents
+    on_device: UploadedEvents
     """All selected events."""
     curve_events: Events
     """Selected events that the sharpness curve uses."""
-    curve_events_on_device: DeviceEvents
+    curve_events_on_device: UploadedEvents
     """The same events on the device."""
     image: NDArray[np.float32]
     """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
