@@ -19,6 +19,7 @@ from .compensation.recordings import compensate_events as compensate_events
 from .compensation.streams import Compensated as Compensated
 from .compensation.streams import Compensator as Compensator
 from .errors import AmiwarpError as AmiwarpError
+from .events.device_events import DeviceEvents as DeviceEvents
 from .events.encoder import Encoder as Encoder
 from .events.encoder_stream import EncoderStream as EncoderStream
 from .events.events import Events as Events

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import encoder_params
+from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
@@ -87,21 +88,41 @@ class BlockCompensator:
             x, y, inside = self._compensate(events, all_cores)
         return Events(x, y, events.t, events.p), inside
 
+    def on_device(self, events: DeviceEvents) -> tuple[wp.array, wp.array, wp.array]:
+        """Return compensated x and y, and 1 for each event inside the image, as Warp arrays of shape ``(n,)``."""
+        check_sensor(events)
+        n = len(events)
+        if not n:
+            return *(wp.empty(0, dtype=float, device=self._device) for _ in "xy"), wp.zeros(
+                0, dtype=wp.uint8, device=self._device
+            )
+        _, _, max_x, max_y, _, _ = limits(events)
+        columns = [_device_column(getattr(events, name), self._plan.padded(n)) for name in ("x", "y", "t")]
+        with self._one_thread:
+            c = self._launch(columns, max_x, max_y, all_cores=True)
+        return c.out_x[:n], c.out_y[:n], c.inside[:n]
+
     def _compensate(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
-        plan, n = self._plan, len(events)
-        padded = plan.padded(n)
+        padded = self._plan.padded(len(events))
+        columns = [_column(self._device, values, wp.uint16, padded) for values in (events.x, events.y)]
+        columns.append(_column(self._device, events.t, wp.int64, padded))
+        c = self._launch(columns, events.x.max(), events.y.max(), all_cores)
+        return [values.numpy()[: len(events)] for values in (c.out_x, c.out_y, c.inside)]
+
+    def _launch(self, columns: list[Any], max_x: int, max_y: int, all_cores: bool) -> Any:
+        """Compensate padded columns x, y, t on the device; return ``Columns``."""
+        plan, padded = self._plan, len(columns[0])
         c = Columns()
-        c.x, c.y = (_column(self._device, values, wp.uint16, padded) for values in (events.x, events.y))
-        c.t = _column(self._device, events.t, wp.int64, padded)
+        c.x, c.y, c.t = columns
         c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=self._device) for _ in range(2))
         c.inside = wp.empty(padded, dtype=wp.uint8, device=self._device)
-        inputs = plan.inputs(self._encoder, c, outside=plan.any_outside(events.x.max(), events.y.max()))
+        inputs = plan.inputs(self._encoder, c, outside=plan.any_outside(max_x, max_y))
         blocks = padded // plan.block
         if all_cores:
             launch(plan.kernel, blocks, inputs, [], device=self._device, smallest=512)
         else:
             wp.launch(plan.kernel, dim=blocks, inputs=[*inputs, 0], device=self._device)
-        return [values.numpy()[:n] for values in (c.out_x, c.out_y, c.inside)]
+        return c
 
 
 def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
@@ -111,29 +132,46 @@ def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
 
 
-def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = "cpu") -> NDArray[np.float32]:
+def _device_column(values: wp.array, padded: int) -> wp.array:
+    """Return a padded column, without a copy if it needs no padding."""
+    if len(values) == padded:
+        return values
+    column = wp.zeros(padded, dtype=values.dtype, device=values.device)
+    wp.copy(column, values)
+    return column
+
+
+@overload
+def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = ...) -> NDArray[np.float32]: ...
+@overload
+def compensate_events(events: DeviceEvents, model: Model, encoder: Encoder, *, device: Any = ...) -> wp.array: ...
+def compensate_events(
+    events: Events | DeviceEvents, model: Model, encoder: Encoder, *, device: Any = None
+) -> NDArray[np.float32] | wp.array:
     """Compensate events.
 
     Parameters
     ----------
-    events : Events
+    events : Events or DeviceEvents
         Events with the whole pixel coordinates of a sensor (uint16).
     model : Model
         Optical model of the prism.
     encoder : Encoder
         Encoder that covers the events.
     device : str or warp.Device, optional
-        Device to compute on.
+        Device to compute on, by default the CPU. Events on a device are compensated there.
 
     Returns
     -------
-    ndarray
-        Coordinates without the prism [px], float32, shape ``(n, 2)``; NaN for events without a solution.
+    ndarray or warp.array
+        Coordinates without the prism [px], float32, shape ``(n, 2)``; NaN for events without a solution. A Warp array
+        on the same device for :class:`DeviceEvents`.
 
     Raises
     ------
     AmiwarpError
-        If the encoder does not cover the events, or their coordinates are not whole pixels.
+        If the encoder does not cover the events, their coordinates are not whole pixels, or they are on another device
+        than ``device``.
 
     Examples
     --------
@@ -144,9 +182,22 @@ def compensate_events(events: Events, model: Model, encoder: Encoder, *, device:
     >>> amiwarp.compensate_events(events, model, encoder).shape
     (2, 2)
     """
+    device = device_for(events, device)
+    if isinstance(events, DeviceEvents):
+        span = (events.t_first, events.t_last) if len(events) else encoder.coverage
+        return _joined(*BlockCompensator(model, encoder, *span, device).on_device(events)[:2])
     first, last = (int(events.t.min()), int(events.t.max())) if len(events) else encoder.coverage
     compensated, _inside = BlockCompensator(model, encoder, first, last, device)(events, all_cores=True)
     return np.stack([compensated.x, compensated.y], axis=1)
+
+
+def _joined(x: wp.array, y: wp.array) -> wp.array:
+    """Return coordinates as one finished array, shape (n, 2)."""
+    xy = wp.empty((len(x), 2), dtype=float, device=x.device)
+    for k, values in enumerate((x, y) if len(x) else ()):
+        wp.copy(xy[:, k], values)
+    wait(xy.device)
+    return xy
 
 
 def inside_image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ import warp as wp
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import azimuths, encoder_params
+from amiwarp.events.device_events import DeviceEvents, time_span
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.votes import (
     BLOCK,
@@ -71,7 +72,7 @@ class UploadedEvents:
 
 
 def upload_events(
-    events: Events,
+    events: Events | DeviceEvents,
     angles: Encoder | NDArray[np.float64],
     device: Any,
     *,
@@ -79,12 +80,12 @@ def upload_events(
     middle_us: int | None = None,
     fold: int = 0,
 ) -> UploadedEvents:
-    """Copy events to ``device`` and attach a prism angle to each.
+    """Copy events to ``device`` and attach a prism angle to each. Events on the device are not copied.
 
     Parameters
     ----------
-    events : Events
-        Events with whole pixel coordinates (uint16).
+    events : Events or DeviceEvents
+        Events with whole pixel coordinates (uint16), sorted by time.
     angles : Encoder or ndarray
         Encoder from which the angles are interpolated, or one angle per event [rad], shape ``(n,)``.
     device : str or warp.Device
@@ -112,7 +113,7 @@ def upload_events(
     n, device = len(events), wp.get_device(device)
     padded = _padded(n, device)
 
-    def put(values: NDArray[Any], dtype: Any) -> Any:
+    def put(values: Any, dtype: Any) -> Any:
         return _put(values, dtype, device)
 
     e = EventArrays()
@@ -121,13 +122,13 @@ def upload_events(
     e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
     e.weight = wp.empty(0, dtype=wp.uint8, device=device)
     if not isinstance(angles, np.ndarray) or middle_us is not None:
-        t = wp.array(events.t, dtype=wp.int64, device=device)
+        t = events.t if isinstance(events, DeviceEvents) else wp.array(events.t, dtype=wp.int64, device=device)
     if isinstance(angles, np.ndarray):
         e.turn = put(np.rint(angles * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
     else:
         e.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
         if n:
-            encoder = encoder_params(angles, int(events.t[0]), int(events.t[-1]), device)
+            encoder = encoder_params(angles, *time_span(events), device)
             launch(turn_events, n, [encoder, t], [e.turn], device=device)
     if middle_us is not None:
         e.time = wp.empty(n, dtype=float, device=device)
@@ -144,13 +145,13 @@ def _padded(n: int, device: Any) -> int:
     return -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
 
 
-def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
-    """Copy values to the device, padded with zeros."""
+def _put(values: NDArray[Any] | wp.array, dtype: Any, device: Any) -> Any:
+    """Copy values to the device, padded with zeros. A Warp array there that needs no padding is not copied."""
     n = len(values)
     if _padded(n, device) == n:
-        return wp.array(values, dtype=dtype, device=device)
+        return values if isinstance(values, wp.array) else wp.array(values, dtype=dtype, device=device)
     array = wp.zeros(_padded(n, device), dtype=dtype, device=device)
-    array.numpy()[:n] = values
+    array.numpy()[:n] = values.numpy() if isinstance(values, wp.array) else values  # only CPUs pad
     return array
 
 

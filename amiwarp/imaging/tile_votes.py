@@ -20,7 +20,8 @@ from amiwarp.optics.exact_model import ExactModel
 
 if TYPE_CHECKING:
     from amiwarp.imaging.device_events import UploadedEvents
-    from amiwarp.imaging.warped_image import CanvasShape, Image
+    from amiwarp.imaging.device_image import Image
+    from amiwarp.imaging.warped_image import CanvasShape
     from amiwarp.optics.models import Model
 
 
