@@ -20,6 +20,7 @@ from .compensation.streams import Compensated as Compensated
 from .compensation.streams import Compensator as Compensator
 from .errors import AmiwarpError as AmiwarpError
 from .events.device_events import DeviceEvents as DeviceEvents
+from .events.device_source import DeviceMemoryEvents as DeviceMemoryEvents
 from .events.encoder import Encoder as Encoder
 from .events.encoder_stream import EncoderStream as EncoderStream
 from .events.events import Events as Events

@@ -83,7 +83,7 @@ def cast(values: Any, dtype: Any) -> Any:
         return values
     out = wp.empty(values.shape, dtype=dtype, device=values.device)
     if values.size:
-        wp.utils.arraycast(values, out)
+        wp.utils.array_cast(values, out)
     return out
 
 
