@@ -52,6 +52,7 @@ from .io.copying import save_recording as save_recording
 from .io.formats import Format as Format
 from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
+from .io.recorded_dataset import RecordedDataset as RecordedDataset
 from .io.truth_export import save_flow_dsec as save_flow_dsec
 from .io.truth_export import save_flow_mvsec as save_flow_mvsec
 from .io.truth_export import save_poses_tum as save_poses_tum
