@@ -18,6 +18,7 @@ from .compensation.recordings import compensate as compensate
 from .compensation.recordings import compensate_events as compensate_events
 from .compensation.streams import Compensated as Compensated
 from .compensation.streams import Compensator as Compensator
+from .compensation.streams import DeviceCompensated as DeviceCompensated
 from .errors import AmiwarpError as AmiwarpError
 from .events.device_events import DeviceEvents as DeviceEvents
 from .events.device_source import DeviceMemoryEvents as DeviceMemoryEvents

@@ -23,8 +23,6 @@ from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native_reader import NativeEvents
-from amiwarp.kernels.compensation import Columns
-from amiwarp.kernels.launch import launch
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
@@ -88,41 +86,20 @@ class BlockCompensator:
             x, y, inside = self._compensate(events, all_cores)
         return Events(x, y, events.t, events.p), inside
 
-    def on_device(self, events: DeviceEvents) -> tuple[wp.array, wp.array, wp.array]:
-        """Return compensated x and y, and 1 for each event inside the image, as Warp arrays of shape ``(n,)``."""
+    def on_device(self, events: DeviceEvents) -> tuple[wp.array, wp.array]:
+        """Return compensated x and y of at least one event, as Warp arrays of shape ``(n,)``."""
         check_sensor(events)
-        n = len(events)
-        if not n:
-            return *(wp.empty(0, dtype=float, device=self._device) for _ in "xy"), wp.zeros(
-                0, dtype=wp.uint8, device=self._device
-            )
         _, _, max_x, max_y, _, _ = limits(events)
-        columns = [_device_column(getattr(events, name), self._plan.padded(n)) for name in ("x", "y", "t")]
         with self._one_thread:
-            c = self._launch(columns, max_x, max_y, all_cores=True)
-        return c.out_x[:n], c.out_y[:n], c.inside[:n]
+            c = self._plan.run(self._plan.device_columns(events), self._encoder, max_x, max_y)
+        return c.out_x[: len(events)], c.out_y[: len(events)]
 
     def _compensate(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
         padded = self._plan.padded(len(events))
         columns = [_column(self._device, values, wp.uint16, padded) for values in (events.x, events.y)]
         columns.append(_column(self._device, events.t, wp.int64, padded))
-        c = self._launch(columns, events.x.max(), events.y.max(), all_cores)
+        c = self._plan.run(columns, self._encoder, events.x.max(), events.y.max(), all_cores=all_cores)
         return [values.numpy()[: len(events)] for values in (c.out_x, c.out_y, c.inside)]
-
-    def _launch(self, columns: list[Any], max_x: int, max_y: int, all_cores: bool) -> Any:
-        """Compensate padded columns x, y, t on the device; return ``Columns``."""
-        plan, padded = self._plan, len(columns[0])
-        c = Columns()
-        c.x, c.y, c.t = columns
-        c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=self._device) for _ in range(2))
-        c.inside = wp.empty(padded, dtype=wp.uint8, device=self._device)
-        inputs = plan.inputs(self._encoder, c, outside=plan.any_outside(max_x, max_y))
-        blocks = padded // plan.block
-        if all_cores:
-            launch(plan.kernel, blocks, inputs, [], device=self._device, smallest=512)
-        else:
-            wp.launch(plan.kernel, dim=blocks, inputs=[*inputs, 0], device=self._device)
-        return c
 
 
 def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
@@ -130,15 +107,6 @@ def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
     if len(values) < padded:
         values = np.concatenate([values, np.zeros(padded - len(values), values.dtype)])
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
-
-
-def _device_column(values: wp.array, padded: int) -> wp.array:
-    """Return a padded column, without a copy if it needs no padding."""
-    if len(values) == padded:
-        return values
-    column = wp.zeros(padded, dtype=values.dtype, device=values.device)
-    wp.copy(column, values)
-    return column
 
 
 @overload
@@ -184,19 +152,21 @@ def compensate_events(
     """
     device = device_for(events, device)
     if isinstance(events, DeviceEvents):
-        span = (events.t_first, events.t_last) if len(events) else encoder.coverage
-        return _joined(*BlockCompensator(model, encoder, *span, device).on_device(events)[:2])
+        return _compensate_on_device(events, model, encoder)
     first, last = (int(events.t.min()), int(events.t.max())) if len(events) else encoder.coverage
     compensated, _inside = BlockCompensator(model, encoder, first, last, device)(events, all_cores=True)
     return np.stack([compensated.x, compensated.y], axis=1)
 
 
-def _joined(x: wp.array, y: wp.array) -> wp.array:
-    """Return coordinates as one finished array, shape (n, 2)."""
-    xy = wp.empty((len(x), 2), dtype=float, device=x.device)
-    for k, values in enumerate((x, y) if len(x) else ()):
-        wp.copy(xy[:, k], values)
-    wait(xy.device)
+def _compensate_on_device(events: DeviceEvents, model: Model, encoder: Encoder) -> wp.array:
+    """Return finished coordinates without the prism [px], shape (n, 2)."""
+    check_sensor(events)
+    xy = wp.empty((len(events), 2), dtype=float, device=events.device)
+    if len(events):
+        compensator = BlockCompensator(model, encoder, events.t_first, events.t_last, events.device)
+        for k, values in enumerate(compensator.on_device(events)):
+            wp.copy(xy[:, k], values)
+    wait(events.device)
     return xy
 
 

@@ -7,7 +7,6 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 BEYOND = wp.constant(1 << 16)  # stands for an infinite coordinate among the largest coordinates
-LIMIT_COUNT = 6  # values that ``find_limits`` finds
 TIME_LIMIT = wp.constant(wp.float64(2.0**62))  # amiwarp.events.checks.TIME_LIMIT [us]
 
 
@@ -86,6 +85,24 @@ def mark_positive(values: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.uin
     out[i] = wp.uint8(wp.where(values[i] > wp.float64(0.0), 1, 0))
     if wp.isnan(values[i]):
         bad[0] = 1
+
+
+@wp.kernel
+def flag_events(
+    inside: wp.array(dtype=wp.uint8),
+    extrapolated: wp.array(dtype=wp.uint8),
+    unknown: int,
+    flags: wp.array(dtype=wp.uint8),
+):
+    """Set the flags of amiwarp.compensation.streams. The first ``unknown`` events have no prism angle.
+
+    ``extrapolated``: 1 for each event whose angle is extrapolated; empty for none.
+    """
+    i = wp.tid()
+    flag = 1 - int(inside[i])
+    if extrapolated.shape[0] > 0:
+        flag += 2 * int(extrapolated[i])
+    flags[i] = wp.uint8(wp.where(i < unknown, 5, flag))
 
 
 for _coordinate in (wp.uint16, wp.float32):
