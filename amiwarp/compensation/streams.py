@@ -208,7 +208,7 @@ class Compensator:
         first, last, _, _, _, decreases = limits(events)
         if first < self._t_last or decreases:
             raise AmiwarpError(
-                f"events of {first} to {last} us are not sorted, or not after {self._t_last} us; sort them"
+                f"events of {first} to {last} us are not sorted, or start before {self._t_last} us; sort them"
             )
         self._t_last = last
         self.waiting += len(events)

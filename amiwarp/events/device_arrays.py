@@ -28,7 +28,7 @@ def event_column(name: str, values: Any, device: Any) -> Any:
     ``device``: where to put it; None for where the values are.
     """
     if on_gpu(values):
-        found = _converted(name, import_array(values, f"events' {name}"))
+        found = converted(name, import_array(values, f"events' {name}"))
     else:
         host = np.ascontiguousarray(HOST[name](name, values))
         found = wp.array(host, dtype=wp.dtype_from_numpy(host.dtype), device="cpu", copy=False)
@@ -52,7 +52,7 @@ def import_array(values: Any, what: str) -> Any:
     return found
 
 
-def _converted(name: str, values: Any) -> Any:
+def converted(name: str, values: Any) -> Any:
     """Return a column in its type: as it is, or as a checked copy."""
     integers = wp.types.type_is_int(values.dtype)
     if name == "t":
