@@ -123,6 +123,8 @@ def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
 
 def on_gpu(value: Any) -> bool:
     """Return whether an array of any library is outside the host's memory, by DLPack's ``__dlpack_device__``."""
+    if isinstance(value, np.ndarray):
+        return False
     try:
         return int(value.__dlpack_device__()[0]) not in HOST_MEMORY
     except Exception:  # other libraries may raise anything; lists and numbers have no such method

@@ -231,7 +231,7 @@ def test_device_arrays_of_other_types_are_refused() -> None:
 
 
 @pytest.mark.parametrize("library", ["torch", "cupy"])
-def test_arrays_on_different_devices_are_refused(library: str) -> None:
+def test_arrays_on_cpu_and_cuda_are_refused(library: str) -> None:
     host = random_events()
     given = {**as_columns(library, "cuda:0", host), "p": host.p}
     with pytest.raises(AmiwarpError, match=r"on devices .*cuda:0.*put them on one device"):
@@ -497,12 +497,12 @@ def test_unsorted_packets_on_a_device_are_refused(device: str) -> None:
 # -- streams of CUDA
 
 
-def test_work_on_a_stream_of_pytorch_is_awaited() -> None:
+def test_work_on_a_cuda_stream_of_pytorch_is_awaited() -> None:
     """Events are written on a side stream after a delay, and handed over without waiting."""
     host = random_events()
     late = as_columns("torch", "cuda:0", host)
     torch = pytest.importorskip("torch")
-    early = {name: torch.zeros_like(values) for name, values in late.items()}
+    early = {name: foreign("torch", "cuda:0", np.zeros_like(getattr(host, name))) for name in NAMES}
     torch.cuda.synchronize()
     expected = amiwarp.iwe(host, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, device="cuda:0")
     loaded = amiwarp.iwe(DeviceEvents.from_arrays(**late), WIDTH, HEIGHT, model=MODEL, encoder=ENCODER)
@@ -519,7 +519,7 @@ def test_work_on_a_stream_of_pytorch_is_awaited() -> None:
         np.testing.assert_array_equal(found.cpu().numpy(), 2.0 * expected)
 
 
-def test_images_of_pytorch_and_cupy_are_awaited() -> None:
+def test_images_on_cuda_streams_of_pytorch_and_cupy_are_awaited() -> None:
     host = random_events()
     tensor = foreign("torch", "cuda:0", amiwarp.iwe(host, WIDTH, HEIGHT))
     torch = pytest.importorskip("torch")
@@ -541,7 +541,7 @@ def test_images_of_pytorch_and_cupy_are_awaited() -> None:
         assert amiwarp.sharpness(late) == expected
 
 
-def test_results_are_finished_on_a_stream_of_warp() -> None:
+def test_results_are_finished_on_a_cuda_stream_of_warp() -> None:
     """CuPy reads the array interface of CUDA, which names no stream: results must be finished on return."""
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
