@@ -15,6 +15,7 @@ import pytest
 import warp as wp
 
 import amiwarp
+from amiwarp import validation
 from amiwarp.compensation.streams import Compensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_arrays import converted, import_array
@@ -65,6 +66,8 @@ def foreign(library: str, device: str, values: np.ndarray) -> Any:
 
 
 def pointer(array: Any) -> int:
+    if isinstance(array, PlainArray):
+        return pointer(array.values)
     for name in ("ptr", "data_ptr", "unsafe_buffer_pointer"):
         if hasattr(array, name):
             found = getattr(array, name)
@@ -237,10 +240,55 @@ def test_arrays_on_cpu_and_cuda_are_refused(library: str) -> None:
     with pytest.raises(AmiwarpError, match=r"on devices .*cuda:0.*put them on one device"):
         DeviceEvents.from_arrays(**given)
     assert_equal(DeviceEvents.from_arrays(**given, device="cuda:0").to_host(), host)
-    with pytest.raises(AmiwarpError, match=r"x is on a GPU; copy it to the host"):
+    with pytest.raises(AmiwarpError, match="x is on a GPU; copy it to the host"):
         Events.from_arrays(**given)
     with pytest.raises(AmiwarpError, match="events are on cuda:0, device is cpu"):
         amiwarp.iwe(DeviceEvents.from_arrays(**given, device="cuda:0"), WIDTH, HEIGHT, device="cpu")
+
+
+@pytest.fixture
+def all_on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host's memory counts as a GPU's, so that the way of arrays on a GPU runs on a CPU too."""
+    monkeypatch.setattr(validation, "HOST_MEMORY", ())
+
+
+@pytest.mark.usefixtures("all_on_gpu")
+@pytest.mark.parametrize("library", ["warp", "torch", "plain"])
+def test_arrays_on_a_gpu_are_read_through_dlpack_alone(library: str) -> None:
+    host = random_events()
+    given = {n: PlainArray(getattr(host, n)) for n in NAMES} if library == "plain" else as_columns(library, "cpu", host)
+    events = DeviceEvents.from_arrays(**given)
+    found = {name: getattr(events, name).ptr for name in NAMES}
+    assert found == {name: pointer(values) for name, values in given.items()}
+    assert_equal(events.to_host(), host)
+    with pytest.raises(AmiwarpError, match="x is on a GPU; copy it to the host"):
+        Events.from_arrays(**given)
+
+
+@pytest.mark.usefixtures("all_on_gpu")
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"x": np.array([1.0, np.inf], np.float32), "y": np.ones(2, np.float32)}, "infinite coordinate"),
+        ({"x": np.array([1, -1])}, "x holds a coordinate outside"),
+        ({"t": np.array([0, 2**62])}, "expected microseconds within"),
+        ({"t": np.array([0, 1, 2])}, "expected one length"),
+        ({"x": np.ones((2, 1), np.int64)}, "expected one length"),
+        ({"p": np.ones(2, complex)}, "p cannot be read through DLPack: .*complex"),
+    ],
+)
+def test_bad_arrays_on_a_gpu_are_refused(changed: dict[str, np.ndarray], message: str) -> None:
+    plain = {"x": np.ones(2, np.uint16), "y": np.ones(2, np.uint16), "t": np.arange(2), "p": np.ones(2, np.uint8)}
+    with pytest.raises(AmiwarpError, match=message):
+        DeviceEvents.from_arrays(**{name: PlainArray(values) for name, values in {**plain, **changed}.items()})
+
+
+@pytest.mark.usefixtures("all_on_gpu")
+def test_polarities_beyond_one_are_on_events() -> None:
+    given = [PlainArray(np.arange(4).astype(dtype)) for dtype in (np.uint16, np.uint16, np.int64, np.uint8)]
+    events = DeviceEvents.from_arrays(*given)
+    assert events.p.numpy().tolist() == [0, 1, 1, 1]
+    assert given[3].values.tolist() == [0, 1, 2, 3]
 
 
 def test_arrays_with_gaps_are_copied(device: str) -> None:
