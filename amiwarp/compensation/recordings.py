@@ -23,6 +23,8 @@ from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native_reader import NativeEvents
+from amiwarp.kernels.event_arrays import join_columns
+from amiwarp.kernels.launch import launch
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
@@ -164,8 +166,7 @@ def _compensate_on_device(events: DeviceEvents, model: Model, encoder: Encoder) 
     xy = wp.empty((len(events), 2), dtype=float, device=events.device)
     if len(events):
         compensator = BlockCompensator(model, encoder, events.t_first, events.t_last, events.device)
-        for k, values in enumerate(compensator.on_device(events)):
-            wp.copy(xy[:, k], values)
+        launch(join_columns, len(events), compensator.on_device(events), [xy], device=events.device)
     wait(events.device)
     return xy
 

@@ -53,7 +53,7 @@ def import_array(values: Any, what: str) -> Any:
 
 
 def converted(name: str, values: Any) -> Any:
-    """Return a column in its type: as it is, or as a checked copy."""
+    """Return a column in the type that events need, as a checked copy if it has another type."""
     integers = wp.types.type_is_int(values.dtype)
     if name == "t":
         if integers:

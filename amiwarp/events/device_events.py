@@ -222,8 +222,8 @@ def device_for(events: Events | DeviceEvents, device: Any) -> Any:
 def wait(device: Any) -> None:
     """Wait until a device has finished the work of Warp's current stream.
 
-    Public functions call it before they return arrays on a device. The caller may then change or release what was
-    given, and read the results on any stream, also with libraries that do not ask for a stream.
+    Public functions call it before they return arrays on a device. The caller may then change or release its
+    arrays, and read the results on any stream, also with libraries that ignore streams.
     """
     if device.is_cuda:
         wp.synchronize_stream(device)

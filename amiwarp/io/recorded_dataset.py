@@ -25,7 +25,7 @@ MOST_BYTES = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class _Item:
-    """What the manifest says of one recording."""
+    """Entry of one recording in the manifest."""
 
     file: str
     split: str
@@ -34,7 +34,7 @@ class _Item:
 
 
 class RecordedDataset:
-    """Recordings of a data set with their labels, for PyTorch's ``DataLoader`` and any other loop.
+    """Recordings of a data set with their labels, for PyTorch's ``DataLoader`` or any other loop.
 
     It has a length and an index, as the data sets of PyTorch, but does not need PyTorch. Only the manifest is held in
     memory, so that the processes of a ``DataLoader`` share the object however they are started.
@@ -46,7 +46,7 @@ class RecordedDataset:
     split : str, optional
         Name of the part to use, such as "train"; by default all parts.
     transform : callable, optional
-        Called with the :class:`Recording` and the dict of its labels; what it returns is the item. Without it, an item
+        Called with the :class:`Recording` and the dict of its labels. Its return value is the item. Without it, an item
         is the tuple of all events and the labels. Worker processes that are spawned need a function of a module.
 
     Raises
@@ -95,7 +95,7 @@ class RecordedDataset:
         return len(self._items)
 
     def __getitem__(self, index: int) -> Any:
-        """Return an item: what ``transform`` makes of it, or its events and labels.
+        """Return an item: the value that ``transform`` returns, or its events and labels.
 
         Raises IndexError after the last item, and :class:`AmiwarpError` if the file is missing or is not the one that
         the manifest describes.

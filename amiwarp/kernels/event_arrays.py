@@ -105,5 +105,13 @@ def flag_events(
     flags[i] = wp.uint8(wp.where(i < unknown, 5, flag))
 
 
+@wp.kernel
+def join_columns(x: wp.array(dtype=float), y: wp.array(dtype=float), start: int, xy: wp.array2d(dtype=float)):
+    """Write coordinates as the rows of one array."""
+    i = start + wp.tid()
+    xy[i, 0] = x[i]
+    xy[i, 1] = y[i]
+
+
 for _coordinate in (wp.uint16, wp.float32):
     wp.overload(find_limits, {"x": wp.array(dtype=_coordinate), "y": wp.array(dtype=_coordinate)})
