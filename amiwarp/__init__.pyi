@@ -18,7 +18,10 @@ from .compensation.recordings import compensate as compensate
 from .compensation.recordings import compensate_events as compensate_events
 from .compensation.streams import Compensated as Compensated
 from .compensation.streams import Compensator as Compensator
+from .compensation.streams import DeviceCompensated as DeviceCompensated
 from .errors import AmiwarpError as AmiwarpError
+from .events.device_events import DeviceEvents as DeviceEvents
+from .events.device_source import DeviceMemoryEvents as DeviceMemoryEvents
 from .events.encoder import Encoder as Encoder
 from .events.encoder_stream import EncoderStream as EncoderStream
 from .events.events import Events as Events
@@ -50,6 +53,7 @@ from .io.copying import save_recording as save_recording
 from .io.formats import Format as Format
 from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
+from .io.recorded_dataset import RecordedDataset as RecordedDataset
 from .io.truth_export import save_flow_dsec as save_flow_dsec
 from .io.truth_export import save_flow_mvsec as save_flow_mvsec
 from .io.truth_export import save_poses_tum as save_poses_tum

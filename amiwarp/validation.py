@@ -26,6 +26,9 @@ Kind = TypeVar("Kind")
 UNUSABLE = (TypeError, ValueError, OverflowError, RecursionError)
 """Exceptions that Python and NumPy raise for values of unexpected types."""
 
+HOST_MEMORY = (1, 3)
+"""DLPack's numbers of devices in host memory: CPU, and pinned memory of CUDA."""
+
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = _short.maxlong = 80
 _short.maxlevel = 2
@@ -106,17 +109,37 @@ def vector(value: object, count: int, what: str, check: Callable[[object, str], 
 def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
     """Return an array of numbers, without a copy if ``value`` is such an array. Raises :class:`AmiwarpError`.
 
-    ``kinds`` are the accepted kinds of types, as in NumPy's ``dtype.kind``. Add ``b`` to accept truth values.
+    ``kinds`` are the accepted kinds of types, as in NumPy's ``dtype.kind``. Add ``b`` to accept truth values. Arrays of
+    other libraries in host memory are shared too.
     """
+    if on_gpu(value):
+        raise AmiwarpError(f"{what} is on a GPU; copy it to the host, or give events as amiwarp.DeviceEvents")
     try:
-        found = np.asarray(value)
+        found = np.asarray(value if not hasattr(value, "__dlpack__") or _numpy_reads(value) else np.from_dlpack(value))
     except UNUSABLE:
         found = np.zeros(0, object)
+    except (RuntimeError, BufferError) as error:  # such as a tensor of PyTorch that requires a gradient
+        raise AmiwarpError(f"{what} cannot be read as an array: {error}") from error
     if isinstance(value, list | tuple) and not value:
         return np.zeros(0)
     if found.dtype.kind not in kinds:
         raise AmiwarpError(f"{what} is {shown(value)}, of type {found.dtype}; expected numbers")
     return found
+
+
+def on_gpu(value: Any) -> bool:
+    """Return whether an array of any library is outside the host's memory, by DLPack's ``__dlpack_device__``."""
+    if isinstance(value, np.ndarray):
+        return False
+    try:
+        return int(value.__dlpack_device__()[0]) not in HOST_MEMORY
+    except Exception:  # other libraries may raise anything; lists and numbers have no such method
+        return False
+
+
+def _numpy_reads(value: object) -> bool:
+    """Return whether NumPy reads an array by itself."""
+    return hasattr(value, "__array__") or hasattr(value, "__array_interface__")
 
 
 def _scalar(value: object) -> Any:

@@ -14,9 +14,10 @@ import warp as wp
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import TURNS, upload_events
+from amiwarp.imaging.device_image import Image
 from amiwarp.imaging.metrics import PictureQuality, model_error, picture_quality
 from amiwarp.imaging.tile_votes import TileVotes
-from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
+from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.reconstruction.result import Picture

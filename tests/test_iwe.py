@@ -11,7 +11,8 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import upload_events
-from amiwarp.imaging.warped_image import FIRST_BATCH, CanvasShape, Image, Votes, iwe
+from amiwarp.imaging.device_image import Image
+from amiwarp.imaging.warped_image import FIRST_BATCH, CanvasShape, Votes, iwe
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS

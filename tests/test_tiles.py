@@ -10,8 +10,9 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import upload_events
+from amiwarp.imaging.device_image import Image
 from amiwarp.imaging.tile_votes import TileVotes
-from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
+from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.circle_models import CircleModel

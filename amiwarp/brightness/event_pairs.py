@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.events.device_encoder import encoder_params
+from amiwarp.events.device_events import time_span
 from amiwarp.kernels import pairs as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events
     from amiwarp.optics.camera_rotation import CameraRotation
@@ -154,8 +156,8 @@ class PairSet:
 class EventTable:
     """Events of one or more time spans on a device, sorted by pixel."""
 
-    def __init__(self, spans: Sequence[Events], tile_of: Any, device: Any) -> None:
-        """Copy the events of the time spans to the device, without sorting them.
+    def __init__(self, spans: Sequence[Events | DeviceEvents], tile_of: Any, device: Any) -> None:
+        """Copy the events of the time spans to the device, without sorting them; a single span on it is not copied.
 
         Only pixels with ``tile_of`` >= 0 are used: shape (height, width), NumPy or on the device.
         """
@@ -173,7 +175,8 @@ class EventTable:
     @property
     def covers(self) -> tuple[int, int]:
         """Times of the first and the last event [us]."""
-        return min(int(s.t[0]) for s in self.spans), max(int(s.t[-1]) for s in self.spans)
+        ends = [time_span(span) for span in self.spans]
+        return min(first for first, _ in ends), max(last for _, last in ends)
 
     def sort(self) -> None:
         """Sort the events by time span and pixel; within a pixel, events stay in time order."""
@@ -286,14 +289,17 @@ def off_excess(pairs: PairSet, *, with_leak: bool = False) -> float:
     return float(found[0]) - 1.0
 
 
-def _upload(parts: Sequence[NDArray[Any]], dtype: Any, device: Any) -> Any:
+def _upload(parts: Sequence[NDArray[Any] | wp.array], dtype: Any, device: Any) -> Any:
     """Concatenate arrays on a device, without a concatenated copy on the host."""
+    if len(parts) == 1 and isinstance(parts[0], wp.array):
+        return parts[0].to(device)
     if len(parts) == 1:
         return wp.array(np.ascontiguousarray(parts[0]), dtype=dtype, device=device, copy=False)
     out = wp.empty(sum(map(len, parts)), dtype=dtype, device=device)
     at = 0
     for part in parts:
-        here = wp.array(np.ascontiguousarray(part), dtype=dtype, device="cpu", copy=False)
+        on_device = isinstance(part, wp.array)
+        here = part if on_device else wp.array(np.ascontiguousarray(part), dtype=dtype, device="cpu", copy=False)
         wp.copy(out, here, at, 0, len(part))
         at += len(part)
     return out

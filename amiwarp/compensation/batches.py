@@ -18,9 +18,11 @@ from amiwarp.compensation.pinned_pool import PinnedPool, PooledArray
 from amiwarp.compensation.pointers import address
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_encoder import encoder_pieces
+from amiwarp.events.device_events import DeviceEvents, limits, wait
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.encoder_angle import EncoderParams
+from amiwarp.kernels.event_arrays import flag_events
 from amiwarp.kernels.launch import RecordedLaunch, background_worker, launch
 
 if TYPE_CHECKING:
@@ -208,6 +210,31 @@ class BatchPipeline:
             x, y, inside = in_flight.out
         return [x, y, np.bitwise_xor(inside, np.uint8(1), out=inside)]
 
+    def run_on_device(
+        self, events: DeviceEvents, unknown: int, extrapolated: NDArray[np.bool_] | None
+    ) -> tuple[wp.array, wp.array, wp.array]:
+        """Compensate and vote a packet on the device; return new arrays x, y [px] and flags.
+
+        Its first ``unknown`` events get no coordinates. ``extrapolated`` marks events with an extrapolated angle.
+        """
+        self._wait_for_votes(0, self._room)
+        n, device = len(events), self._device
+        _, _, max_x, max_y, _, _ = limits(events)
+        if unknown < n:
+            c = self._plan.run(self._plan.device_columns(events), self._encoder, max_x, max_y)
+            x, y, inside = c.out_x[:n], c.out_y[:n], c.inside[:n]
+        else:
+            x, y = (wp.empty(n, dtype=float, device=device) for _ in range(2))
+            inside = wp.zeros(n, dtype=wp.uint8, device=device)
+        for values in (x, y) if unknown else ():
+            values[:unknown].fill_(float("nan"))
+        marks = np.zeros(0, np.uint8) if extrapolated is None else extrapolated.view(np.uint8)
+        flags = wp.empty(n, dtype=wp.uint8, device=device)
+        inputs = [inside, wp.array(marks, dtype=wp.uint8, device=device), unknown]
+        wp.launch(flag_events, n, inputs=inputs, outputs=[flags], device=device)
+        self._votes.add_points(x, y, wp.zeros(n, dtype=wp.uint8, device=device))
+        return x, y, flags
+
     def _copy_back(self, at: int, end: int, direct: bool) -> list[NDArray[Any]] | None:
         """Start to copy results from a GPU: to the buffers, or, if ``direct`` is given, to arrays for the caller."""
         if not direct:
@@ -265,6 +292,14 @@ class BatchPipeline:
         self._vote(least=1)
         self._wait_for_votes(0, self._room)
         return self._votes.take()[0]
+
+    def image_on_device(self) -> wp.array:
+        """Return the image as a finished Warp array, see :meth:`image`."""
+        self._vote(least=1)
+        self._wait_for_votes(0, self._room)
+        image = self._votes.take_on_device()[0]
+        wait(self._device)
+        return image
 
 
 def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -8,10 +8,11 @@ import warp as wp
 
 from amiwarp.events.device_encoder import azimuths
 from amiwarp.kernels import compensation as kernels
-from amiwarp.kernels.launch import load
+from amiwarp.kernels.launch import launch, load
 from amiwarp.optics.device_camera import camera_params, pinhole_params
 
 if TYPE_CHECKING:
+    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.optics.models import Model
 
 
@@ -38,6 +39,32 @@ class LaunchPlan:
     def any_outside(self, max_x: int, max_y: int) -> bool:
         """Return whether any event can lie outside the sensor, given the largest coordinates of the events [px]."""
         return max_x >= self.size[0] or max_y >= self.size[1]
+
+    def device_columns(self, events: DeviceEvents) -> list[wp.array]:
+        """Return x, y and t of events on the device, padded, without a copy if they need no padding."""
+        columns: list[wp.array] = []
+        for values in (events.x, events.y, events.t):
+            padded = self.padded(len(events))
+            column = values if padded == len(events) else wp.zeros(padded, dtype=values.dtype, device=values.device)
+            if column is not values:
+                wp.copy(column, values)
+            columns.append(column)
+        return columns
+
+    def run(self, columns: list[wp.array], encoder: Any, max_x: int, max_y: int, *, all_cores: bool = True) -> Any:
+        """Compensate padded columns x, y, t, with these largest coordinates [px]; return new ``Columns``."""
+        padded, device = len(columns[0]), columns[0].device
+        c = kernels.Columns()
+        c.x, c.y, c.t = columns
+        c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=device) for _ in range(2))
+        c.inside = wp.empty(padded, dtype=wp.uint8, device=device)
+        inputs = self.inputs(encoder, c, outside=self.any_outside(max_x, max_y))
+        blocks = padded // self.block
+        if all_cores:
+            launch(self.kernel, blocks, inputs, [], device=device, smallest=512)
+        else:
+            wp.launch(self.kernel, dim=blocks, inputs=[*inputs, 0], device=device)
+        return c
 
     def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:
         """Return the kernel's inputs, except the first block.

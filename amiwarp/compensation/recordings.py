@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import warp as wp
@@ -18,11 +18,12 @@ from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import encoder_params
+from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native_reader import NativeEvents
-from amiwarp.kernels.compensation import Columns
+from amiwarp.kernels.event_arrays import join_columns
 from amiwarp.kernels.launch import launch
 from amiwarp.progress import Progress
 
@@ -87,21 +88,20 @@ class BlockCompensator:
             x, y, inside = self._compensate(events, all_cores)
         return Events(x, y, events.t, events.p), inside
 
+    def on_device(self, events: DeviceEvents) -> tuple[wp.array, wp.array]:
+        """Return compensated x and y of at least one event, as Warp arrays of shape ``(n,)``."""
+        check_sensor(events)
+        _, _, max_x, max_y, _, _ = limits(events)
+        with self._one_thread:
+            c = self._plan.run(self._plan.device_columns(events), self._encoder, max_x, max_y)
+        return c.out_x[: len(events)], c.out_y[: len(events)]
+
     def _compensate(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
-        plan, n = self._plan, len(events)
-        padded = plan.padded(n)
-        c = Columns()
-        c.x, c.y = (_column(self._device, values, wp.uint16, padded) for values in (events.x, events.y))
-        c.t = _column(self._device, events.t, wp.int64, padded)
-        c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=self._device) for _ in range(2))
-        c.inside = wp.empty(padded, dtype=wp.uint8, device=self._device)
-        inputs = plan.inputs(self._encoder, c, outside=plan.any_outside(events.x.max(), events.y.max()))
-        blocks = padded // plan.block
-        if all_cores:
-            launch(plan.kernel, blocks, inputs, [], device=self._device, smallest=512)
-        else:
-            wp.launch(plan.kernel, dim=blocks, inputs=[*inputs, 0], device=self._device)
-        return [values.numpy()[:n] for values in (c.out_x, c.out_y, c.inside)]
+        padded = self._plan.padded(len(events))
+        columns = [_column(self._device, values, wp.uint16, padded) for values in (events.x, events.y)]
+        columns.append(_column(self._device, events.t, wp.int64, padded))
+        c = self._plan.run(columns, self._encoder, events.x.max(), events.y.max(), all_cores=all_cores)
+        return [values.numpy()[: len(events)] for values in (c.out_x, c.out_y, c.inside)]
 
 
 def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
@@ -111,29 +111,37 @@ def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
 
 
-def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = "cpu") -> NDArray[np.float32]:
+@overload
+def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = ...) -> NDArray[np.float32]: ...
+@overload
+def compensate_events(events: DeviceEvents, model: Model, encoder: Encoder, *, device: Any = ...) -> wp.array: ...
+def compensate_events(
+    events: Events | DeviceEvents, model: Model, encoder: Encoder, *, device: Any = None
+) -> NDArray[np.float32] | wp.array:
     """Compensate events in memory: return their positions without the prism.
 
     Parameters
     ----------
-    events : Events
+    events : Events or DeviceEvents
         Events with the whole pixel coordinates of a sensor (uint16).
     model : Model
         Optical model of the prism.
     encoder : Encoder
         Encoder that covers the events.
     device : str or warp.Device, optional
-        Device to compute on.
+        Device to compute on, by default the CPU. Events on a device are compensated there.
 
     Returns
     -------
-    ndarray
-        Coordinates without the prism [px], float32, shape ``(n, 2)``; NaN for events without a solution.
+    ndarray or warp.array
+        Coordinates without the prism [px], float32, shape ``(n, 2)``; NaN for events without a solution. A Warp array
+        on the same device for :class:`DeviceEvents`.
 
     Raises
     ------
     AmiwarpError
-        If the encoder does not cover the events, or their coordinates are not whole pixels.
+        If the encoder does not cover the events, their coordinates are not whole pixels, or they are on another device
+        than ``device``.
 
     Examples
     --------
@@ -144,9 +152,23 @@ def compensate_events(events: Events, model: Model, encoder: Encoder, *, device:
     >>> amiwarp.compensate_events(events, model, encoder).shape
     (2, 2)
     """
+    device = device_for(events, device)
+    if isinstance(events, DeviceEvents):
+        return _compensate_on_device(events, model, encoder)
     first, last = (int(events.t.min()), int(events.t.max())) if len(events) else encoder.coverage
     compensated, _inside = BlockCompensator(model, encoder, first, last, device)(events, all_cores=True)
     return np.stack([compensated.x, compensated.y], axis=1)
+
+
+def _compensate_on_device(events: DeviceEvents, model: Model, encoder: Encoder) -> wp.array:
+    """Return finished coordinates without the prism [px], shape (n, 2)."""
+    check_sensor(events)
+    xy = wp.empty((len(events), 2), dtype=float, device=events.device)
+    if len(events):
+        compensator = BlockCompensator(model, encoder, events.t_first, events.t_last, events.device)
+        launch(join_columns, len(events), compensator.on_device(events), [xy], device=events.device)
+    wait(events.device)
+    return xy
 
 
 def inside_image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np.bool_]:

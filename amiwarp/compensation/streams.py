@@ -13,6 +13,7 @@ import warp as wp
 from amiwarp.compensation.batches import BatchInFlight, BatchPipeline, StagedBatch
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
+from amiwarp.events.device_events import DeviceEvents, limits, wait
 from amiwarp.events.events import Events
 
 if TYPE_CHECKING:
@@ -32,9 +33,11 @@ LEAST_RETURNED = 2
 computes. The next call returns those."""
 AHEAD_US = 100_000
 """Span of encoder samples that is copied to the device at once, if the samples are available [us]."""
+EVENT_BYTES = 13
+"""Memory of an event from a sensor [bytes]."""
 OVERHEAD = 1024
 """Memory of a packet's Python objects in addition to its arrays [bytes]."""
-QueuedPacket: TypeAlias = tuple[Events, int, int, int]
+QueuedPacket: TypeAlias = tuple[Events | DeviceEvents, int, int, int]
 """Queued packet, its last event time, the time when it was queued, and its time of arrival [us]."""
 
 
@@ -62,8 +65,33 @@ class Compensated:
     """Arrival time of the first packet of these events, by the caller's clock [us]."""
 
 
-def held_bytes(events: Events) -> int:
+@dataclass(frozen=True, slots=True, eq=False)
+class DeviceCompensated:
+    """Compensated events of one packet on a device.
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    >>> model = amiwarp.CircleModel.from_prism(camera, amiwarp.Prism(0.02), 0.3)
+    >>> compensator = amiwarp.Compensator(model, amiwarp.EncoderStream(), start_us=0)
+    >>> compensator.put(amiwarp.Events.from_arrays([10], [20], [0], [1]), now_us=0)
+    >>> [packet] = compensator.take_on_device(now_us=0)
+    >>> packet.flags.numpy()  # outside the image, because no prism angle is known
+    array([5], dtype=uint8)
+    """
+
+    events: DeviceEvents
+    """Coordinates without the prism, float32 [px], NaN if there are none; times and polarities are unchanged."""
+    flags: wp.array
+    """Sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED` and :data:`NO_ANGLE` for each event, uint8, shape ``(n,)``."""
+    arrived_us: int = 0
+    """Arrival time of the packet, by the caller's clock [us]."""
+
+
+def held_bytes(events: Events | DeviceEvents) -> int:
     """Return the memory of a waiting packet of events [bytes], including its Python objects."""
+    if isinstance(events, DeviceEvents):
+        return OVERHEAD + EVENT_BYTES * len(events)
     return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
 
 
@@ -137,12 +165,12 @@ class Compensator:
         self._t_last = -(2**62)
         self._covered: tuple[int, int] | None = None
 
-    def put(self, events: Events, now_us: int, *, arrived_us: int | None = None) -> None:
+    def put(self, events: Events | DeviceEvents, now_us: int, *, arrived_us: int | None = None) -> None:
         """Queue a packet. The packet is kept, not copied.
 
         Parameters
         ----------
-        events : Events
+        events : Events or DeviceEvents
             Events with whole pixel coordinates (uint16), sorted by time, not earlier than those before.
         now_us : int
             Current time of the caller's clock [us], from which the packet waits.
@@ -156,6 +184,10 @@ class Compensator:
             then.
         """
         check_sensor(events)
+        arrived = now_us if arrived_us is None else arrived_us
+        if isinstance(events, DeviceEvents):
+            self._put_on_device(events, now_us, arrived)
+            return
         t = events.t
         if not t.size:
             return
@@ -170,9 +202,24 @@ class Compensator:
             parts = [events[start : start + self.batch] for start in range(0, t.size, self.batch)]
         self._t_last = t.item(-1)
         self.waiting += t.size
-        arrived = now_us if arrived_us is None else arrived_us
         self.waiting_bytes += sum(map(held_bytes, parts))
         self._queue.extend((part, part.t.item(-1), now_us, arrived) for part in parts)
+
+    def _put_on_device(self, events: DeviceEvents, now_us: int, arrived_us: int) -> None:
+        """Queue a packet on a device."""
+        if not len(events):
+            return
+        first, last, _, _, _, decreases = limits(events)
+        if first < self._t_last or decreases:
+            raise AmiwarpError(
+                f"events of {first} to {last} us are not sorted, or start before {self._t_last} us; sort them"
+            )
+        self._t_last = last
+        self.waiting += len(events)
+        for start in range(0, len(events), self.batch):
+            part = events[start : start + self.batch]
+            self.waiting_bytes += held_bytes(part)
+            self._queue.append((part, part.t_last, now_us, arrived_us))
 
     def take(self, now_us: int) -> list[Compensated]:
         """Return the compensated events that are ready.
@@ -210,6 +257,35 @@ class Compensator:
             if self._staged is None and self._in_flight is None:
                 return out
 
+    def take_on_device(self, now_us: int) -> list[DeviceCompensated]:
+        """Return the compensated events that are ready, on the device.
+
+        Use either this method or :meth:`take` for a stream. Packets are not joined. Those on the device are not copied;
+        others are copied to it.
+
+        Parameters
+        ----------
+        now_us : int
+            Current time of the caller's clock [us]. At the end of a stream, ``2**62`` returns everything that waits.
+
+        Returns
+        -------
+        list of DeviceCompensated
+            Compensated events, in the order of input.
+
+        Raises
+        ------
+        AmiwarpError
+            If :meth:`take` has left a batch in flight.
+        """
+        if self._staged is not None or self._in_flight is not None:
+            raise AmiwarpError("take has left a batch in flight; use either take or take_on_device")
+        out: list[DeviceCompensated] = []
+        while packets := self._pop_ready(now_us):
+            out += [self._compensate_on_device(events, arrived) for events, _, _, arrived in packets]
+        wait(self._device)
+        return out
+
     def flush(self) -> list[Compensated]:
         """Return all events that still wait, with extrapolated prism angles if necessary.
 
@@ -235,6 +311,16 @@ class Compensator:
         """
         return self._pipeline.image()
 
+    def image_on_device(self) -> wp.array:
+        """Return the image of all events that were compensated since the last call, on the device.
+
+        Returns
+        -------
+        warp.array
+            Events per pixel, float32, shape ``(height, width)``.
+        """
+        return self._pipeline.image_on_device()
+
     def _pop_ready(self, now_us: int) -> list[QueuedPacket]:
         """Remove the next batch from the queue: packets that encoder samples cover or that waited too long."""
         packets: list[QueuedPacket] = []
@@ -253,21 +339,43 @@ class Compensator:
         return packets
 
     def _stage(self, packets: list[QueuedPacket]) -> StagedBatch:
-        return self._pipeline.stage([events for events, *_ in packets], packets[0][3])
+        parts = [part.to_host() if isinstance(part, DeviceEvents) else part for part, *_ in packets]
+        return self._pipeline.stage(parts, packets[0][3])
 
     def _submit(self, staged: StagedBatch) -> tuple[BatchInFlight, NDArray[np.bool_] | None]:
         """Submit a batch; return also which of its events have an extrapolated angle, or None if none has."""
-        parts, n = staged.parts, staged.end - staged.at
+        parts = staged.parts
         first, last = int(parts[0].t[0]), int(parts[-1].t[-1])
-        first_known, last_known = self.encoder.first, self.encoder.last
-        if first_known is None or last_known is None:
-            unknown = n
-        else:
-            unknown = 0 if first >= first_known else sum(int(np.searchsorted(part.t, first_known)) for part in parts)
-            if unknown < n:
-                self._set_encoder(max(first, first_known), last, last_known)
+        unknown = self._prepare_encoder(first, last, [part.t for part in parts])
         in_flight = self._pipeline.submit(staged, unknown)
         return in_flight, None if self.encoder.knows(first, last) else self.encoder.guessed(in_flight.t)
+
+    def _compensate_on_device(self, events: Events | DeviceEvents, arrived_us: int) -> DeviceCompensated:
+        """Compensate a packet on the device."""
+        if not isinstance(events, DeviceEvents) or events.device != self._device:
+            events = DeviceEvents.from_arrays(events.x, events.y, events.t, events.p, device=self._device)
+        first, last = events.t_first, events.t_last
+        first_known = self.encoder.first
+        some_unknown = first_known is None or first < first_known
+        known = self.encoder.knows(first, last)
+        t = [events.t.numpy()] if some_unknown or not known else []  # copied to the host only if an angle is missing
+        unknown = self._prepare_encoder(first, last, t)
+        x, y, flags = self._pipeline.run_on_device(events, unknown, None if known else self.encoder.guessed(t[0]))
+        return DeviceCompensated(DeviceEvents(x, y, events.t, events.p), flags, arrived_us)
+
+    def _prepare_encoder(self, first: int, last: int, times: list[NDArray[np.int64]]) -> int:
+        """Copy the encoder over a span of event times [us] to the device; return how many events have no angle.
+
+        ``times`` are the times of the events; they are used only if the first has none.
+        """
+        first_known, last_known = self.encoder.first, self.encoder.last
+        n = sum(t.size for t in times)
+        if first_known is None or last_known is None:
+            return n
+        unknown = 0 if first >= first_known else sum(int(np.searchsorted(t, first_known)) for t in times)
+        if unknown < n or not n:
+            self._set_encoder(max(first, first_known), last, last_known)
+        return unknown
 
     def _finish(self, in_flight: BatchInFlight, extrapolated: NDArray[np.bool_] | None) -> Compensated:
         x, y, flags = self._pipeline.finish(in_flight)

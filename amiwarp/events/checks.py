@@ -12,6 +12,7 @@ from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array as as_numbers
 
 if TYPE_CHECKING:
+    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.events.events import Events
 
 TIME_LIMIT = 2**62
@@ -44,8 +45,12 @@ def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
 
 
 def as_polarity(values: ArrayLike) -> NDArray[np.uint8]:
-    """Return polarities as uint8: 1 if positive or true, else 0."""
+    """Return polarities as uint8: 1 if positive or true, else 0. Truth values, and 0 and 1 as uint8, are not copied."""
     array = as_numbers(values, "events' p", "iufb")
+    if array.dtype == np.bool_:
+        return array.view(np.uint8)
+    if array.dtype == np.uint8 and array.size and array.max() <= 1:
+        return array
     if array.dtype.kind == "f" and np.isnan(array).any():
         raise AmiwarpError("events' p holds NaN; expected 1 for ON, 0 or -1 for OFF")
     return (array > 0).astype(np.uint8)
@@ -63,12 +68,10 @@ def as_times(values: ArrayLike) -> NDArray[np.int64]:
     return np.asarray(np.rint(array) if array.dtype.kind == "f" else array, np.int64)
 
 
-def check_sensor(events: Events) -> None:
+def check_sensor(events: Events | DeviceEvents) -> None:
     """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
-    if events.x.dtype != SENSOR_DTYPE:
-        raise AmiwarpError(
-            f"event coordinates are {events.x.dtype}, already compensated; give events from a sensor (uint16)"
-        )
+    if not events.whole_pixels:
+        raise AmiwarpError("event coordinates are float32, already compensated; give events from a sensor (uint16)")
 
 
 def check_events(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_coordinate, as_polarity, as_times, check_events
+from amiwarp.events.checks import SENSOR_DTYPE, as_coordinate, as_polarity, as_times, check_events
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import instance, whole
 
@@ -63,7 +63,11 @@ class Events:
 
     @classmethod
     def from_arrays(cls, x: ArrayLike, y: ArrayLike, t: ArrayLike, p: ArrayLike) -> Events:
-        """Create events from arrays of any numeric type.
+        """Create events from arrays of any numeric type, of any library, in host memory.
+
+        Arrays of NumPy, Warp, PyTorch, JAX and others with DLPack are used without a copy if they have the types of
+        :class:`Events`, or truth values as ``p``. Arrays of other types are copied. For arrays on a GPU, use
+        :class:`amiwarp.DeviceEvents`.
 
         Parameters
         ----------
@@ -119,6 +123,11 @@ class Events:
             return cls.empty()
         x, y, t, p = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("x", "y", "t", "p"))
         return cls(x, y, t, p)
+
+    @property
+    def whole_pixels(self) -> bool:
+        """Whether the coordinates are those of a sensor, not compensated."""
+        return bool(self.x.dtype == SENSOR_DTYPE)
 
     def __len__(self) -> int:
         return int(self.t.size)

@@ -11,6 +11,7 @@ import warp as wp
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import azimuths, encoder_params
+from amiwarp.events.device_events import DeviceEvents, time_span
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.votes import (
     BLOCK,
@@ -41,7 +42,7 @@ LARGEST_WEIGHT = 63
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceEvents:
+class UploadedEvents:
     """Events with their prism angles on a device; made by :func:`upload_events`."""
 
     arrays: Any
@@ -62,7 +63,7 @@ class DeviceEvents:
         """Set the prism angles for the value ``value`` of the drifting parameter."""
         launch(drift_turns, self.count, [self.base, self.slope, value], [self.arrays.turn], device=self.base.device)
 
-    def in_parts(self, parts: int, *, per_polarity: bool) -> DeviceEvents:
+    def in_parts(self, parts: int, *, per_polarity: bool) -> UploadedEvents:
         """Return the same events split over ``parts`` images, or over ``parts`` pairs (OFF, ON) of images."""
         a, e = self.arrays, EventArrays()
         e.x, e.y, e.turn, e.azimuths, e.time, e.weight = a.x, a.y, a.turn, a.azimuths, a.time, a.weight
@@ -73,20 +74,20 @@ class DeviceEvents:
 
 
 def upload_events(
-    events: Events,
+    events: Events | DeviceEvents,
     angles: Encoder | NDArray[np.float64],
     device: Any,
     *,
     slope: NDArray[np.float64] | None = None,
     middle_us: int | None = None,
     fold: int = 0,
-) -> DeviceEvents:
-    """Copy events to ``device`` and attach a prism angle to each.
+) -> UploadedEvents:
+    """Copy events to ``device`` and attach a prism angle to each. Events on the device are not copied.
 
     Parameters
     ----------
-    events : Events
-        Events with whole pixel coordinates (uint16).
+    events : Events or DeviceEvents
+        Events with whole pixel coordinates (uint16), sorted by time.
     angles : Encoder or ndarray
         Encoder from which the angles are interpolated, or one angle per event [rad], shape ``(n,)``.
     device : str or warp.Device
@@ -102,7 +103,7 @@ def upload_events(
 
     Returns
     -------
-    DeviceEvents
+    UploadedEvents
         The events on the device.
 
     Raises
@@ -114,7 +115,7 @@ def upload_events(
     n, device = len(events), wp.get_device(device)
     padded = _padded(n, device)
 
-    def put(values: NDArray[Any], dtype: Any) -> Any:
+    def put(values: Any, dtype: Any) -> Any:
         return _put(values, dtype, device)
 
     e = EventArrays()
@@ -123,13 +124,13 @@ def upload_events(
     e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
     e.weight = wp.empty(0, dtype=wp.uint8, device=device)
     if not isinstance(angles, np.ndarray) or middle_us is not None:
-        t = wp.array(events.t, dtype=wp.int64, device=device)
+        t = events.t if isinstance(events, DeviceEvents) else wp.array(events.t, dtype=wp.int64, device=device)
     if isinstance(angles, np.ndarray):
         e.turn = put(np.rint(angles * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
     else:
         e.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
         if n:
-            encoder = encoder_params(angles, int(events.t[0]), int(events.t[-1]), device)
+            encoder = encoder_params(angles, *time_span(events), device)
             launch(turn_events, n, [encoder, t], [e.turn], device=device)
     if middle_us is not None:
         e.time = wp.empty(n, dtype=float, device=device)
@@ -137,8 +138,8 @@ def upload_events(
     if fold:
         return _folded(e, n, fold)
     if slope is None:
-        return DeviceEvents(e, n, None, None)
-    return DeviceEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
+        return UploadedEvents(e, n, None, None)
+    return UploadedEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
 
 
 def _padded(n: int, device: Any) -> int:
@@ -146,17 +147,17 @@ def _padded(n: int, device: Any) -> int:
     return -(-n // int(BLOCK)) * int(BLOCK) if device.is_cpu else n
 
 
-def _put(values: NDArray[Any], dtype: Any, device: Any) -> Any:
-    """Copy values to the device, padded with zeros."""
+def _put(values: NDArray[Any] | wp.array, dtype: Any, device: Any) -> Any:
+    """Copy values to the device, padded with zeros. A Warp array there that needs no padding is not copied."""
     n = len(values)
     if _padded(n, device) == n:
-        return wp.array(values, dtype=dtype, device=device)
+        return values if isinstance(values, wp.array) else wp.array(values, dtype=dtype, device=device)
     array = wp.zeros(_padded(n, device), dtype=dtype, device=device)
-    array.numpy()[:n] = values
+    array.numpy()[:n] = values.numpy() if isinstance(values, wp.array) else values  # only CPUs pad
     return array
 
 
-def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
+def _folded(e: Any, n: int, bins: int) -> UploadedEvents:
     """Merge events of equal pixel, polarity and angle bin into weighted points, sorted and counted on the device.
 
     Keys are sorted by bin first, so that neighbouring points share an angle.
@@ -180,4 +181,4 @@ def _folded(e: Any, n: int, bins: int) -> DeviceEvents:
     out.layer = wp.zeros(_padded(m, device), dtype=wp.uint8, device=device)
     out.weight, out.azimuths, out.time = _put(weight, wp.uint8, device), e.azimuths, e.time
     launch(unfold_keys, m, [wp.array(key, dtype=wp.int64, device=device), bins], [out], device=device)
-    return DeviceEvents(out, m, None, None)
+    return UploadedEvents(out, m, None, None)

@@ -9,12 +9,14 @@ import numpy as np
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_arrays import cast, import_array
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.warped_image import CanvasShape, Image
+from amiwarp.imaging.device_image import Image
+from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.kernels import iwe as kernels
 from amiwarp.kernels.iwe import STRIP
 from amiwarp.kernels.launch import launch
-from amiwarp.validation import array, choice, real
+from amiwarp.validation import array, choice, on_gpu, real
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -69,6 +71,11 @@ class SharpnessMeter:
         sums = self._host.numpy().reshape(self._parts, -1, 2).sum(axis=1)
         return [self._score(float(total), float(terms)) for total, terms in sums]
 
+    @property
+    def finite(self) -> bool:
+        """Whether all values of the last measured image were finite."""
+        return bool(np.isfinite(self._host.numpy()[..., 0]).all())
+
     def measure(self) -> float:
         """Return the sharpness of :attr:`image`, which has one part."""
         self.launch()
@@ -101,24 +108,25 @@ def gaussian(sigma: float) -> NDArray[np.float32]:
 
 
 def sharpness(
-    image: NDArray[np.float32],
+    image: Any,
     kind: Sharpness = Sharpness.VARIANCE,
     *,
     smoothing: float = 0.0,
-    device: Any = "cpu",
+    device: Any = None,
 ) -> float:
     """Compute the sharpness of an image of warped events.
 
     Parameters
     ----------
-    image : ndarray
-        Image [events per pixel], shape ``(height, width)`` or ``(2, height, width)``.
+    image : array
+        Image [events per pixel], shape ``(height, width)`` or ``(2, height, width)``: an array of NumPy, Warp, PyTorch,
+        CuPy, JAX or any other library with DLPack.
     kind : Sharpness, optional
         Sharpness measure.
     smoothing : float, optional
         Standard deviation of a Gaussian applied first [px]; 0 disables it.
     device : str or warp.Device, optional
-        Device to compute on.
+        Device to compute on, by default that of the image.
 
     Returns
     -------
@@ -139,13 +147,19 @@ def sharpness(
     >>> amiwarp.sharpness(edge), amiwarp.sharpness(even)
     (7.0, 0.0)
     """
-    image = array(image, "image")
-    if image.ndim not in (2, 3) or not image.size:
+    on_device = on_gpu(image) or isinstance(image, wp.array)
+    image = cast(import_array(image, "image"), wp.float32) if on_device else array(image, "image")
+    if image.ndim not in (2, 3) or not image.size or (image.ndim == 3 and len(image) > 2):
         raise AmiwarpError(f"image has shape {image.shape}; expected (height, width) or (2, height, width)")
-    stack = image if image.ndim == 3 else image[None]
+    stack = image.reshape((-1, *image.shape[-2:]))
     canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
-    if len(stack) > 2 or not np.all(np.isfinite(image)):
-        raise AmiwarpError(f"image of shape {image.shape} is not a finite (height, width) or (2, height, width) image")
+    if not on_device and not np.all(np.isfinite(stack)):
+        raise AmiwarpError(f"image of shape {image.shape} holds a value that is not finite; replace it")
+    if device is None:
+        device = image.device if on_device else "cpu"
     meter = SharpnessMeter(canvas, kind, smoothing=smoothing, device=device)
-    meter.image.write(stack)
-    return meter.measure()
+    meter.image.write(stack.to(meter.device) if on_device else stack)
+    found = meter.measure()
+    if not meter.finite:
+        raise AmiwarpError(f"image of shape {image.shape} holds a value that is not finite; replace it")
+    return found

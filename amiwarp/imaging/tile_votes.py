@@ -19,8 +19,9 @@ from amiwarp.optics.displacement import model_camera
 from amiwarp.optics.exact_model import ExactModel
 
 if TYPE_CHECKING:
-    from amiwarp.imaging.device_events import DeviceEvents
-    from amiwarp.imaging.warped_image import CanvasShape, Image
+    from amiwarp.imaging.device_events import UploadedEvents
+    from amiwarp.imaging.device_image import Image
+    from amiwarp.imaging.warped_image import CanvasShape
     from amiwarp.optics.models import Model
 
 
@@ -32,7 +33,7 @@ class TileVotes:
     """
 
     def __init__(
-        self, image: Image, canvas: CanvasShape, events: DeviceEvents, like: Model, *, candidates: int = 1
+        self, image: Image, canvas: CanvasShape, events: UploadedEvents, like: Model, *, candidates: int = 1
     ) -> None:
         """Sort the events. ``image`` is an image of the canvas, into which votes are read later.
 
@@ -60,7 +61,7 @@ class TileVotes:
         motion.drift, motion.camera_rotation = self._on_device[1:]
         self._motion = kernels.Still() if still else motion
 
-    def _sort(self, events: DeviceEvents) -> Any:
+    def _sort(self, events: UploadedEvents) -> Any:
         """Sort the events by tile and pack each event into one word."""
         a, n, device = events.arrays, events.count, self.device
         layers = self.canvas.shape[0]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_arrays import cast
+from amiwarp.events.device_events import DeviceEvents, device_for, wait
 from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.device_events import DeviceEvents, upload_events
-from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_totals, empty_words, read_votes
+from amiwarp.imaging.device_events import UploadedEvents, upload_events
+from amiwarp.imaging.device_image import Image
+from amiwarp.kernels.iwe import add_totals, empty_words, read_votes
 from amiwarp.kernels.launch import RecordedLaunch, launch, launch_slices, slice_count
 from amiwarp.kernels.votes import (
     BLOCK,
@@ -104,42 +107,6 @@ class CanvasShape:
         return c
 
 
-class Image:
-    """Vote image on a device, with a border of zeros so that kernels need not test for the image's edge."""
-
-    def __init__(self, canvas: CanvasShape, radius: int, device: Any) -> None:
-        """Allocate the image. ``radius``: largest distance from a pixel at which kernels read [px]."""
-        self.shape = canvas.shape
-        self.device = wp.get_device(device)
-        self.width = CPU_WIDTH if self.device.is_cpu else 1
-        layers, rows, columns = canvas.shape
-        f = Frame()
-        f.rows, f.columns, f.blocks = rows, columns, -(-columns // self.width)
-        f.stride = max(f.blocks * self.width, columns + radius)
-        f.layer = (rows + radius) * f.stride
-        f.first = (radius + 1) * f.stride
-        self.frame = f
-        self.blocks = layers * rows * f.blocks
-        self.pixels = wp.zeros(f.first + layers * f.layer + f.stride, dtype=float, device=device)
-
-    def _view(self, flat: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the pixels in a flat array without the border around them, shape (layers, rows, columns)."""
-        layers, rows, columns = self.shape
-        end = self.frame.first + layers * self.frame.layer
-        stacked = flat[self.frame.first : end].reshape(layers, -1, self.frame.stride)
-        return np.asarray(stacked[:, :rows, :columns])
-
-    def numpy(self) -> NDArray[np.float32]:
-        """Return a copy, shape (layers, rows, columns)."""
-        return self._view(self.pixels.numpy()).copy()
-
-    def write(self, image: NDArray[np.float32]) -> None:
-        """Set all pixels from an array of shape (layers, rows, columns)."""
-        flat = np.zeros(len(self.pixels), np.float32)
-        self._view(flat)[...] = image
-        wp.copy(self.pixels, wp.array(flat, dtype=float, device="cpu"))
-
-
 class Votes:
     """Buffers in which events are voted into the image of a canvas, allocated once.
 
@@ -199,7 +166,7 @@ class Votes:
         return bool(self.device.is_cuda or self._spilled.numpy().any())
 
     def add_events(
-        self, model: Model, events: DeviceEvents, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None
+        self, model: Model, events: UploadedEvents, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None
     ) -> None:
         """Compensate events on the same device by ``model`` and vote them.
 
@@ -239,8 +206,11 @@ class Votes:
         kernel = vote_point_blocks if self.device.is_cpu else vote_points
         return RecordedLaunch(kernel, [x, y, layer, self._params], [self._cells[0]], device=self.device)
 
-    def add_unmoved(self, events: Events) -> None:
+    def add_unmoved(self, events: Events | DeviceEvents) -> None:
         """Vote events at their coordinates, raw or already compensated. Events with NaN coordinates are not voted."""
+        if isinstance(events, DeviceEvents):
+            self.add_points(cast(events.x, wp.float32), cast(events.y, wp.float32), events.p)
+            return
         x, y = (wp.array(v.astype(np.float32), dtype=float, device=self.device) for v in (events.x, events.y))
         self.add_points(x, y, wp.array(events.p, dtype=wp.uint8, device=self.device))
 
@@ -325,9 +295,27 @@ class Votes:
         self.clear()
         return self._image.numpy()
 
+    def take_on_device(self) -> Any:
+        """Return the current image as a new Warp array, see :meth:`take`."""
+        self.read(self._image)
+        self.clear()
+        return self._image.on_device()
 
+
+@overload
 def iwe(
-    events: Events,
+    events: Events, width: int, height: int, *, model: Model | None = ..., encoder: Encoder | None = ...,
+    camera_rotation: CameraRotation | None = ..., pad: int = ..., per_polarity: bool = ..., vote: Vote = ...,
+    device: Any = ...,
+) -> NDArray[np.float32]: ...  # fmt: skip
+@overload
+def iwe(
+    events: DeviceEvents, width: int, height: int, *, model: Model | None = ..., encoder: Encoder | None = ...,
+    camera_rotation: CameraRotation | None = ..., pad: int = ..., per_polarity: bool = ..., vote: Vote = ...,
+    device: Any = ...,
+) -> wp.array: ...  # fmt: skip
+def iwe(
+    events: Events | DeviceEvents,
     width: int,
     height: int,
     *,
@@ -337,15 +325,15 @@ def iwe(
     pad: int = 0,
     per_polarity: bool = False,
     vote: Vote = Vote.BILINEAR,
-    device: Any = "cpu",
-) -> NDArray[np.float32]:
+    device: Any = None,
+) -> NDArray[np.float32] | wp.array:
     """Compute the image of warped events (IWE).
 
     With ``model`` and ``encoder``, the events are compensated first. Without them, they are voted at their coordinates.
 
     Parameters
     ----------
-    events : Events
+    events : Events or DeviceEvents
         Events to vote.
     width, height : int
         Sensor size [px].
@@ -362,18 +350,20 @@ def iwe(
     vote : Vote, optional
         How a vote is shared among pixels.
     device : str or warp.Device, optional
-        Device to compute on.
+        Device to compute on, by default the CPU. Events on a device are voted there, without a copy.
 
     Returns
     -------
-    ndarray
+    ndarray or warp.array
         Events per pixel, float32, shape ``(height + 2 * pad, width + 2 * pad)``. With ``per_polarity``, shape
-        ``(2, height + 2 * pad, width + 2 * pad)``: OFF, then ON.
+        ``(2, height + 2 * pad, width + 2 * pad)``: OFF, then ON. A Warp array on the same device for
+        :class:`DeviceEvents`.
 
     Raises
     ------
     AmiwarpError
-        If only one of ``model`` and ``encoder`` is given, or the encoder does not cover the events.
+        If only one of ``model`` and ``encoder`` is given, the encoder does not cover the events, or the events are on
+        another device than ``device``.
 
     Examples
     --------
@@ -384,6 +374,7 @@ def iwe(
     """
     if (model is None) != (encoder is None):
         raise AmiwarpError("only one of model and encoder is given; give both a model and an encoder, or neither")
+    device = device_for(events, device)
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)
     for start in range(0, len(events), PIECE):
         piece = events[start : start + PIECE]
@@ -393,5 +384,6 @@ def iwe(
             votes.add_events(model, arrays, camera_rotation=camera_rotation)
         else:
             votes.add_unmoved(piece)
-    image = votes.take()
+    image = votes.take_on_device() if isinstance(events, DeviceEvents) else votes.take()
+    wait(device)
     return image if per_polarity else image[0]

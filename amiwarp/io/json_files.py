@@ -24,15 +24,17 @@ LARGEST_INTEGER = 2**62
 """Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.checks.TIME_LIMIT`."""
 
 
-def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
+def read_json(path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     """Return the JSON object of a file.
 
     Parameters
     ----------
     path : str or path-like
-        A file in UTF-8 of at most :data:`MOST_BYTES`.
+        A file in UTF-8.
     what : str
         What the file should contain, for messages, such as "a calibration".
+    most_bytes : int, optional
+        Largest size of the file [bytes].
 
     Returns
     -------
@@ -49,9 +51,9 @@ def read_json(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
     with errors_name(path, lambda: f"cannot be read as {what}"):
         check_regular(path)
         with path.open("rb") as file:
-            text = file.read(MOST_BYTES + 1)
-        if len(text) > MOST_BYTES:
-            raise AmiwarpError(f"{path}: is larger than {MOST_BYTES >> 20} MiB, so it is not {what}; give another file")
+            text = file.read(most_bytes + 1)
+        if len(text) > most_bytes:
+            raise AmiwarpError(f"{path}: is larger than {most_bytes >> 20} MiB, so it is not {what}; give another file")
         data = parse_json(text)
         if not isinstance(data, dict):
             raise AmiwarpError(f"the file holds {shown(data)}; expected an object in braces")

@@ -18,6 +18,7 @@ from amiwarp.brightness.event_pairs import EventTable, PairSet
 from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_source import DeviceMemoryEvents, read_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.known import dilated, known_nodes
@@ -76,7 +77,7 @@ class Reconstruction:
     fill : Fill, optional
         How to fill unknown parts.
     device : str or warp.Device, optional
-        Device to compute on.
+        Device to compute on, by default that of :class:`DeviceMemoryEvents`, else the CPU.
 
     Raises
     ------
@@ -103,7 +104,7 @@ class Reconstruction:
         encoder: Encoder | None = None,
         camera_rotation: CameraRotation | None = None,
         fill: Fill = Fill.SMOOTH,
-        device: Any = "cpu",
+        device: Any = None,
     ) -> None:
         if not len(recording.events):
             raise AmiwarpError(f"{recording.name}: has no events; give a recording with events")
@@ -118,6 +119,8 @@ class Reconstruction:
         self.recording, self.model, self.encoder = recording, model, encoder
         if camera_rotation is None and calibration is not None:
             camera_rotation = calibration.camera_rotation
+        if device is None:
+            device = recording.events.device if isinstance(recording.events, DeviceMemoryEvents) else "cpu"
         self.camera_rotation, self.device = camera_rotation or CameraRotation(), device
         self.fill = choice(Fill, fill, "fill")
         self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
@@ -263,7 +266,7 @@ class Reconstruction:
 
     def _table(self, start_us: int, length_us: int) -> tuple[EventTable, NDArray[np.int32]]:
         """Return the window's events without hot pixels, and the number of events per pixel, shape (height, width)."""
-        events = self.recording.events.between(start_us, start_us + length_us)
+        events = read_between(self.recording.events, start_us, start_us + length_us)
         width, height = self.recording.events.size
         table = EventTable([events], np.zeros((height, width), np.int32), self.device)
         return table, table.exclude_hot_pixels()
@@ -341,7 +344,7 @@ def reconstruct(
     turns: float | None = None,
     camera_rotation: CameraRotation | None = None,
     fill: Fill = Fill.SMOOTH,
-    device: Any = "cpu",
+    device: Any = None,
 ) -> Picture:
     """Reconstruct a picture of the scene from one time window, a quarter turn of the prism or longer.
 
@@ -368,7 +371,7 @@ def reconstruct(
     fill : Fill, optional
         How to fill unknown parts.
     device : str or warp.Device, optional
-        Device to compute on.
+        Device to compute on, by default that of :class:`DeviceMemoryEvents`, else the CPU.
 
     Returns
     -------

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.brightness.solver import Tiles
+from amiwarp.events.device_source import read_between
 from amiwarp.events.encoder import TWO_PI
 from amiwarp.optics.camera_rotation import CameraRotation, border
 
@@ -63,6 +64,7 @@ def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: i
         return 0.0
     length = max(1, math.floor(length_us / turn_us)) * turn_us
     start = min(max(start_us, first), last - length)
-    p = source.between(round(start), round(start + length)).p
+    p = read_between(source, round(start), round(start + length)).p
+    p = p if isinstance(p, np.ndarray) else p.numpy()
     on = int(p.sum())
     return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from amiwarp.events.device_events import DeviceEvents, wait
 from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
 from amiwarp.kernels import event_generation as kernels
@@ -82,6 +83,12 @@ class DeviceBlock:
     def points(self) -> NDArray[np.float32]:
         """Return the scene point of each event: its pixel without the prism [px], shape (n, 2)."""
         return self.arrays.points.numpy() if self.count else np.empty((0, 2), np.float32)
+
+    def on_device(self) -> tuple[DeviceEvents, wp.array]:
+        """Return the finished events, and their scene points without the prism, without a copy."""
+        b = self.arrays
+        wait(b.t.device)
+        return DeviceEvents(b.x, b.y, b.t, b.p), b.points
 
     def truth(self) -> EventTruth:
         """Return the ground truth of the events. In a world, call it before the engine goes on."""

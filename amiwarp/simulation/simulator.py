@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.events.truth import EventTruth
@@ -20,14 +18,17 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.simulation.engine import DeviceBlock, Engine
-from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
+from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
+from amiwarp.simulation.parameters import check_values, true_parameters
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.worlds.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.worlds.world_scene import WorldScene
-from amiwarp.validation import instance, real, whole
 
 if TYPE_CHECKING:
+    import warp as wp
+
+    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.events.encoder import Encoder
 
 
@@ -73,19 +74,7 @@ class Simulation:
     """Device that computes, such as ``cpu`` or ``cuda:0``."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.scene, WorldScene):
-            instance(self.scene, Scene, "simulation's scene")
-        kinds: dict[str, type] = {"camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
-                 "camera_motion": CameraMotion}  # fmt: skip
-        if self.encoder_model is not None:
-            kinds["encoder_model"] = EncoderModel
-        for name, kind in kinds.items():
-            instance(getattr(self, name), kind, f"simulation's {name}")
-        real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
-        if self.camera.width * self.camera.height > 1 << 22:
-            given = f"{self.camera.width}x{self.camera.height}"
-            raise AmiwarpError(f"camera of {given} has more than 4194304 pixels; give a smaller camera")
-        whole(self.seed, "seed", 0, (1 << 31) - 1)
+        check_values(self)
 
     @property
     def duration_us(self) -> int:
@@ -122,22 +111,7 @@ class Simulation:
         dict
             Values by the names that calibration uses, and those of the sensor.
         """
-        constant = self.camera_motion.constant and not (
-            isinstance(self.scene, WorldScene) and self.scene.trajectory.moves
-        )  # a trajectory has no constant angular velocity
-        rates = np.asarray(self.camera_motion.rates) if constant else np.full(3, np.nan)
-        omega = dict(zip(("omega_x", "omega_y", "omega_z"), rates.ravel()[-3:].tolist(), strict=True))
-        clock = {} if self.encoder_model is None else {"clock_offset_us": self.encoder_model.clock_offset_us}
-        return {
-            "apex": self.prism.apex,
-            "index": self.prism.index,
-            "phase": self.motion.phase,
-            **clock,
-            "tilt_x": self.motion.tilt[0],
-            "tilt_y": self.motion.tilt[1],
-            **{name: value for name, value in omega.items() if math.isfinite(value)},
-            **asdict(self.sensor),
-        }
+        return true_parameters(self)
 
     def metadata(self) -> dict[str, MetadataValue]:
         """Return the metadata that the recording stores about its simulation.
@@ -189,6 +163,27 @@ class Simulation:
         """
         for block, _ in self._run_engine(chunk_us, progress):
             yield block.events(), block.truth()
+
+    def device_blocks(
+        self, *, chunk_us: int | None = None, progress: Progress | None = None
+    ) -> Iterator[tuple[DeviceEvents, wp.array]]:
+        """Yield the events of successive time spans on the device that simulates them, without a copy to the host.
+
+        Parameters
+        ----------
+        chunk_us : int, optional
+            Length of a span [us]. The default depends on the device. The events do not depend on it.
+        progress : Progress, optional
+            Called with the finished share.
+
+        Yields
+        ------
+        tuple
+            Events, and the scene point of each event, as in :meth:`blocks`: a Warp array of vec2, shape ``(n,)``, which
+            other libraries read as ``(n, 2)``.
+        """
+        for block, _ in self._run_engine(chunk_us, progress):
+            yield block.on_device()
 
     def _run_engine(self, chunk_us: int | None, progress: Progress | None) -> Iterator[tuple[DeviceBlock, int]]:
         """Yield the blocks of successive time spans, each with the end of its span [us]."""
@@ -319,7 +314,8 @@ def simulate(
 ) -> Recording:
     """Simulate a recording.
 
-    For recordings larger than memory, use :meth:`Simulation.write` or :meth:`Simulation.blocks`.
+    The events are in the host's memory. For recordings larger than memory, use :meth:`Simulation.write` or
+    :meth:`Simulation.blocks`; for events that stay on ``device``, use :meth:`Simulation.device_blocks`.
 
     Parameters
     ----------

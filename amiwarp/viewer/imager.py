@@ -9,7 +9,7 @@ import numpy as np
 
 from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.device_events import DeviceEvents
+from amiwarp.imaging.device_events import UploadedEvents
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.viewer.drawn_truth import DrawnTruth
@@ -36,7 +36,7 @@ class WindowImager:
         self._votes = Votes(canvas, device)
         self._meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device)
 
-    def measure(self, model: Model, events: DeviceEvents, offset_us: float) -> tuple[NDArray[np.float32], float]:
+    def measure(self, model: Model, events: UploadedEvents, offset_us: float) -> tuple[NDArray[np.float32], float]:
         """Return the image [events per pixel], shape ``(height, width)``, and its sharpness.
 
         ``offset_us`` is added to the encoder's clock offset [us].
@@ -63,11 +63,11 @@ class LoadedWindow:
     """Prism angles of the drawn events [rad], shape ``(n,)``, without the clock offset that is set on the page."""
     speed: NDArray[np.float64]
     """Speed of the prism at the drawn events [rad/us], shape ``(n,)``."""
-    on_device: DeviceEvents
+    on_device: UploadedEvents
     """All selected events, on the device."""
     curve_events: Events
     """Selected events from which the sharpness curve is computed."""
-    curve_events_on_device: DeviceEvents
+    curve_events_on_device: UploadedEvents
     """Events of the sharpness curve, on the device."""
     image: NDArray[np.float32]
     """Image of the events as recorded [events per pixel], shape ``(height, width)``."""

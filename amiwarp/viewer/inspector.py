@@ -17,7 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.device_events import DeviceEvents, upload_events
+from amiwarp.imaging.device_events import UploadedEvents, upload_events
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.drawn_truth import DrawnTruth
@@ -371,7 +371,7 @@ class Inspector:
             sharpness,
         )  # fmt: skip
 
-    def _upload(self, events: Events, knobs: Knobs) -> DeviceEvents:
+    def _upload(self, events: Events, knobs: Knobs) -> UploadedEvents:
         source = self.recording.events
         if self.recording.encoder is None:
             encoder = constant_speed(knobs.rpm, source.t_first, source.t_last, self.zero_us)

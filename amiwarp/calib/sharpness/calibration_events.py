@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events
-    from amiwarp.imaging.device_events import DeviceEvents
+    from amiwarp.imaging.device_events import UploadedEvents
 
     SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
@@ -33,9 +33,9 @@ class CalibrationEvents:
     None if neither is free."""
     fold: int = 0
     """Number of angle bins per turn into which a pixel's events are merged; 0: events are not merged."""
-    _uploaded: dict[tuple[str, int | None], DeviceEvents] = field(default_factory=dict, repr=False, init=False)
+    _uploaded: dict[tuple[str, int | None], UploadedEvents] = field(default_factory=dict, repr=False, init=False)
 
-    def on(self, device: Any, middle_us: int | None) -> DeviceEvents:
+    def on(self, device: Any, middle_us: int | None) -> UploadedEvents:
         """Return the events on a device, uploaded once; with times relative to ``middle_us`` if it is given."""
         if (str(device), middle_us) not in self._uploaded:
             slope = None if self.slope_of is None else self.slope_of(self.events.t)

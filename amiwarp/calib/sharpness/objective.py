@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.imaging.device_events import DeviceEvents
+    from amiwarp.imaging.device_events import UploadedEvents
     from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
@@ -38,7 +38,7 @@ class Objective:
     def __init__(
         self,
         space: ParameterSpace,
-        events: DeviceEvents,
+        events: UploadedEvents,
         *,
         kind: Sharpness,
         smoothing: float,
@@ -53,7 +53,7 @@ class Objective:
         ----------
         space : ParameterSpace
             The free parameters.
-        events : DeviceEvents
+        events : UploadedEvents
             The events on the device, with slopes for a free clock offset or rpm, and times for a camera rotation.
         kind : Sharpness
             Measure of sharpness.
@@ -118,7 +118,7 @@ class Objective:
 class _DirectImage:
     """Image of warped events that is voted in one pass over the events in the order of time."""
 
-    def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter) -> None:
+    def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter) -> None:
         self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
 
     def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
@@ -131,7 +131,7 @@ class _DirectImage:
 class _TiledImage:
     """Image of warped events that is voted tile by tile, launched as one CUDA graph."""
 
-    def __init__(self, canvas: CanvasShape, events: DeviceEvents, meter: SharpnessMeter, like: Model) -> None:
+    def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter, like: Model) -> None:
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
         self._graph: Any = None
 

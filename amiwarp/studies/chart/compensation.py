@@ -22,7 +22,8 @@ from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import TURNS, upload_events
-from amiwarp.imaging.warped_image import CanvasShape, Image, Votes
+from amiwarp.imaging.device_image import Image
+from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.optics.displacement import wrap_angle

@@ -1,0 +1,608 @@
+"""Events and images in arrays of other libraries: shared by pointer, equal to the host's results, safe on streams."""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import subprocess
+import sys
+import weakref
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import amiwarp
+from amiwarp import validation
+from amiwarp.compensation.streams import Compensator
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_arrays import converted, import_array
+from amiwarp.events.device_events import DeviceEvents
+from amiwarp.events.device_source import DeviceMemoryEvents
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.prism import Prism
+from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.simulator import Simulation
+
+WIDTH, HEIGHT = 64, 48
+CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, math.radians(60)), Prism(math.radians(2.0))
+MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.4)
+ENCODER = Encoder.constant_speed(720.0, 0, 100_000)
+NAMES = ("x", "y", "t", "p")
+SHARED = [("numpy", "cpu"), ("warp", "cpu"), ("torch", "cpu")]
+SHARED += [(library, "cuda:0") for library in ("warp", "torch", "cupy", "jax")]
+"""Libraries and the devices on which they share arrays."""
+
+
+def random_events(n: int = 5000, seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (WIDTH, HEIGHT))
+    return Events(x, y, np.sort(rng.integers(0, 100_000, n)), rng.integers(0, 2, n).astype(np.uint8))
+
+
+def foreign(library: str, device: str, values: np.ndarray) -> Any:
+    """Return a copy of values as an array of a library. Without the library or the device, the test is skipped."""
+    if device != "cpu" and not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    if library == "warp":
+        return wp.array(values, dtype=wp.dtype_from_numpy(values.dtype), device=device)
+    if library == "torch":
+        return pytest.importorskip("torch").from_numpy(values.copy()).to(device)
+    if library == "cupy":
+        return pytest.importorskip("cupy").asarray(values)
+    if library == "jax":
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leave memory to the other libraries
+        jax = pytest.importorskip("jax")
+        jax.config.update("jax_enable_x64", True)
+        try:
+            return jax.device_put(values, jax.devices("gpu")[0])
+        except RuntimeError:
+            pytest.skip("JAX finds no GPU")
+    return values.copy()
+
+
+def pointer(array: Any) -> int:
+    if isinstance(array, PlainArray):
+        return pointer(array.values)
+    for name in ("ptr", "data_ptr", "unsafe_buffer_pointer"):
+        if hasattr(array, name):
+            found = getattr(array, name)
+            return int(found() if callable(found) else found)
+    return int(array.ctypes.data if isinstance(array, np.ndarray) else array.data.ptr)
+
+
+def as_columns(library: str, device: str, events: Events) -> dict[str, Any]:
+    return {name: foreign(library, device, getattr(events, name)) for name in NAMES}
+
+
+def on_device(events: Events, device: str) -> DeviceEvents:
+    return DeviceEvents.from_arrays(events.x, events.y, events.t, events.p, device=device)
+
+
+def assert_equal(found: Events, expected: Events) -> None:
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+# -- arrays in
+
+
+@pytest.mark.parametrize(("library", "device"), SHARED)
+def test_events_share_the_memory_of_the_arrays(library: str, device: str) -> None:
+    host = random_events()
+    given = as_columns(library, device, host)
+    events = DeviceEvents.from_arrays(**given)
+    assert {name: getattr(events, name).ptr for name in NAMES} == {name: pointer(given[name]) for name in NAMES}
+    assert str(events.device) == device
+    assert_equal(events.to_host(), host)
+
+
+@pytest.mark.parametrize(("library", "device"), SHARED)
+def test_truth_values_share_their_memory_as_polarities(library: str, device: str) -> None:
+    host = random_events()
+    p = foreign(library, device, host.p > 0)
+    events = DeviceEvents.from_arrays(**{**as_columns(library, device, host), "p": p})
+    assert events.p.ptr == pointer(p)
+    assert_equal(events.to_host(), host)
+
+
+@pytest.mark.parametrize("library", ["numpy", "warp", "torch"])
+@pytest.mark.parametrize("truth", [False, True])
+def test_numpy_events_share_the_memory_of_arrays_on_the_host(library: str, truth: bool) -> None:
+    host = random_events()
+    given = as_columns(library, "cpu", host)
+    if truth:
+        given["p"] = foreign(library, "cpu", host.p > 0)
+    events = Events.from_arrays(**given)
+    assert {name: pointer(getattr(events, name)) for name in NAMES} == {n: pointer(given[n]) for n in NAMES}
+    assert_equal(events, host)
+
+
+class PlainArray:
+    """An array of a library that offers nothing but DLPack."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def __dlpack__(self, **options: Any) -> Any:
+        return self.values.__dlpack__(**options)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return self.values.__dlpack_device__()
+
+
+def test_dlpack_alone_is_enough() -> None:
+    host = random_events()
+    given = {name: PlainArray(getattr(host, name)) for name in NAMES}
+    for kind in (Events, DeviceEvents):
+        events = kind.from_arrays(**given)
+        assert {name: pointer(getattr(events, name)) for name in NAMES} == {n: pointer(getattr(host, n)) for n in NAMES}
+
+
+def test_events_from_numpy_move_to_a_device(device: str) -> None:
+    events = on_device(random_events(), device)
+    assert str(events.device) == device
+    assert_equal(events.to_host(), random_events())
+
+
+COPIED = {
+    "x": [np.arange(4, dtype=np.int32), np.array([0.0, np.nan, 1.5, -2.0])],
+    "y": [np.arange(4, dtype=np.int64)],
+    "t": [np.array([-3, 0, 5, 7], np.int32), np.array([0.5, 1.5, 2.5, 1e15])],
+    "p": [np.array([-1, 1, 0, 1], np.int8), np.array([0.0, 2.0, -1.0, 1.0])],
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_other_types_are_converted_on_the_device_as_on_the_host(name: str, device: str) -> None:
+    for values in COPIED[name]:
+        plain = {"x": [0] * 4, "y": [0] * 4, "t": [0] * 4, "p": [0] * 4}
+        pair = {"x": values, "y": values} if name in "xy" else {name: values}
+        expected = getattr(Events.from_arrays(**{**plain, **pair}), name)
+        given = wp.array(values, dtype=wp.dtype_from_numpy(values.dtype), device=device)
+        found = converted(name, given)
+        assert found.numpy().dtype == expected.dtype
+        np.testing.assert_array_equal(found.numpy(), expected)
+        np.testing.assert_array_equal(given.numpy(), values)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("x", np.array([0, 65536], np.int32), "x holds a coordinate outside 0 .. 65535"),
+        ("y", np.array([0, -1], np.int64), "y holds a coordinate outside 0 .. 65535"),
+        ("x", np.array([0.0, 1e300]), "x holds a coordinate that float32 cannot hold"),
+        ("t", np.array([0.0, np.nan]), "t is not finite"),
+        ("t", np.array([0.0, -(2.0**62)]), "t is not finite"),
+        ("p", np.array([0.0, np.nan]), "p holds NaN"),
+    ],
+)
+def test_values_that_do_not_fit_are_refused_on_the_device(
+    name: str, values: np.ndarray, message: str, device: str
+) -> None:
+    with pytest.raises(AmiwarpError, match=message):
+        converted(name, wp.array(values, dtype=wp.dtype_from_numpy(values.dtype), device=device))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"x": [1]}, "expected one length"),
+        ({"x": [[1, 2], [3, 4]]}, "expected one length"),
+        ({"x": [-1, 2]}, "expected pixels in 0 .. 65535"),
+        ({"x": [np.inf, 2.0], "y": [1.0, 2.0]}, "infinite coordinate|float32 cannot hold"),
+        ({"x": [1.0, 2.0]}, "use from_arrays|expected both uint16 or both float32"),
+        ({"t": [0.0, np.nan]}, "not finite"),
+        ({"t": [0, 2**62]}, "expected microseconds"),
+        ({"p": [0.0, np.nan]}, "p holds NaN"),
+        ({"y": ["a", "b"]}, "expected numbers"),
+        ({"y": None}, "expected numbers"),
+    ],
+)
+@pytest.mark.parametrize("kind", [Events, DeviceEvents])
+def test_bad_arrays_are_refused(kind: Any, changed: dict[str, Any], message: str) -> None:
+    given = {"x": [1, 2], "y": [1, 2], "t": [0, 1], "p": [0, 1], **changed}
+    with pytest.raises(AmiwarpError, match=message):
+        kind.from_arrays(**given)
+
+
+@pytest.mark.parametrize("kind", [Events, DeviceEvents])
+def test_tensors_that_cannot_be_shared_are_refused(kind: Any) -> None:
+    torch = pytest.importorskip("torch")
+    for tensor, message in (
+        (torch.ones(2, requires_grad=True), "x cannot be read as an array.*detach"),
+        (torch.ones(2, dtype=torch.bfloat16), "expected numbers"),
+    ):
+        with pytest.raises(AmiwarpError, match=message):
+            kind.from_arrays(tensor, tensor, [0, 1], [0, 1])
+
+
+def test_device_arrays_of_other_types_are_refused() -> None:
+    with pytest.raises(AmiwarpError, match="x has values of type vec2f"):
+        import_array(wp.zeros(3, dtype=wp.vec2), "events' x")
+    x, t, p = wp.zeros(3, dtype=wp.uint16), wp.zeros(3, dtype=wp.int64), wp.zeros(3, dtype=wp.uint8)
+    with pytest.raises(AmiwarpError, match="use from_arrays, which converts"):
+        DeviceEvents(x, x, wp.zeros(3, dtype=wp.int32), p)
+    with pytest.raises(AmiwarpError, match="gaps"):
+        DeviceEvents(wp.zeros(6, dtype=wp.uint16)[::2], x, t, p)
+    with pytest.raises(AmiwarpError, match="expected a array"):
+        DeviceEvents(np.zeros(3, np.uint16), x, t, p)
+
+
+@pytest.mark.parametrize("library", ["torch", "cupy"])
+def test_arrays_on_cpu_and_cuda_are_refused(library: str) -> None:
+    host = random_events()
+    given = {**as_columns(library, "cuda:0", host), "p": host.p}
+    with pytest.raises(AmiwarpError, match=r"on devices .*cuda:0.*put them on one device"):
+        DeviceEvents.from_arrays(**given)
+    assert_equal(DeviceEvents.from_arrays(**given, device="cuda:0").to_host(), host)
+    with pytest.raises(AmiwarpError, match="x is on a GPU; copy it to the host"):
+        Events.from_arrays(**given)
+    with pytest.raises(AmiwarpError, match="events are on cuda:0, device is cpu"):
+        amiwarp.iwe(DeviceEvents.from_arrays(**given, device="cuda:0"), WIDTH, HEIGHT, device="cpu")
+
+
+@pytest.fixture
+def all_on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host's memory counts as a GPU's, so that the way of arrays on a GPU runs on a CPU too."""
+    monkeypatch.setattr(validation, "HOST_MEMORY", ())
+
+
+@pytest.mark.usefixtures("all_on_gpu")
+@pytest.mark.parametrize("library", ["warp", "torch", "plain"])
+def test_arrays_on_a_gpu_are_read_through_dlpack_alone(library: str) -> None:
+    host = random_events()
+    given = {n: PlainArray(getattr(host, n)) for n in NAMES} if library == "plain" else as_columns(library, "cpu", host)
+    events = DeviceEvents.from_arrays(**given)
+    found = {name: getattr(events, name).ptr for name in NAMES}
+    assert found == {name: pointer(values) for name, values in given.items()}
+    assert_equal(events.to_host(), host)
+    with pytest.raises(AmiwarpError, match="x is on a GPU; copy it to the host"):
+        Events.from_arrays(**given)
+
+
+@pytest.mark.usefixtures("all_on_gpu")
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"x": np.array([1.0, np.inf], np.float32), "y": np.ones(2, np.float32)}, "infinite coordinate"),
+        ({"x": np.array([1, -1])}, "x holds a coordinate outside"),
+        ({"t": np.array([0, 2**62])}, "expected microseconds within"),
+        ({"t": np.array([0, 1, 2])}, "expected one length"),
+        ({"x": np.ones((2, 1), np.int64)}, "expected one length"),
+        ({"p": np.ones(2, complex)}, "p cannot be read through DLPack: .*complex"),
+    ],
+)
+def test_bad_arrays_on_a_gpu_are_refused(changed: dict[str, np.ndarray], message: str) -> None:
+    plain = {"x": np.ones(2, np.uint16), "y": np.ones(2, np.uint16), "t": np.arange(2), "p": np.ones(2, np.uint8)}
+    with pytest.raises(AmiwarpError, match=message):
+        DeviceEvents.from_arrays(**{name: PlainArray(values) for name, values in {**plain, **changed}.items()})
+
+
+@pytest.mark.usefixtures("all_on_gpu")
+def test_polarities_beyond_one_are_on_events() -> None:
+    given = [PlainArray(np.arange(4).astype(dtype)) for dtype in (np.uint16, np.uint16, np.int64, np.uint8)]
+    events = DeviceEvents.from_arrays(*given)
+    assert events.p.numpy().tolist() == [0, 1, 1, 1]
+    assert given[3].values.tolist() == [0, 1, 2, 3]
+
+
+def test_arrays_with_gaps_are_copied(device: str) -> None:
+    host = random_events()
+    wide = {n: np.repeat(getattr(host, n), 2) for n in NAMES}
+    given = {n: wp.array(v, dtype=wp.dtype_from_numpy(v.dtype), device=device)[::2] for n, v in wide.items()}
+    assert not given["x"].is_contiguous
+    assert_equal(DeviceEvents.from_arrays(**given).to_host(), host)
+    assert import_array(given["x"], "x").is_contiguous
+
+
+def test_arrays_are_kept_alive_and_released() -> None:
+    host = random_events()
+    x = host.x.copy()
+    reference = weakref.ref(x)
+    events = DeviceEvents.from_arrays(x, host.y, host.t, host.p)
+    part = events[10:20]
+    del x, events
+    gc.collect()
+    assert reference() is not None
+    np.testing.assert_array_equal(part.x.numpy(), host.x[10:20])
+    del part
+    gc.collect()
+    assert reference() is None
+
+
+def test_slices_and_joins_of_device_events(device: str) -> None:
+    host = random_events()
+    events = on_device(host, device)
+    parts = [events[:100], events[100:100], events[100:]]
+    assert parts[0].t.ptr == events.t.ptr
+    assert_equal(DeviceEvents.concatenate(parts).to_host(), host)
+    assert (events[5:].t_first, events[:-5].t_last) == (host.t[5], host.t[-6])
+    assert len(events[7:3]) == len(events[9999:]) == 0
+    with pytest.raises(AmiwarpError, match="no first or last time"):
+        _ = events[:0].t_first
+    with pytest.raises(AmiwarpError, match="steps of 2"):
+        events[::2]
+    with pytest.raises(AmiwarpError, match="give at least one"):
+        DeviceEvents.concatenate([])
+
+
+def test_no_array_library_is_needed() -> None:
+    script = (
+        "import sys, amiwarp; e = amiwarp.DeviceEvents.from_arrays([1], [2], [3], [1]); amiwarp.iwe(e, 4, 4);"
+        "print('loaded:', *[m for m in ('torch', 'cupy', 'jax') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "loaded:"
+
+
+# -- results
+
+
+@pytest.mark.parametrize("options", [{}, {"per_polarity": True, "pad": 3}, {"vote": "nearest"}])
+@pytest.mark.parametrize("compensated", [False, True])
+def test_images_on_a_device_are_those_of_the_host(compensated: bool, options: dict[str, Any], device: str) -> None:
+    host = random_events()
+    if compensated:
+        options = {**options, "model": MODEL, "encoder": ENCODER}
+    image = amiwarp.iwe(on_device(host, device), WIDTH, HEIGHT, **options)
+    expected = amiwarp.iwe(host, WIDTH, HEIGHT, device=device, **options)
+    assert (str(image.device), image.is_contiguous) == (device, True)
+    np.testing.assert_array_equal(image.numpy(), expected)
+    assert expected.sum() > len(host) / 2
+    assert amiwarp.sharpness(image) == amiwarp.sharpness(expected, device=device)
+
+
+def test_compensated_coordinates_on_a_device_are_images_again(device: str) -> None:
+    host = random_events(5001)
+    xy = amiwarp.compensate_events(on_device(host, device), MODEL, ENCODER)
+    expected = amiwarp.compensate_events(host, MODEL, ENCODER, device=device)
+    np.testing.assert_array_equal(xy.numpy(), expected)
+    moved = on_device(Events(expected[:, 0].copy(), expected[:, 1].copy(), host.t, host.p), device)
+    assert not moved.whole_pixels
+    np.testing.assert_array_equal(
+        amiwarp.iwe(moved, WIDTH, HEIGHT).numpy(), amiwarp.iwe(moved.to_host(), WIDTH, HEIGHT, device=device)
+    )
+    with pytest.raises(AmiwarpError, match="already compensated"):
+        amiwarp.compensate_events(moved, MODEL, ENCODER)
+
+
+def test_events_outside_the_sensor_on_a_device(device: str) -> None:
+    """The ellipse model reads a table of the pixels; events outside must not be looked up in it."""
+    host = random_events()
+    host = Events(host.x + np.uint16(WIDTH), host.y, host.t, host.p)
+    model = EllipseModel.from_prism(CAMERA, PRISM, 0.4)
+    found = amiwarp.compensate_events(on_device(host, device), model, ENCODER)
+    np.testing.assert_array_equal(found.numpy(), amiwarp.compensate_events(host, model, ENCODER, device=device))
+
+
+def test_no_events_on_a_device(device: str) -> None:
+    none = on_device(Events.empty(), device)
+    assert amiwarp.iwe(none, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER).numpy().sum() == 0.0
+    assert amiwarp.compensate_events(none, MODEL, ENCODER).shape == (0, 2)
+    assert len(DeviceEvents.concatenate([none, none])) == 0
+
+
+@pytest.mark.parametrize(("library", "device"), [case for case in SHARED if case[0] not in ("numpy", "warp")])
+def test_other_libraries_share_the_memory_of_results(library: str, device: str) -> None:
+    host = random_events()
+    events = DeviceEvents.from_arrays(**as_columns(library, device, host))
+    image = amiwarp.iwe(events, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER)
+    xy = amiwarp.compensate_events(events, MODEL, ENCODER)
+    module = {"torch": "torch", "cupy": "cupy", "jax": "jax.dlpack"}[library]
+    read = pytest.importorskip(module).from_dlpack
+    for result in (image, xy, events.x):
+        shared = read(result)
+        assert pointer(shared) == result.ptr
+        assert tuple(shared.shape) == result.shape
+        on_host = shared.cpu().numpy() if library == "torch" else shared.get() if library == "cupy" else shared
+        np.testing.assert_array_equal(np.asarray(on_host), result.numpy())
+    expected = amiwarp.sharpness(image.numpy(), smoothing=1.0, device=device)
+    assert amiwarp.sharpness(read(image), smoothing=1.0) == expected
+    assert amiwarp.sharpness(read(image).T.T, smoothing=1.0) == expected
+
+
+def test_sharpness_refuses_bad_images_on_a_device(device: str) -> None:
+    for shape in ((4,), (3, 4, 4), (0, 4), (1, 2, 4, 4)):
+        with pytest.raises(AmiwarpError, match=r"expected \(height, width\)"):
+            amiwarp.sharpness(wp.zeros(shape, dtype=float, device=device))
+    for value in (np.nan, np.inf, -np.inf):
+        image = np.ones((4, 5), np.float32)
+        image[1, 2] = value
+        with pytest.raises(AmiwarpError, match="not finite"):
+            amiwarp.sharpness(wp.array(image, dtype=float, device=device))
+    whole = wp.array(np.arange(20).reshape(4, 5), dtype=wp.int32, device=device)
+    assert amiwarp.sharpness(whole) == amiwarp.sharpness(whole.numpy(), device=device)
+
+
+def test_arrays_given_are_not_modified(device: str) -> None:
+    host = random_events()
+    events = on_device(Events(*(getattr(host, name).copy() for name in NAMES)), device)
+    amiwarp.iwe(events, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, per_polarity=True)
+    amiwarp.compensate_events(events, MODEL, ENCODER)
+    source = DeviceMemoryEvents(events, WIDTH, HEIGHT)
+    amiwarp.reconstruct(Recording(source, CAMERA, ENCODER, PRISM), model=MODEL)
+    compensator = Compensator(MODEL, streamed(ENCODER), device=device)
+    compensator.put(events, 0)
+    assert len(compensator.take_on_device(2**62)) == 1
+    assert_equal(events.to_host(), host)
+
+
+# -- the simulator, sources and streams
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    picture = np.kron(np.random.default_rng(1).uniform(0.05, 1.0, (24, 32)), np.ones((4, 4))).astype(np.float32)
+    return Simulation(scene=Scene.from_picture(picture), camera=CAMERA, prism=PRISM, duration_s=0.1)
+
+
+def test_simulated_events_stay_on_the_device(simulation: Simulation, device: str) -> None:
+    simulation = replace(simulation, device=device)
+    on_host = list(simulation.blocks(chunk_us=30_000))
+    blocks = list(simulation.device_blocks(chunk_us=30_000))
+    assert len(blocks) == len(on_host) == 4
+    for (events, points), (expected, expected_points) in zip(blocks, on_host, strict=True):
+        assert str(events.device) == device
+        assert_equal(events.to_host(), expected)
+        np.testing.assert_array_equal(points.numpy(), expected_points)
+    assert sum(len(events) for events, _ in blocks) > 5000
+
+
+def test_reconstruction_reads_events_on_the_device(simulation: Simulation, device: str) -> None:
+    recording = simulation.run()
+    host = recording.events.slice(0, len(recording.events))
+    source = DeviceMemoryEvents(on_device(host, device), WIDTH, HEIGHT)
+    found = amiwarp.reconstruct(replace(recording, events=source), model=MODEL)
+    expected = amiwarp.reconstruct(recording, model=MODEL, device=device)
+    np.testing.assert_array_equal(found.known, expected.known)
+    # additions on a GPU have no fixed order
+    np.testing.assert_array_equal(found.log, expected.log)
+
+
+def test_a_source_on_a_device_equals_a_source_in_memory(device: str) -> None:
+    host = random_events()
+    source, expected = DeviceMemoryEvents(on_device(host, device), WIDTH, HEIGHT), MemoryEvents(host, WIDTH, HEIGHT)
+    assert isinstance(source, amiwarp.EventSource)
+    assert (len(source), source.t_first, source.t_last, source.size) == (
+        len(expected), expected.t_first, expected.t_last, expected.size)  # fmt: skip
+    for t in (-1, 0, int(host.t[10]), 50_000, 10**9):
+        assert source.find(t) == expected.find(t)
+    assert_equal(source.between(20_000, 60_000), expected.between(20_000, 60_000))
+    assert_equal(source.slice(-5, 70), expected.slice(-5, 70))
+    for found, block in zip(source.blocks(duration_us=7000), expected.blocks(duration_us=7000), strict=True):
+        assert_equal(found, block)
+
+
+def test_a_source_on_a_device_refuses_bad_events(device: str) -> None:
+    host = random_events()
+    with pytest.raises(AmiwarpError, match=r"event \d+ .*lies outside the 64x40 frame"):
+        DeviceMemoryEvents(on_device(host, device), WIDTH, 40)
+    with pytest.raises(AmiwarpError, match=r"event 1 .*earlier than the one before"):
+        DeviceMemoryEvents(DeviceEvents.from_arrays([1, 1], [1, 1], [5, 4], [0, 1], device=device), WIDTH, HEIGHT)
+
+
+def streamed(encoder: Encoder) -> EncoderStream:
+    stream = EncoderStream()
+    stream.append(encoder.t, encoder.angle)
+    return stream
+
+
+@pytest.mark.parametrize("covered", [(-5000, 110_000), (20_000, 60_000)])
+@pytest.mark.parametrize("kind", ["host", "device"])
+def test_a_stream_on_a_device_comes_out_as_on_the_host(kind: str, covered: tuple[int, int], device: str) -> None:
+    """Also with events before the first encoder sample and after the last one."""
+    host = random_events(20_000)
+    packets = host if kind == "host" else on_device(host, device)
+    plain, kept = (
+        Compensator(MODEL, streamed(Encoder.constant_speed(720.0, *covered)), batch=4000, device=device) for _ in "ab"
+    )
+    expected, found, start = [], [], 0
+    for n in (1, 0, 63, 65, 9000, 777, 20_000):
+        plain.put(host[start : start + n], 0)
+        kept.put(packets[start : start + n], 0)
+        expected += plain.take(0)
+        found += kept.take_on_device(0)
+        start += n
+    expected += plain.flush()
+    found += kept.take_on_device(2**62)
+    assert_equal(
+        DeviceEvents.concatenate([packet.events for packet in found]).to_host(),
+        Events.concatenate([packet.events for packet in expected]),
+    )
+    flags = np.concatenate([packet.flags.numpy() for packet in found])
+    np.testing.assert_array_equal(flags, np.concatenate([packet.flags for packet in expected]))
+    assert set(flags.tolist()) == ({0, 1} if covered[0] < 0 else {0, 1, 2, 3, 5})
+    np.testing.assert_array_equal(kept.image_on_device().numpy(), plain.image())
+    assert (kept.waiting, kept.waiting_bytes) == (0, 0)
+
+
+def test_packets_on_a_device_can_be_taken_on_the_host(device: str) -> None:
+    host = random_events()
+    compensator = Compensator(MODEL, streamed(ENCODER), device=device)
+    compensator.put(on_device(host, device), 0)
+    [packet] = compensator.flush()
+    np.testing.assert_array_equal(
+        np.stack([packet.events.x, packet.events.y], axis=1),
+        amiwarp.compensate_events(host, MODEL, ENCODER, device=device),
+    )
+
+
+def test_unsorted_packets_on_a_device_are_refused(device: str) -> None:
+    compensator = Compensator(MODEL, EncoderStream(), device=device)
+    with pytest.raises(AmiwarpError, match="not sorted"):
+        compensator.put(DeviceEvents.from_arrays([1, 1], [1, 1], [5, 4], [0, 1], device=device), 0)
+    compensator.put(DeviceEvents.from_arrays([1], [1], [5], [0], device=device), 0)
+    with pytest.raises(AmiwarpError, match="start before 5 us"):
+        compensator.put(DeviceEvents.from_arrays([1], [1], [4], [0], device=device), 0)
+    assert compensator.waiting == 1
+
+
+# -- streams of CUDA
+
+
+def test_work_on_a_cuda_stream_of_pytorch_is_awaited() -> None:
+    """Events are written on a side stream after a delay, and handed over without waiting."""
+    host = random_events()
+    late = as_columns("torch", "cuda:0", host)
+    torch = pytest.importorskip("torch")
+    early = {name: foreign("torch", "cuda:0", np.zeros_like(getattr(host, name))) for name in NAMES}
+    torch.cuda.synchronize()
+    expected = amiwarp.iwe(host, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER, device="cuda:0")
+    loaded = amiwarp.iwe(DeviceEvents.from_arrays(**late), WIDTH, HEIGHT, model=MODEL, encoder=ENCODER)
+    np.testing.assert_array_equal(loaded.numpy(), expected)
+    with torch.cuda.stream(torch.cuda.Stream()):
+        torch.cuda._sleep(200_000_000)  # about 0.1 s
+        for name, values in late.items():
+            early[name].copy_(values)
+        assert not torch.cuda.current_stream().query()  # the events are not written yet
+        events = DeviceEvents.from_arrays(**early)
+        image = amiwarp.iwe(events, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER)
+        found = torch.from_dlpack(image) * 2.0
+        del image, events
+        np.testing.assert_array_equal(found.cpu().numpy(), 2.0 * expected)
+
+
+def test_images_on_cuda_streams_of_pytorch_and_cupy_are_awaited() -> None:
+    host = random_events()
+    tensor = foreign("torch", "cuda:0", amiwarp.iwe(host, WIDTH, HEIGHT))
+    torch = pytest.importorskip("torch")
+    expected = amiwarp.sharpness(tensor)
+    late = torch.zeros_like(tensor)
+    torch.cuda.synchronize()
+    with torch.cuda.stream(torch.cuda.Stream()):
+        torch.cuda._sleep(200_000_000)
+        late.copy_(tensor)
+        assert amiwarp.sharpness(late) == expected
+    cupy = pytest.importorskip("cupy")
+    source = cupy.asarray(tensor.cpu().numpy())
+    late = cupy.zeros_like(source)
+    cupy.cuda.Device().synchronize()
+    with cupy.cuda.Stream(non_blocking=True):
+        for _ in range(200):  # work that takes some milliseconds
+            cupy.ones((2048, 2048), cupy.float32).sum()
+        late[...] = source
+        assert amiwarp.sharpness(late) == expected
+
+
+def test_results_are_finished_on_a_cuda_stream_of_warp() -> None:
+    """CuPy reads the array interface of CUDA, which names no stream: results must be finished on return."""
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    cupy = pytest.importorskip("cupy")
+    host = random_events(2_000_000)
+    events = on_device(host, "cuda:0")
+    expected = amiwarp.iwe(host, WIDTH, HEIGHT, device="cuda:0")
+    with wp.ScopedStream(wp.Stream("cuda:0")):
+        image = amiwarp.iwe(events, WIDTH, HEIGHT)
+        with cupy.cuda.Stream(non_blocking=True):
+            np.testing.assert_array_equal(cupy.asarray(image).get(), expected)

@@ -1,0 +1,131 @@
+"""Data sets of recordings: what the manifest says is what is read, also by the processes of a DataLoader."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.io.copying import save_recording
+from amiwarp.io.recorded_dataset import RecordedDataset
+
+COUNTS = (3, 1, 4, 0, 5)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five recordings, of which recording k has COUNTS[k] events at column k."""
+    root = tmp_path_factory.mktemp("data")
+    items = []
+    for k, n in enumerate(COUNTS):
+        split = "test" if k == 4 else "train"
+        (root / split).mkdir(exist_ok=True)
+        events = Events.from_arrays(np.full(n, k), np.zeros(n, int), np.arange(n) * 10, np.ones(n, int))
+        save_recording(root / split / f"{k:06}.h5", Recording(MemoryEvents(events, 8, 6)))
+        items.append({"file": f"{split}/{k:06}.h5", "sha256": "0", "split": split, "labels": {"k": k}, "events": n})
+    write_manifest(root, items=items)
+    return root
+
+
+def write_manifest(root: Path, **changed: Any) -> None:
+    content = {"format": "amiwarp-dataset", "version": 1, "complete": True, "items": [], **changed}
+    (root / "manifest.json").write_text(json.dumps(content))
+
+
+def count_events(recording: Recording, labels: dict[str, Any]) -> tuple[int, int]:
+    return len(recording.events), labels["k"]
+
+
+def test_items_are_the_events_and_labels_of_a_split(folder: Path) -> None:
+    dataset = RecordedDataset(folder, "train")
+    assert len(dataset) == 4
+    assert dataset.labels == [{"k": 0}, {"k": 1}, {"k": 2}, {"k": 3}]
+    for (events, labels), n in zip(dataset, COUNTS[:4], strict=True):
+        assert events.x.tolist() == [labels["k"]] * n
+        assert events.t.tolist() == [10 * i for i in range(n)]
+    assert len(RecordedDataset(folder)) == 5
+    assert dataset[-1][1] == {"k": 3}
+    with pytest.raises(IndexError):
+        dataset[4]
+
+
+def test_a_transform_makes_the_item(folder: Path) -> None:
+    dataset = RecordedDataset(str(folder), "test", transform=count_events)
+    assert list(dataset) == [(5, 4)]
+    assert list(pickle.loads(pickle.dumps(dataset))) == [(5, 4)]
+
+
+def test_labels_belong_to_the_caller(folder: Path) -> None:
+    dataset = RecordedDataset(folder)
+    dataset[0][1]["k"] = dataset.labels[0]["k"] = "changed"
+    assert dataset[0][1] == {"k": 0}
+
+
+def test_a_spawned_process_of_a_loader_reads_it(folder: Path) -> None:
+    data = pytest.importorskip("torch.utils.data")
+    dataset = RecordedDataset(folder, "train", transform=count_events)
+    loader = data.DataLoader(dataset, batch_size=2, num_workers=1, multiprocessing_context="spawn")
+    assert [[column.tolist() for column in batch] for batch in loader] == [[[3, 1], [0, 1]], [[4, 0], [2, 3]]]
+
+
+def test_a_folder_without_a_manifest_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(AmiwarpError, match=r"has no manifest.json; give the folder that 'amiwarp dataset' wrote"):
+        RecordedDataset(tmp_path)
+    with pytest.raises(AmiwarpError, match=r"has no manifest.json"):
+        RecordedDataset(tmp_path / "none")
+
+
+def test_an_unknown_split_is_refused_with_the_known_ones(folder: Path) -> None:
+    with pytest.raises(AmiwarpError, match=r"split 'val'; it has test \(1\), train \(4\)"):
+        RecordedDataset(folder, "val")
+
+
+GOOD = {"file": "a.h5", "split": "train", "labels": {}, "events": 1}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"format": "other"}, "field format is 'other'; expected 'amiwarp-dataset'"),
+        ({"version": 2}, "field version is 2, newer than 1; update amiwarp"),
+        ({"version": "1"}, "field version = '1'"),
+        ({"items": {}}, "field items is {}; expected a list"),
+        ({"items": []}, "it has no recordings"),
+        ({"items": [3]}, r"field items\[0\] is 3; expected a dict"),
+        ({"items": [GOOD, {**GOOD, "file": "/etc/a.h5"}]}, r"items\[1\].file is '/etc/a.h5'; expected a path below"),
+        ({"items": [{**GOOD, "file": "x/../../a.h5"}]}, r"items\[0\].file is 'x/../../a.h5'; expected a path below"),
+        ({"items": [{**GOOD, "file": ""}]}, r"items\[0\].file is ''"),
+        ({"items": [{**GOOD, "file": 1}]}, r"items\[0\].file is 1; expected a str"),
+        ({"items": [{**GOOD, "split": None}]}, r"items\[0\].split is None; expected a str"),
+        ({"items": [{**GOOD, "labels": []}]}, r"items\[0\].labels is \[\]; expected a dict"),
+        ({"items": [{**GOOD, "events": -1}]}, r"items\[0\].events = -1"),
+        ({"items": [{"file": "a.h5"}]}, r"items\[0\].split is None"),
+    ],
+)
+def test_a_bad_manifest_is_refused(tmp_path: Path, changed: dict[str, Any], message: str) -> None:
+    write_manifest(tmp_path, **changed)
+    with pytest.raises(AmiwarpError, match=message):
+        RecordedDataset(tmp_path)
+
+
+def test_damaged_json_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text("{")
+    with pytest.raises(AmiwarpError, match=r"manifest.json: .*is not JSON"):
+        RecordedDataset(tmp_path)
+
+
+def test_a_missing_or_changed_recording_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_bytes((folder / "train" / "000000.h5").read_bytes())
+    write_manifest(tmp_path, items=[{**GOOD, "events": 7}, {**GOOD, "file": "b.h5"}])
+    dataset = RecordedDataset(tmp_path)
+    with pytest.raises(AmiwarpError, match=r"a.h5: holds 3 events, the manifest says 7"):
+        dataset[0]
+    with pytest.raises(AmiwarpError, match=r"b.h5: no such file"):
+        dataset[1]
