@@ -31,12 +31,32 @@ SENSORS = ((128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480
 """Sizes of known sensors [px], for files without a size."""
 
 
-def smallest_sensor(x_max: int, y_max: int) -> tuple[int, int]:
+def smallest_sensor(x_max: int, y_max: int, sensors: tuple[tuple[int, int], ...] = SENSORS) -> tuple[int, int]:
     """Return the size of the smallest known sensor with pixel (x_max, y_max), or the smallest frame that holds it."""
-    for width, height in SENSORS:
+    for width, height in sensors:
         if x_max < width and y_max < height:
             return width, height
     return x_max + 1, y_max + 1
+
+
+RECORDS = ("triggers", "frames", "imu_samples")
+"""Names of the counts of other records than events. They are shown, but are no repairs."""
+
+PROGRESS = ("read", "total")
+"""Names of the counts of what a pass has read so far, and of all there is, in any unit."""
+
+
+def whole_pixels(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Return floating coordinates as integers. NaN and values beyond 32 bits become -1, which lies outside."""
+    return np.where(np.abs(values) < 2**31, values, -1).astype(np.int64)
+
+
+def microseconds(seconds: NDArray[Any]) -> NDArray[np.int64]:
+    """Return times in seconds as whole microseconds. Raises :class:`AmiwarpError` if one is not finite."""
+    times = seconds.astype(np.float64) * 1e6
+    if not (np.abs(times) < 2**62).all():
+        raise AmiwarpError("a time is not finite or beyond int64; the file is damaged")
+    return np.rint(times).astype(np.int64)
 
 
 @dataclass(slots=True)
@@ -78,8 +98,12 @@ class FileEvents:
         packets: Callable[[dict[str, int]], Iterator[Packet]],
         *,
         size: tuple[int, int] | None,
+        sensors: tuple[tuple[int, int], ...] = SENSORS,
     ) -> None:
-        """Make the first pass. ``packets`` starts a pass and gets a dictionary for counts. ``size`` may be unknown."""
+        """Make the first pass. ``packets`` starts a pass and gets a dictionary for counts.
+
+        Without a ``size``, that of the smallest of ``sensors`` with all events is taken.
+        """
         if size is not None:
             check_size(*size, path)
         self.path = path
@@ -94,7 +118,7 @@ class FileEvents:
                 self._kept.append(block)
                 self._kept = self._kept if self._counts.count <= KEEP_EVENTS else None
         self._check_counts()
-        self._size = size or smallest_sensor(self._counts.x_max, self._counts.y_max)
+        self._size = size or smallest_sensor(self._counts.x_max, self._counts.y_max, sensors)
         register_reader(self, self.path)
 
     def _check_counts(self) -> None:
@@ -111,7 +135,18 @@ class FileEvents:
     def repairs(self) -> dict[str, int]:
         """Number of repairs and other findings by name, without zeros."""
         repairs = {"repaired_time_events": self._counts.late, "dropped_outside_events": self._counts.outside}
-        return {name: count for name, count in {**repairs, **self._counts.notes}.items() if count}
+        notes = {name: count for name, count in self._counts.notes.items() if name not in (*RECORDS, *PROGRESS)}
+        return {name: count for name, count in {**repairs, **notes}.items() if count}
+
+    @property
+    def records(self) -> dict[str, int]:
+        """Number of other records by name: triggers, frames and IMU samples, without zeros."""
+        return {name: self._counts.notes[name] for name in RECORDS if self._counts.notes.get(name)}
+
+    @property
+    def metadata(self) -> dict[str, int]:
+        """Counts for the metadata of a recording: other records and repairs."""
+        return {**self.records, **self.repairs}
 
     def __len__(self) -> int:
         return self._counts.count

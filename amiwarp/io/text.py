@@ -38,7 +38,7 @@ def open_text(path: Path) -> Recording:
     events = FileEvents(path, partial(_packets, path), size=size)
     calib = path.with_name("calib.txt")
     camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
-    return Recording(events=events, camera=camera, metadata={"format": "text", **events.repairs}, name=path.stem)
+    return Recording(events=events, camera=camera, metadata={"format": "text", **events.metadata}, name=path.stem)
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
