@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import Recording
-from amiwarp.io.counters import unwrapped
+from amiwarp.io.counters import last_word, unwrapped
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.regular_file import check_regular
@@ -53,8 +53,14 @@ def open_aedat2(path: Path) -> Recording:
     check_regular(path)
     with errors_name(path, lambda: "reading the header"):
         chip, offset = _read_header(path)
-    events = FileEvents(path, partial(_packets, path, chip, offset), size=(chip.width, chip.height))
+    read, last = partial(_packets, path, chip, offset), partial(_last_time, path, offset)
+    events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
     return Recording(events=events, metadata={"format": "aedat2", **events.metadata}, name=path.stem)
+
+
+def _last_time(path: Path, offset: int, estimate: int) -> int | None:
+    """Return the time of the last record [us]."""
+    return last_word(path, offset, ">u4", estimate)
 
 
 def trigger_packets(path: Path) -> Iterator[Packet]:

@@ -7,7 +7,9 @@ of these faults, the file is refused, because then its format, size or order mus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Callable, Generator, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -37,6 +39,28 @@ def smallest_sensor(x_max: int, y_max: int, sensors: tuple[tuple[int, int], ...]
         if x_max < width and y_max < height:
             return width, height
     return x_max + 1, y_max + 1
+
+
+_head: ContextVar[int | None] = ContextVar("head", default=None)
+"""Number of events after which the first pass ends, or None."""
+
+
+@contextlib.contextmanager
+def head_only(count: int) -> Iterator[None]:
+    """Let the sources that are opened in the block read only about their first ``count`` events.
+
+    Their length is then that of this part, and :attr:`FileEvents.share` tells how much of the file it is.
+    """
+    token = _head.set(count)
+    try:
+        yield
+    finally:
+        _head.reset(token)
+
+
+def head_limit() -> int | None:
+    """Return the number of events of :func:`head_only`, or None outside it."""
+    return _head.get()
 
 
 RECORDS = ("triggers", "frames", "imu_samples")
@@ -99,10 +123,12 @@ class FileEvents:
         *,
         size: tuple[int, int] | None,
         sensors: tuple[tuple[int, int], ...] = SENSORS,
+        last_time: Callable[[int], int | None] | None = None,
     ) -> None:
         """Make the first pass. ``packets`` starts a pass and gets a dictionary for counts.
 
-        Without a ``size``, that of the smallest of ``sensors`` with all events is taken.
+        Without a ``size``, that of the smallest of ``sensors`` with all events is taken. ``last_time`` returns the time
+        of the last event [us] from the end of the file, given an estimate; it is used if only the head is read.
         """
         if size is not None:
             check_size(*size, path)
@@ -113,13 +139,32 @@ class FileEvents:
         """Whether the file stores the sensor size. Otherwise the smallest known sensor with all events is taken."""
         self._kept: list[Events] | None = []
         self._counts = PassCounts()
-        for block in self._pass(self._counts):
-            if self._kept is not None:
-                self._kept.append(block)
-                self._kept = self._kept if self._counts.count <= KEEP_EVENTS else None
+        self._last_time = last_time
+        self.share: float = 1.0
+        """Share of the file that was read: below 1 only within :func:`head_only`."""
+        with contextlib.closing(self._pass(self._counts)) as blocks:
+            self._first_pass(blocks, head_limit())
         self._check_counts()
         self._size = size or smallest_sensor(self._counts.x_max, self._counts.y_max, sensors)
         register_reader(self, self.path)
+
+    def _first_pass(self, blocks: Iterator[Events], limit: int | None) -> None:
+        """Read all blocks, or those up to ``limit`` events if the reader notes how much of the file they are."""
+        for block in blocks:
+            if self._kept is not None:
+                self._kept.append(block)
+                self._kept = self._kept if self._counts.count <= KEEP_EVENTS or limit is not None else None
+            read, total = (self._counts.notes.get(name, 0) for name in PROGRESS)
+            if limit is not None and self._counts.count >= limit and 0 < read < total:
+                self.share = read / total
+                return
+
+    def last_time(self) -> int | None:
+        """Return the time of the last event [us] if only the head was read, or None if the file does not tell it."""
+        if self._last_time is None:
+            return None
+        elapsed = (self.t_last - self.t_first) / self.share
+        return self._last_time(self.t_first + int(elapsed))
 
     def _check_counts(self) -> None:
         """Raise :class:`AmiwarpError` for too many faulty events, and for none at all."""
@@ -205,7 +250,7 @@ class FileEvents:
     def _all(self) -> Iterator[Events]:
         return iter(self._kept) if self._kept is not None else self._pass(PassCounts())
 
-    def _pass(self, counts: PassCounts) -> Iterator[Events]:
+    def _pass(self, counts: PassCounts) -> Generator[Events, None, None]:
         with errors_name(self.path, counts.position):
             for packet in self._packets(counts.notes):
                 # Large packets are cut, so that copies stay small even if one packet holds the whole file.

@@ -11,14 +11,14 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.reading_process import packets, run
 
-READ = "amiwarp.io.hdf5_layouts:read_rows"
+READ = "amiwarp.io.hdf5_row_server:read_rows"
 """Function of the reading process."""
 
 
 def open_rows(path: Path, layout: str, group: str) -> Recording:
     """Open the events of a group, which :func:`amiwarp.io.hdf5_layouts.find_layout` has found."""
     source = os.path.abspath(path)
-    about = run("amiwarp.io.hdf5_layouts:read_head", source, group)
+    about = run("amiwarp.io.hdf5_row_server:read_head", source, group)
     events = FileEvents(path, partial(packets, READ, source, f"{group}/events"), size=_size(about["size"]))
     metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata}
     return Recording(events=events, metadata=metadata, name=path.stem)

@@ -21,7 +21,7 @@ from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.camera_attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order
-from amiwarp.io.file_scan import smallest_sensor
+from amiwarp.io.file_scan import head_limit, smallest_sensor
 from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.hdf5_rows import open_rows
 from amiwarp.io.input_files import errors_name, register_reader
@@ -65,7 +65,7 @@ class NativeEvents:
             check_size(width, height, self.path)
             return width, height
         largest = [0, 0]
-        for start in range(0, self._count, DEFAULT_BLOCK):
+        for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
             for axis, name in enumerate(("x", "y")):
                 values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
                 largest[axis] = max(largest[axis], int(values.max()))

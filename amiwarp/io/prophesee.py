@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import Recording
-from amiwarp.io.counters import unwrapped
+from amiwarp.io.counters import last_word, nearest, unwrapped
 from amiwarp.io.evt_words import TIME_HIGH, Evt2Decoder, swap_halves, words_of
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
@@ -61,12 +61,14 @@ def open_evt(path: Path) -> Recording:
     word = {"2.0": 4, "2": 4, "2.1": 8, "21": 8, "3.0": 2, "3": 2}.get(version)
     if word is None:
         raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0, 2.1 or 3.0")
+    swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
     source: Callable[[dict[str, int]], Iterator[Packet]]
     if word == 8:
-        version, source = "2.1", partial(_evt21_packets, path, offset, fields.get("format", ""), False)
+        version, source = "2.1", partial(_evt21_packets, path, offset, swapped, False)
     else:
         source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", os.path.abspath(path), False)
-    events = FileEvents(path, source, size=_evt_size(fields))
+    last = None if word == 2 else partial(_last_evt_time, path, offset, word, swapped)
+    events = FileEvents(path, source, size=_evt_size(fields), last_time=last)
     truncated = (path.stat().st_size - offset) % word
     noted = {"truncated_bytes": truncated} if truncated else {}
     return Recording(events=events, metadata={"format": f"evt{version}", **noted, **events.metadata}, name=path.stem)
@@ -105,26 +107,41 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges of the external triggers of a RAW file."""
     fields, offset = _read_header(path)
     if fields.get("evt", fields.get("format", "")).startswith(("2.1", "EVT21")):
-        return _evt21_packets(path, offset, fields.get("format", ""), True, {})
+        return _evt21_packets(path, offset, _is_swapped(path, offset, fields.get("format", "")), True, {})
     return packets("amiwarp.io.prophesee:read_evt_packets", os.path.abspath(path), True, {})
 
 
-def _evt21_packets(path: Path, offset: int, layout: str, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:
+def _evt21_packets(path: Path, offset: int, swapped: bool, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:
     """Yield the events, or the triggers, of EVT 2.1, which faery does not read."""
     decoder = Evt2Decoder(vectors=True)
     notes["total"] = path.stat().st_size
     with path.open("rb") as file:
         file.seek(offset)
-        legacy = "endianness=legacy" in layout
-        if "endianness=" not in layout:
-            legacy = _halves_are_swapped(words_of(file.read(8 * EVT21_BLOCK), "2.1"))
-            file.seek(offset)
         while data := file.read(8 * EVT21_BLOCK):
             notes["read"] = file.tell()
             words = words_of(data, "2.1")
-            events, edges = decoder.decode(swap_halves(words) if legacy else words)
+            events, edges = decoder.decode(swap_halves(words) if swapped else words)
             notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
             yield edges if triggers else events
+
+
+def _last_evt_time(path: Path, offset: int, word: int, swapped: bool, estimate: int) -> int | None:
+    """Return the time of the last event of a file of EVT 2.0 or 2.1 [us]. Times of EVT 3.0 wrap after 17 s."""
+    count = (path.stat().st_size - offset) // word
+    with path.open("rb") as file:
+        file.seek(offset + max(count - EVT21_BLOCK, 0) * word)
+        words = words_of(file.read(word * EVT21_BLOCK), "2" if word == 4 else "2.1")
+    t = Evt2Decoder(vectors=word == 8).decode(swap_halves(words) if swapped else words)[0][2]
+    return nearest(int(t[-1]), 34, estimate) if t.size else None
+
+
+def _is_swapped(path: Path, offset: int, layout: str) -> bool:
+    """Return whether a file of EVT 2.1 has swapped halves, according to its header's ``layout`` or its first words."""
+    if "endianness=" in layout:
+        return "endianness=legacy" in layout
+    with path.open("rb") as file:
+        file.seek(offset)
+        return _halves_are_swapped(words_of(file.read(8 * EVT21_BLOCK), "2.1"))
 
 
 def _halves_are_swapped(words: NDArray[np.uint64]) -> bool:
@@ -156,7 +173,8 @@ def open_dat(path: Path) -> Recording:
         raise AmiwarpError(f"{path}: DAT version is '{version[:40]}'; expected 1 or 2")
     width, height = fields.get("width", ""), fields.get("height", "")
     size = (int(width), int(height)) if width.isdecimal() and height.isdecimal() else None
-    events = FileEvents(path, partial(_dat_packets, path, offset + 2, version), size=size)
+    read, last = partial(_dat_packets, path, offset + 2, version), partial(last_word, path, offset + 2, "<u4")
+    events = FileEvents(path, read, size=size, last_time=last)
     return Recording(events=events, metadata={"format": f"dat{version}", **events.metadata}, name=path.stem)
 
 

@@ -39,7 +39,8 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     with errors_name(path, lambda: "opening the bag"):
         about = run("amiwarp.io.rosbag:read_head", source, topic)
     read = partial(packets, "amiwarp.io.rosbag:read_packets", source, about["topic"], False)
-    events = FileEvents(path, read, size=tuple(about["size"]) if min(about["size"]) else None)
+    size = tuple(about["size"]) if min(about["size"]) else None
+    events = FileEvents(path, read, size=size)
     metadata = {"format": about["format"], "topic": about["topic"], **about["counts"], **events.metadata}
     return Recording(events=events, metadata=metadata, name=path.stem)
 
