@@ -91,7 +91,7 @@ def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
     n, on, outside, done = len(source), 0, 0, 0
     compensated = False
     with progress("reading") as advance:
-        for block in source.blocks():
+        for block in source.blocks(count=min(DEFAULT_BLOCK, HEAD_EVENTS)):
             on += int(np.count_nonzero(block.p))
             done += len(block)
             if block.x.dtype != np.uint16:
