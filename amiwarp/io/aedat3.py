@@ -40,6 +40,9 @@ EDGES = {2: 1, 3: 0, 4: 1}
 LARGEST_PACKET = 1 << 28
 """Largest packet that is read [bytes]."""
 
+JOINED = 1 << 17
+"""Number of events from which on packets are joined and decoded."""
+
 SIZES = {"DVS128": (128, 128), "DAVIS128": (128, 128), "DAVIS208": (208, 192), "DAVIS240": (240, 180),
          "DAVIS346": (346, 260), "DAVIS640": (640, 480), "DVXPLORER": (640, 480)}  # fmt: skip
 """Sensor sizes [px] by the beginning of the source's name in the header."""
@@ -103,18 +106,29 @@ def _contents(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[
 
 
 def _packets(path: Path, offset: int, notes: dict[str, int]) -> Iterator[Packet]:
-    first = None
+    first, parts, count = None, [], 0
     for kind, source, words, overflow in _contents(path, offset, notes):
-        data = words[:, 0]
         if kind == SPECIAL:
-            edges = np.isin(data >> 1 & 0x7F, list(EDGES))
+            edges = np.isin(words[:, 0] >> 1 & 0x7F, list(EDGES))
             notes["triggers"] = notes.get("triggers", 0) + int(np.count_nonzero(edges))
             continue
         first = source if first is None else first
         if source != first:
             notes["events_of_other_sources"] = notes.get("events_of_other_sources", 0) + len(words)
             continue
-        yield data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, words[:, 1] + overflow, data >> 1 & 1
+        words[:, 1] += overflow
+        parts.append(words)
+        count += len(words)
+        if count >= JOINED:  # packets of the camera are small
+            yield _decoded(parts)
+            parts, count = [], 0
+    if parts:
+        yield _decoded(parts)
+
+
+def _decoded(parts: list[NDArray[Any]]) -> Packet:
+    data, t = np.concatenate(parts).T
+    return data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, t, data >> 1 & 1
 
 
 def trigger_packets(path: Path) -> Iterator[Packet]:
