@@ -119,7 +119,8 @@ def _choose(bag: Any, topic: str | None, version: int) -> Any:
     listed = ", ".join(f"{name} ({one.msgcount} messages)" for name, one in sorted(found.items())[:20])
     if found and topic is None:
         raise AmiwarpError(
-            f"is a ROS {version} bag with events in several topics: {listed}; choose one with --topic (in Python topic=)"
+            f"is a ROS {version} bag with events in several topics: {listed}; "
+            "choose one with --topic (in Python topic=)"
         )
     if found and topic in found:
         return found[topic]
