@@ -77,7 +77,8 @@ def whole_pixels(values: NDArray[Any]) -> NDArray[np.int64]:
 
 def microseconds(seconds: NDArray[Any]) -> NDArray[np.int64]:
     """Return times in seconds as whole microseconds. Raises :class:`AmiwarpError` if one is not finite."""
-    times = seconds.astype(np.float64) * 1e6
+    with np.errstate(over="ignore"):
+        times = seconds.astype(np.float64) * 1e6
     if not (np.abs(times) < 2**62).all():
         raise AmiwarpError("a time is not finite or beyond int64; the file is damaged")
     return np.rint(times).astype(np.int64)

@@ -51,7 +51,7 @@ def looks_like_bin(head: bytes, size: int) -> bool:
     mark = y == MARK_ROW
     late = np.count_nonzero(np.diff(t[~mark]) < 0)
     sensible = t[~mark].size and int(y[~mark].max()) < MARK_ROW and int(t.max()) > int(t.min())
-    return bool(sensible and late <= np.count_nonzero(mark) + t.size // 500)
+    return bool(sensible and late <= np.count_nonzero(mark) + t.size // 100)
 
 
 def _columns(data: NDArray[np.uint8]) -> Packet:
