@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from io_samples import make_events, write_dat, write_evt, write_native, write_text
-from io_samples_extra import arrays, write_aedat2, write_evt21, write_m3ed, write_ros1
+from io_samples_extra import arrays, write_aedat2, write_evimo2, write_evt21, write_m3ed, write_ros1
 from typer.testing import CliRunner
 
 from amiwarp.cli.app import app
@@ -80,6 +80,14 @@ def test_large_files_with_an_index_are_exact(tmp_path: Path) -> None:
     assert (data["t_first_us"], data["t_last_us"]) == (EVENTS.t[0], EVENTS.t[-1])
     assert data["on_share"] == pytest.approx(EVENTS.p[:500].mean())
     assert "of the first 10 % of the file" in run("info", tmp_path / "large.h5")
+
+
+@pytest.mark.usefixtures("large")
+def test_large_folders_are_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.io.npz.DEFAULT_BLOCK", 500)
+    write_evimo2(tmp_path / "scene", EVENTS)
+    data = json.loads(run("info", tmp_path / "scene", "--json"))
+    assert (data["events"], data["estimated"], data["share_read"]) == (len(EVENTS), True, 0.1)
 
 
 @pytest.mark.usefixtures("large")

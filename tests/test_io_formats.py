@@ -12,8 +12,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from faery.extension import evt
-from io_samples import make_events, refusal
+from faery.extension import aedat, evt
+from io_samples import make_events, refusal, to_faery
 from io_samples_extra import (
     ENCODERS,
     LATE,
@@ -229,7 +229,7 @@ def test_evimo2_folders(tmp_path):
 
 def test_m3ed_has_a_camera_and_several_need_a_choice(tmp_path):
     write_m3ed(tmp_path / "a.h5", EVENTS, sides=("left", "right"))
-    with pytest.raises(AmiwarpError, match=r"cameras: prophesee/left, prophesee/right; choose one with --topic"):
+    with pytest.raises(AmiwarpError, match=r"cameras: prophesee/left, prophesee/right; choose one with .*--topic"):
         open_recording(tmp_path / "a.h5")
     recording = open_recording(tmp_path / "a.h5", topic="prophesee/right")
     lens = RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.0)
@@ -380,6 +380,30 @@ def test_triggers_of_raw_files(tmp_path, version):
     )
     assert open_recording(path).metadata["triggers"] == 3
     assert np.diff(read_encoder_triggers(path, 3).t).tolist() == [11]
+
+
+def test_triggers_of_aedat4(tmp_path):
+    attribute, node = aedat.DescriptionAttribute, aedat.DescriptionNode
+    outputs = []
+    for number, (kind, size) in enumerate((("EVTS", SIZE), ("TRIG", ()))):
+        place = f"/mainloop/Recorder/outInfo/{number}/"
+        names = ("originalModuleName", "originalOutputName", "typeDescription")
+        stream = {"compression": attribute("string", "LZ4"), "typeIdentifier": attribute("string", kind)}
+        stream |= {name: attribute("string", "test") for name in names}
+        about = {f"size{axis}": attribute("int", value) for axis, value in zip("XY", size, strict=False)}
+        info = node("info", f"{place}info/", {"source": attribute("string", "test"), **about}, [])
+        outputs.append(node(str(number), place, stream, [info]))
+    edges = np.zeros(5, [("t", "<u8"), ("source", "u1")])
+    # Rising edge, falling edge, pulse, and the beginning and end of an exposure.
+    edges["t"], edges["source"] = 1_000_000 + np.arange(5) * 500, [1, 2, 3, 8, 9]
+    root = node("outInfo", "/mainloop/Recorder/outInfo/", {}, outputs)
+    with aedat.Encoder(tmp_path / "a.aedat4", [root], ("lz4", 1)) as encoder:
+        encoder.write(0, to_faery(EVENTS))
+        encoder.write(1, edges)
+    recording = open_recording(tmp_path / "a.aedat4")
+    assert recording.metadata == {"format": "aedat4", "triggers": 3}
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    assert read_encoder_triggers(tmp_path / "a.aedat4").t.tolist() == [1_000_000, 1_001_000]
 
 
 def tar(data: bytes) -> bytes:

@@ -50,7 +50,7 @@ def run(
     Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
     read, unless --count is given. Figures that are then estimates are marked as such.
     """
-    large = file.is_file() and file.stat().st_size > LARGE_BYTES and not count
+    large = not count and _file_bytes(file) > LARGE_BYTES
     began = time.perf_counter()
     with head_only(HEAD_EVENTS) if large else contextlib.nullcontext():
         recording = open_recording(file, topic=topic)
@@ -58,6 +58,12 @@ def run(
     if data["estimated"]:
         data["count_s"] = (time.perf_counter() - began) / recording.events.share  # type: ignore[attr-defined]
     report(common, data, [table(_rows(data))])
+
+
+def _file_bytes(path: Path) -> int:
+    """Return the size of a file, or of the files in a folder [bytes]."""
+    files = path.iterdir() if path.is_dir() else (path,)
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def describe(recording: Recording, file: str, *, head: bool = False) -> dict[str, Any]:

@@ -123,7 +123,7 @@ def _choose(bag: Any, topic: str | None, version: int) -> Any:
     if found and topic is None:
         raise AmiwarpError(
             f"is a ROS {version} bag with events in several topics: {listed}; "
-            "choose one with --topic (in Python topic=)"
+            "choose one with amiwarp convert --topic, in Python with topic="
         )
     if found and topic in found:
         return found[topic]
