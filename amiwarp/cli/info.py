@@ -62,8 +62,10 @@ def run(
 
 def _file_bytes(path: Path) -> int:
     """Return the size of a file, or of the files in a folder [bytes]."""
-    files = path.iterdir() if path.is_dir() else (path,)
-    return sum(file.stat().st_size for file in files if file.is_file())
+    with contextlib.suppress(OSError):  # opening the file names the fault
+        files = path.iterdir() if path.is_dir() else (path,)
+        return sum(file.stat().st_size for file in files if file.is_file())
+    return 0
 
 
 def describe(recording: Recording, file: str, *, head: bool = False) -> dict[str, Any]:

@@ -32,9 +32,8 @@ def find_layout(file: Any, topic: str | None, member: Member) -> tuple[str, str]
     if topic is not None and topic not in found:
         raise AmiwarpError(f"has no events in '{topic}'; the choices for --topic are {listed}")
     if topic is None and len(found) > 1:
-        raise AmiwarpError(
-            f"holds the events of several cameras: {listed}; choose one with amiwarp convert --topic, in Python with topic="
-        )
+        remedy = "choose one with amiwarp convert --topic, in Python with topic="
+        raise AmiwarpError(f"holds the events of several cameras: {listed}; {remedy}")
     chosen = next(iter(found)) if topic is None else topic
     return found[chosen], chosen
 
