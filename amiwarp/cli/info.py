@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,12 +50,9 @@ def run(
     read, unless --count is given. Figures that are then estimates are marked as such.
     """
     large = not count and _file_bytes(file) > LARGE_BYTES
-    began = time.perf_counter()
     with head_only(HEAD_EVENTS) if large else contextlib.nullcontext():
         recording = open_recording(file, topic=topic)
     data = describe(recording, str(file), head=large)
-    if data["estimated"]:
-        data["count_s"] = (time.perf_counter() - began) / recording.events.share  # type: ignore[attr-defined]
     report(common, data, [table(_rows(data))])
 
 
@@ -125,6 +121,7 @@ def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
         "rate_mev_per_s": n / seconds / 1e6 if seconds > 0 else None,
         "on_share": on / done if done else None,
         "estimated": share < 1.0,
+        "count_s": getattr(source, "seconds", None),
         "share_read": share if share < 1.0 else done / max(n, 1),
         "compensated": compensated,
     }
@@ -218,12 +215,9 @@ def _degrees(parameters: dict[str, float]) -> dict[str, float]:
 def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     n = d["events"]
     kind = f"{d['format']}, compensated ({d['outside']:,} outside)" if d["compensated"] else str(d["format"])
+    takes = "" if d["count_s"] is None else f", in about {d['count_s']:.0f} s"
     part = f"the first {100 * d['share_read']:.2g} % of the file"
-    about, counted = (
-        ("about ", f" (from {part}; --count counts them, in about {d['count_s']:.0f} s)")
-        if d["estimated"]
-        else ("", "")
-    )
+    about, counted = ("about ", f" (from {part}; --count counts them{takes})") if d["estimated"] else ("", "")
     events = f"{about}{float(f'{n:.3g}'):,.0f}{counted}" if d["estimated"] else f"{n:,}"
     rows = [("file", d["file"]), ("format", kind), ("size", f"{d['width']} x {d['height']} px"), ("events", events)]
     if n:

@@ -8,6 +8,7 @@ of these faults, the file is refused, because then its format, size or order mus
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Generator, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -143,6 +144,8 @@ class FileEvents:
         self._last_time = last_time
         self.share: float = 1.0
         """Share of the file that was read: below 1 only within :func:`head_only`."""
+        self.seconds: float | None = None
+        """Estimate of the time to read the whole file [s], or None if unknown or not needed."""
         with contextlib.closing(self._pass(self._counts)) as blocks:
             self._first_pass(blocks, head_limit())
         self._check_counts()
@@ -151,13 +154,18 @@ class FileEvents:
 
     def _first_pass(self, blocks: Iterator[Events], limit: int | None) -> None:
         """Read all blocks, or those up to ``limit`` events if the reader notes how much of the file they are."""
+        began: tuple[float, int] | None = None
         for block in blocks:
             if self._kept is not None:
                 self._kept.append(block)
                 self._kept = self._kept if self._counts.count <= KEEP_EVENTS or limit is not None else None
             read, total = (self._counts.notes.get(name, 0) for name in PROGRESS)
+            # The time before the first block starts processes, and does not grow with the file.
+            began = began or (time.perf_counter(), read)
             if limit is not None and self._counts.count >= limit and 0 < read < total:
                 self.share = read / total
+                if read > began[1]:
+                    self.seconds = (time.perf_counter() - began[0]) * total / (read - began[1])
                 return
 
     def last_time(self) -> int | None:
