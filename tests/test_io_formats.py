@@ -199,6 +199,12 @@ def test_bin_with_and_without_marks(tmp_path):
     recording = open_recording(tmp_path / "a.bin")
     assert (recording.events.size, recording.metadata) == ((34, 34), {"format": "bin"})
     assert_equal(recording.events.slice(0, 999), events)
+    # A file without a header can begin like any other: here like text, a PDF, a bitmap and a gzip archive.
+    for x, y in ((ord("1"), ord(" ")), (ord("%"), ord("P")), (ord("B"), ord("M")), (0x1F, 0x8B)):
+        first = small(EVENTS, 200, 170, t_first=0)
+        first.x[0], first.y[0] = x, y
+        write_bin(tmp_path / "c.bin", first)
+        assert_equal(open_recording(tmp_path / "c.bin").events.slice(0, 999), first)
     wide = small(EVENTS, 200, 170, t_first=0)
     marked = Events(wide.x, wide.y, wide.t % 2**13, wide.p)
     at = int(np.searchsorted(wide.t, 2**13))

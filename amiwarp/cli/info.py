@@ -29,7 +29,7 @@ EXAMPLE = "amiwarp info recording.h5"
 
 
 LARGE_BYTES = 1 << 28
-"""Size from which on files are read only in part, unless asked to count [bytes]."""
+"""Size from which on files are read only in part, unless --count is given [bytes]."""
 
 HEAD_EVENTS = 1 << 22
 """Number of events that are read of a large file."""
@@ -109,7 +109,7 @@ def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
     first, last = (source.t_first, source.t_last) if n else (None, None)
     share = getattr(source, "share", 1.0)
     if share < 1.0 and first is not None and last is not None:
-        # In a part of the file, the end is known only if the file's last bytes tell it.
+        # In a part of the file, the end is known only if the last bytes of the file hold its time.
         n, known = round(n / share), source.last_time()  # type: ignore[attr-defined]
         last = first + round((last - first) / share) if known is None else known
     seconds = 0.0 if first is None or last is None else (last - first) * 1e-6

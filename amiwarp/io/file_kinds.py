@@ -12,12 +12,7 @@ UNPACK = "unpack it first"
 KINDS: tuple[tuple[int, bytes, str, str], ...] = (
     # position, bytes, what the file is, what to do
     (0, b"MATLAB 5.0 MAT-file", "a MATLAB 5 file", MATLAB),
-    (
-        0,
-        b"MATLAB 7.3 MAT-file",
-        "a MATLAB 7.3 file",
-        MATLAB,
-    ),
+    (0, b"MATLAB 7.3 MAT-file", "a MATLAB 7.3 file", MATLAB),
     (0, b"\x89PNG\r\n\x1a\n", "a PNG picture", PICTURE),
     (0, b"\xff\xd8\xff", "a JPEG picture", PICTURE),
     (0, b"GIF8", "a GIF picture", PICTURE),

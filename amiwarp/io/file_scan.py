@@ -169,7 +169,7 @@ class FileEvents:
                 return
 
     def last_time(self) -> int | None:
-        """Return the time of the last event [us] if only the head was read, or None if the file does not tell it."""
+        """Return the time of the last event [us] if only the head was read, or None if its end does not hold it."""
         if self._last_time is None:
             return None
         elapsed = (self.t_last - self.t_first) / self.share

@@ -79,14 +79,15 @@ def detect_format(path: Path) -> Format:
             return found
     if head.startswith(b"#!AER-DAT"):
         raise AmiwarpError(f"{path}: is AEDAT {head[9:12].decode('ascii', 'replace')}; only 2.0, 3.1 and 4 are read")
+    # Before the others: such files have no header, so any of them can begin like text or a picture.
+    if looks_like_bin(head, file_bytes):
+        return Format.BIN
     if head.startswith(b"%") and not head.startswith(b"%PDF"):
         return Format.EVT if _is_evt(head) else Format.DAT
     if _looks_like_text(head):
         return Format.TEXT
     if kind := name_kind(head):
         raise AmiwarpError(f"{path}: {kind}")
-    if looks_like_bin(head, file_bytes):
-        return Format.BIN
     known = ", ".join(member.value for member in Format)
     raise AmiwarpError(f"{path}: content is of no known format; expected one of {known}")
 

@@ -43,15 +43,15 @@ def open_bin(path: Path) -> Recording:
 def looks_like_bin(head: bytes, size: int) -> bool:
     """Return whether a file of ``size`` bytes that begins with ``head`` holds such events.
 
-    Without a header, this is a judgement: whole events, rows of the cameras, and times that rise, except at marks.
+    Without a header, the content decides: whole events, rows of the cameras, and times that rise, except at marks.
     """
     if size % EVENT_BYTES or len(head) < 8 * EVENT_BYTES:
         return False
     _, y, t, _ = _columns(np.frombuffer(head, np.uint8, len(head) // EVENT_BYTES * EVENT_BYTES))
     mark = y == MARK_ROW
-    late = np.count_nonzero(np.diff(t[~mark]) < 0)
-    sensible = t[~mark].size and int(y[~mark].max()) < MARK_ROW and int(t.max()) > int(t.min())
-    return bool(sensible and late <= np.count_nonzero(mark) + t.size // 100)
+    step = np.diff(t[~mark])
+    late, rising = np.count_nonzero(step < 0), np.count_nonzero(step > 0)
+    return bool((y <= MARK_ROW).all() and late <= np.count_nonzero(mark) + t.size // 100 and 2 * rising > t.size)
 
 
 def _columns(data: NDArray[np.uint8]) -> Packet:
@@ -65,9 +65,7 @@ def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
     with path.open("rb") as file:
         while data := file.read(EVENT_BYTES * DEFAULT_BLOCK):
             notes["read"] = file.tell()
-            if len(data) % EVENT_BYTES:
-                notes["truncated_bytes"] = len(data) % EVENT_BYTES
-            x, y, t, p = _columns(np.frombuffer(data, np.uint8, len(data) // EVENT_BYTES * EVENT_BYTES))
+            x, y, t, p = _columns(np.frombuffer(data, np.uint8))
             is_mark = y == MARK_ROW
             t = t + (marks + np.cumsum(is_mark)) * MARK_US
             marks += int(np.count_nonzero(is_mark))

@@ -128,7 +128,7 @@ def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[
 
 
 def noting_progress(decoder: Iterator[Any], path: str, notes: dict[str, int]) -> Iterator[Any]:
-    """Yield the packets of a compiled decoder, and note how much of its file it has read, if the system tells it."""
+    """Yield the packets of a compiled decoder, and note how much of its file it has read, on Linux."""
     number = _open_file(path)
     for packet in decoder:
         if number is not None:
