@@ -329,6 +329,8 @@ def test_topics_of_a_bag(tmp_path):
     write_ros1(tmp_path / "b.bag", {"/chatter": [text]})
     with pytest.raises(AmiwarpError, match=r"without event topics; its topics are /chatter \(std_msgs/String\)"):
         open_recording(tmp_path / "b.bag")
+    path = write_ros2(tmp_path / "d", {"/chatter": [typestore(False).types["std_msgs/msg/String"]("hello")]})
+    assert "is a ROS 2 bag without event topics; its topics are /chatter" in str(refusal(open_recording, path))
     np.savez(tmp_path / "c.npz", x=[1], y=[1], t=[1], p=[1])
     with pytest.raises(AmiwarpError, match=r"c\.npz: holds one stream of events, no topics"):
         open_recording(tmp_path / "c.npz", topic="/left")
@@ -458,3 +460,15 @@ def test_other_files_are_named(tmp_path, message):
     with pytest.raises(AmiwarpError, match=rf"file\.raw: {message}"):
         open_recording(tmp_path / "file.raw")
     assert os.listdir(tmp_path) == ["file.raw"]
+
+
+def test_real_files_of_other_kinds_are_named(data_dir):
+    real = {
+        "text/shapes_rotation/shapes_rotation_first_1.43s.mat": "is a MATLAB 5 file",
+        "images/brick.png": "is a PNG picture",
+        "images/china.jpg": "is a JPEG picture",
+        "video/bikes_640x272_25fps.mp4": "is an MP4 video",
+        "video/nfs240fps_basketball_20x200x200.npy": "is a NumPy array",
+    }
+    for name, message in real.items():
+        assert f"{name}: {message}" in str(refusal(open_recording, data_dir / name))
