@@ -134,7 +134,8 @@ def guided(target: str, seconds: float, keep: Path) -> None:
         atheris.Fuzz()
 
 
-GUIDED = ("stream", "serial", "encoder_csv", "calibration_json", "camera_json", "calib_txt", "text")
+GUIDED = ("stream", "serial", "encoder_csv", "calibration_json", "camera_json", "calib_txt", "text", "aedat2", "aedat3",
+          "evt21", "n_mnist")  # fmt: skip
 
 
 def _targets() -> Iterator[tuple[str, Callable[[bytes], Any]]]:

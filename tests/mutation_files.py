@@ -26,6 +26,7 @@ import hdf5plugin
 import numpy as np
 from calibration_sample import exact_calibration
 from io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
+from io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2
 from PIL import Image
 
 from amiwarp.calib import Calibration
@@ -99,6 +100,12 @@ def write_plain_truth(path: Path) -> None:
         file.attrs["width"], file.attrs["height"] = 8, 6
         for name, values in found.items():
             file[name] = values
+
+
+def write_mono(path: Path) -> None:
+    """Write a ROS 2 bag of packets with 64 bits for each event."""
+    made = write_ros2(path.with_name("bag"), {"/events": packets("mono", EVENTS)})
+    path.write_bytes(made.read_bytes())
 
 
 def write_csv(path: Path) -> None:
@@ -194,6 +201,12 @@ KINDS: dict[str, Kind] = {
         for name, (_, ending, write) in WRITERS.items()
         if name not in ("native", "dsec")
     },
+    **{
+        name: (f".{ending}", partial(lambda write, path: write(path, EVENTS), write), read_recording)
+        for name, (_, ending, _, write) in MORE_WRITERS.items()
+    },
+    "ros2_mono": (".db3", write_mono, read_recording),
+    "n_mnist": (".bin", lambda path: write_bin(path, small(EVENTS, 34, 34, t_first=0)), read_recording),
     "native": (".h5", lambda path: write_native(path, EVENTS), read_recording),
     **{
         f"hdf5_{name}": (".h5", partial(write_hdf5, given, "earliest"), read_recording)

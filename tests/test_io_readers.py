@@ -19,15 +19,18 @@ from amiwarp.optics.prism import Prism
 EVENTS = make_events()
 
 REAL = {
-    # file: (events, span [ms] to the published digits, size)
-    "evt/evt3_driving_1280x720.raw": (219_596, 8.8, (1280, 720)),
-    "evt/evt2_balls_640x480.raw": (521_252, 95.9, (640, 480)),
-    "aedat/aedat4_dvxplorerlite_320x240.aedat4": (111_954, 590, (320, 240)),
-    "aedat/aedat4_davis346_cars.aedat4": (6_676, 170, (346, 260)),
-    "text/shapes_rotation/events.txt": (20_000, 98.6, (240, 180)),
-    "text/dynamic_rotation/events.txt": (30_000, 21, (240, 180)),
-    "text/slider_depth/events_chunk.txt": (50_000, 170, (240, 180)),
-    "small/ncars.dat": (2_009, 100, (128, 128)),
+    # file: (events, span [ms] to the published digits, size, other records)
+    "evt/evt3_driving_1280x720.raw": (219_596, 8.8, (1280, 720), {}),
+    "evt/evt2_balls_640x480.raw": (521_252, 95.9, (640, 480), {}),
+    "aedat/aedat4_dvxplorerlite_320x240.aedat4": (111_954, 590, (320, 240), {"imu_samples": 475}),
+    "aedat/aedat4_davis346_cars.aedat4": (6_676, 170, (346, 260), {"frames": 4, "imu_samples": 160}),
+    "text/shapes_rotation/events.txt": (20_000, 98.6, (240, 180), {}),
+    "text/dynamic_rotation/events.txt": (30_000, 21, (240, 180), {}),
+    "text/slider_depth/events_chunk.txt": (50_000, 170, (240, 180), {}),
+    "small/ncars.dat": (2_009, 100, (128, 128), {}),
+    "aedat/aedat2_davis240_IMU_translBoxes.aedat": (162_771, 2072.7, (240, 180), {"imu_samples": 4834}),
+    "rosbag/ros2_evt3_640x480_trig10Hz.db3": (378_266, 1799.1, (640, 480), {"triggers": 36}),
+    "small/nmnist.bin": (4_325, 310.5, (34, 34), {}),
 }
 
 
@@ -49,12 +52,13 @@ def assert_same_source(given: EventSource, expected: EventSource) -> None:
 
 @pytest.mark.parametrize("file", REAL)
 def test_real_files_to_the_exact_count(data_dir, tmp_path, file):
-    count, span_ms, size = REAL[file]
+    count, span_ms, size, records = REAL[file]
     recording = open_recording(data_dir / file)
     source = recording.events
     assert (len(source), source.size) == (count, size)
     assert (source.t_last - source.t_first) / 1000 == pytest.approx(span_ms, abs=0.6 if span_ms > 99 else 0.06)
-    assert set(recording.metadata) == {"format"}
+    expected = {"format": recording.metadata["format"], **records}
+    assert {name: value for name, value in recording.metadata.items() if name != "topic"} == expected
     summary = convert(data_dir / file, tmp_path / "out.h5")
     assert (summary.events, summary.t_first, summary.t_last, summary.repairs) == (
         count,
@@ -117,7 +121,9 @@ def test_truncated_files(tmp_path, name):
 def test_garbage_is_refused(tmp_path, ending, content):
     path = tmp_path / f"garbage.{ending}"
     path.write_bytes(content)
-    with pytest.raises(AmiwarpError, match=f"garbage.{ending}: (is empty|content is of no known format)"):
+    with pytest.raises(
+        AmiwarpError, match=f"garbage.{ending}: (is empty|is a JPEG picture|content is of no known format)"
+    ):
         open_recording(path)
     for chosen in Format:
         with pytest.raises(AmiwarpError, match=f"garbage.{ending}"):
@@ -131,8 +137,8 @@ def test_paths_and_formats_that_are_none(tmp_path):
         open_recording(tmp_path)
     with pytest.raises(AmiwarpError, match="format is 'wav'; choose among hdf5, evt"):
         open_recording(tmp_path / "none.raw", format="wav")
-    (tmp_path / "old.aedat").write_bytes(b"#!AER-DAT2.0\r\n")
-    with pytest.raises(AmiwarpError, match=r"is AEDAT 2\.0; only AEDAT 4"):
+    (tmp_path / "old.aedat").write_bytes(b"#!AER-DAT1.0\r\n")
+    with pytest.raises(AmiwarpError, match=r"is AEDAT 1\.0; only 2\.0, 3\.1 and 4 are read"):
         open_recording(tmp_path / "old.aedat")
 
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from amiwarp.cli.console import progress, report
-from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
+from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, Topic
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.io import convert, open_recording, read_encoder_csv
+from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -35,6 +35,15 @@ class EncoderOptions:
             rich_help_panel=_PANEL,
         ),
     ] = None
+    encoder_from: Annotated[
+        str | None,
+        typer.Option(
+            help="Take the encoder from the trigger edges in the recording: triggers:CHANNEL. Each rising edge is one "
+            "count; by default it is the index pulse, one per turn.",
+            metavar="triggers:CHANNEL",
+            rich_help_panel=_PANEL,
+        ),
+    ] = None
     counts_per_turn: Annotated[
         int | None, typer.Option(min=1, help="Encoder counts per turn.", rich_help_panel=_PANEL)
     ] = None
@@ -52,12 +61,14 @@ class EncoderOptions:
         Literal["1", "-1"], typer.Option(help="Counting direction; -1: backwards.", rich_help_panel=_PANEL)
     ] = "1"
 
-    def build(self) -> Encoder | None:
-        """Return the encoder of the log, or None if no log is given."""
+    def build(self, source: Path, topic: str | None) -> Encoder | None:
+        """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
+        if self.encoder_from is not None:
+            return self._from_triggers(self.encoder_from, source, topic)
         if self.encoder is None:
             if self != EncoderOptions():
                 what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
-                raise AmiwarpError(f"{what}; give --encoder too")
+                raise AmiwarpError(f"{what}; give --encoder or --encoder-from too")
             return None
         return read_encoder_csv(
             self.encoder,
@@ -65,6 +76,17 @@ class EncoderOptions:
             counter_bits=self.counter_bits,
             direction=int(self.direction),
         )
+
+    def _from_triggers(self, text: str, source: Path, topic: str | None) -> Encoder:
+        kind, colon, channel = text.partition(":")
+        if kind != "triggers" or (colon and not channel.isdecimal()):
+            raise AmiwarpError(f"--encoder-from {text!r} is unknown; write triggers:CHANNEL, for example triggers:0")
+        if self.encoder is not None or self.counter_bits is not None:
+            raise AmiwarpError("--encoder and --counter-bits describe an encoder log; leave them or --encoder-from out")
+        return read_encoder_triggers(
+            source, int(channel or 0), counts_per_turn=self.counts_per_turn or 1, direction=int(self.direction),
+            topic=topic,
+        )  # fmt: skip
 
 
 def run(
@@ -74,6 +96,7 @@ def run(
     encoder: EncoderOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
+    topic: Topic = None,
     common: Common,
 ) -> None:
     """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
@@ -81,16 +104,16 @@ def run(
     Memory use does not depend on the length of the recording.
     """
     began = time.perf_counter()
-    log = encoder.build()
+    log = encoder.build(source, topic)
     lens = wedge = None
     if camera != CameraOptions() or prism != NominalPrismOptions():  # opening may read the whole file
-        recording = open_recording(source)
+        recording = open_recording(source, topic=topic)
         # If the file does not hold the sensor's size, the camera's size is used.
         lens = camera.build(*recording.events.size, fixed=getattr(recording.events, "size_is_known", True))
         wedge = prism.build(recording.prism)
     with progress("converting") as advance:
         summary = convert(
-            source, out, encoder=log, camera=lens, prism=wedge,
+            source, out, encoder=log, camera=lens, prism=wedge, topic=topic,
             progress=advance,
         )  # fmt: skip
     seconds = time.perf_counter() - began

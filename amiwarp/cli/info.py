@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,11 +11,13 @@ import numpy as np
 import typer
 
 from amiwarp.cli.console import progress, report, table
+from amiwarp.cli.inputs import Topic
 from amiwarp.cli.options import Common
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.truth import Cause
 from amiwarp.io import open_recording
 from amiwarp.io.conversion import GAP_INTERVALS
+from amiwarp.io.file_scan import head_only
 from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
@@ -27,18 +30,44 @@ MOST_NAMES = 16
 """Number of instances, bodies and joints that are named; ``--json`` names all."""
 
 
-def run(file: Annotated[Path, typer.Argument(help="Recording in any supported format.")], *, common: Common) -> None:
+LARGE_BYTES = 1 << 28
+"""Size from which on files are read only in part, unless --count is given [bytes]."""
+
+HEAD_EVENTS = 1 << 22
+"""Number of events that are read of a large file."""
+
+
+def run(
+    file: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    *,
+    count: Annotated[
+        bool, typer.Option("--count", help="Read all of a large file, to count its events instead of estimating them.")
+    ] = False,
+    topic: Topic = None,
+    common: Common,
+) -> None:
     """Show a recording's format, events, encoder, camera, prism, ground truth and repairs.
 
-    The file is read once, in blocks.
+    Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
+    read, unless --count is given. Figures that are then estimates are marked as such.
     """
-    recording = open_recording(file)
-    data = describe(recording, str(file))
+    large = not count and _file_bytes(file) > LARGE_BYTES
+    with head_only(HEAD_EVENTS) if large else contextlib.nullcontext():
+        recording = open_recording(file, topic=topic)
+    data = describe(recording, str(file), head=large)
     report(common, data, [table(_rows(data))])
 
 
-def describe(recording: Recording, file: str) -> dict[str, Any]:
-    """Return the description of a recording, with angles in degrees."""
+def _file_bytes(path: Path) -> int:
+    """Return the size of a file, or of the files in a folder [bytes]."""
+    with contextlib.suppress(OSError):  # opening the file names the fault
+        files = path.iterdir() if path.is_dir() else (path,)
+        return sum(file.stat().st_size for file in files if file.is_file())
+    return 0
+
+
+def describe(recording: Recording, file: str, *, head: bool = False) -> dict[str, Any]:
+    """Return the description of a recording, with angles in degrees. With ``head``, only its first events are read."""
     source = recording.events
     width, height = source.size
     data: dict[str, Any] = {
@@ -46,13 +75,14 @@ def describe(recording: Recording, file: str) -> dict[str, Any]:
         "format": recording.metadata.get("format", "amiwarp"),
         "width": width,
         "height": height,
-        **_events(source),
+        **_events(source, head=head),
         "encoder": None if recording.encoder is None else _encoder(recording.encoder, source),
         "camera": None if recording.camera is None else _camera(recording),
         "prism": None,
         "truth": None if recording.truth is None else _degrees(recording.truth.parameters),
         "truth_points": recording.truth is not None and recording.truth.points(0, 1) is not None,
-        "world": None if recording.truth is None else _world(recording.truth, len(source)),
+        "world": None if recording.truth is None else _world(recording.truth, None if head else len(source)),
+        "records": getattr(source, "records", {}),
         "repairs": getattr(source, "repairs", {}),
         "metadata": recording.metadata,
     }
@@ -63,12 +93,11 @@ def describe(recording: Recording, file: str) -> dict[str, Any]:
     return data
 
 
-def _events(source: EventSource) -> dict[str, Any]:
-    n, on, outside = len(source), 0, 0
+def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
+    n, on, outside, done = len(source), 0, 0, 0
     compensated = False
     with progress("reading") as advance:
-        done = 0
-        for block in source.blocks():
+        for block in source.blocks(count=min(DEFAULT_BLOCK, HEAD_EVENTS)):
             on += int(np.count_nonzero(block.p))
             done += len(block)
             if block.x.dtype != np.uint16:
@@ -77,7 +106,14 @@ def _events(source: EventSource) -> dict[str, Any]:
                 inside &= (np.rint(block.y) >= 0) & (np.rint(block.y) < source.size[1])
                 outside += int(np.count_nonzero(~inside))
             advance("reading", done / max(n, 1))
+            if head and done >= HEAD_EVENTS:
+                break
     first, last = (source.t_first, source.t_last) if n else (None, None)
+    share = getattr(source, "share", 1.0)
+    if share < 1.0 and first is not None and last is not None:
+        # In a part of the file, the end is known only if the last bytes of the file hold its time.
+        n, known = round(n / share), source.last_time()  # type: ignore[attr-defined]
+        last = first + round((last - first) / share) if known is None else known
     seconds = 0.0 if first is None or last is None else (last - first) * 1e-6
     out = {
         "events": n,
@@ -85,7 +121,10 @@ def _events(source: EventSource) -> dict[str, Any]:
         "t_last_us": last,
         "duration_s": seconds,
         "rate_mev_per_s": n / seconds / 1e6 if seconds > 0 else None,
-        "on_share": on / n if n else None,
+        "on_share": on / done if done else None,
+        "estimated": share < 1.0,
+        "count_s": getattr(source, "seconds", None),
+        "share_read": share if share < 1.0 else done / max(n, 1),
         "compensated": compensated,
     }
     return {**out, "outside": outside} if compensated else out
@@ -117,8 +156,8 @@ def _camera(recording: Recording) -> dict[str, Any]:
     return {**camera_to_json(camera), "fov_deg": math.degrees(camera.fov)}
 
 
-def _world(truth: Truth, count: int) -> dict[str, Any] | None:
-    """Return a description of the ground truth that is stored in addition to the parameters, or None."""
+def _world(truth: Truth, count: int | None) -> dict[str, Any] | None:
+    """Return the ground truth that is stored in addition to the parameters, or None."""
     stores = {"cause": truth.stored_causes, "instance": truth.stored_instances, "depth": truth.stored_depths,
               "place": truth.stored_places}  # fmt: skip
     stored = [name for name, store in stores.items() if store is not None]
@@ -139,9 +178,9 @@ def _world(truth: Truth, count: int) -> dict[str, Any] | None:
     }
 
 
-def _causes(truth: Truth, count: int) -> dict[str, int] | None:
-    """Return the number of events by cause; None if the causes are not stored."""
-    if truth.stored_causes is None:
+def _causes(truth: Truth, count: int | None) -> dict[str, int] | None:
+    """Return the number of the first ``count`` events by cause, or None if it is not stored or not counted."""
+    if truth.stored_causes is None or count is None:
         return None
     totals = np.zeros(256, np.int64)
     for start in range(0, count, DEFAULT_BLOCK):
@@ -186,11 +225,18 @@ def _degrees(parameters: dict[str, float]) -> dict[str, float]:
 def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     n = d["events"]
     kind = f"{d['format']}, compensated ({d['outside']:,} outside)" if d["compensated"] else str(d["format"])
-    rows = [("file", d["file"]), ("format", kind), ("size", f"{d['width']} x {d['height']} px"), ("events", f"{n:,}")]
+    takes = "" if d["count_s"] is None else f", in about {d['count_s']:.0f} s"
+    part = f"the first {100 * d['share_read']:.2g} % of the file"
+    about, counted = ("about ", f" (from {part}; --count counts them{takes})") if d["estimated"] else ("", "")
+    events = f"{about}{float(f'{n:.3g}'):,.0f}{counted}" if d["estimated"] else f"{n:,}"
+    rows = [("file", d["file"]), ("format", kind), ("size", f"{d['width']} x {d['height']} px"), ("events", events)]
     if n:
-        rate = "" if d["rate_mev_per_s"] is None else f", {d['rate_mev_per_s']:.3g} Mev/s"
-        rows.append(("time", f"{d['t_first_us']} .. {d['t_last_us']} us: {d['duration_s']:.6g} s{rate}"))
-        rows.append(("polarity", f"{100 * d['on_share']:.1f} % ON"))
+        rate = "" if d["rate_mev_per_s"] is None else f", {about}{d['rate_mev_per_s']:.3g} Mev/s"
+        rows.append(("time", f"{d['t_first_us']} .. {about}{d['t_last_us']} us: {d['duration_s']:.6g} s{rate}"))
+        of = f" of {part}" if d["share_read"] < 1.0 else ""
+        rows.append(("polarity", f"{100 * d['on_share']:.1f} % ON{of}"))
+    if d["records"]:
+        rows.append(("other", ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in d["records"].items())))
     rows.append(("encoder", _encoder_text(d["encoder"])))
     c, p = d["camera"], d["prism"]
     lens = "" if c is None else (c.get("distortion") or {}).get("kind", "no distortion").replace("_", "-")
@@ -204,7 +250,7 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     if d["world"] is not None:
         rows += _world_rows(d["world"])
     rows.append(("repairs", ", ".join(f"{name} {count:,}" for name, count in d["repairs"].items()) or "none"))
-    rest = {k: v for k, v in d["metadata"].items() if k != "format" and k not in d["repairs"]}
+    rest = {k: v for k, v in d["metadata"].items() if k != "format" and k not in d["repairs"] and k not in d["records"]}
     return rows + [(name, str(value)) for name, value in rest.items()]
 
 

@@ -19,6 +19,11 @@ from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
 
+Topic = Annotated[
+    str | None, typer.Option(help="Topic of a ROS bag, or camera of an HDF5 file, if the file holds several.")
+]
+"""Option that chooses among several streams of events."""
+
 _CAMERA = "Camera"
 _PRISM = "Prism"
 

@@ -22,8 +22,6 @@ TWO_PI = 2.0 * math.pi
 """One turn [rad]."""
 MOST_SAMPLES = 1 << 28
 """Largest number of samples that :meth:`Encoder.constant_speed` makes: three days at one sample per millisecond."""
-LARGEST_RPM = 1e9
-"""Largest speed of a prism [turns/min] that :meth:`Encoder.constant_speed` accepts."""
 LARGEST_ANGLE = 1e10
 """Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
@@ -199,7 +197,7 @@ class Encoder:
         >>> amiwarp.Encoder.constant_speed(600.0, 0, 100_000).angle_at([50_000]).round(4)
         array([3.1416])
         """
-        rpm = real(rpm, "constant speed", -LARGEST_RPM, LARGEST_RPM, " turns/min")
+        rpm = real(rpm, "constant speed", -1e9, 1e9, " turns/min")
         for t, what in ((t_first, "t_first"), (t_last, "t_last")):
             whole(t, f"constant speed: {what}", -TIME_LIMIT + 1, TIME_LIMIT - 1, " us")
         whole(interval_us, "constant speed: interval_us", 1, TIME_LIMIT, " us")

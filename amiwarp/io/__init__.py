@@ -8,6 +8,7 @@ from amiwarp.io.copying import save_recording
 from amiwarp.io.encoder_csv import read_encoder_csv
 from amiwarp.io.formats import Format, detect_format, open_recording
 from amiwarp.io.native_writer import RecordingWriter
+from amiwarp.io.trigger_encoder import read_encoder_triggers
 
 __all__ = [
     "ConversionSummary",
@@ -17,5 +18,6 @@ __all__ = [
     "detect_format",
     "open_recording",
     "read_encoder_csv",
+    "read_encoder_triggers",
     "save_recording",
 ]

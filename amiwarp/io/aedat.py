@@ -1,4 +1,4 @@
-"""Reader of iniVation's AEDAT 4.0 files, with faery: the first stream of events. Frames, IMU and triggers are ignored.
+"""Reader of iniVation's AEDAT 4.0 files, with faery: the first stream of events. Frames and IMU samples are counted.
 
 The decoder does not check the file's structure: text that is not UTF-8 ends the process. Therefore the header and the
 packet sizes are checked first.
@@ -14,13 +14,22 @@ from pathlib import Path
 from typing import BinaryIO
 from xml.etree import ElementTree
 
+import numpy as np
+
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply
+from amiwarp.io.reading_server import Reply, noting_progress
 from amiwarp.io.regular_file import check_regular
+
+COUNTED = {"frame": "frames", "imus": "imu_samples"}
+"""Types of other streams, and the names of their counts."""
+
+RISING, FALLING, PULSE = 1, 2, 3
+EDGES = (RISING, FALLING, PULSE)
+"""Types of triggers at the external input. Others mark the exposure and the reading of frames."""
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 """First bytes of an AEDAT 4.0 file."""
@@ -33,9 +42,9 @@ def open_aedat4(path: Path) -> Recording:
         with path.open("rb") as file:
             _check_frame(path, file)
         width, height, number = run("amiwarp.io.aedat:read_head", os.path.abspath(path))
-    source = partial(packets, "amiwarp.io.aedat:read_packets", os.path.abspath(path), number)
+    source = partial(packets, "amiwarp.io.aedat:read_packets", os.path.abspath(path), number, False)
     events = FileEvents(path, source, size=(width, height))
-    return Recording(events=events, metadata={"format": "aedat4", **events.repairs}, name=path.stem)
+    return Recording(events=events, metadata={"format": "aedat4", **events.metadata}, name=path.stem)
 
 
 def _check_frame(path: Path, file: BinaryIO) -> None:
@@ -95,11 +104,26 @@ def read_head(path: str) -> Reply:
     raise AmiwarpError("has no stream of events; give a file with events")
 
 
-def read_packets(notes: dict[str, int], path: str, number: int) -> Iterator[Packet]:
-    """Yield the packets of a stream of events. Called in the reading process."""
+def trigger_packets(path: Path) -> Iterator[Packet]:
+    """Yield the edges at the external input, of channel 0."""
+    with path.open("rb") as file:
+        _check_frame(path, file)
+    return packets("amiwarp.io.aedat:read_packets", os.path.abspath(path), -1, True, {})
+
+
+def read_packets(notes: dict[str, int], path: str, number: int, triggers: bool) -> Iterator[Packet]:
+    """Yield the packets of a stream of events, or the edges at the external input. Runs in the reading process."""
     from faery.extension import aedat
 
     with aedat.Decoder(path) as decoder:
-        for track, packet in decoder:
-            if track.id == number and track.data_type == "events":
+        for track, packet in noting_progress(decoder, path, notes):
+            if name := COUNTED.get(track.data_type):
+                notes[name] = notes.get(name, 0) + (1 if name == "frames" else len(packet))
+            elif track.data_type == "triggers":
+                edges = packet[np.isin(packet["source"], EDGES)]
+                notes["triggers"] = notes.get("triggers", 0) + len(edges)
+                if triggers:
+                    channel = np.zeros(len(edges), np.uint8)
+                    yield channel, channel, edges["t"], edges["source"] != FALLING
+            elif track.id == number and track.data_type == "events" and not triggers:
                 yield packet["x"], packet["y"], packet["t"], packet["p"]

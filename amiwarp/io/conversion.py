@@ -64,6 +64,7 @@ def convert(
     encoder: Encoder | None = None,
     camera: Camera | None = None,
     prism: NominalPrism | None = None,
+    topic: str | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> ConversionSummary:
@@ -81,6 +82,8 @@ def convert(
         Replaces the camera of the file. Gives the sensor size if the file does not store it.
     prism : Prism or UnsizedPrism, optional
         Replaces the nominal prism of the file.
+    topic : str, optional
+        The topic or camera to read, if the input holds several, see :func:`open_recording`.
     progress : callable, optional
         Called with the name of the step and the finished fraction of the task, 0 to 1.
     overwrite : bool, default False
@@ -104,7 +107,7 @@ def convert(
     >>> amiwarp.convert("in.h5", "out.h5", prism=amiwarp.Prism(apex=0.03)).events
     2
     """
-    recording = open_recording(source_path)
+    recording = open_recording(source_path, topic=topic)
     source = recording.events
     encoder = encoder or recording.encoder
     camera = camera or recording.camera

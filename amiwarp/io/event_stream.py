@@ -12,7 +12,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply
+from amiwarp.io.reading_server import Reply, noting_progress
 from amiwarp.io.regular_file import check_regular
 
 
@@ -23,7 +23,7 @@ def open_es(path: Path) -> Recording:
         width, height = run("amiwarp.io.event_stream:read_head", os.path.abspath(path))
     source = partial(packets, "amiwarp.io.event_stream:read_packets", os.path.abspath(path), height)
     events = FileEvents(path, source, size=(width, height))
-    return Recording(events=events, metadata={"format": "es", **events.repairs}, name=path.stem)
+    return Recording(events=events, metadata={"format": "es", **events.metadata}, name=path.stem)
 
 
 def read_head(path: str) -> Reply:
@@ -43,6 +43,6 @@ def read_packets(notes: dict[str, int], path: str, height: int) -> Iterator[Pack
 
     with es.Decoder(path, 0) as decoder:
         atis = decoder.event_type == "atis"
-        for packet in decoder:
+        for packet in noting_progress(decoder, path, notes):
             events = packet[~packet["exposure"].astype(bool)] if atis else packet
             yield events["x"], height - 1 - events["y"], events["t"], events["polarity" if atis else "p"]

@@ -7,7 +7,10 @@ of these faults, the file is refused, because then its format, size or order mus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import contextlib
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -32,12 +35,55 @@ SENSORS = ((128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480
 """Sizes of known sensors (width, height) [px], for files that do not state a size."""
 
 
-def smallest_sensor(x_max: int, y_max: int) -> tuple[int, int]:
+def smallest_sensor(x_max: int, y_max: int, sensors: tuple[tuple[int, int], ...] = SENSORS) -> tuple[int, int]:
     """Return the size of the smallest known sensor with pixel (x_max, y_max), or the smallest frame that holds it."""
-    for width, height in SENSORS:
+    for width, height in sensors:
         if x_max < width and y_max < height:
             return width, height
     return x_max + 1, y_max + 1
+
+
+_head: ContextVar[int | None] = ContextVar("head", default=None)
+"""Number of events after which the first pass ends, or None."""
+
+
+@contextlib.contextmanager
+def head_only(count: int) -> Iterator[None]:
+    """Let the sources that are opened in the block read only about their first ``count`` events.
+
+    Their length is then that of this part, and :attr:`FileEvents.share` tells how much of the file it is.
+    """
+    token = _head.set(count)
+    try:
+        yield
+    finally:
+        _head.reset(token)
+
+
+def head_limit() -> int | None:
+    """Return the number of events of :func:`head_only`, or None outside it."""
+    return _head.get()
+
+
+RECORDS = ("triggers", "frames", "imu_samples")
+"""Names of the counts of other records than events. They are shown, but are no repairs."""
+
+PROGRESS = ("read", "total")
+"""Names of the counts of what a pass has read so far, and of all there is, in any unit."""
+
+
+def whole_pixels(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Return floating coordinates as integers. NaN and values beyond 32 bits become -1, which lies outside."""
+    return np.where(np.abs(values) < 2**31, values, -1).astype(np.int64)
+
+
+def microseconds(seconds: NDArray[Any]) -> NDArray[np.int64]:
+    """Return times in seconds as whole microseconds. Raises :class:`AmiwarpError` if one is not finite."""
+    with np.errstate(over="ignore"):
+        times = seconds.astype(np.float64) * 1e6
+    if not (np.abs(times) < 2**62).all():
+        raise AmiwarpError("a time is not finite or beyond int64; the file is damaged")
+    return np.rint(times).astype(np.int64)
 
 
 @dataclass(slots=True)
@@ -79,11 +125,13 @@ class FileEvents:
         packets: Callable[[dict[str, int]], Iterator[Packet]],
         *,
         size: tuple[int, int] | None,
+        sensors: tuple[tuple[int, int], ...] = SENSORS,
+        last_time: Callable[[int], int | None] | None = None,
     ) -> None:
-        """Make the first pass over the file.
+        """Make the first pass. ``packets`` starts a pass and gets a dictionary for counts.
 
-        ``packets`` is a function that starts a pass and gets a dictionary for counts. ``size`` is None if the sensor
-        size is unknown.
+        Without a ``size``, that of the smallest of ``sensors`` with all events is taken. ``last_time`` returns the time
+        of the last event [us] from the end of the file, given an estimate; it is used if only the head is read.
         """
         if size is not None:
             check_size(*size, path)
@@ -95,13 +143,39 @@ class FileEvents:
         assumed."""
         self._kept: list[Events] | None = []
         self._counts = PassCounts()
-        for block in self._pass(self._counts):
+        self._last_time = last_time
+        self.share: float = 1.0
+        """Share of the file that was read: below 1 only within :func:`head_only`."""
+        self.seconds: float | None = None
+        """Estimate of the time to read the whole file [s], or None if unknown or not needed."""
+        with contextlib.closing(self._pass(self._counts)) as blocks:
+            self._first_pass(blocks, head_limit())
+        self._check_counts()
+        self._size = size or smallest_sensor(self._counts.x_max, self._counts.y_max, sensors)
+        register_reader(self, self.path)
+
+    def _first_pass(self, blocks: Iterator[Events], limit: int | None) -> None:
+        """Read all blocks, or those up to ``limit`` events if the reader notes how much of the file they are."""
+        began: tuple[float, int] | None = None
+        for block in blocks:
             if self._kept is not None:
                 self._kept.append(block)
-                self._kept = self._kept if self._counts.count <= KEEP_EVENTS else None
-        self._check_counts()
-        self._size = size or smallest_sensor(self._counts.x_max, self._counts.y_max)
-        register_reader(self, self.path)
+                self._kept = self._kept if self._counts.count <= KEEP_EVENTS or limit is not None else None
+            read, total = (self._counts.notes.get(name, 0) for name in PROGRESS)
+            # The time before the first block starts processes, and does not grow with the file.
+            began = began or (time.perf_counter(), read)
+            if limit is not None and self._counts.count >= limit and 0 < read < total:
+                self.share = read / total
+                if read > began[1]:
+                    self.seconds = (time.perf_counter() - began[0]) * total / (read - began[1])
+                return
+
+    def last_time(self) -> int | None:
+        """Return the time of the last event [us] if only the head was read, or None if its end does not hold it."""
+        if self._last_time is None:
+            return None
+        elapsed = (self.t_last - self.t_first) / self.share
+        return self._last_time(self.t_first + int(elapsed))
 
     def _check_counts(self) -> None:
         """Raise :class:`AmiwarpError` if the file has no events, or too many faulty events."""
@@ -117,7 +191,18 @@ class FileEvents:
     def repairs(self) -> dict[str, int]:
         """Number of repairs and other findings by name; names with the number 0 are left out."""
         repairs = {"repaired_time_events": self._counts.late, "dropped_outside_events": self._counts.outside}
-        return {name: count for name, count in {**repairs, **self._counts.notes}.items() if count}
+        notes = {name: count for name, count in self._counts.notes.items() if name not in (*RECORDS, *PROGRESS)}
+        return {name: count for name, count in {**repairs, **notes}.items() if count}
+
+    @property
+    def records(self) -> dict[str, int]:
+        """Number of other records by name: triggers, frames and IMU samples, without zeros."""
+        return {name: self._counts.notes[name] for name in RECORDS if self._counts.notes.get(name)}
+
+    @property
+    def metadata(self) -> dict[str, int]:
+        """Counts for the metadata of a recording: other records and repairs."""
+        return {**self.records, **self.repairs}
 
     def __len__(self) -> int:
         return self._counts.count
@@ -176,7 +261,7 @@ class FileEvents:
     def _all(self) -> Iterator[Events]:
         return iter(self._kept) if self._kept is not None else self._pass(PassCounts())
 
-    def _pass(self, counts: PassCounts) -> Iterator[Events]:
+    def _pass(self, counts: PassCounts) -> Generator[Events, None, None]:
         with errors_name(self.path, counts.position):
             for packet in self._packets(counts.notes):
                 # Large packets are cut, so that copies stay small even if one packet holds the whole file.

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import enum
+import importlib
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.io.file_kinds import name_kind
 from amiwarp.io.input_files import errors_name
+from amiwarp.io.nmnist import looks_like_bin
 from amiwarp.io.regular_file import check_regular
 from amiwarp.validation import choice
 
@@ -18,42 +21,73 @@ class Format(enum.StrEnum):
     """Formats of recordings that can be read."""
 
     HDF5 = "hdf5"
-    """Native recording, or event file of DSEC."""
+    """Native recording, or event file of DSEC, TUM-VIE, M3ED, MVSEC or Prophesee."""
     EVT = "evt"
-    """Prophesee RAW, EVT 2.0 and 3.0."""
+    """Prophesee RAW, EVT 2.0, 2.1 and 3.0."""
     DAT = "dat"
     """Prophesee DAT."""
     AEDAT4 = "aedat4"
     """iniVation AEDAT 4.0."""
+    AEDAT3 = "aedat3"
+    """iniVation AEDAT 3.1."""
+    AEDAT2 = "aedat2"
+    """jAER AEDAT 2.0 of the DVS128 and the DAVIS cameras."""
+    ROSBAG = "rosbag"
+    """Bag of ROS 1, or of ROS 2 (SQLite or MCAP)."""
     ES = "es"
     """Event Stream."""
     TEXT = "text"
     """Text of the Event Camera Dataset: lines ``t x y p``, with t in seconds."""
     NPZ = "npz"
-    """NumPy archive with the arrays x, y, t and p."""
+    """NumPy archive with the arrays x, y, t and p, or of N-ImageNet or EV-IMO."""
+    EVIMO = "evimo"
+    """Folder of EV-IMO2."""
+    BIN = "bin"
+    """Events of 5 bytes of N-MNIST and N-Caltech101."""
+
+
+SIGNATURES = (
+    (b"\x89HDF\r\n\x1a\n", Format.HDF5),
+    (b"#!AER-DAT4", Format.AEDAT4),
+    (b"#!AER-DAT3.1", Format.AEDAT3),
+    (b"#!AER-DAT2.0", Format.AEDAT2),
+    (b"#ROSBAG V2.0", Format.ROSBAG),
+    (b"SQLite format 3\0", Format.ROSBAG),
+    (b"\x89MCAP0\r\n", Format.ROSBAG),
+    (b"Event Stream", Format.ES),
+    (b"PK\x03\x04", Format.NPZ),
+)
+"""First bytes of the formats that have a signature."""
+
+FOLDERS = (("metadata.yaml", Format.ROSBAG), ("dataset_events_t.npy", Format.EVIMO))
+"""Files by which the formats are recognised that are folders."""
 
 
 def detect_format(path: Path) -> Format:
     """Return the format of a file from its first bytes. Raises :class:`AmiwarpError` for an unknown format."""
+    for name, found in FOLDERS:
+        if path.is_dir() and (path / name).is_file():
+            return found
     check_regular(path)
     with errors_name(path, lambda: "opening"), path.open("rb") as file:
         head = file.read(4096)
+        file_bytes = os.fstat(file.fileno()).st_size
     if not head:
         raise AmiwarpError(f"{path}: is empty; give a recording")
-    for magic, found in (
-        (b"\x89HDF\r\n\x1a\n", Format.HDF5),
-        (b"#!AER-DAT4", Format.AEDAT4),
-        (b"Event Stream", Format.ES),
-        (b"PK\x03\x04", Format.NPZ),
-    ):
+    for magic, found in SIGNATURES:
         if head.startswith(magic):
             return found
     if head.startswith(b"#!AER-DAT"):
-        raise AmiwarpError(f"{path}: is AEDAT {head[9:12].decode('ascii', 'replace')}; only AEDAT 4 is read")
-    if head.startswith(b"%"):
+        raise AmiwarpError(f"{path}: is AEDAT {head[9:12].decode('ascii', 'replace')}; only 2.0, 3.1 and 4 are read")
+    # Before the others: such files have no header, so any of them can begin like text or a picture.
+    if looks_like_bin(head, file_bytes):
+        return Format.BIN
+    if head.startswith(b"%") and not head.startswith(b"%PDF"):
         return Format.EVT if _is_evt(head) else Format.DAT
     if _looks_like_text(head):
         return Format.TEXT
+    if kind := name_kind(head):
+        raise AmiwarpError(f"{path}: {kind}")
     known = ", ".join(member.value for member in Format)
     raise AmiwarpError(f"{path}: content is of no known format; expected one of {known}")
 
@@ -71,7 +105,9 @@ def _looks_like_text(head: bytes) -> bool:
         return False
 
 
-def open_recording(path: str | os.PathLike[str], *, format: Format | str | None = None) -> Recording:
+def open_recording(
+    path: str | os.PathLike[str], *, format: Format | str | None = None, topic: str | None = None
+) -> Recording:
     """Open a recording of any supported format.
 
     Formats without an index are read once to count, check and repair their events. The recording's ``metadata`` lists
@@ -83,6 +119,9 @@ def open_recording(path: str | os.PathLike[str], *, format: Format | str | None 
         The file.
     format : Format or str, optional
         The format. By default it is detected from the content.
+    topic : str, optional
+        The topic of a ROS bag, or the camera of an HDF5 file, if the file holds several: for example ``/dvs/events`` or
+        ``davis/left``. The error without it lists them.
 
     Returns
     -------
@@ -104,24 +143,32 @@ def open_recording(path: str | os.PathLike[str], *, format: Format | str | None 
     """
     path = Path(path)
     chosen = detect_format(path) if format is None else choice(Format, format, f"{path}: format")
+    if chosen in (Format.HDF5, Format.ROSBAG):
+        return _opener(chosen)(path, topic)
+    if topic is not None:
+        raise AmiwarpError(f"{path}: holds one stream of events, no topics; leave the topic out")
     return _opener(chosen)(path)
 
 
-def _opener(chosen: Format) -> Callable[[Path], Recording]:
-    """Return the function that opens a format."""
-    # Each reader is imported on use, because its library takes time to load.
-    if chosen is Format.HDF5:
-        from amiwarp.io.native_reader import open_native as opener
-    elif chosen is Format.EVT:
-        from amiwarp.io.prophesee import open_evt as opener
-    elif chosen is Format.DAT:
-        from amiwarp.io.prophesee import open_dat as opener
-    elif chosen is Format.AEDAT4:
-        from amiwarp.io.aedat import open_aedat4 as opener
-    elif chosen is Format.ES:
-        from amiwarp.io.event_stream import open_es as opener
-    elif chosen is Format.TEXT:
-        from amiwarp.io.text import open_text as opener
-    else:
-        from amiwarp.io.npz import open_npz as opener
+OPENERS = {
+    Format.HDF5: "native_reader:open_native",
+    Format.EVT: "prophesee:open_evt",
+    Format.DAT: "prophesee:open_dat",
+    Format.AEDAT4: "aedat:open_aedat4",
+    Format.AEDAT3: "aedat3:open_aedat3",
+    Format.AEDAT2: "aedat2:open_aedat2",
+    Format.ROSBAG: "rosbag:open_rosbag",
+    Format.ES: "event_stream:open_es",
+    Format.TEXT: "text:open_text",
+    Format.NPZ: "npz:open_npz",
+    Format.EVIMO: "npz:open_evimo",
+    Format.BIN: "nmnist:open_bin",
+}
+"""Modules of amiwarp.io and their functions that open the formats."""
+
+
+def _opener(chosen: Format) -> Callable[..., Recording]:
+    """Return the function that opens a format. Its module is imported on use, because some libraries load slowly."""
+    module, _, name = OPENERS[chosen].partition(":")
+    opener: Callable[..., Recording] = getattr(importlib.import_module(f"amiwarp.io.{module}"), name)
     return opener

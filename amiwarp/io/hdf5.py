@@ -38,7 +38,9 @@ class Hdf5File:
     holds.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, topic: str | None = None) -> None:
+        """Open a file. ``topic`` chooses among several cameras."""
+        self._topic = topic
         self._absolute = os.path.abspath(path)
         self._lock = threading.Lock()
         self._process: list[ReadingProcess] = []  # at most one; the finalizer has the same list
@@ -52,6 +54,8 @@ class Hdf5File:
             self.close()
             raise
         self._attributes = about["attributes"]
+        self.layout, self.group = str(about["layout"]), str(about["group"])
+        """Layout of the file (native, m3ed, mvsec or ecf), and the group of its events."""
         self.unfinished = bool(about["unfinished"])
         """Whether the file is still being written, or the program that wrote it was interrupted."""
         self.columns = {name: Column(self, handle, name, column) for name, column in about["columns"].items()}
@@ -77,7 +81,7 @@ class Hdf5File:
 
     def _start(self) -> Any:
         self._process[:] = [borrow()]
-        about, _ = self._process[0].call(f"{SERVER}:open_file", self._absolute)
+        about, _ = self._process[0].call(f"{SERVER}:open_file", self._absolute, self._topic)
         if about["identity"] != self._identity:
             raise AmiwarpError("was replaced by another file while it was read; open the file again")
         return about

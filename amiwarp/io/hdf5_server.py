@@ -19,6 +19,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32
+from amiwarp.io.hdf5_layouts import M3ED_COLUMNS, find_layout, m3ed_attributes
 from amiwarp.io.reading_server import Reply, keep, kept
 
 ATTRIBUTES = {
@@ -92,25 +93,31 @@ FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32", 4: "szip", 5: "nbit", 6:
 """Names of HDF5 filters by number, for messages."""
 
 
-def open_file(path: str) -> Reply:
-    """Open a file and return its identity, whether it is unfinished, its attributes and its datasets."""
+def open_file(path: str, topic: str | None) -> Reply:
+    """Open a file and return its identity, layout, whether it is unfinished, its attributes and its datasets."""
     file, unfinished = _open(path)
     keep("file", file)
     columns: dict[str, Any] = {}
     keep("columns", columns)
-    if not isinstance(_member(file, "events"), h5py.Group):
-        raise AmiwarpError("HDF5 without a group 'events'; expected events/x, y, t, p")
-    groups = {name: group for name in ATTRIBUTES if (group := _group(file, name)) is not None}
+    layout, group = find_layout(file, topic, member)
+    groups = {name: found for name in ATTRIBUTES if (found := _group(file, name)) is not None}
+    attributes = {name: dict(_attributes(found, name)) for name, found in groups.items()}
+    names = {name: name for name in COLUMNS}
+    if layout == "m3ed":
+        names = {name: f"{group}/{theirs}" for name, theirs in M3ED_COLUMNS.items()}
+        attributes = m3ed_attributes(file, group, member)
     described = {}
-    for name, kinds in COLUMNS.items():
-        dataset = _member(file, name)
+    for name, stored in names.items() if layout in ("native", "m3ed") else ():
+        dataset = member(file, stored)
         if dataset is not None:
-            described[name] = _describe(dataset, name, kinds, path, unfinished)
+            described[name] = _describe(dataset, name, COLUMNS[name], path, unfinished)
             columns[name] = dataset
     return {
         "identity": _identity(file),
+        "layout": layout,
+        "group": group,
         "unfinished": unfinished,
-        "attributes": {name: dict(_attributes(group, name)) for name, group in groups.items()},
+        "attributes": attributes,
         "columns": described,
     }, []
 
@@ -145,7 +152,7 @@ def _identity(file: Any) -> list[int]:
     return [found.st_dev, found.st_ino]
 
 
-def _member(file: Any, name: str) -> Any:
+def member(file: Any, name: str) -> Any:
     """Return a group or dataset of the file, or None. All access to objects of the file goes through here.
 
     Raises :class:`AmiwarpError` for links, and for datasets whose values are in other files.
@@ -169,7 +176,7 @@ def _member(file: Any, name: str) -> Any:
 
 
 def _group(file: Any, name: str) -> Any:
-    found = _member(file, name)
+    found = member(file, name)
     if found is not None and not isinstance(found, h5py.Group):
         raise AmiwarpError(f"'{name}' is not a group; see docs/reference/recording-format.md")
     return found
@@ -231,7 +238,7 @@ def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) 
     filters = [creation.get_filter(at) for at in range(creation.get_nfilters())]
     places: list[tuple[int, int]] | None = None
     if dataset.chunks is None:
-        count = _plain_length(dataset, name, path)
+        count = plain_length(dataset, name, path)
     else:
         chunks = _chunks(dataset, name, filters, path, unfinished)
         count = _chunked_length(dataset, name, chunks, unfinished)
@@ -249,8 +256,8 @@ def row_bytes(dataset: Any) -> int:
     return int(dataset.dtype.itemsize) * math.prod(dataset.shape[1:])
 
 
-def _plain_length(dataset: Any, name: str, path: str) -> int:
-    """Return the length of a dataset without chunks, after checking that the file holds all of its data."""
+def plain_length(dataset: Any, name: str, path: str) -> int:
+    """Return the length of a dataset without chunks, after checking that the file holds all of it."""
     count, offset = int(dataset.shape[0]) if dataset.shape else 1, dataset.id.get_offset()
     declared, stored = count * row_bytes(dataset), dataset.id.get_storage_size()
     compact = dataset.id.get_create_plist().get_layout() == h5py.h5d.COMPACT

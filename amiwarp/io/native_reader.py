@@ -21,8 +21,9 @@ from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.camera_attributes import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, in_order
-from amiwarp.io.file_scan import smallest_sensor
+from amiwarp.io.file_scan import head_limit, smallest_sensor
 from amiwarp.io.hdf5 import Column, Hdf5File
+from amiwarp.io.hdf5_rows import open_rows
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.io.native_layout import FORMAT, FORMAT_VERSION
 from amiwarp.io.regular_file import check_regular
@@ -64,11 +65,11 @@ class NativeEvents:
             check_size(width, height, self.path)
             return width, height
         largest = [0, 0]
-        for start in range(0, self._count, DEFAULT_BLOCK):
+        for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
             for axis, name in enumerate(("x", "y")):
                 values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
                 largest[axis] = max(largest[axis], int(values.max()))
-        width, height = smallest_sensor(*largest)
+        width, height = smallest_sensor(largest[0], largest[1])
         return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
 
     def __len__(self) -> int:
@@ -172,12 +173,18 @@ class NativeEvents:
         return low, high
 
 
-def open_native(path: Path) -> Recording:
-    """Open a native recording or a DSEC event file. Raises :class:`AmiwarpError` for other files."""
+def open_native(path: Path, topic: str | None = None) -> Recording:
+    """Open a native recording, or a file of another layout. ``topic`` chooses among several cameras.
+
+    Raises :class:`AmiwarpError` for other files.
+    """
     check_regular(path)
     with errors_name(path, lambda: "opening HDF5"):
-        file = Hdf5File(path)
+        file = Hdf5File(path, topic)
         try:
+            if file.layout in ("mvsec", "ecf"):
+                file.close()
+                return open_rows(path, file.layout, file.group)
             return _read_recording(path, file)
         except BaseException:
             file.close()
@@ -195,6 +202,8 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         for name, value in _attributes(file, "metadata").items()
     }
     metadata["format"] = "native" if attribute(root, f"{path}: /", "format", str, "") == FORMAT else "dsec"
+    if file.layout == "m3ed":
+        metadata |= {"format": "m3ed", "topic": file.group}
     camera, prism = file.attributes("camera"), file.attributes("prism")
     found = None if camera is None else read_camera(camera, f"{path}: /camera")
     if found is not None and (found.width, found.height) != events.size:

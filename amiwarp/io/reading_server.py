@@ -8,6 +8,7 @@ import json
 import os
 import struct
 import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +19,9 @@ from amiwarp.errors import AmiwarpError
 
 PACKET = 1 << 17
 """Number of events that are joined to one packet before it is sent."""
+
+PACKET_S = 2.0
+"""Processor time after which packets are sent, however few they are [s]. A request has a limit of time."""
 
 Reply = tuple[Any, list[NDArray[Any]]]
 """Reply to a request: a JSON value, and arrays of shape ``(n,)``."""
@@ -114,10 +118,31 @@ def advance() -> Reply:
 
 
 def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[NDArray[Any], ...]]:
-    """Return the next packets, which together hold at least :data:`PACKET` events unless the stream ends."""
-    count = 0
+    """Yield packets until they hold at least :data:`PACKET` events, or took :data:`PACKET_S`, if they hold few."""
+    count, began = 0, time.process_time()
     for packet in source:
         count += len(packet[0])
         yield packet
-        if count >= PACKET:
+        if count >= PACKET or time.process_time() - began > PACKET_S:
             return
+
+
+def noting_progress(decoder: Iterator[Any], path: str, notes: dict[str, int]) -> Iterator[Any]:
+    """Yield the packets of a compiled decoder, and note how much of its file it has read, on Linux."""
+    number = _open_file(path)
+    for packet in decoder:
+        if number is not None:
+            with contextlib.suppress(OSError, ValueError), open(f"/proc/self/fdinfo/{number}") as about:
+                notes["read"] = int(about.readline().split()[1])
+                notes["total"] = os.path.getsize(path)
+        yield packet
+
+
+def _open_file(path: str) -> str | None:
+    """Return the number of the open file with this path, on Linux."""
+    with contextlib.suppress(OSError):
+        for number in os.listdir("/proc/self/fd"):
+            with contextlib.suppress(OSError):
+                if os.path.samefile(f"/proc/self/fd/{number}", path):
+                    return number
+    return None

@@ -7,6 +7,7 @@ known sensor that holds all events (240x180 for that dataset). A ``calib.txt`` i
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -35,10 +36,10 @@ def open_text(path: Path) -> Recording:
     check_regular(path)
     with errors_name(path, lambda: "line 1"), path.open("rb") as file:
         size, _ = _read_size(path, file)
-    events = FileEvents(path, partial(_packets, path), size=size)
+    events = FileEvents(path, partial(_packets, path), size=size, last_time=partial(_last_time, path))
     calib = path.with_name("calib.txt")
     camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
-    return Recording(events=events, camera=camera, metadata={"format": "text", **events.repairs}, name=path.stem)
+    return Recording(events=events, camera=camera, metadata={"format": "text", **events.metadata}, name=path.stem)
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
@@ -70,11 +71,23 @@ def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]
     return (int(words[0]), int(words[1])), 1
 
 
+def _last_time(path: Path, estimate: int) -> int | None:
+    """Return the time of the last line [us], or None if it holds none."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 2 * LONGEST_LINE, 0))
+        lines = [line for line in file.read().split(b"\n")[1:] if line.strip() and not line.lstrip().startswith(b"#")]
+    with contextlib.suppress(ValueError, IndexError, OverflowError):
+        return round(float(lines[-1].split()[0]) * 1e6)
+    return None
+
+
 def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
     with path.open("rb") as file:
         _, line_number = _read_size(path, file)
         rest = b""
+        notes["total"] = path.stat().st_size
         while data := file.read(READ_BYTES):
+            notes["read"] = file.tell()
             whole, newline, rest = (rest + data).rpartition(b"\n")
             if len(rest) > LONGEST_LINE:
                 raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")

@@ -1,0 +1,133 @@
+"""Reader of AEDAT 2.0 files of jAER: DVS128 and the DAVIS cameras.
+
+After a header of lines that begin with ``#``, each record has a 32-bit address and a 32-bit time [us], both big-endian.
+The address holds an event, a sample of a frame (APS) or of the inertial unit (IMU), or an edge at the external input.
+Pixels count from the bottom right, as jAER decodes them, and are turned into columns from the left, rows from the top.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import DEFAULT_BLOCK
+from amiwarp.events.recording import Recording
+from amiwarp.io.counters import last_word, unwrapped
+from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.input_files import errors_name
+from amiwarp.io.regular_file import check_regular
+
+MAGIC = b"#!AER-DAT2.0"
+HEADER_BYTES = 1 << 24
+"""Longest header that is read [bytes]. It can hold all settings of the camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chip:
+    """Layout of a camera's addresses."""
+
+    width: int
+    height: int
+    davis: bool
+    """Whether the addresses are those of a DAVIS camera, else those of the DVS128."""
+
+
+CHIPS = {
+    "dvs128": Chip(128, 128, False), "davis128": Chip(128, 128, True), "davis208": Chip(208, 192, True),
+    "davis240": Chip(240, 180, True), "davis346": Chip(346, 260, True), "davis640": Chip(640, 480, True),
+    "tmpdiff128": Chip(128, 128, False),
+}  # fmt: skip
+"""Layouts by the name of jAER's class in the header, in lower case and without a suffix."""
+
+
+def open_aedat2(path: Path) -> Recording:
+    """Open the events of an AEDAT 2.0 file."""
+    check_regular(path)
+    with errors_name(path, lambda: "reading the header"):
+        chip, offset = _read_header(path)
+    read, last = partial(_packets, path, chip, offset), partial(_last_time, path, offset)
+    events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
+    return Recording(events=events, metadata={"format": "aedat2", **events.metadata}, name=path.stem)
+
+
+def _last_time(path: Path, offset: int, estimate: int) -> int | None:
+    """Return the time of the last record [us]."""
+    return last_word(path, offset, ">u4", estimate)
+
+
+def trigger_packets(path: Path) -> Iterator[Packet]:
+    """Yield the edges at the external input, all as rising edges of channel 0."""
+    chip, offset = _read_header(path)
+    for words, t in _records(path, offset, {}):
+        at = (words >> 31 == 0) & (words >> 10 & 1 == 1) if chip.davis else words >> 15 & 1 == 1
+        nothing = np.zeros(np.count_nonzero(at), np.int64)
+        yield nothing, nothing, t[at], nothing + 1
+
+
+def _read_header(path: Path) -> tuple[Chip, int]:
+    """Return the camera, and the position of the first record."""
+    with path.open("rb") as file:
+        name, start = "", 0
+        while (line := file.readline(HEADER_BYTES)).startswith(b"#") and line.endswith(b"\n"):
+            start += len(line)
+            if found := re.match(rb"#\s*AEChip:\s*(\S+)", line):
+                name = found[1].decode("ascii", "replace")
+            if start > HEADER_BYTES:
+                raise AmiwarpError(f"the header is longer than {HEADER_BYTES >> 20} MiB; the file is damaged")
+    short = name.rpartition(".")[2].lower()
+    chip = next((chip for key, chip in CHIPS.items() if short.startswith(key)), None)
+    if chip is None:
+        given = f"camera '{name[:60]}'" if name else "no camera (AEChip)"
+        raise AmiwarpError(f"the header names {given}; expected one of {', '.join(CHIPS)}")
+    return chip, start
+
+
+def _records(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[NDArray[Any], NDArray[np.int64]]]:
+    """Yield addresses and unwrapped times [us]."""
+    last: int | None = None
+    notes["total"] = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(offset)
+        while data := file.read(8 * DEFAULT_BLOCK):
+            notes["read"] = file.tell()
+            if len(data) % 8:
+                notes["truncated_bytes"] = len(data) % 8
+            words = np.frombuffer(data, ">u4", len(data) // 8 * 2).reshape(-1, 2)
+            t = unwrapped(words[:, 1].astype(np.int64), 32, last)
+            last = int(t[-1]) if t.size else last
+            yield words[:, 0].astype(np.int64), t
+
+
+def _packets(path: Path, chip: Chip, offset: int, notes: dict[str, int]) -> Iterator[Packet]:
+    for words, t in _records(path, offset, notes):
+        yield _davis(words, t, chip, notes) if chip.davis else _dvs128(words, t, notes)
+
+
+def _davis(words: NDArray[np.int64], t: NDArray[np.int64], chip: Chip, notes: dict[str, int]) -> Packet:
+    other, external = words >> 31 == 1, words >> 10 & 1 == 1
+    kind = words[other] >> 10 & 3
+    # A frame has two samples of each pixel: the type is 0 for the reset level, 1 for the signal. One pixel is counted.
+    frames = np.count_nonzero((kind == 1) & (words[other] >> 12 & 0x7FFFF == 0))
+    # An IMU sample has seven values. The first, of type 0, stands for all.
+    samples = np.count_nonzero((kind == 3) & (words[other] >> 28 & 7 == 0))
+    for name, count in (("frames", frames), ("imu_samples", samples), ("triggers", (external & ~other).sum())):
+        notes[name] = notes.get(name, 0) + int(count)
+    at = ~other & ~external
+    kept = words[at]
+    return chip.width - 1 - (kept >> 12 & 0x3FF), chip.height - 1 - (kept >> 22 & 0x1FF), t[at], kept >> 11 & 1
+
+
+def _dvs128(words: NDArray[np.int64], t: NDArray[np.int64], notes: dict[str, int]) -> Packet:
+    external = words >> 15 & 1 == 1
+    notes["triggers"] = notes.get("triggers", 0) + int(external.sum())
+    kept = words[~external]
+    # In jAER, bit 0 is 0 for an ON event.
+    return 127 - (kept >> 1 & 0x7F), 127 - (kept >> 8 & 0x7F), t[~external], 1 - (kept & 1)

@@ -1,0 +1,157 @@
+"""``amiwarp info`` and ``amiwarp convert`` with files of other cameras: topics, triggers, estimates for large files."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from io_samples import make_events, write_dat, write_evt, write_native, write_text
+from io_samples_extra import arrays, write_aedat2, write_evimo2, write_evt21, write_m3ed, write_ros1
+from typer.testing import CliRunner
+
+from amiwarp.cli.app import app
+from amiwarp.events.events import Events
+from amiwarp.io import open_recording
+
+EVENTS = make_events(5000)
+
+
+def run(*args: str | Path) -> str:
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    assert result.exit_code == 0, result.stderr
+    return result.stdout
+
+
+def fails(*args: str | Path) -> str:
+    result = CliRunner().invoke(app, [str(arg) for arg in args])
+    assert result.exit_code == 1
+    return " ".join(result.stderr.split())
+
+
+@pytest.fixture
+def large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Treat files from 1 kB on as large, and their first 600 events as the part that is read, in blocks of 500."""
+    monkeypatch.setattr("amiwarp.cli.info.LARGE_BYTES", 1000)
+    monkeypatch.setattr("amiwarp.cli.info.HEAD_EVENTS", 600)
+    for module in ("prophesee", "aedat2", "text"):
+        name, value = ("READ_BYTES", 4000) if module == "text" else ("DEFAULT_BLOCK", 500)
+        monkeypatch.setattr(f"amiwarp.io.{module}.{name}", value)
+    monkeypatch.setattr("amiwarp.io.prophesee.EVT21_BLOCK", 500)
+
+
+WRITERS: dict[str, Any] = {
+    # name: (ending, writer, whether the end of the file tells the last time)
+    "dat": ("dat", write_dat, True),
+    "aedat2": ("aedat", write_aedat2, True),
+    "evt21": ("raw", write_evt21, True),
+    "text": ("txt", write_text, True),
+}
+
+
+@pytest.mark.usefixtures("large")
+@pytest.mark.parametrize("name", WRITERS)
+def test_large_files_are_estimated(tmp_path: Path, name: str) -> None:
+    ending, write, tells_end = WRITERS[name]
+    events = Events(EVENTS.x, EVENTS.y, EVENTS.t * 50, EVENTS.p)
+    path = tmp_path / f"large.{ending}"
+    write(path, events)
+    data = json.loads(run("info", path, "--json"))
+    assert data["estimated"] is True
+    assert 0.05 < data["share_read"] < 0.3
+    assert data["events"] == pytest.approx(len(events), rel=0.1)
+    assert data["count_s"] > 0
+    assert data["t_first_us"] == events.t[0]
+    if tells_end:
+        assert data["t_last_us"] == events.t[-1]
+    text = run("info", path)
+    assert "events" in text
+    assert "--count counts them" in text
+    counted = json.loads(run("info", path, "--count", "--json"))
+    assert (counted["events"], counted["estimated"], counted["share_read"]) == (len(events), False, 1.0)
+    assert "about" not in run("info", path, "--count")
+
+
+@pytest.mark.usefixtures("large")
+def test_large_files_with_an_index_are_exact(tmp_path: Path) -> None:
+    write_native(tmp_path / "large.h5", EVENTS)
+    data = json.loads(run("info", tmp_path / "large.h5", "--json"))
+    assert (data["events"], data["estimated"], data["share_read"]) == (len(EVENTS), False, 0.12)
+    assert (data["t_first_us"], data["t_last_us"]) == (EVENTS.t[0], EVENTS.t[-1])
+    assert data["on_share"] == pytest.approx(EVENTS.p[:600].mean())
+    assert "of the first 12 % of the file" in run("info", tmp_path / "large.h5")
+
+
+@pytest.mark.usefixtures("large")
+def test_large_folders_are_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.io.npz.DEFAULT_BLOCK", 500)
+    write_evimo2(tmp_path / "scene", EVENTS)
+    data = json.loads(run("info", tmp_path / "scene", "--json"))
+    assert (data["events"], data["estimated"], data["share_read"]) == (len(EVENTS), True, 0.2)
+
+
+@pytest.mark.usefixtures("large")
+def test_small_parts_of_a_file_are_only_read_by_info(tmp_path: Path) -> None:
+    write_dat(tmp_path / "large.dat", EVENTS)
+    assert len(open_recording(tmp_path / "large.dat").events) == len(EVENTS)
+
+
+def test_real_large_raw_file(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.cli.info.LARGE_BYTES", 1000)
+    monkeypatch.setattr("amiwarp.cli.info.HEAD_EVENTS", 1000)
+    path = data_dir / "evt/evt2_balls_640x480.raw"
+    data = json.loads(run("info", path, "--json"))
+    # Where the system does not tell how far the decoder has read, all is read.
+    assert data["events"] == pytest.approx(521_252, rel=0.2)
+    source = open_recording(path).events
+    assert (data["t_first_us"], data["t_last_us"]) == (source.t_first, source.t_last)
+
+
+def test_info_of_other_records(data_dir: Path) -> None:
+    text = run("info", data_dir / "aedat/aedat4_davis346_cars.aedat4")
+    assert "4 frames, 160 imu samples" in text
+    data = json.loads(run("info", data_dir / "aedat/aedat4_davis346_cars.aedat4", "--json"))
+    assert (data["records"], data["repairs"]) == ({"frames": 4, "imu_samples": 160}, {})
+
+
+def test_topics(tmp_path: Path) -> None:
+    events = EVENTS[:300]
+    topics = {"/left": arrays(events, ros1=True), "/right": arrays(events[:99], ros1=True)}
+    write_ros1(tmp_path / "a.bag", topics)
+    assert "/left" in fails("info", tmp_path / "a.bag")
+    assert json.loads(run("info", tmp_path / "a.bag", "--topic", "/right", "--json"))["events"] == 99
+    run("convert", tmp_path / "a.bag", tmp_path / "out.h5", "--topic", "/left", "--fov-deg", "60")
+    assert len(open_recording(tmp_path / "out.h5").events) == 300
+    write_m3ed(tmp_path / "b.h5", events, sides=("left", "right"))
+    assert "prophesee/right" in fails("convert", tmp_path / "b.h5", tmp_path / "c.h5")
+    run("convert", tmp_path / "b.h5", tmp_path / "c.h5", "--topic", "prophesee/right")
+    assert open_recording(tmp_path / "c.h5").camera is not None
+
+
+def test_encoder_from_triggers(data_dir: Path, tmp_path: Path) -> None:
+    path = data_dir / "rosbag/ros2_evt3_640x480_trig10Hz.db3"
+    run("convert", path, tmp_path / "out.h5", "--encoder-from", "triggers:6")
+    encoder = open_recording(tmp_path / "out.h5").encoder
+    assert encoder is not None
+    assert encoder.index_t is not None
+    assert (len(encoder.index_t), encoder.rpm) == (18, pytest.approx(600.0))
+    steps = ("--counts-per-turn", "2", "--direction", "-1", "--force")
+    run("convert", path, tmp_path / "out.h5", "--encoder-from", "triggers:6", *steps)
+    assert open_recording(tmp_path / "out.h5").encoder.rpm == pytest.approx(-300.0)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--encoder-from", "triggers:x"), "write triggers:CHANNEL"),
+        (("--encoder-from", "index:0"), "write triggers:CHANNEL"),
+        (("--encoder-from", "triggers:0", "--counter-bits", "8"), "--counter-bits describe an encoder log"),
+        (("--encoder-from", "triggers:0"), "expected at least 2; the rising edges are: none"),
+        (("--direction", "-1"), "give --encoder or --encoder-from too"),
+    ],
+)
+def test_encoder_from_refuses(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+    write_evt("evt3")(tmp_path / "a.raw", EVENTS)
+    assert message in fails("convert", tmp_path / "a.raw", tmp_path / "out.h5", *options)
+    assert not (tmp_path / "out.h5").exists()
+    assert np.array_equal(open_recording(tmp_path / "a.raw").events.slice(0, 9).x, EVENTS.x[:9])

@@ -1,0 +1,474 @@
+"""Files of data sets, of ROS and of older cameras: read exactly, or named for what they are."""
+
+import gzip
+import io
+import json
+import os
+import struct
+import tarfile
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from faery.extension import aedat, evt
+from io_samples import make_events, refusal, to_faery
+from io_samples_extra import (
+    ENCODERS,
+    LATE,
+    MORE_WRITERS,
+    SIZE,
+    aedat3_packet,
+    array_message,
+    arrays,
+    evt2_words,
+    evt3_words,
+    packets,
+    small,
+    typestore,
+    write_aedat2,
+    write_aedat3,
+    write_bin,
+    write_evimo2,
+    write_evt21,
+    write_m3ed,
+    write_mvsec,
+    write_prophesee_hdf5,
+    write_ros1,
+    write_ros2,
+)
+from test_io_readers import assert_equal, assert_same_source
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.io import convert, open_recording, read_encoder_triggers
+from amiwarp.io import file_scan as scan
+from amiwarp.io.evt_words import Evt2Decoder, Evt3Decoder, words_of
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+
+EVENTS = make_events()
+NOTHING = np.zeros(0, np.uint8)
+
+
+def written(folder: Path, name: str, events: Events = EVENTS) -> Path:
+    path = folder / f"sample.{MORE_WRITERS[name][1]}"
+    MORE_WRITERS[name][3](path, events)
+    return path
+
+
+@pytest.mark.parametrize("name", MORE_WRITERS)
+@pytest.mark.parametrize("keep", [True, False])
+def test_formats_read_back(tmp_path, monkeypatch, name, keep):
+    if not keep:
+        monkeypatch.setattr(scan, "KEEP_EVENTS", 0)
+    found, _, size, _ = MORE_WRITERS[name]
+    path = written(tmp_path, name)
+    recording = open_recording(path)
+    assert (recording.metadata["format"], recording.events.size, recording.name) == (found, size, "sample")
+    assert_same_source(recording.events, MemoryEvents(EVENTS, *size))
+    assert getattr(recording.events, "repairs", {}) == {}
+    path.rename(tmp_path / "sample.other")
+    assert len(open_recording(tmp_path / "sample.other").events) == len(EVENTS)
+
+
+@pytest.mark.parametrize("name", MORE_WRITERS)
+def test_cut_files_are_read_in_part_or_refused(tmp_path, name):
+    path = written(tmp_path, name)
+    whole = path.read_bytes()
+    for share in (0.01, 0.5, 0.95):
+        path.write_bytes(whole[: int(share * len(whole))])
+        said = refusal(open_recording, path)
+        if said is None:
+            source = open_recording(path).events
+            assert 0 < len(source) < len(EVENTS)
+            assert_equal(source.slice(0, len(source) - 1), EVENTS[: len(source) - 1])
+        else:
+            assert str(path) in said
+            assert "\n" not in said
+
+
+def test_evt_words_as_faery_decodes_them(data_dir):
+    for name, version in (("evt3_driving_1280x720.raw", "3"), ("evt2_balls_640x480.raw", "2")):
+        path = data_dir / "evt" / name
+        data = path.read_bytes()
+        start = data.rindex(b"\n% ", 0, 1000)
+        words = words_of(data[data.index(b"\n", start + 1) + 1 :], version)
+        decoder = Evt3Decoder() if version == "3" else Evt2Decoder(vectors=False)
+        # Pieces of odd length, as in the messages of ROS.
+        found = [decoder.decode(words[at : at + 10_007])[0] for at in range(0, len(words), 10_007)]
+        x, y, t, p = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        with evt.Decoder(path, (2048, 2048), f"evt{version}") as packets_:
+            expected = np.concatenate([packet["events"] for packet in packets_ if "events" in packet])
+        for given, field in ((x, "x"), (y, "y"), (p, "p")):
+            np.testing.assert_array_equal(given, expected[field])
+        # faery raises a time to the largest in any word before it: by up to 11 us in the file of EVT 3.
+        assert 0 <= (expected["t"].astype(np.int64) - t).max() <= (11 if version == "3" else 0)
+
+
+@pytest.mark.parametrize(("words", "decoder"), [(evt2_words, Evt2Decoder(vectors=False)), (evt3_words, Evt3Decoder())])
+def test_evt_words_in_pieces(words, decoder):
+    data = words(EVENTS)
+    found = [decoder.decode(data[at : at + 7])[0] for at in range(0, len(data), 7)]
+    x, y, t, p = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    for given, field in ((x, "x"), (y, "y"), (p, "p"), (t - t[0], "t")):
+        expected = EVENTS.t - EVENTS.t[0] if field == "t" else getattr(EVENTS, field)
+        np.testing.assert_array_equal(given, expected)
+
+
+def test_evt3_time_runs_on_past_24_bits(tmp_path):
+    events = Events(EVENTS.x, EVENTS.y, EVENTS.t + np.arange(len(EVENTS)) * 200_000, EVENTS.p)
+    t = Evt3Decoder().decode(evt3_words(events))[0][2]
+    np.testing.assert_array_equal(t, events.t)
+    assert t[-1] > 7 << 24
+
+
+@pytest.mark.parametrize("legacy", [True, False])
+@pytest.mark.parametrize("header", [None, "% evt 2.1\n% geometry 320x240\n"])
+def test_evt21_in_both_byte_orders(tmp_path, legacy, header):
+    write_evt21(tmp_path / "a.raw", EVENTS, legacy=legacy, header=header)
+    if header is None and not legacy:
+        (tmp_path / "a.raw").write_bytes(
+            (tmp_path / "a.raw").read_bytes().replace(b"EVT21;", b"EVT21;endianness=little;")
+        )
+    recording = open_recording(tmp_path / "a.raw")
+    assert recording.events.size == SIZE
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+
+
+def test_evt21_vectors(tmp_path):
+    words = np.array([0x8 << 60 | 5 << 32, 1 << 60 | 3 << 54 | 64 << 43 | 9 << 32 | 0x80000005], np.uint64)
+    (tmp_path / "a.raw").write_bytes(
+        b"% evt 2.1\n% format EVT21;endianness=little;height=720;width=1280\n% end\n" + words.tobytes()
+    )
+    events = open_recording(tmp_path / "a.raw").events.slice(0, 9)
+    assert (events.x.tolist(), events.y.tolist()) == ([64, 66, 95], [9, 9, 9])
+    assert (events.t.tolist(), events.p.tolist()) == ([5 * 64 + 3] * 3, [1, 1, 1])
+
+
+def test_aedat2_tells_events_from_frames_imu_and_triggers(tmp_path):
+    now = int(EVENTS.t[100])
+    frame = [(1 << 31 | y << 22 | x << 12 | kind << 10 | 99, now) for kind in (0, 1) for y in (0, 1) for x in (0, 1)]
+    imu = [(1 << 31 | kind << 28 | 500 << 12 | 3 << 10, now) for kind in range(7)]
+    edges = [(1 << 10, now), (1 << 10, now + 1000), (1 << 10, now + 2000)]
+    extra = np.array(frame + imu + imu + edges[:1], ">u4").tobytes()
+    write_aedat2(tmp_path / "a.aedat", EVENTS, between=extra)
+    recording = open_recording(tmp_path / "a.aedat")
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    assert recording.metadata == {"format": "aedat2", "frames": 1, "imu_samples": 2, "triggers": 1}
+    (tmp_path / "a.aedat").write_bytes((tmp_path / "a.aedat").read_bytes() + np.array(edges[1:], ">u4").tobytes())
+    assert read_encoder_triggers(tmp_path / "a.aedat").rpm == pytest.approx(60_000)
+
+
+def test_aedat2_of_a_dvs128_and_wrapping_times(tmp_path):
+    events = small(EVENTS, 128, 128, t_first=2**32 - 3000)
+    write_aedat2(tmp_path / "a.aedat", events, chip="DVS128")
+    recording = open_recording(tmp_path / "a.aedat")
+    assert recording.events.size == (128, 128)
+    assert_equal(recording.events.slice(0, 999), events)
+    assert events.t[-1] > 2**32
+    (tmp_path / "a.aedat").write_bytes((tmp_path / "a.aedat").read_bytes().replace(b"DVS128", b"Cochlea"))
+    with pytest.raises(AmiwarpError, match=r"a\.aedat: .*names camera 'eu.seebetter.*Cochlea'; expected one of dvs128"):
+        open_recording(tmp_path / "a.aedat")
+
+
+def test_aedat3_triggers_sources_and_overflow(tmp_path):
+    late = int(EVENTS.t[120])
+    special = np.array([[2 << 1 | 1, late], [3 << 1 | 1, late], [2 << 1, late], [2 << 1 | 1, late + 500]], "<u4")
+    other = np.array([[1 << 17 | 1, late]], "<u4")
+    between = aedat3_packet(0, special) + aedat3_packet(1, other, source=2)
+    write_aedat3(tmp_path / "a.aedat", EVENTS, between=between)
+    recording = open_recording(tmp_path / "a.aedat")
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    assert recording.metadata == {
+        "format": "aedat3", "imu_samples": 5, "triggers": 3, "events_of_other_sources": 1,
+    }  # fmt: skip
+    assert np.diff(read_encoder_triggers(tmp_path / "a.aedat").t).tolist() == [500]
+    later = Events(EVENTS.x, EVENTS.y, EVENTS.t + 2**31, EVENTS.p)
+    write_aedat3(tmp_path / "b.aedat", later)
+    assert_equal(open_recording(tmp_path / "b.aedat").events.slice(0, 999), later)
+    (tmp_path / "b.aedat").write_bytes((tmp_path / "b.aedat").read_bytes().replace(b"Format: RAW", b"Format: PNG"))
+    with pytest.raises(AmiwarpError, match=r"b\.aedat: .*the packets have the format 'PNG'"):
+        open_recording(tmp_path / "b.aedat")
+
+
+def test_bin_with_and_without_marks(tmp_path):
+    events = small(EVENTS, 34, 34, t_first=0)
+    write_bin(tmp_path / "a.bin", events)
+    recording = open_recording(tmp_path / "a.bin")
+    assert (recording.events.size, recording.metadata) == ((34, 34), {"format": "bin"})
+    assert_equal(recording.events.slice(0, 999), events)
+    # A file without a header can begin like any other: here like text, a PDF, a bitmap and a gzip archive.
+    for x, y in ((ord("1"), ord(" ")), (ord("%"), ord("P")), (ord("B"), ord("M")), (0x1F, 0x8B)):
+        first = small(EVENTS, 200, 170, t_first=0)
+        first.x[0], first.y[0] = x, y
+        write_bin(tmp_path / "c.bin", first)
+        assert_equal(open_recording(tmp_path / "c.bin").events.slice(0, 999), first)
+    wide = small(EVENTS, 200, 170, t_first=0)
+    marked = Events(wide.x, wide.y, wide.t % 2**13, wide.p)
+    at = int(np.searchsorted(wide.t, 2**13))
+    parts = [
+        marked[:at],
+        Events(*(np.array([v], d) for v, d in ((0, "u2"), (240, "u2"), (0, "i8"), (0, "u1")))),
+        marked[at:],
+    ]
+    write_bin(tmp_path / "b.bin", Events.concatenate(parts))
+    recording = open_recording(tmp_path / "b.bin")
+    assert (recording.events.size, recording.metadata["overflow_marks"]) == ((240, 180), 1)
+    assert_equal(recording.events.slice(0, 999), wide)
+
+
+def test_evimo2_folders(tmp_path):
+    write_evimo2(tmp_path / "scene", EVENTS)
+    recording = open_recording(tmp_path / "scene")
+    assert (recording.events.size, recording.name) == (SIZE, "scene")
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    assert convert(tmp_path / "scene", tmp_path / "out.h5").events == len(EVENTS)
+    np.save(tmp_path / "scene/dataset_events_p.npy", EVENTS.p[:5])
+    with pytest.raises(AmiwarpError, match=r"scene: .*the arrays have the shapes t \(600,\), xy \(600, 2\), p \(5,\)"):
+        open_recording(tmp_path / "scene")
+    (tmp_path / "scene/dataset_events_p.npy").unlink()
+    with pytest.raises(AmiwarpError, match=r"dataset_events_p\.npy: no such file"):
+        open_recording(tmp_path / "scene")
+
+
+def test_m3ed_has_a_camera_and_several_need_a_choice(tmp_path):
+    write_m3ed(tmp_path / "a.h5", EVENTS, sides=("left", "right"))
+    with pytest.raises(AmiwarpError, match=r"cameras: prophesee/left, prophesee/right; choose one with .*--topic"):
+        open_recording(tmp_path / "a.h5")
+    recording = open_recording(tmp_path / "a.h5", topic="prophesee/right")
+    lens = RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.0)
+    assert recording.camera == Camera(*SIZE, 200.0, 201.0, 150.0, 110.0, lens)
+    assert recording.metadata == {"format": "m3ed", "topic": "prophesee/right"}
+    with pytest.raises(AmiwarpError, match="no events in 'middle'; the choices for --topic are prophesee/left"):
+        open_recording(tmp_path / "a.h5", topic="middle")
+
+
+def test_mvsec_counts_frames_and_needs_a_choice(tmp_path):
+    write_mvsec(tmp_path / "a.hdf5", EVENTS, sides=("left", "right"))
+    assert "davis/left, davis/right; choose one" in str(refusal(open_recording, tmp_path / "a.hdf5"))
+    recording = open_recording(tmp_path / "a.hdf5", topic="davis/left")
+    assert recording.metadata == {"format": "mvsec", "topic": "davis/left", "frames": 3, "imu_samples": 7}
+    assert convert(tmp_path / "a.hdf5", tmp_path / "out.h5", topic="davis/right").events == len(EVENTS)
+
+
+def test_prophesee_hdf5_without_its_codec(tmp_path):
+    write_prophesee_hdf5(tmp_path / "a.hdf5", EVENTS, compression="gzip")
+    assert open_recording(tmp_path / "a.hdf5").metadata["triggers"] == 4
+    assert read_encoder_triggers(tmp_path / "a.hdf5").rpm == pytest.approx(30_000)
+    rows = h5py.File(tmp_path / "a.hdf5")["CD/events"][()]
+    creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    creation.set_chunk((256,))
+    creation.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL, ())
+    with h5py.File(tmp_path / "b.hdf5", "w") as file:
+        group = file.create_group("CD")
+        kind, space = h5py.h5t.py_create(rows.dtype), h5py.h5s.create_simple(rows.shape)
+        h5py.h5d.create(group.id, b"events", kind, space, creation)
+        group["events"][...] = rows
+    with pytest.raises(AmiwarpError, match=r"b\.hdf5: .*ECF codec, which is not installed; .*HDF5_PLUGIN_PATH"):
+        open_recording(tmp_path / "b.hdf5")
+
+
+def test_hdf5_without_known_events_is_named(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["data"] = np.zeros((3, 4))
+        file["labels"] = np.zeros(3)
+    assert "without a group 'events'" in str(refusal(open_recording, tmp_path / "a.h5"))
+    assert "its groups are data, labels" in str(refusal(open_recording, tmp_path / "a.h5"))
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file.create_dataset("davis/left/events", shape=(10**15, 4), dtype="f8", chunks=(1000, 4))
+    assert "declares 1000000000000000 rows, which it does not hold" in str(refusal(open_recording, tmp_path / "b.h5"))
+
+
+@pytest.mark.parametrize("package", ["dvs_msgs", "prophesee_event_msgs"])
+@pytest.mark.parametrize("ros1", [True, False])
+def test_arrays_of_ros(tmp_path, package, ros1):
+    messages = {"/events": arrays(EVENTS, ros1=ros1, package=package)}
+    path = tmp_path / "a.bag"
+    if ros1:
+        write_ros1(path, messages)
+    else:
+        path = write_ros2(tmp_path / "a", messages)
+    recording = open_recording(path)
+    assert recording.events.size == SIZE
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+
+
+@pytest.mark.parametrize("encoding", ENCODERS)
+@pytest.mark.parametrize("ros1", [True, False])
+def test_packets_of_ros(tmp_path, encoding, ros1):
+    events = Events(EVENTS.x, EVENTS.y, EVENTS.t + LATE, EVENTS.p) if encoding == "libcaer" else EVENTS
+    topics = {"/camera/events": packets(encoding, events, ros1=ros1)}
+    path = tmp_path / "a.bag"
+    if ros1:
+        write_ros1(path, topics)
+    else:
+        path = write_ros2(tmp_path / "a", topics)
+    assert_equal(open_recording(path).events.slice(0, 999), events)
+
+
+def test_folder_of_a_ros2_bag(tmp_path):
+    write_ros2(tmp_path / "a", {"/events": packets("evt3", EVENTS)})
+    recording = open_recording(tmp_path / "a")
+    assert (recording.metadata["topic"], recording.name) == ("/events", "a")
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+
+
+def test_topics_of_a_bag(tmp_path):
+    store = typestore(True)
+    text = store.types["std_msgs/msg/String"]("hello")
+    two = {"/left": arrays(EVENTS, ros1=True), "/right": arrays(EVENTS[:99], ros1=True), "/chatter": [text]}
+    write_ros1(tmp_path / "a.bag", two)
+    with pytest.raises(AmiwarpError, match=r"events in several topics: /left \(\d+ messages\), /right .*--topic"):
+        open_recording(tmp_path / "a.bag")
+    assert len(open_recording(tmp_path / "a.bag", topic="/right").events) == 99
+    assert convert(tmp_path / "a.bag", tmp_path / "out.h5", topic="/left").events == len(EVENTS)
+    with pytest.raises(AmiwarpError, match=r"no events in the topic '/chatter'; the topics with events are /left"):
+        open_recording(tmp_path / "a.bag", topic="/chatter")
+    write_ros1(tmp_path / "b.bag", {"/chatter": [text]})
+    with pytest.raises(AmiwarpError, match=r"without event topics; its topics are /chatter \(std_msgs/String\)"):
+        open_recording(tmp_path / "b.bag")
+    path = write_ros2(tmp_path / "d", {"/chatter": [typestore(False).types["std_msgs/msg/String"]("hello")]})
+    assert "is a ROS 2 bag without event topics; its topics are /chatter" in str(refusal(open_recording, path))
+    np.savez(tmp_path / "c.npz", x=[1], y=[1], t=[1], p=[1])
+    with pytest.raises(AmiwarpError, match=r"c\.npz: holds one stream of events, no topics"):
+        open_recording(tmp_path / "c.npz", topic="/left")
+
+
+def test_messages_of_ros_that_are_refused(tmp_path):
+    big = packets("evt3", EVENTS)
+    big[0].is_bigendian = True
+    path = write_ros2(tmp_path / "a", {"/events": big})
+    assert "big-endian words" in str(refusal(open_recording, path))
+    other = packets("evt3", EVENTS)
+    other[0].encoding = "zip"
+    path = write_ros2(tmp_path / "b", {"/events": other})
+    assert "encoding 'zip'; expected one of evt3" in str(refusal(open_recording, path))
+    store = typestore(True)
+    empty = array_message(store, EVENTS[:0], ros1=True)
+    write_ros1(tmp_path / "c.bag", {"/events": [empty]})
+    assert "holds no events" in str(refusal(open_recording, tmp_path / "c.bag"))
+
+
+def test_triggers_become_an_encoder(data_dir, tmp_path):
+    path = data_dir / "rosbag/ros2_evt3_640x480_trig10Hz.db3"
+    encoder = read_encoder_triggers(path, 6)
+    assert (len(encoder.t), encoder.rpm) == (18, pytest.approx(600.0))
+    assert encoder.index_t is not None
+    assert encoder.index_t.tolist() == encoder.t.tolist()
+    source = open_recording(path).events
+    assert encoder.covers(source.t_first, source.t_last)
+    with pytest.raises(AmiwarpError, match=r"0 rising trigger edges of channel 0; .*edges are: 18 of channel 6"):
+        read_encoder_triggers(path, 0)
+    counts = read_encoder_triggers(path, 6, counts_per_turn=4, direction=-1)
+    assert (counts.rpm, counts.index_t) == (pytest.approx(-150.0), None)
+    summary = convert(path, tmp_path / "out.h5", encoder=encoder)
+    assert (summary.events, summary.index_slip, summary.encoder_covers) == (378_266, pytest.approx(0.0, abs=1e-9), True)
+    write_bin(tmp_path / "a.bin", small(EVENTS, 34, 34, t_first=0))
+    with pytest.raises(AmiwarpError, match=r"files of the format bin store no triggers"):
+        read_encoder_triggers(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize("version", ["2", "3", "2.1"])
+def test_triggers_of_raw_files(tmp_path, version):
+    if version == "3":
+        words = np.array([0x8001, 0x6005, 0xA301, 0x0007, 0x6006, 0x280A, 0x6009, 0xA300, 0x6010, 0xA301], "<u2")
+    else:
+        words = np.array([0x8 << 28 | 1, 0xA << 28 | 5 << 22 | 3 << 8, 1 << 28 | 6 << 22 | 10 << 11 | 7,
+                          0xA << 28 | 9 << 22 | 3 << 8, 0xA << 28 | 16 << 22 | 3 << 8], "<u8")  # fmt: skip
+        value = np.array([0, 1, 1, 0, 1], "<u8")
+        words = (
+            (words | value * (np.arange(5) != 2)).astype("<u4") if version == "2" else words << np.uint64(32) | value
+        )
+    layout = "% format EVT21;endianness=little;height=240;width=320\n" if version == "2.1" else "% geometry 320x240\n"
+    path = tmp_path / "a.raw"
+    path.write_bytes(
+        f"% evt {version if '.' in version else version + '.0'}\n{layout}% end\n".encode() + words.tobytes()
+    )
+    assert open_recording(path).metadata["triggers"] == 3
+    assert np.diff(read_encoder_triggers(path, 3).t).tolist() == [11]
+
+
+def test_triggers_of_aedat4(tmp_path):
+    attribute, node = aedat.DescriptionAttribute, aedat.DescriptionNode
+    outputs = []
+    for number, (kind, size) in enumerate((("EVTS", SIZE), ("TRIG", ()))):
+        place = f"/mainloop/Recorder/outInfo/{number}/"
+        names = ("originalModuleName", "originalOutputName", "typeDescription")
+        stream = {"compression": attribute("string", "LZ4"), "typeIdentifier": attribute("string", kind)}
+        stream |= {name: attribute("string", "test") for name in names}
+        about = {f"size{axis}": attribute("int", value) for axis, value in zip("XY", size, strict=False)}
+        info = node("info", f"{place}info/", {"source": attribute("string", "test"), **about}, [])
+        outputs.append(node(str(number), place, stream, [info]))
+    edges = np.zeros(5, [("t", "<u8"), ("source", "u1")])
+    # Rising edge, falling edge, pulse, and the beginning and end of an exposure.
+    edges["t"], edges["source"] = 1_000_000 + np.arange(5) * 500, [1, 2, 3, 8, 9]
+    root = node("outInfo", "/mainloop/Recorder/outInfo/", {}, outputs)
+    with aedat.Encoder(tmp_path / "a.aedat4", [root], ("lz4", 1)) as encoder:
+        encoder.write(0, to_faery(EVENTS))
+        encoder.write(1, edges)
+    recording = open_recording(tmp_path / "a.aedat4")
+    assert recording.metadata == {"format": "aedat4", "triggers": 3}
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    assert read_encoder_triggers(tmp_path / "a.aedat4").t.tolist() == [1_000_000, 1_001_000]
+
+
+def tar(data: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as archive:
+        about = tarfile.TarInfo("events.txt")
+        about.size = len(data)
+        archive.addfile(about, io.BytesIO(data))
+    return buffer.getvalue()
+
+
+def zipped(data: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("events.txt", data)
+    return buffer.getvalue()
+
+
+def npy() -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.arange(4))
+    return buffer.getvalue()
+
+
+FOREIGN = {
+    "is a MATLAB 5 file; save": b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(200),
+    "is a PNG picture; .*simulate --picture": b"\x89PNG\r\n\x1a\n" + bytes(99),
+    "is an MP4 video; .*translate": struct.pack(">I", 24) + b"ftypisom" + bytes(99),
+    "is an AVI video": b"RIFF" + bytes(4) + b"AVI LIST" + bytes(99),
+    "is a gzip archive; unpack it first": gzip.compress(b"1 2 3"),
+    "is a tar archive; unpack": tar(b"1 2 3 0\n"),
+    "is a bzip2 archive": b"BZh91AY&SY" + bytes(99),
+    "is a pcap capture": b"\xd4\xc3\xb2\xa1" + bytes(99),
+    r"is a NumPy array \(\.npy\); .*savez": npy(),
+    "is a ZIP archive without x, y, t and p": zipped(b"1 2 3 0\n"),
+    "is a ROS 1 bag of version 1": b"#ROSBAG V1.2\n" + bytes(99),
+    r"is AEDAT 1\.0; only 2\.0, 3\.1 and 4": b"#!AER-DAT1.0\r\n" + bytes(99),
+    "is a JSON document": json.dumps({"width": 3}).encode(),
+    "is a PDF document": b"%PDF-1.7\n" + bytes(99),
+}
+
+
+@pytest.mark.parametrize("message", FOREIGN)
+def test_other_files_are_named(tmp_path, message):
+    (tmp_path / "file.raw").write_bytes(FOREIGN[message])
+    with pytest.raises(AmiwarpError, match=rf"file\.raw: {message}"):
+        open_recording(tmp_path / "file.raw")
+    assert os.listdir(tmp_path) == ["file.raw"]
+
+
+def test_real_files_of_other_kinds_are_named(data_dir):
+    real = {
+        "text/shapes_rotation/shapes_rotation_first_1.43s.mat": "is a MATLAB 5 file",
+        "images/brick.png": "is a PNG picture",
+        "images/china.jpg": "is a JPEG picture",
+        "video/bikes_640x272_25fps.mp4": "is an MP4 video",
+        "video/nfs240fps_basketball_20x200x200.npy": "is a NumPy array",
+    }
+    for name, message in real.items():
+        assert f"{name}: {message}" in str(refusal(open_recording, data_dir / name))
