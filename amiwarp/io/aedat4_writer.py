@@ -1,0 +1,51 @@
+"""Writer of iniVation's AEDAT 4.0 files, with faery: one stream of events, compressed by LZ4."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amiwarp.events.events import Events, regroup
+from amiwarp.io.output_formats import Outline
+
+PACKET = 1 << 14
+"""Events per packet of the file."""
+
+PACKET_EVENT = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), (("p", "on"), "?")])
+"""Events as faery takes them."""
+
+
+def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events."""
+    from faery.extension import aedat
+
+    with aedat.Encoder(part, _description(about), ("lz4", 1)) as encoder:
+        for events in regroup(blocks, count=PACKET):
+            packet = np.empty(len(events), PACKET_EVENT)
+            for name in ("t", "x", "y", "p"):
+                packet[name] = getattr(events, name)
+            encoder.write(0, packet)
+
+
+def _description(about: Outline) -> list[Any]:
+    """Return the description of the stream in the header, as iniVation's recorder writes it."""
+    from faery.extension import aedat
+
+    attribute, node = aedat.DescriptionAttribute, aedat.DescriptionNode
+    size = {"sizeX": about.width, "sizeY": about.height}
+    texts = {
+        "compression": "LZ4",
+        "originalModuleName": "amiwarp",
+        "originalOutputName": "events",
+        "typeDescription": "Array of events (polarity ON/OFF).",
+        "typeIdentifier": "EVTS",
+    }
+    root = "/mainloop/Recorder/outInfo/"
+    attributes = {name: attribute("int", value) for name, value in size.items()}
+    attributes["source"] = attribute("string", "amiwarp")
+    info = node("info", f"{root}0/info/", attributes, [])
+    stream = {name: attribute("string", text) for name, text in texts.items()}
+    return [node("outInfo", root, {}, [node("0", f"{root}0/", stream, [info])])]
