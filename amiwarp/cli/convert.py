@@ -130,8 +130,8 @@ def _lines(d: dict[str, Any]) -> list[str]:
         lines.append(
             f"warning: the encoder has {len(d['encoder_gaps'])} gaps, the first at {first[0]} .. {first[1]} us"
         )
-    for what in d["left_out"]:
-        lines.append(f"note: {LIMITS[d['format']].label} does not hold the {what}: it was left out")
+    if d["left_out"]:
+        lines.append(f"note: {LIMITS[d['format']].label} does not hold, and leaves out: {', '.join(d['left_out'])}")
     if d["slip_deg"] is not None:
         lines.append(f"encoder slips up to {d['slip_deg']:.3g} deg at its index pulses")
     return lines

@@ -1,7 +1,7 @@
 """Writer of ROS 2 bags, with rosbags: packets of event_camera_msgs in EVT 3.0, as drivers of Prophesee cameras record.
 
-event_camera_msgs is the message package that ROS 2 distributions contain. A bag is a single file, MCAP or SQLite, which
-holds the definition of its messages. The stamp of a packet is the time of its first event.
+event_camera_msgs is part of the ROS 2 distributions. A bag is a single file, MCAP or SQLite, which holds the definition
+of its messages. The stamp of a packet is the time of its first event.
 """
 
 from __future__ import annotations
