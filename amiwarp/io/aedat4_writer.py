@@ -8,26 +8,31 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.events.events import Events, regroup
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events
+from amiwarp.io.aedat import open_aedat4
 from amiwarp.io.output_formats import Outline
-
-PACKET = 1 << 14
-"""Events per packet of the file."""
 
 PACKET_EVENT = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), (("p", "on"), "?")])
 """Events as faery takes them."""
 
 
 def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events."""
+    """Write all events, and count them in the file, because the encoder does not report a disk that is full at last."""
     from faery.extension import aedat
 
     with aedat.Encoder(part, _description(about), ("lz4", 1)) as encoder:
-        for events in regroup(blocks, count=PACKET):
+        for events in blocks:
             packet = np.empty(len(events), PACKET_EVENT)
             for name in ("t", "x", "y", "p"):
                 packet[name] = getattr(events, name)
             encoder.write(0, packet)
+    try:
+        count = len(open_aedat4(part).events) if about.count else 0
+    except AmiwarpError:  # the file is truncated
+        count = 0
+    if count != about.count:
+        raise AmiwarpError(f"the file holds {count} of {about.count} events; check that the disk is not full")
 
 
 def _description(about: Outline) -> list[Any]:
