@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import eventcv
 import h5py
@@ -386,10 +387,14 @@ def test_a_disk_that_is_full_at_the_end_is_noticed(tmp_path, monkeypatch):
     def cut(path, *arguments):
         with encoder(path, *arguments) as found:
             yield found
-        os.truncate(path, os.path.getsize(path) - 1)
+        os.truncate(path, os.path.getsize(path) - 5000)
 
+    with monkeypatch.context() as patched:
+        patched.setattr("shutil.disk_usage", lambda _folder: SimpleNamespace(free=5000))
+        with pytest.raises(AmiwarpError, match=r"out\.aedat4: .*disk is full: 50000 of 50000 events"):
+            convert(source, tmp_path / "out.aedat4")
     monkeypatch.setattr(aedat, "Encoder", cut)
-    with pytest.raises(AmiwarpError, match=r"out\.aedat4: .*the file holds 0 of 50000 events; .* disk"):
+    with pytest.raises(AmiwarpError, match=r"out\.aedat4: .*disk is full: 0 of 50000 events"):
         convert(source, tmp_path / "out.aedat4")
     assert os.listdir(tmp_path) == ["source.h5"]
 

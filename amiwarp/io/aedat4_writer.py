@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,12 @@ PACKET_EVENT = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), (("p", "on"),
 """Events as faery takes them."""
 
 
+LAST_BYTES = 1 << 16
+"""Free disk space that is needed when the file is closed [bytes]."""
+
+
 def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events, and count them in the file, because the encoder does not report a disk that is full at last."""
+    """Write all events, then count them in the file."""
     from faery.extension import aedat
 
     with aedat.Encoder(part, _description(about), ("lz4", 1)) as encoder:
@@ -31,8 +36,9 @@ def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         count = len(open_aedat4(part).events) if about.count else 0
     except AmiwarpError:  # the file is truncated
         count = 0
-    if count != about.count:
-        raise AmiwarpError(f"the file holds {count} of {about.count} events; check that the disk is not full")
+    # The encoder does not report whether it could write its last bytes.
+    if count != about.count or shutil.disk_usage(part.parent).free < LAST_BYTES:
+        raise AmiwarpError(f"the disk is full: {count} of {about.count} events could be written; free some space")
 
 
 def _description(about: Outline) -> list[Any]:
