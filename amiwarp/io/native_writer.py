@@ -22,7 +22,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
-from amiwarp.io.atomic_output import NewFile
+from amiwarp.io.atomic_output import NewFile, spare_space
 from amiwarp.io.chunks import CHUNK, Codec, append_chunk, encode, in_order
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
@@ -116,6 +116,7 @@ class RecordingWriter:
         self._truth: TruthWriter | None = None
         self._datasets: dict[str, Any] = {}
         self._new: NewFile | None = None
+        self._spare = contextlib.ExitStack()
         self._pending: list[Columns] = []
         self._pending_count = 0
         self._written = 0
@@ -135,6 +136,7 @@ class RecordingWriter:
         self._new = NewFile(self.path, overwrite=self._overwrite)
         try:
             with errors_name(self.path, lambda: "making the file"):
+                self._spare.enter_context(spare_space(self._new.part.parent))
                 # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
                 self._file = h5py.File(self._new.part, "x", libver=("v110", "v110"))
                 self._truth = TruthWriter(self._file, self.path, self._size, self._codec)
@@ -153,6 +155,7 @@ class RecordingWriter:
         try:
             with errors_name(self.path, lambda: f"finishing after {len(self)} events"):
                 self._finish()
+                self._spare.close()
                 self._file.close()
                 self._new.commit()
         except BaseException:
@@ -382,8 +385,9 @@ class RecordingWriter:
                     self._extend(f"encoder/{name}", values)
 
     def _discard(self) -> None:
+        self._spare.close()
         if self._file is not None:
-            # Closing fails too if the disk is full. The file is removed in any case.
+            # The file is removed even if it cannot be closed.
             with contextlib.suppress(Exception):
                 self._file.close()
         if self._new is not None:
