@@ -205,6 +205,13 @@ def test_amiwarp_reads_what_it_writes(tmp_path, name):
     assert sorted(os.listdir(tmp_path)) == [f"out{CLIENTS[name][0]}", "source.h5"]
 
 
+def test_late_times_in_text_are_exact(tmp_path):
+    t = np.sort(np.random.default_rng(0).integers(2**51 - 2**30, 2**51, 2000))
+    events = events_at([-(2**51), *t.tolist()])
+    path = exported(tmp_path, "text", MemoryEvents(events, *SIZE))
+    np.testing.assert_array_equal(open_recording(path).events.slice(0, 3000).t, events.t)
+
+
 @pytest.mark.parametrize("name", ["evt3", "text"])
 def test_eventcv_reads_what_is_written(tmp_path, name):
     events = make_events(5000)

@@ -97,8 +97,8 @@ LIMITS = {
     OutputFormat.EVT3: Limits("RAW EVT 3.0", side=2048, t_first=0, span=LONGEST_US),
     OutputFormat.AEDAT4: Limits("AEDAT 4", side=2**15, t_first=0),
     OutputFormat.NPZ: Limits("npz"),
-    # Readers take the seconds as float64, which is exact to the microsecond up to these times, 142 years.
-    OutputFormat.TEXT: Limits("text", t_first=-(2**52), t_last=2**52, holds_size=False),
+    # Readers take the seconds as float64, which is exact to the microsecond up to these times, 71 years.
+    OutputFormat.TEXT: Limits("text", t_first=-(2**51), t_last=2**51, holds_size=False),
     # A time in ROS has 32 bits for the seconds.
     OutputFormat.ROS2: Limits("a ROS 2 bag", side=2048, t_first=0, t_last=2**31 * 10**6 - 1, span=LONGEST_US),
 }
