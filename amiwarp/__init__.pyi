@@ -47,12 +47,14 @@ from .imaging.metrics import model_error as model_error
 from .imaging.metrics import truth_model as truth_model
 from .imaging.sharpness_costs import sharpness as sharpness
 from .imaging.warped_image import iwe as iwe
+from .io.chunks import Codec as Codec
 from .io.conversion import ConversionSummary as ConversionSummary
 from .io.conversion import convert as convert
 from .io.copying import save_recording as save_recording
 from .io.formats import Format as Format
 from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
+from .io.output_formats import OutputFormat as OutputFormat
 from .io.recorded_dataset import RecordedDataset as RecordedDataset
 from .io.truth_export import save_flow_dsec as save_flow_dsec
 from .io.truth_export import save_flow_mvsec as save_flow_mvsec

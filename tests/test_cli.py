@@ -297,6 +297,20 @@ def test_convert_adds_encoder_camera_and_prism(place: Path) -> None:
     assert seen["prism"] == {"apex_deg": pytest.approx(1.5), "index": 1.6, "flat_side": "scene"}
 
 
+def test_convert_says_what_a_format_leaves_out(place: Path) -> None:
+    data = ok("convert", "recording.h5", "out.aedat4")
+    assert (data["format"], data["left_out"]) == (
+        "aedat4", ["encoder", "camera", "prism", "ground truth", "metadata"]
+    )  # fmt: skip
+    result = run("convert", "recording.h5", "out.bin", "--format", "text")
+    assert result.exit_code == 0
+    left_out = "sensor size, encoder, camera, prism, ground truth, metadata"
+    assert f"note: text does not hold, and leaves out: {left_out}\n" in result.stdout
+    assert len((place / "out.bin").read_text().splitlines()) == data["events"]
+    assert "leaves out" not in run("convert", "recording.h5", "plain.h5", "--codec", "gzip").stdout
+    assert ok("info", "plain.h5")["events"] == data["events"]
+
+
 def test_info_prints_a_table(place: Path) -> None:
     result = run("info", "recording.h5")
     assert result.exit_code == 0

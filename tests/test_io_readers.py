@@ -12,6 +12,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording
 from amiwarp.io import file_scan as scan
+from amiwarp.io.output_formats import OutputFormat
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import Prism
@@ -325,6 +326,8 @@ def test_convert_puts_in_encoder_camera_and_prism(tmp_path):
         encoder_covers=True,
         encoder_gaps=((1_001_900, 1_004_100),),
         index_slip=summary.index_slip,
+        format=OutputFormat.NATIVE,
+        left_out=(),
     )
     assert summary.index_slip == pytest.approx(0.0, abs=1e-9)
     again = convert(tmp_path / "out.h5", tmp_path / "again.h5")
@@ -334,12 +337,12 @@ def test_convert_puts_in_encoder_camera_and_prism(tmp_path):
 
 def test_convert_refuses(tmp_path):
     path = write_sample(tmp_path, "npz", EVENTS)
-    (tmp_path / "link").symlink_to(path)
+    (tmp_path / "link.h5").symlink_to(path)
     before = path.read_bytes()
-    for target in (path, tmp_path / "link"):
+    for target in (path, tmp_path / "link.h5"):
         with pytest.raises(AmiwarpError, match="is read in this run"):
             convert(path, target, overwrite=True)
     with pytest.raises(AmiwarpError, match="give both the same size"):
         convert(path, tmp_path / "out.h5", camera=Camera(10, 10, 5.0, 5.0, 4.5, 4.5))
     assert path.read_bytes() == before
-    assert sorted(os.listdir(tmp_path)) == ["link", "sample.npz"]
+    assert sorted(os.listdir(tmp_path)) == ["link.h5", "sample.npz"]

@@ -307,6 +307,7 @@ def test_bad_input_is_one_line(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], says: str
 ) -> None:
     monkeypatch.chdir(folder)
+    monkeypatch.setitem(sys.modules, "dv_processing", None)  # as if it were not installed
     before = set(folder.iterdir())
     done = CliRunner().invoke(app, args)
     assert done.exit_code == 1

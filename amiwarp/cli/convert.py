@@ -1,4 +1,4 @@
-"""``amiwarp convert``: conversion of recordings to the native format."""
+"""``amiwarp convert``: conversion of recordings to the native format and to others."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, Topic
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
+from amiwarp.io.chunks import Codec
+from amiwarp.io.output_formats import LIMITS, OutputFormat
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -91,8 +93,21 @@ class EncoderOptions:
 
 def run(
     source: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
-    out: Annotated[Path, typer.Argument(help="Native recording to write (.h5)."), OUTPUT],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            help="File to write. Its extension gives the format: .h5 (native), .raw (Prophesee EVT 3.0), .aedat4, "
+            ".npz, .txt, .mcap or .db3 (ROS 2 bag)."
+        ),
+        OUTPUT,
+    ],
     *,
+    format: Annotated[
+        OutputFormat | None, typer.Option(help="Format to write, if not that of the extension.", show_default=False)
+    ] = None,
+    codec: Annotated[
+        Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")
+    ] = Codec.BLOSC,
     encoder: EncoderOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
@@ -101,7 +116,8 @@ def run(
 ) -> None:
     """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
 
-    Memory use does not depend on the length of the recording.
+    Other formats hold the events only; the command lists what it leaves out. Memory use does not depend on the length
+    of the recording.
     """
     began = time.perf_counter()
     log = encoder.build(source, topic)
@@ -113,7 +129,7 @@ def run(
         wedge = prism.build(recording.prism)
     with progress("converting") as advance:
         summary = convert(
-            source, out, encoder=log, camera=lens, prism=wedge, topic=topic,
+            source, out, encoder=log, camera=lens, prism=wedge, topic=topic, format=format, codec=codec,
             progress=advance,
         )  # fmt: skip
     seconds = time.perf_counter() - began
@@ -137,6 +153,8 @@ def _lines(d: dict[str, Any]) -> list[str]:
         lines.append(
             f"warning: the encoder has {len(d['encoder_gaps'])} gaps, the first at {first[0]} .. {first[1]} us"
         )
+    if d["left_out"]:
+        lines.append(f"note: {LIMITS[d['format']].label} does not hold, and leaves out: {', '.join(d['left_out'])}")
     if d["slip_deg"] is not None:
         lines.append(f"encoder slips up to {d['slip_deg']:.3g} deg at its index pulses")
     return lines

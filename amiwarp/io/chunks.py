@@ -1,11 +1,14 @@
 """Encoder and decoder of the chunks of native recordings, in parallel threads. HDF5 itself uses one thread at a time.
 
-A stored chunk is a Blosc frame (version 1, as written by HDF5's filter 32001) followed by its Fletcher-32 checksum.
+A stored chunk is a Blosc frame (version 1, as written by HDF5's filter 32001) or deflated bytes, followed by its
+Fletcher-32 checksum. HDF5 itself reads the deflated chunks of :attr:`Codec.GZIP`.
 """
 
 from __future__ import annotations
 
+import enum
 import os
+import zlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -41,6 +44,25 @@ CHECKSUM_ROW = 256
 """Number of 16-bit words that the checksum sums at a time."""
 
 
+GZIP_LEVEL = 1
+"""Level of deflate: 1 is the fastest. Higher levels make event files only a few percent smaller."""
+
+
+class Codec(enum.StrEnum):
+    """Compression of native recordings.
+
+    Examples
+    --------
+    >>> amiwarp.Codec("gzip")
+    <Codec.GZIP: 'gzip'>
+    """
+
+    BLOSC = "blosc"
+    """Blosc (LZ4, bit shuffle): the fastest. Other programs need HDF5's Blosc filter to read it."""
+    GZIP = "gzip"
+    """Deflate with byte shuffle, which every HDF5 library reads."""
+
+
 def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, None]:
     """Run jobs in parallel threads, and yield their results in the order of the jobs.
 
@@ -68,13 +90,20 @@ def _blosc() -> Any:
     return Blosc(cname="lz4", clevel=1, shuffle=Blosc.BITSHUFFLE)
 
 
-def encode(values: NDArray[Any]) -> bytes:
+def encode(values: NDArray[Any], codec: Codec = Codec.BLOSC) -> bytes:
     """Return the stored bytes of a chunk. A shorter array is padded with zeros, as HDF5 does."""
     whole = values
     if len(values) < CHUNK:
         whole = np.concatenate([values, np.zeros((CHUNK - len(values), *values.shape[1:]), values.dtype)])
-    frame = _blosc().encode(np.ascontiguousarray(whole))
+    whole = np.ascontiguousarray(whole)
+    frame = _blosc().encode(whole) if codec is Codec.BLOSC else _deflate(whole)
     return b"".join((frame, checksum(frame).to_bytes(4, "little")))
+
+
+def _deflate(values: NDArray[Any]) -> bytes:
+    """Compress the bytes of values as HDF5's filters shuffle and deflate do."""
+    shuffled = values.view(np.uint8).reshape(-1, values.itemsize).T
+    return zlib.compress(shuffled.tobytes(), GZIP_LEVEL)
 
 
 def decode(stored: bytes, out: NDArray[Any]) -> bool:

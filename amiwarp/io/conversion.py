@@ -1,26 +1,35 @@
-"""Conversion of a recording of any format to the native one, with its encoder, camera and prism."""
+"""Conversion of a recording from any format to the native one or to others."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import EventSource
+from amiwarp.io.atomic_output import check_output
+from amiwarp.io.chunks import Codec
 from amiwarp.io.copying import copy_events
+from amiwarp.io.export import export
 from amiwarp.io.formats import open_recording
 from amiwarp.io.native_writer import RecordingWriter
+from amiwarp.io.output_formats import LIMITS, OutputFormat, check_codec, output_format
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
+    from amiwarp.events.recording import Recording
     from amiwarp.optics.prism import NominalPrism
 
 GAP_INTERVALS = 5
 """Number of median sample intervals above which the time between two encoder samples is reported as a gap."""
+
+
+SOURCE_NAMES = ("source_name", "source_format")
+"""Metadata that name the recording that was converted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +64,10 @@ class ConversionSummary:
     index_slip: float | None
     """Largest angle error at an index pulse [rad], or None without pulses. A value above one count means that counts
     were lost."""
+    format: OutputFormat
+    """Format that was written."""
+    left_out: tuple[str, ...]
+    """Parts of the recording that the format does not hold, such as ``"encoder"``. Empty for the native format."""
 
 
 def convert(
@@ -67,15 +80,21 @@ def convert(
     topic: str | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
+    format: OutputFormat | str | None = None,
+    codec: Codec | str = Codec.BLOSC,
 ) -> ConversionSummary:
-    """Convert a recording to the native format, in constant memory.
+    """Convert a recording to the native format or to another one, in constant memory.
+
+    Only the native format holds the encoder, the camera, the prism, the ground truth and the metadata. All formats
+    keep x, y, t and p of every event exactly.
 
     Parameters
     ----------
     source_path : str or path-like
         The recording to read, in any format of :class:`Format`.
     out_path : str or path-like
-        The native HDF5 file to write.
+        The file to write. Its extension gives the format: ``.h5`` or ``.hdf5`` (native), ``.raw`` (Prophesee EVT 3.0),
+        ``.aedat4``, ``.npz``, ``.txt``, and ``.mcap`` or ``.db3`` (ROS 2 bag).
     encoder : Encoder, optional
         Replaces the encoder of the file.
     camera : Camera, optional
@@ -88,6 +107,10 @@ def convert(
         Called with the name of the step and the finished fraction of the task, 0 to 1.
     overwrite : bool, default False
         Whether an existing output may be replaced.
+    format : OutputFormat or str, optional
+        The format to write, if not that of the extension. The layout of DSEC (``"dsec"``) needs it.
+    codec : Codec or str, default "blosc"
+        Compression of HDF5. Programs without HDF5's Blosc filter read ``"gzip"``.
 
     Returns
     -------
@@ -97,8 +120,8 @@ def convert(
     Raises
     ------
     AmiwarpError
-        If the input cannot be read or the output cannot be written, if both are the same file, or if the output exists
-        without ``overwrite``. Then no output remains.
+        If the input cannot be read or the output cannot be written, if both are the same file, if the output exists
+        without ``overwrite``, or if the format cannot hold the events. Then no output remains.
 
     Examples
     --------
@@ -106,34 +129,56 @@ def convert(
     >>> amiwarp.save_recording("in.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4)))
     >>> amiwarp.convert("in.h5", "out.h5", prism=amiwarp.Prism(apex=0.03)).events
     2
+    >>> amiwarp.convert("out.h5", "out.aedat4").left_out
+    ('prism',)
     """
-    recording = open_recording(source_path, topic=topic)
-    source = recording.events
-    encoder = encoder or recording.encoder
-    camera = camera or recording.camera
-    width, height = source.size
-    if camera is not None and not getattr(source, "size_is_known", True):
-        width, height = camera.width, camera.height
+    out_path = Path(out_path)
+    check_output(out_path, overwrite=overwrite)
+    chosen = output_format(out_path, format)
+    codec = check_codec(out_path, codec, chosen)
+    opened = open_recording(source_path, topic=topic)
+    recording = replace(
+        opened, encoder=encoder or opened.encoder, camera=camera or opened.camera, prism=prism or opened.prism
+    )
+    size = recording.events.size
+    if recording.camera is not None and not getattr(recording.events, "size_is_known", True):
+        size = recording.camera.width, recording.camera.height
+    if chosen is OutputFormat.NATIVE:
+        _write_native(recording, out_path, size, codec, progress, overwrite)
+    else:
+        export(recording.events, out_path, chosen, size, codec=codec, progress=progress, overwrite=overwrite)
+    return _summary(recording, size, chosen)
+
+
+def _write_native(
+    recording: Recording,
+    path: Path,
+    size: tuple[int, int],
+    codec: Codec,
+    progress: Progress | None,
+    overwrite: bool,
+) -> None:
+    """Write a native recording. Its metadata name the source."""
     metadata = {name: value for name, value in recording.metadata.items() if name != "format"}
+    source = recording.name, recording.metadata["format"]
     with RecordingWriter(
-        out_path,
-        width=width,
-        height=height,
-        camera=camera,
-        prism=prism or recording.prism,
-        encoder=encoder,
+        path,
+        width=size[0],
+        height=size[1],
+        camera=recording.camera,
+        prism=recording.prism,
+        encoder=recording.encoder,
         truth_parameters=None if recording.truth is None else recording.truth.parameters,
         truth_labels=None if recording.truth is None else recording.truth.labels,
-        metadata={"source_name": recording.name, "source_format": recording.metadata["format"], **metadata},
+        metadata={**dict(zip(SOURCE_NAMES, source, strict=True)), **metadata},
         overwrite=overwrite,
+        codec=codec,
     ) as writer:
         copy_events(recording, writer, progress)
-    return _summary(source, (width, height), encoder, dict(getattr(source, "repairs", {})))
 
 
-def _summary(
-    source: EventSource, size: tuple[int, int], encoder: Encoder | None, repairs: dict[str, int]
-) -> ConversionSummary:
+def _summary(recording: Recording, size: tuple[int, int], chosen: OutputFormat) -> ConversionSummary:
+    source, encoder = recording.events, recording.encoder
     ends = (source.t_first, source.t_last) if len(source) else None
     slip = np.zeros(0) if encoder is None else encoder.slip()
     return ConversionSummary(
@@ -142,11 +187,27 @@ def _summary(
         t_last=ends[1] if ends else None,
         width=size[0],
         height=size[1],
-        repairs=repairs,
+        repairs=dict(getattr(source, "repairs", {})),
         encoder_covers=None if encoder is None else ends is None or encoder.covers(*ends),
         encoder_gaps=() if encoder is None else _gaps(encoder),
         index_slip=float(np.abs(slip).max()) if slip.size else None,
+        format=chosen,
+        left_out=() if chosen is OutputFormat.NATIVE else _left_out(recording, LIMITS[chosen].holds_size),
     )
+
+
+def _left_out(recording: Recording, holds_size: bool) -> tuple[str, ...]:
+    """Return what a recording has in addition to its events, and the size if that is not held either."""
+    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {})}
+    found = {
+        "sensor size": not holds_size,
+        "encoder": recording.encoder is not None,
+        "camera": recording.camera is not None,
+        "prism": recording.prism is not None,
+        "ground truth": recording.truth is not None,
+        "metadata": not set(recording.metadata) <= known,
+    }
+    return tuple(name for name, left in found.items() if left)
 
 
 def _gaps(encoder: Encoder) -> tuple[tuple[int, int], ...]:

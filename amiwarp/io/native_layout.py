@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.camera_attributes import camera_attributes, prism_attributes
-from amiwarp.io.chunks import CHUNK
+from amiwarp.io.chunks import CHUNK, GZIP_LEVEL, Codec
 from amiwarp.optics.camera import Camera, check_size
 
 if TYPE_CHECKING:
@@ -76,10 +76,19 @@ def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
 
 
-def make_dataset(file: Any, name: str, dtype: Any, row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
+def make_dataset(
+    file: Any,
+    name: str,
+    dtype: Any,
+    row: tuple[int, ...] = (),
+    chunk_rows: int = CHUNK,
+    codec: Codec = Codec.BLOSC,
+) -> Any:
     """Create an empty dataset of the native layout, whose rows have the shape ``row``."""
     import hdf5plugin
 
+    blosc = {"compression": hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)}
+    gzip = {"compression": "gzip", "compression_opts": GZIP_LEVEL, "shuffle": True}
     # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.
     return file.create_dataset(
         name,
@@ -88,7 +97,7 @@ def make_dataset(file: Any, name: str, dtype: Any, row: tuple[int, ...] = (), ch
         chunks=(chunk_rows, *row),
         dtype=dtype,
         fletcher32=True,
-        compression=hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
+        **(blosc if codec is Codec.BLOSC else gzip),
     )
 
 

@@ -22,8 +22,8 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
-from amiwarp.io.atomic_output import NewFile
-from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
+from amiwarp.io.atomic_output import NewFile, spare_space
+from amiwarp.io.chunks import CHUNK, Codec, append_chunk, encode, in_order
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
     Columns,
@@ -37,6 +37,7 @@ from amiwarp.io.native_layout import (
 )
 from amiwarp.io.truth_writer import TruthWriter, event_columns
 from amiwarp.optics.camera import Camera
+from amiwarp.validation import choice
 
 if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
@@ -71,6 +72,8 @@ class RecordingWriter:
         Other information: text, numbers and truth values by name.
     overwrite : bool, default False
         Whether an existing file may be replaced.
+    codec : Codec or str, default "blosc"
+        Compression. Programs without HDF5's Blosc filter read ``"gzip"``.
 
     Raises
     ------
@@ -100,8 +103,10 @@ class RecordingWriter:
         truth_labels: WorldLabels | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
         overwrite: bool = False,
+        codec: Codec | str = Codec.BLOSC,
     ) -> None:
         self.path, self._overwrite = Path(path), overwrite
+        self._codec = choice(Codec, codec, f"{self.path}: codec")
         check_frame(self.path, width, height, camera)
         self._size = (int(width), int(height))
         self._camera, self._prism, self._encoder = camera, prism, encoder
@@ -111,6 +116,7 @@ class RecordingWriter:
         self._truth: TruthWriter | None = None
         self._datasets: dict[str, Any] = {}
         self._new: NewFile | None = None
+        self._spare = contextlib.ExitStack()
         self._pending: list[Columns] = []
         self._pending_count = 0
         self._written = 0
@@ -130,9 +136,10 @@ class RecordingWriter:
         self._new = NewFile(self.path, overwrite=self._overwrite)
         try:
             with errors_name(self.path, lambda: "making the file"):
+                self._spare.enter_context(spare_space(self._new.part.parent))
                 # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
                 self._file = h5py.File(self._new.part, "x", libver=("v110", "v110"))
-                self._truth = TruthWriter(self._file, self.path, self._size)
+                self._truth = TruthWriter(self._file, self.path, self._size, self._codec)
                 self._write_header()
         except BaseException:
             self._discard()
@@ -148,6 +155,7 @@ class RecordingWriter:
         try:
             with errors_name(self.path, lambda: f"finishing after {len(self)} events"):
                 self._finish()
+                self._spare.close()
                 self._file.close()
                 self._new.commit()
         except BaseException:
@@ -249,7 +257,7 @@ class RecordingWriter:
         events, inside = piece()
         columns = {"events/x": events.x, "events/y": events.y, "events/t": events.t - self._t_offset}
         columns |= {"events/p": events.p, "events/inside": inside}
-        return events, inside, columns, [encode(part) for part in chunks_of(columns)]
+        return events, inside, columns, [encode(part, self._codec) for part in chunks_of(columns)]
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder, which is written at the end.
@@ -324,7 +332,9 @@ class RecordingWriter:
             return
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
         complete = {name: column[:whole] for name, column in joined.items()}
-        with contextlib.closing(in_order(partial(encode, part) for part in chunks_of(complete))) as encoded:
+        with contextlib.closing(
+            in_order(partial(encode, part, self._codec) for part in chunks_of(complete))
+        ) as encoded:
             self._store(complete, encoded)
         self._written += whole
         self._pending_count -= whole
@@ -347,7 +357,7 @@ class RecordingWriter:
 
     def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = ()) -> Any:
         if name not in self._datasets:
-            self._datasets[name] = make_dataset(self._file, name, dtype, row)
+            self._datasets[name] = make_dataset(self._file, name, dtype, row, codec=self._codec)
         return self._datasets[name]
 
     def _write_header(self) -> None:
@@ -375,8 +385,9 @@ class RecordingWriter:
                     self._extend(f"encoder/{name}", values)
 
     def _discard(self) -> None:
+        self._spare.close()
         if self._file is not None:
-            # Closing fails too if the disk is full. The file is removed in any case.
+            # The file is removed even if it cannot be closed.
             with contextlib.suppress(Exception):
                 self._file.close()
         if self._new is not None:

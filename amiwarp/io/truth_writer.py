@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses
+from amiwarp.io.chunks import Codec
 from amiwarp.io.native_layout import Columns, make_dataset
 
 EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
@@ -52,9 +53,9 @@ class TruthWriter:
     Each instant and each table of poses must have the same arrays as the first.
     """
 
-    def __init__(self, file: Any, path: Path, size: tuple[int, int]) -> None:
+    def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
         """Set up the writer; ``size`` is the width and height of the sensor [px]."""
-        self._file, self._path, self._size = file, path, size
+        self._file, self._path, self._size, self._codec = file, path, size, codec
         self._datasets: dict[str, Any] = {}
         self._names: dict[str, tuple[str, ...]] = {}
 
@@ -125,7 +126,9 @@ class TruthWriter:
     def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
         """Append rows to a dataset through HDF5."""
         if name not in self._datasets:
-            self._datasets[name] = make_dataset(self._file, name, values.dtype, values.shape[1:], chunk_rows)
+            self._datasets[name] = make_dataset(
+                self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec
+            )
         dataset = self._datasets[name]
         if dataset.shape[1:] != values.shape[1:]:
             raise AmiwarpError(

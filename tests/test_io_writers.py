@@ -1,0 +1,464 @@
+"""Every format that is written is read back exactly, by amiwarp and by programs that are not amiwarp."""
+
+import contextlib
+import itertools
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import eventcv
+import h5py
+import hdf5plugin  # noqa: F401 - its import registers the compression
+import numpy as np
+import pytest
+from faery.extension import aedat, evt
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from io_samples import SIZE, make_events
+from rosbags.highlevel import AnyReader
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, EventSource, MemoryEvents
+from amiwarp.events.recording import Recording, Truth
+from amiwarp.io import convert, open_recording, save_recording
+from amiwarp.io.chunks import CHUNK, Codec
+from amiwarp.io.evt3_writer import Evt3Encoder
+from amiwarp.io.export import export
+from amiwarp.io.output_formats import OutputFormat
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import Prism
+
+Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""x, y, t and p, as a client gives them."""
+
+HOURS_28 = 100_000_000_000
+"""Longest recording of the formats with EVT 3.0 [us]."""
+
+
+def save(path: Path, events: Events, **options: object) -> Path:
+    save_recording(path, Recording(MemoryEvents(events, *SIZE), **options), overwrite=True)
+    return path
+
+
+def by_dsec(path: Path) -> Columns:
+    """Read as DSEC's own programs do, and check its index."""
+    with h5py.File(path) as file:
+        assert sorted(file) == ["events", "ms_to_idx", "t_offset"]
+        assert [file[f"events/{name}"].dtype.str for name in "xytp"] == ["<u2", "<u2", "<u4", "|u1"]
+        assert (file["ms_to_idx"].dtype.str, file["t_offset"].shape) == ("<u8", ())
+        t, index = file["events/t"][:], file["ms_to_idx"][:]
+        ms = np.arange(t[-1] // 1000 + 1 if t.size else 0)
+        np.testing.assert_array_equal(index, np.searchsorted(t, 1000 * ms))
+        return file["events/x"][:], file["events/y"][:], t + file["t_offset"][()], file["events/p"][:]
+
+
+def by_faery(path: Path) -> Columns:
+    with evt.Decoder(path, None, None) as decoder:
+        assert (decoder.version, decoder.dimensions) == ("evt3", SIZE)
+        packets = [packet["events"] for packet in decoder if "events" in packet]
+    events = np.concatenate(packets) if packets else np.zeros(0, [(name, "<u8") for name in "txyp"])
+    return events["x"], events["y"], events["t"], events["p"]
+
+
+def by_eventcv(path: Path) -> Columns:
+    options = {"time_unit": "microseconds"} if path.suffix == ".h5" else {}
+    return tuple(eventcv.load(str(path), **options).numpy().T)
+
+
+def by_dv_processing(path: Path) -> Columns:
+    recording = pytest.importorskip("dv_processing").io.MonoCameraRecording(str(path))
+    assert recording.getEventResolution() == SIZE
+    x, y, t, p = [[np.zeros(0, np.int64)] for _ in range(4)]
+    while (batch := recording.getNextEventBatch()) is not None:
+        x.append(batch.coordinates()[:, 0])
+        y.append(batch.coordinates()[:, 1])
+        t.append(batch.timestamps())
+        p.append(batch.polarities())
+    return np.concatenate(x), np.concatenate(y), np.concatenate(t), np.concatenate(p)
+
+
+def by_numpy(path: Path) -> Columns:
+    with np.load(path) as archive:
+        assert (int(archive["width"]), int(archive["height"])) == SIZE
+        assert [archive[name].dtype.str for name in "xytp"] == ["<u2", "<u2", "<i8", "|u1"]
+        return archive["x"], archive["y"], archive["t"], archive["p"]
+
+
+def by_decimals(path: Path) -> Columns:
+    """Read text without rounding: the point is taken out of the seconds."""
+    rows = [line.split() for line in path.read_text().splitlines()]
+    assert all(len(row) == 4 and len(row[0].partition(".")[2]) == 6 for row in rows)
+    table = np.array([[int(word.replace(".", "")) for word in row] for row in rows], np.int64).reshape(-1, 4)
+    return table[:, 1], table[:, 2], table[:, 0], table[:, 3]
+
+
+def by_rosbags(path: Path) -> Columns:
+    """Read a bag with the definitions that it holds. Its packets, one after the other, are the words of a RAW file."""
+    words, stamps, counts = [], [], []
+    with AnyReader([path]) as reader:
+        for connection, recorded, data in reader.messages():
+            assert (connection.topic, connection.msgtype) == (
+                "/event_camera/events",
+                "event_camera_msgs/msg/EventPacket",
+            )
+            packet = reader.deserialize(data, connection.msgtype)
+            assert (packet.width, packet.height, packet.encoding, packet.is_bigendian) == (*SIZE, "evt3", False)
+            assert packet.seq == len(words)
+            stamps.append(packet.header.stamp.sec * 1_000_000 + packet.header.stamp.nanosec // 1000)
+            assert recorded == stamps[-1] * 1000
+            words.append(packet.events.tobytes())
+            counts.append(int(np.count_nonzero(packet.events.view("<u2") >> 12 == 2)))
+    origin = 0 if not stamps or stamps[0] < HOURS_28 else stamps[0]
+    raw = path.with_suffix(".packets")
+    raw.write_bytes(f"% evt 3.0\n% geometry {SIZE[0]}x{SIZE[1]}\n% t0 {origin}\n% end\n".encode() + b"".join(words))
+    columns = by_faery(raw)
+    np.testing.assert_array_equal(columns[2][np.cumsum([0, *counts])[:-1]], stamps)
+    return columns
+
+
+CLIENTS: dict[str, tuple[str, Callable[[Path], Columns]]] = {
+    # format: (extension, client)
+    "dsec": (".h5", by_dsec),
+    "evt3": (".raw", by_faery),
+    "aedat4": (".aedat4", by_eventcv),
+    "npz": (".npz", by_numpy),
+    "text": (".txt", by_decimals),
+    "ros2 mcap": (".mcap", by_rosbags),
+    "ros2 db3": (".db3", by_rosbags),
+}
+
+
+def assert_columns(found: Columns, events: Events) -> None:
+    for name, values in zip("xytp", found, strict=True):
+        np.testing.assert_array_equal(values, getattr(events, name), err_msg=name)
+
+
+def written(folder: Path, name: str, events: Events) -> Path:
+    source = save(folder / "source.h5", events)
+    path = folder / f"out{CLIENTS[name][0]}"
+    summary = convert(source, path, format=name.split()[0], overwrite=True)
+    assert (summary.events, summary.format, summary.left_out) == (
+        len(events),
+        name.split()[0],
+        ("sensor size",) if name == "text" else (),
+    )
+    return path
+
+
+def exported(folder: Path, name: str, source: EventSource) -> Path:
+    """Write the events of a source without a file for them."""
+    path = folder / f"out{CLIENTS[name][0]}"
+    chosen = OutputFormat(name.split()[0])
+    export(source, path, chosen, SIZE, codec=Codec.BLOSC, progress=None, overwrite=True)
+    return path
+
+
+def events_at(t: list[int], seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    x, y = (rng.integers(0, side, len(t)) for side in SIZE)
+    return Events.from_arrays(x, y, np.array(t, np.int64), rng.integers(0, 2, len(t)))
+
+
+GAPS = st.one_of(
+    st.integers(0, 3),
+    st.integers(4090, 4100),
+    st.integers(0, 10**6),
+    st.integers(2**24 - 5000, 2**24 + 5000),
+    st.integers(2**24, 2**27),
+)
+"""Times between events [us]: equal times, steps of the upper bits of EVT 3.0, and gaps of several of its ranges."""
+
+
+@pytest.mark.parametrize("name", [name for name in CLIENTS if name != "ros2 db3"])
+@given(
+    start=st.sampled_from([0, 7, 2**24 - 1, 2**31, 1_700_000_000_000_000]),
+    gaps=st.lists(GAPS, max_size=24),
+    seed=st.integers(0, 99),
+)
+@example(start=0, gaps=[0] * 20, seed=1)
+@example(start=2**25, gaps=[], seed=1)
+@example(start=4095 << 12, gaps=[1 << 12, 4094 << 12, 4095 << 12, 1 << 12], seed=1)
+@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_events_come_back_from_other_programs(tmp_path, name, start, gaps, seed):
+    events = events_at(np.cumsum([start, *gaps]).tolist(), seed)
+    assert_columns(CLIENTS[name][1](exported(tmp_path, name, MemoryEvents(events, *SIZE))), events)
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_no_events_come_back_from_other_programs(tmp_path, name):
+    events = Events.empty()
+    assert_columns(CLIENTS[name][1](written(tmp_path, name, events)), events)
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_amiwarp_reads_what_it_writes(tmp_path, name):
+    events = make_events(3 * CHUNK // 2)
+    recording = open_recording(written(tmp_path, name, events))
+    found = recording.events.slice(0, len(events) + 1)
+    assert_columns((found.x, found.y, found.t, found.p), events)
+    assert set(recording.metadata) == ({"format", "topic"} if name.startswith("ros2") else {"format"})
+    assert recording.events.size == SIZE
+    assert sorted(os.listdir(tmp_path)) == [f"out{CLIENTS[name][0]}", "source.h5"]
+
+
+def test_late_times_in_text_are_exact(tmp_path):
+    t = np.sort(np.random.default_rng(0).integers(2**51 - 2**30, 2**51, 2000))
+    events = events_at([-(2**51), *t.tolist()])
+    path = exported(tmp_path, "text", MemoryEvents(events, *SIZE))
+    np.testing.assert_array_equal(open_recording(path).events.slice(0, 3000).t, events.t)
+
+
+@pytest.mark.parametrize("name", ["evt3", "text"])
+def test_eventcv_reads_what_is_written(tmp_path, name):
+    events = make_events(5000)
+    assert_columns(by_eventcv(written(tmp_path, name, events)), events)
+
+
+@pytest.mark.parametrize("count", [0, 1, 50_000])
+def test_dv_processing_reads_aedat4(tmp_path, count):
+    events = make_events(50_000)[:count]
+    assert_columns(by_dv_processing(written(tmp_path, "aedat4", events)), events)
+
+
+REAL = {
+    "evt/evt3_driving_1280x720.raw": 219_596,
+    "evt/evt2_balls_640x480.raw": 521_252,
+    "aedat/aedat4_dvxplorerlite_320x240.aedat4": 111_954,
+    "text/slider_depth/events_chunk.txt": 50_000,
+}
+
+
+@pytest.mark.parametrize("file", REAL)
+def test_real_recordings_come_back(data_dir, tmp_path, file):
+    source = open_recording(data_dir / file).events
+    events = source.slice(0, len(source))
+    for ending in (".raw", ".aedat4", ".npz", ".txt"):
+        assert convert(data_dir / file, tmp_path / f"out{ending}").events == REAL[file]
+        found = open_recording(tmp_path / f"out{ending}").events
+        assert_columns(tuple(getattr(found.slice(0, len(events) + 1), name) for name in "xytp"), events)
+
+
+HDF5_WITHOUT_PLUGINS = """
+import sys, h5py, numpy as np
+with h5py.File(sys.argv[1]) as file:
+    np.savez(sys.argv[2], **{name: file["events/" + name][:] for name in "xytp"}, t_offset=file["t_offset"][()],
+             truth=file["truth/x"][:], angle=file["encoder/angle"][:])
+assert "hdf5plugin" not in sys.modules
+"""
+
+
+def by_plain_hdf5(path: Path, out: Path) -> subprocess.CompletedProcess[str]:
+    """Read a native recording in a process whose HDF5 has no plugins."""
+    command = [sys.executable, "-I", "-c", HDF5_WITHOUT_PLUGINS, str(path), str(out)]
+    environment = {**os.environ, "HDF5_PLUGIN_PATH": ""}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_plain_hdf5_libraries_read_gzip(tmp_path):
+    events = make_events(CHUNK + 4321)
+    points = np.random.default_rng(0).random((len(events), 2)).astype(np.float32)
+    encoder = Encoder.constant_speed(3000.0, 999_000, int(events.t[-1]))
+    blosc = save(tmp_path / "blosc.h5", events, encoder=encoder, truth=Truth({"apex": 0.03}, points))
+    assert convert(blosc, tmp_path / "gzip.h5", codec="gzip").left_out == ()
+    assert "HDF5_PLUGIN_PATH" in by_plain_hdf5(blosc, tmp_path / "none.npz").stderr
+    result = by_plain_hdf5(tmp_path / "gzip.h5", tmp_path / "plain.npz")
+    assert result.returncode == 0, result.stderr
+    with np.load(tmp_path / "plain.npz") as plain:
+        assert_columns((plain["x"], plain["y"], plain["t"] + plain["t_offset"], plain["p"]), events)
+        np.testing.assert_array_equal(plain["truth"], points[:, 0])
+        np.testing.assert_array_equal(plain["angle"], encoder.angle)
+    x, y, t, p = by_eventcv(tmp_path / "gzip.h5")
+    assert_columns((x, y, t + events.t[0], p), events)  # eventcv does not add t_offset
+    back = open_recording(tmp_path / "gzip.h5")
+    found = back.events.slice(0, len(events))
+    assert_columns((found.x, found.y, found.t, found.p), events)
+    np.testing.assert_array_equal(back.truth.points(0, len(events)), points)
+
+
+def test_eventcv_reads_dsec_with_gzip(tmp_path):
+    events = make_events(5000)
+    convert(save(tmp_path / "source.h5", events), tmp_path / "out.h5", format="dsec", codec="gzip")
+    x, y, t, p = by_eventcv(tmp_path / "out.h5")
+    assert_columns((x, y, t + events.t[0], p), events)
+
+
+@pytest.mark.parametrize("name", [OutputFormat.EVT3, OutputFormat.TEXT])
+def test_what_is_left_out_is_named(tmp_path, name):
+    events = make_events(50)
+    camera = Camera(*SIZE, 200.0, 200.0, 150.0, 110.0)
+    source = save(
+        tmp_path / "source.h5",
+        events,
+        encoder=Encoder.constant_speed(3000.0, 999_000, int(events.t[-1])),
+        camera=camera,
+        prism=Prism(0.03),
+        truth=Truth({"apex": 0.03}),
+        metadata={"seed": 7},
+    )
+    size = ("sensor size",) if name is OutputFormat.TEXT else ()
+    left_out = convert(source, tmp_path / "out.x", format=name).left_out
+    assert left_out == (*size, "encoder", "camera", "prism", "ground truth", "metadata")
+    assert convert(source, tmp_path / "out.h5").left_out == ()
+
+
+def test_the_size_of_the_camera_is_written(tmp_path):
+    events = make_events(50)
+    np.savez(tmp_path / "a.npz", x=events.x % 50, y=events.y % 40, t=events.t, p=events.p)
+    convert(tmp_path / "a.npz", tmp_path / "b.npz", camera=Camera(77, 66, 50.0, 50.0, 38.0, 32.5))
+    assert open_recording(tmp_path / "b.npz").events.size == (77, 66)
+
+
+def test_times_before_zero(tmp_path):
+    events = events_at([-5_000_001, -1, 0, 3])
+    source = save(tmp_path / "source.h5", events)
+    for name in ("npz", "text", "dsec"):
+        assert_columns(CLIENTS[name][1](written(tmp_path, name, events)), events)
+    for ending, label in ((".raw", "RAW EVT 3.0"), (".aedat4", "AEDAT 4"), (".mcap", "a ROS 2 bag")):
+        with pytest.raises(AmiwarpError, match=rf"an event is at -5000001 us, {label} holds 0 \.\. .*\(\.h5\)"):
+            convert(source, tmp_path / f"none{ending}")
+
+
+REFUSED = [
+    ("a.raw", {}, {"size": (2049, 100)}, r"the sensor is 2049x100, RAW EVT 3\.0 holds up to 2048x2048"),
+    ("a.mcap", {}, {"size": (4000, 300)}, r"a ROS 2 bag holds up to 2048x2048"),
+    ("a.aedat4", {}, {"size": (40_000, 100)}, r"AEDAT 4 holds up to 32768x32768"),
+    ("a.h5", {"format": "dsec"}, {"t": [0, 2**32]}, r"span 4294967296 us, the DSEC layout holds up to 4294967295 us"),
+    (
+        "a.db3",
+        {},
+        {"t": [2**31 * 10**6]},
+        r"at 2147483648000000 us, a ROS 2 bag holds 0 \.\. 2147483647999999 us",
+    ),
+    ("a.txt", {}, {"t": [2**53]}, "text holds"),
+    ("a.raw", {}, {"t": [5, HOURS_28 + 6]}, "span 100000000001 us, RAW EVT 3.0 holds up to 100000000000 us"),
+    ("a.csv", {}, {}, r"the extension '\.csv' is of no format .* among \.h5, .*--format .*native, dsec, evt3"),
+    ("a.h5", {"format": "bag"}, {}, "format is 'bag'; choose among native, dsec"),
+    ("a.h5", {"codec": "zip"}, {}, "codec is 'zip'; choose among blosc, gzip"),
+    ("a.npz", {"codec": "gzip"}, {}, r"codec is gzip, which is for HDF5 \(\.h5\)"),
+    ("a.raw", {"format": "ros2"}, {}, r"has the extension \.mcap or \.db3"),
+]
+
+
+@pytest.mark.parametrize(("out", "options", "made", "message"), REFUSED)
+def test_what_a_format_cannot_hold_is_refused(tmp_path, out, options, made, message):
+    events = events_at(made.get("t", [0, 1, 2]))
+    if events.t[-1] - events.t[0] <= HOURS_28:
+        source = tmp_path / "source.h5"
+        save_recording(source, Recording(MemoryEvents(events, *made.get("size", SIZE))))
+    else:
+        source = tmp_path / "source.npz"
+        np.savez(source, x=events.x, y=events.y, t=events.t, p=events.p)
+    before = sorted(os.listdir(tmp_path))
+    with pytest.raises(AmiwarpError, match=rf"{out}: .*{message}"):
+        convert(source, tmp_path / out, **options)
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_fractional_pixels_are_refused(tmp_path, name):
+    events = make_events(100)
+    compensated = Events(events.x.astype(np.float32) + 0.5, events.y.astype(np.float32), events.t, events.p)
+    source = save(tmp_path / "source.h5", compensated)
+    with pytest.raises(AmiwarpError, match=r"out.*fractional pixels, .* holds whole pixels; write a native recording"):
+        convert(source, tmp_path / f"out{CLIENTS[name][0]}", format=name.split()[0])
+    assert os.listdir(tmp_path) == ["source.h5"]
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_an_interrupted_conversion_leaves_what_was_there(tmp_path, name):
+    source, path = save(tmp_path / "source.h5", make_events(200)), tmp_path / f"out{CLIENTS[name][0]}"
+    path.write_bytes(b"mine")
+
+    def interrupt(what: str, share: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(AmiwarpError, match="exists; give another name"):
+        convert(source, path, format=name.split()[0])
+    with pytest.raises(KeyboardInterrupt):
+        convert(source, path, format=name.split()[0], progress=interrupt, overwrite=True)
+    with pytest.raises(AmiwarpError, match="is read in this run"):
+        convert(source, source, format=name.split()[0], overwrite=True)
+    assert sorted(os.listdir(tmp_path)) == sorted([path.name, "source.h5"])
+    assert path.read_bytes() == b"mine"
+
+
+def test_a_disk_that_is_full_at_the_end_is_noticed(tmp_path, monkeypatch):
+    """faery does not report that its last bytes could not be written."""
+    source, encoder = save(tmp_path / "source.h5", make_events(50_000)), aedat.Encoder
+
+    @contextlib.contextmanager
+    def cut(path, *arguments):
+        with encoder(path, *arguments) as found:
+            yield found
+        os.truncate(path, os.path.getsize(path) - 5000)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shutil.disk_usage", lambda _folder: SimpleNamespace(free=5000))
+        with pytest.raises(AmiwarpError, match=r"out\.aedat4: .*disk is full: 50000 of 50000 events"):
+            convert(source, tmp_path / "out.aedat4")
+    monkeypatch.setattr(aedat, "Encoder", cut)
+    with pytest.raises(AmiwarpError, match=r"out\.aedat4: .*disk is full: 0 of 50000 events"):
+        convert(source, tmp_path / "out.aedat4")
+    assert os.listdir(tmp_path) == ["source.h5"]
+
+
+def test_a_missing_rosbags_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    source = save(tmp_path / "source.h5", make_events(10))
+    with pytest.raises(AmiwarpError, match=r"out\.mcap: ROS bags need rosbags; .* pip install 'amiwarp\[ros\]'"):
+        convert(source, tmp_path / "out.mcap")
+    assert os.listdir(tmp_path) == ["source.h5"]
+
+
+@given(
+    cuts=st.lists(st.integers(0, 60), max_size=5), gaps=st.lists(GAPS, min_size=60, max_size=60), whole=st.booleans()
+)
+@settings(deadline=None, max_examples=60)
+def test_evt3_words_follow_the_format(cuts, gaps, whole):
+    """Decode word by word, as Prophesee's documentation defines them, with the wraps of the time counted."""
+    events = events_at(np.cumsum(gaps).tolist(), len(cuts))
+    encoder, found = Evt3Encoder(0), []
+    high = low = y = turns = 0
+    places = [0, *sorted(cuts), 60]
+    for start, stop in itertools.pairwise(places):
+        if start == stop:
+            continue
+        words = encoder.encode(events[start:stop], self_contained=whole)
+        for word in words.tolist():
+            kind, value = word >> 12, word & 0xFFF
+            if kind == 8:
+                assert value >= high or (high, value) == (0xFFF, 0)
+                turns += value < high
+                high = value
+            elif kind == 6:
+                low = value
+            elif kind == 0:
+                y = value
+            else:
+                assert kind == 2
+                found.append((value & 0x7FF, y, (turns << 24) + (high << 12) + low, value >> 11))
+        if whole:
+            kinds = (words >> 12).tolist()
+            assert kinds[kinds.index(6) :][:3] == [6, 0, 2]
+            assert set(kinds[: kinds.index(6)]) == {8}
+    assert_columns(tuple(np.array(found, np.int64).reshape(-1, 4).T), events)
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_events_are_taken_block_by_block(tmp_path, name):
+    taken = []
+
+    class Counted(MemoryEvents):
+        def blocks(self, **options):
+            assert options == {}
+            for block in super().blocks(count=1000):
+                taken.append(len(block))
+                yield block
+
+    events = make_events(5500)
+    assert_columns(CLIENTS[name][1](exported(tmp_path, name, Counted(events, *SIZE))), events)
+    assert taken == [1000] * 5 + [500]
