@@ -88,8 +88,8 @@ def _plan_lines(plan: DatasetPlan) -> list[str]:
     if plan.missing:
         lines += [
             f"about {plan.events:.3g} events and {plan.bytes / 1e9:.3g} GB to write",
-            f"about {duration_text(plan.seconds)} with {plan.workers} workers on {plan.device}, "
-            f"estimated from {plan.samples} samples",
+            f"about {duration_text(plan.seconds)} (± {100 * plan.uncertainty:.0f} %) with {plan.workers} workers on "
+            f"{plan.device}, estimated from {plan.samples} samples",
         ]
     return lines
 

@@ -12,8 +12,15 @@ from amiwarp.io.input_files import errors_name
 from amiwarp.io.regular_file import check_regular
 
 
+def create_journal(path: Path) -> None:
+    """Create an empty journal unless it exists. Raises :class:`AmiwarpError` if that fails."""
+    check_output(path, overwrite=True)
+    with errors_name(path, lambda: "cannot be written"):
+        path.touch()
+
+
 def append_line(path: Path, data: dict[str, Any]) -> None:
-    """Append an object to a journal, which is created if necessary. Raises :class:`AmiwarpError` if that fails."""
+    """Append an object to a journal. Raises :class:`AmiwarpError` if that fails."""
     check_output(path, overwrite=True)
     with errors_name(path, lambda: "cannot be written"), path.open("ab+") as file:
         size = file.seek(0, 2)

@@ -14,7 +14,7 @@ from typing import Any
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import NewFile, write_text
-from amiwarp.io.json_lines import append_line, read_lines
+from amiwarp.io.json_lines import append_line, create_journal, read_lines
 from amiwarp.studies.dataset.items import Item
 from amiwarp.studies.dataset.making import Failed, Made
 from amiwarp.studies.dataset.sources import content_digest
@@ -50,6 +50,10 @@ class Journal:
         found = (Made.from_json(data) for data in read_lines(self._path))
         self.made = {made.key: made for made in found if made is not None}
         """Recordings by the key of their item."""
+
+    def create(self) -> None:
+        """Create the journal unless it exists. It marks the folder as a data set."""
+        create_journal(self._path)
 
     def add(self, made: Made) -> None:
         """Add a recording."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.kernels.cpu_threads import limited_cpu_threads
 from amiwarp.progress import Progress, silent
@@ -19,11 +21,11 @@ from amiwarp.studies.dataset.run import missing, worker_count
 from amiwarp.studies.dataset.sources import content_digest
 from amiwarp.studies.dataset.specification import load_specification
 
-SAMPLES = 6
+SAMPLES = 24
 """Largest number of recordings that are sampled for each kind of source."""
 LONGEST_SAMPLE_S = 0.1
 """Longest simulated time of a sample [s]."""
-SAMPLING_S = 20.0
+SAMPLING_S = 10.0
 """Time after which no further sample of a kind of source begins [s]."""
 
 
@@ -34,8 +36,8 @@ class DatasetPlan:
     Examples
     --------
     >>> plan = amiwarp.DatasetPlan(
-    ...     recordings=12, missing=10, splits={"train": 12}, sources={"pictures": 12}, samples=6, events=1e6,
-    ...     bytes=1e7, worker_seconds=30.0, workers=2, device="cpu")
+    ...     recordings=12, missing=10, splits={"train": 12}, sources={"pictures": 12}, samples=6, uncertainty=0.1,
+    ...     events=1e6, bytes=1e7, worker_seconds=30.0, workers=2, device="cpu")
     >>> plan.seconds
     15.0
     """
@@ -50,6 +52,8 @@ class DatasetPlan:
     """Number of recordings of each kind of source."""
     samples: int
     """Number of missing recordings that were sampled."""
+    uncertainty: float
+    """Standard error of the expected time, relative to it, from the spread of the samples."""
     events: float
     """Expected number of events of the missing recordings."""
     bytes: float
@@ -92,8 +96,9 @@ def plan_dataset(
 ) -> DatasetPlan:
     """Estimate the size of a data set and the time to make it. No recording is added to the folder.
 
-    Up to six recordings of each kind of source are simulated for at most 0.1 s each. Events, bytes and time grow
-    linearly with the duration; the mean of the samples stands for all recordings of that kind.
+    Up to 24 recordings of each kind of source are simulated for at most 0.1 s each, within about 10 s. Events, bytes
+    and time are taken to grow linearly with the duration, and the mean of the samples stands for all recordings of that
+    kind.
 
     Parameters
     ----------
@@ -141,19 +146,23 @@ def plan_dataset(
     by_kind: defaultdict[str, list[Item]] = defaultdict(list)
     for item in todo:
         by_kind[item.kind].append(item)
-    total, samples = _Cost(), 0
+    total, samples, variance = _Cost(), 0, 0.0
     # the folder of the data set may not exist yet, and its disk is the one that matters
     near = next(folder for folder in (out.resolve(), *out.resolve().parents) if folder.is_dir())
     with scratch_folder(near) as scratch:
-        for kind, of_kind in by_kind.items():
-            cost, count = _sample(of_kind, scratch, "cuda:0" if device == ANY_GPU else device, progress or silent)
-            total, samples = total.plus(cost, len(by_kind[kind])), samples + count
+        for of_kind in by_kind.values():
+            found = _sample(of_kind, scratch, "cuda:0" if device == ANY_GPU else device, progress or silent)
+            for cost in found:
+                total = total.plus(cost, len(of_kind) / len(found))
+            samples += len(found)
+            variance += len(of_kind) ** 2 * _variance_of_mean([cost.seconds for cost in found], len(of_kind))
     return DatasetPlan(
         recordings=len(items),
         missing=len(todo),
         splits=dict(Counter(item.split for item in items)),
         sources=dict(Counter(item.kind for item in items)),
         samples=samples,
+        uncertainty=variance**0.5 / total.seconds if total.seconds else 0.0,
         events=total.events,
         bytes=total.bytes,
         worker_seconds=total.seconds,
@@ -162,18 +171,32 @@ def plan_dataset(
     )
 
 
-def _sample(items: Sequence[Item], scratch: Path, device: str, progress: Progress) -> tuple[_Cost, int]:
-    """Return the mean cost of one recording, and the number of samples. The order of the items is random."""
-    chosen = items[:SAMPLES]
-    began, total = time.perf_counter(), _Cost()
+def _sample(items: Sequence[Item], scratch: Path, device: str, progress: Progress) -> list[_Cost]:
+    """Return the costs of sampled recordings. The order of the items is random.
+
+    A recording that fails is left out. If all fail, the last error is raised.
+    """
+    chosen, began, costs = items[:SAMPLES], time.perf_counter(), list[_Cost]()
     with limited_cpu_threads(1 if device == "cpu" else None):
-        _cost(chosen[0], scratch, device, 1e-3)  # compiles the kernels
         for count, item in enumerate(chosen, 1):
-            total = total.plus(_whole_cost(item, scratch, device))
+            try:
+                if not costs:  # compiles the kernels
+                    _cost(item, scratch, device, 1e-3)
+                costs.append(_whole_cost(item, scratch, device))
+            except AmiwarpError:
+                if not costs and count == len(chosen):
+                    raise
             progress(f"sampling {item.kind}", count / len(chosen))
-            if time.perf_counter() - began > SAMPLING_S:
+            if costs and time.perf_counter() - began > SAMPLING_S:
                 break
-    return _Cost().plus(total, 1.0 / count), count
+    return costs
+
+
+def _variance_of_mean(values: Sequence[float], of: int) -> float:
+    """Return the variance of the mean of values that were drawn from ``of`` without replacement."""
+    if len(values) < 2:
+        return 0.0
+    return statistics.variance(values) / len(values) * (1.0 - len(values) / of)
 
 
 def _whole_cost(item: Item, scratch: Path, device: str) -> _Cost:

@@ -138,6 +138,7 @@ def make_dataset(
     items = list_items(spec)
     make_folder(out)
     journal = Journal(out)
+    journal.create()
     state = _Run()
     todo = missing(journal, items)
     try:
