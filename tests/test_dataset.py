@@ -4,15 +4,18 @@ import hashlib
 import json
 import math
 import os
+import runpy
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import distributed
+import matplotlib.pyplot as plt
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -287,15 +290,25 @@ def test_other_sources(place: Path, recording: amiwarp.Recording) -> None:
         Image.fromarray(np.kron(np.eye(3, 4, k - 1) * 255, np.ones((8, 8))).astype(np.uint8)).save(video / f"{k}.png")
     amiwarp.save_recording(place / "real.h5", recording)
     (place / "poses.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,1.2,0,0,0,1\n1,0,0,1.3,0,0,0,1\n")
+    (place / "tile.obj").write_text("v -1 -1 3\nv 1 -1 3\nv 0 1 3\nf 1 3 2\n")
+    (place / "tile.toml").write_text(
+        'format = "amiwarp-world"\nversion = 1\nbodies = [{name = "tile", mesh = "tile.obj"}]\n'
+    )
     (place / "labels.csv").write_text("file,speed,code,name\nreal.h5,1.5,007,a\nother.h5,2,1,b\n")
     (place / "spec.toml").write_text(
         HEAD + "duration_s = 0.01\nprisms = [{apex_deg = 1.0}]\nspeeds_rpm = [900.0]\ntruth_hz = 200.0\n"
         'sensors = [{name = "mine", preset = "gen4", refractory_us = 5.0}]\n'
         '[[sources]]\nvideos = "films/*"\nfps = 200.0\n[[sources]]\nrecordings = "*.h5"\nlabel_table = "labels.csv"\n'
-        'licence = "CC-BY-4.0"\n[camera]\nsize = [24, 18]\n'
+        'licence = "CC-BY-4.0"\n[[sources]]\nworld_files = "tile.toml"\ntrajectories = ["poses.csv"]\n'
+        "[camera]\nsize = [24, 18]\n"
     )
     assert make(place).failed == {}
-    film, real = manifest(place)["items"]
+    film, real, world = manifest(place)["items"]
+    assert (world["trajectory"], world["source_kind"]) == ("poses.csv", "world_files")
+    seen = amiwarp.open_recording(place / "out" / world["file"]).truth
+    assert seen is not None
+    assert seen.frames is not None
+    assert len(seen.frames) == 3
     assert (film["source"], film["duration_s"], film["sensor"], film["labels"]) == ("films/one", 0.015, "mine", {})
     opened = amiwarp.open_recording(place / "out" / real["file"])
     events = recording.events
@@ -388,3 +401,42 @@ def test_journal_leaves_out_what_was_cut_off(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("seconds", "text"), [(5.4, "5 s"), (119.0, "119 s"), (150.0, "2.5 min"), (3e5, "3.5 days")])
 def test_durations_read_well(seconds: float, text: str) -> None:
     assert duration_text(seconds) == text
+
+
+def test_the_tutorial_s_classifier_beats_chance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tempfile, "mkdtemp", lambda: str(tmp_path))
+    monkeypatch.setattr(plt, "show", lambda: None)
+    found = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "tutorials" / "08_data_set.py"))
+    plt.close("all")
+    tested = int((~found["train"]).sum())
+    assert tested >= 15
+    assert found["chance"] < 0.6
+    assert found["accuracy"] > found["chance"] + 3.0 * math.sqrt(found["chance"] * (1.0 - found["chance"]) / tested)
+    assert f"accuracy {found['accuracy']:.0%}" in capsys.readouterr().out
+
+
+def test_a_mesh_or_a_file_of_poses_that_changed_is_seen(place: Path) -> None:
+    (place / "spec.toml").write_text(BASE + '[[sources]]\nworld_files = "w.toml"\ntrajectories = ["poses.csv"]\n')
+    (place / "w.toml").write_text('bodies = [{mesh = "tile.obj"}]\n')
+    keys = set()
+    for mesh, poses in (("a", "a"), ("b", "a"), ("b", "b"), ("b", "b")):
+        (place / "tile.obj").write_text(mesh)
+        (place / "poses.csv").write_text(poses)
+        keys |= {item.key for item in list_items(load_specification(place / "spec.toml"))}
+    assert len(keys) == 3 * 2
+
+
+def test_the_specification_of_the_guide(place: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "how-to" / "dataset.md").read_text()
+    (place / "shapes.toml").write_text(page.partition("```toml\n")[2].partition("```")[0])
+    items = list_items(load_specification(place / "shapes.toml"))
+    assert len(items) == (6 + 2) * 2 * 2 * 2 * 2
+    assert {item.labels["background"] for item in items} == {"grey", "room"}
+    fast = [item.recipe["sensor"] for item in items if item.recipe["sensor"]["name"] == "fast"]
+    assert {sensor["refractory_us"] for sensor in fast} == {20.0}
+    (made,) = [line for line in page.splitlines() if line.startswith("Each item has ")]
+    make(place)
+    named = page[page.index(made) :].partition("Above")[0]
+    assert [name for name in manifest(place)["items"][0] if f"`{name}`" not in named] == []

@@ -90,6 +90,8 @@ class Job:
     """Folder for unfinished files, on the same disk."""
     device: str
     """Device; :data:`ANY_GPU` is the worker's GPU."""
+    threads: int | None
+    """Number of CPU threads that the worker may use; None for all."""
 
 
 def make(job: Job) -> Made | Failed:
@@ -100,7 +102,7 @@ def make(job: Job) -> Made | Failed:
             "all workers share under the same path"
         )
     try:
-        with limited_cpu_threads(1 if job.device == "cpu" else None):
+        with limited_cpu_threads(job.threads):
             return _make(job)
     except Exception as error:  # whatever one recording raises must not stop the others
         what = str(error) if isinstance(error, AmiwarpError) else f"{type(error).__name__}: {error}"

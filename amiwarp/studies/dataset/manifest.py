@@ -50,6 +50,7 @@ class Journal:
         found = (Made.from_json(data) for data in read_lines(self._path))
         self.made = {made.key: made for made in found if made is not None}
         """Recordings by the key of their item."""
+        self._touched: list[Made] = []
 
     def create(self) -> None:
         """Create the journal unless it exists. It marks the folder as a data set."""
@@ -76,8 +77,14 @@ class Journal:
         if changed != made.mtime_ns:
             if content_digest(path) != made.sha256:
                 return None
-            self.add(replace(made, mtime_ns=changed))
-        return self.made[item.key]
+            made = replace(made, mtime_ns=changed)
+            self._touched.append(made)
+        return made
+
+    def note_touched(self) -> None:
+        """Record the times of undamaged files whose time of change differed, so that they are not read again."""
+        while self._touched:
+            self.add(self._touched.pop())
 
     def others(self, items: Sequence[Item]) -> list[str]:
         """Return the existing recordings that belong to none of the items, for example of an earlier specification."""

@@ -17,7 +17,7 @@ from amiwarp.studies.cluster import ANY_GPU
 from amiwarp.studies.dataset.items import Item, list_items
 from amiwarp.studies.dataset.making import simulation_of, write_recording
 from amiwarp.studies.dataset.manifest import Journal, check_folder
-from amiwarp.studies.dataset.run import missing, worker_count
+from amiwarp.studies.dataset.run import missing, threads_of_worker, worker_count
 from amiwarp.studies.dataset.sources import content_digest
 from amiwarp.studies.dataset.specification import load_specification
 
@@ -146,12 +146,14 @@ def plan_dataset(
     by_kind: defaultdict[str, list[Item]] = defaultdict(list)
     for item in todo:
         by_kind[item.kind].append(item)
+    count = worker_count(workers, device)
+    threads = threads_of_worker(device, count)
     total, samples, variance = _Cost(), 0, 0.0
     # the folder of the data set may not exist yet, and its disk is the one that matters
     near = next(folder for folder in (out.resolve(), *out.resolve().parents) if folder.is_dir())
     with scratch_folder(near) as scratch:
         for of_kind in by_kind.values():
-            found = _sample(of_kind, scratch, "cuda:0" if device == ANY_GPU else device, progress or silent)
+            found = _sample(of_kind, scratch, "cuda:0" if device == ANY_GPU else device, threads, progress or silent)
             for cost in found:
                 total = total.plus(cost, len(of_kind) / len(found))
             samples += len(found)
@@ -166,18 +168,18 @@ def plan_dataset(
         events=total.events,
         bytes=total.bytes,
         worker_seconds=total.seconds,
-        workers=worker_count(workers, device),
+        workers=count,
         device=device,
     )
 
 
-def _sample(items: Sequence[Item], scratch: Path, device: str, progress: Progress) -> list[_Cost]:
+def _sample(items: Sequence[Item], scratch: Path, device: str, threads: int | None, progress: Progress) -> list[_Cost]:
     """Return the costs of sampled recordings. The order of the items is random.
 
     A recording that fails is left out. If all fail, the last error is raised.
     """
     chosen, began, costs = items[:SAMPLES], time.perf_counter(), list[_Cost]()
-    with limited_cpu_threads(1 if device == "cpu" else None):
+    with limited_cpu_threads(threads):
         for count, item in enumerate(chosen, 1):
             try:
                 if not costs:  # compiles the kernels

@@ -115,6 +115,11 @@ def make_dataset(
     AmiwarpError
         If the specification is wrong, a source is not found, the folder holds other files, or workers are missing.
 
+    Notes
+    -----
+    Several local workers are processes that import the running script. Call this function under
+    ``if __name__ == "__main__":`` in a script.
+
     Examples
     --------
     >>> import pathlib
@@ -136,14 +141,17 @@ def make_dataset(
     require_pyarrow()
     check_folder(out)
     items = list_items(spec)
+    count = _local_workers(scheduler, workers, device)
     make_folder(out)
     journal = Journal(out)
     journal.create()
     state = _Run()
     todo = missing(journal, items)
+    journal.note_touched()
     try:
         if todo:
-            _make_all(todo, out, journal, state, _workers(scheduler, workers, device), device, progress or silent)
+            jobs = _Jobs(out.resolve(), device, threads_of_worker(device, count))
+            _make_all(todo, jobs, journal, state, _workers(scheduler, count, device), progress or silent)
     finally:
         write_manifest(out, spec, items, journal, state.failed)
     return _summary(items, journal, state, len(items) - len(todo), time.perf_counter() - began)
@@ -173,33 +181,57 @@ def worker_count(workers: int | None, device: str) -> int:
     return max(1, gpu_count(start_quietly()))
 
 
-def _workers(scheduler: str | None, workers: int | None, device: str) -> AbstractContextManager[Workers]:
-    if scheduler is not None and workers is not None:
-        raise AmiwarpError(f"workers = {workers} applies to local processes; leave it out with a scheduler")
-    _check_device(device, scheduler)
-    count = 0 if scheduler is not None else worker_count(workers, device)
+def threads_of_worker(device: str, workers: int | None) -> int | None:
+    """Return the number of CPU threads of each of ``workers`` local workers; None for all, in a cluster.
+
+    On the CPU each worker runs on one thread. Workers with a GPU share the cores, which encode and write the events.
+    """
+    if device == "cpu":
+        return 1
+    return None if workers is None else max(1, cpu_threads() // workers)
+
+
+def _workers(scheduler: str | None, count: int | None, device: str) -> AbstractContextManager[Workers]:
+    """Return the workers, which begin when the context is entered. ``count`` is that of local workers."""
     if count == 1:
         return single_worker()
-    return start_workers("amiwarp dataset", "dataset", scheduler, count, device)
+    return start_workers("amiwarp dataset", "dataset", scheduler, count or 0, device)
 
 
-def _check_device(device: str, scheduler: str | None) -> None:
-    """Raise :class:`AmiwarpError` if this machine lacks the device of local workers."""
+def _local_workers(scheduler: str | None, workers: int | None, device: str) -> int | None:
+    """Return the number of local workers; None with a scheduler.
+
+    Raises :class:`AmiwarpError` if this machine lacks their device.
+    """
+    if scheduler is not None:
+        if workers is not None:
+            raise AmiwarpError(f"workers = {workers} applies to local processes; leave it out with a scheduler")
+        return None
     from amiwarp.kernels.quiet_start import start_quietly
 
-    known = start_quietly() if scheduler is None else []
-    if scheduler is None and device not in (*known, *([ANY_GPU] if gpu_count(known) else [])):
+    known = start_quietly()
+    if device not in (*known, *([ANY_GPU] if gpu_count(known) else [])):
         raise AmiwarpError(f"device {device!r} is not available; choose one of {', '.join(known)}")
+    return worker_count(workers, device)
+
+
+@dataclass(frozen=True)
+class _Jobs:
+    """What all jobs of a run share."""
+
+    out: Path
+    device: str
+    threads: int | None
 
 
 def _make_all(
-    todo: Sequence[Item], out: Path, journal: Journal, state: _Run, workers: AbstractContextManager[Workers],
-    device: str, progress: Progress,
+    todo: Sequence[Item], shared: _Jobs, journal: Journal, state: _Run, workers: AbstractContextManager[Workers],
+    progress: Progress,
 ) -> None:  # fmt: skip
     """Make all recordings, and record each in the journal when it is finished."""
     began = time.perf_counter()
-    with scratch_folder(out) as scratch, workers as running:
-        jobs = (Job(item, out.resolve(), scratch.resolve(), device) for item in todo)
+    with scratch_folder(shared.out) as scratch, workers as running:
+        jobs = (Job(item, shared.out, scratch, shared.device, shared.threads) for item in todo)
         results = run_jobs(running, make, jobs)
         progress(f"0 of {len(todo):,} recordings", 0.0)
         with contextlib.closing(results):
