@@ -16,7 +16,6 @@ import argparse
 import contextlib
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -31,7 +30,9 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
+from amiwarp.io.json_lines import read_lines
 from amiwarp.kernels.cpu_threads import cpu_threads, limited_cpu_threads
+from amiwarp.kernels.quiet_start import start_quietly
 from amiwarp.simulation.engine import Engine
 from amiwarp.studies.cluster import ANY_GPU
 from amiwarp.studies.dataset import manifest
@@ -80,7 +81,7 @@ def write_inputs(folder: Path, seeds: int, duration: float) -> dict[str, Path]:
 
 
 class BusyMeter:
-    """Mean share of the time in which each GPU ran a kernel, from nvidia-smi, and processor time of all processes."""
+    """Mean share of the time in which each GPU ran a kernel, from nvidia-smi."""
 
     def __init__(self, gpu: bool) -> None:
         self._samples: list[tuple[float, float]] = []
@@ -88,28 +89,20 @@ class BusyMeter:
         if gpu and shutil.which(SMI[0]):
             self._process = subprocess.Popen(SMI, stdout=subprocess.PIPE, text=True)
             threading.Thread(target=self._read, daemon=True).start()
-        self._cpu = processor_s()
 
     def _read(self) -> None:
         for line in self._process.stdout:
             with contextlib.suppress(ValueError):
                 self._samples.append((time.perf_counter(), float(line) / 100.0))
 
-    def stop(self, began: float, gpus: int) -> dict[str, float | None]:
-        """Return the processor time [s], and the share of the GPUs in use that was busy since ``began``."""
+    def stop(self, began: float, gpus: int) -> float | None:
+        """Return the share of the time since ``began`` in which the GPUs in use were busy; None if unknown."""
         if self._process is not None:
             self._process.terminate()
             self._process.wait()
         found = [share for at, share in self._samples if at >= began]
         visible = max(1, wp.get_cuda_device_count() if wp.is_cuda_available() else 1)
-        busy = float(np.mean(found)) * visible / gpus if found else None  # idle GPUs are in the mean
-        return {"processor_s": processor_s() - self._cpu, "gpu_busy": busy}
-
-
-def processor_s() -> float:
-    """Return the processor time of this process and of its finished children [s]."""
-    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+        return float(np.mean(found)) * visible / gpus if found else None  # idle GPUs are in the mean
 
 
 def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[dict[str, Any], dict[str, str]]:
@@ -124,6 +117,8 @@ def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[
     warm = min(2 * workers, len(finished) - 2)
     steady_s = finished[-1] - finished[warm]
     found = json.loads((out / manifest.MANIFEST).read_text())
+    # the median leaves out each worker's first recording, which imports and compiles
+    times = [line["processor_s"] for line in read_lines(out / manifest.JOURNAL)]
     per_s = (len(finished) - 1 - warm) / steady_s
     row = {
         "device": device, "gpus": gpus, "workers": workers, "items": done.made, "failed": len(done.failed),
@@ -131,9 +126,10 @@ def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[
         done.made, "events_per_item": done.events / done.made, "bytes_per_item": done.bytes / done.made,
         "start_s": finished[1] - began, "elapsed_s": done.seconds,
         "worker_busy": done.worker_seconds / (workers * (finished[-1] - finished[0])),
-        **meter.stop(finished[warm], max(1, gpus)),
+        "processor_busy": done.processor_seconds / (workers * (finished[-1] - finished[0])),
+        "processor_s_per_item": float(np.median(times)),
+        "gpu_busy": meter.stop(finished[warm], max(1, gpus)),
     }  # fmt: skip
-    row["processor_s_per_item"] = row["processor_s"] / done.made
     return row, {item["file"]: item["sha256"] for item in found["items"]}
 
 
@@ -155,6 +151,10 @@ def add_scaling(rows: list[dict[str, Any]]) -> None:
         each = row["workers"] // max(1, row["gpus"])
         base = [r for r in rows if r["gpus"] <= 1 and r["workers"] == (each if row["gpus"] else 1)]
         row["scaling"] = row["items_per_s"] / base[0]["items_per_s"]
+        if not row["gpus"]:  # what free cores would give
+            row["scaling_of_processor_time"] = (
+                row["workers"] * base[0]["processor_s_per_item"] / row["processor_s_per_item"]
+            )
 
 
 def stages(item: Item, folder: Path, device: str) -> dict[str, float]:
@@ -193,7 +193,8 @@ def passed(simulation: Any, device: str, to_host: bool) -> float:
 def plan(rows: list[dict[str, Any]], of: list[dict[str, Any]], kind: str) -> dict[str, Any]:
     """Return the time and size of many recordings on many devices, and the stage that limits them."""
     units = PLANNED_DEVICES[kind]
-    best = max(rows, key=lambda row: row["items_per_s"] / max(1, row["gpus"] or row["workers"]))
+    most = max(row["gpus"] or row["workers"] for row in rows)
+    best = max(rows, key=lambda row: ((row["gpus"] or row["workers"]) == most, row["items_per_s"]))
     rate = units * best["items_per_s"] / max(1, best["gpus"] or best["workers"])
     (one,) = (row for row in of if row["source"] == "pictures")
     slowest = max((name for name in one if isinstance(one[name], float)), key=lambda name: one[name])
@@ -226,6 +227,7 @@ def main() -> int:
     except ValueError:
         leave_out_tables()
     seeds = -(-(args.items or {"cpu": 40, "cuda": 400}[args.device]) // 20)
+    start_quietly()
     began = time.perf_counter()
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(dir=args.folder) as name:

@@ -54,6 +54,8 @@ class Made:
     """Height of the sensor [px]."""
     seconds: float
     """Time that the worker took [s]."""
+    processor_s: float
+    """Processor time that its process took [s]."""
     device: str
     """Device that it was computed on."""
     amiwarp: str
@@ -110,7 +112,7 @@ def make(job: Job) -> Made | Failed:
 
 
 def _make(job: Job) -> Made:
-    began = time.perf_counter()
+    began, began_processor = time.perf_counter(), time.process_time()
     item, device = job.item, "cuda:0" if job.device == ANY_GPU else job.device
     part, path = job.scratch / f"{item.key}.h5", job.out / item.file
     written = write_recording(item, part, device)
@@ -120,7 +122,8 @@ def _make(job: Job) -> Made:
     state = path.stat()
     return Made(
         item.key, item.file, state.st_size, state.st_mtime_ns, digest, written.events, written.duration_s,
-        written.width, written.height, round(time.perf_counter() - began, 6), device, __version__,
+        written.width, written.height, round(time.perf_counter() - began, 6),
+        round(time.process_time() - began_processor, 6), device, __version__,
     )  # fmt: skip
 
 

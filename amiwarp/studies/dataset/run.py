@@ -34,7 +34,8 @@ class DatasetSummary:
     --------
     >>> summary = amiwarp.DatasetSummary(
     ...     recordings=12, made=11, kept=0, failed={"train/a-1.h5": "no such file"}, not_in_specification=(),
-    ...     splits={"train": 11}, events=10, bytes=100, seconds=2.0, worker_seconds=3.0, workers=2)
+    ...     splits={"train": 11}, events=10, bytes=100, seconds=2.0, worker_seconds=3.0,
+    ...     processor_seconds=2.5, workers=2)
     >>> summary.made + summary.kept + len(summary.failed) == summary.recordings
     True
     """
@@ -59,6 +60,8 @@ class DatasetSummary:
     """Elapsed time [s]."""
     worker_seconds: float
     """Time that the workers spent on recordings, added up [s]."""
+    processor_seconds: float
+    """Processor time that they spent, added up [s]."""
     workers: int
     """Largest number of workers; 0 if there was nothing to make."""
 
@@ -71,6 +74,7 @@ class _Run:
     events: int = 0
     bytes: int = 0
     worker_seconds: float = 0.0
+    processor_seconds: float = 0.0
     workers: int = 0
     failed: list[Failed] = field(default_factory=list)
 
@@ -262,6 +266,7 @@ def _keep(journal: Journal, state: _Run, result: Made | Failed) -> None:
     state.events += result.events
     state.bytes += result.bytes
     state.worker_seconds += result.seconds
+    state.processor_seconds += result.processor_s
 
 
 def _line(state: _Run, done: int, total: int, seconds: float) -> str:
@@ -293,5 +298,6 @@ def _summary(items: Sequence[Item], journal: Journal, state: _Run, kept: int, se
         bytes=state.bytes,
         seconds=seconds,
         worker_seconds=state.worker_seconds,
+        processor_seconds=state.processor_seconds,
         workers=state.workers,
     )
