@@ -26,8 +26,9 @@ import amiwarp
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_lines import append_line, create_journal, read_lines
-from amiwarp.studies.cluster import Workers, run_jobs, single_worker
+from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
 from amiwarp.studies.dataset.items import list_items
+from amiwarp.studies.dataset.making import simulation_of
 from amiwarp.studies.dataset.manifest import JOURNAL, MANIFEST, TABLE
 from amiwarp.studies.dataset.run import DatasetSummary, duration_text, make_dataset
 from amiwarp.studies.dataset.specification import load_specification
@@ -440,3 +441,15 @@ def test_the_specification_of_the_guide(place: Path) -> None:
     make(place)
     named = page[page.index(made) :].partition("Above")[0]
     assert [name for name in manifest(place)["items"][0] if f"`{name}`" not in named] == []
+
+
+def test_recordings_are_those_of_the_simulator_on_each_device(place: Path, device: str) -> None:
+    done = make(place, device="cpu" if device == "cpu" else ANY_GPU)
+    assert (done.made, done.failed) == (12, {})
+    items = {item.file: item for item in list_items(load_specification(place / "spec.toml"))}
+    for row in manifest(place)["items"][:3]:
+        recording = amiwarp.open_recording(place / "out" / row["file"])
+        expected = simulation_of(items[row["file"]], device).run().events
+        assert (row["device"], row["events"]) == (device, len(expected))
+        np.testing.assert_array_equal(recording.events.slice(0, 10**9).t, expected.slice(0, 10**9).t)
+        np.testing.assert_array_equal(recording.events.slice(0, 10**9).x, expected.slice(0, 10**9).x)
