@@ -122,8 +122,8 @@ def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[
     per_s = (len(finished) - 1 - warm) / steady_s
     row = {
         "device": device, "gpus": gpus, "workers": workers, "items": done.made, "failed": len(done.failed),
-        "items_per_s": per_s, "events_per_s": per_s * done.events / done.made, "bytes_per_s": per_s * done.bytes /
-        done.made, "events_per_item": done.events / done.made, "bytes_per_item": done.bytes / done.made,
+        "items_per_s": per_s, "events_per_s": per_s * done.events / done.made, "bytes_per_s": per_s * done.size_bytes /
+        done.made, "events_per_item": done.events / done.made, "bytes_per_item": done.size_bytes / done.made,
         "start_s": finished[1] - began, "elapsed_s": done.seconds,
         "worker_busy": done.worker_seconds / (workers * (finished[-1] - finished[0])),
         "processor_busy": done.processor_seconds / (workers * (finished[-1] - finished[0])),

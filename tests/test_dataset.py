@@ -240,14 +240,14 @@ def test_a_dry_run_makes_nothing(place: Path) -> None:
     assert plan["seconds"] == pytest.approx(plan["worker_seconds"] / 2, rel=1e-12)
     assert {p.name for p in place.iterdir()} == {"pictures", "spec.toml"}
     done = make(place)
-    assert (plan["events"], plan["bytes"]) == (done.events, done.bytes)
+    assert (plan["events"], plan["size_bytes"]) == (done.events, done.size_bytes)
     text = run(place / "spec.toml", place / "out", "--dry-run", "--device", "cpu").stdout
     assert "12 recordings (12 of pictures), 0 of them missing" in text
     (place / "spec.toml").write_text(BASE.replace("0.01", "0.4").replace("24, 18", "16, 12") + PICTURES)
     long = amiwarp.plan_dataset(place / "spec.toml", place / "out", workers=1)
     made = make(place)
     assert long.events == pytest.approx(made.events, rel=0.1)
-    assert long.bytes == pytest.approx(made.bytes, rel=0.1)
+    assert long.size_bytes == pytest.approx(made.size_bytes, rel=0.1)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
@@ -352,6 +352,8 @@ WRONG: dict[str, tuple[Callable[[str], str], str]] = {
     "no kind": (changed('pictures = "pictures/*/*.png"', ""), r"\[0\] has no source; give one of pictures"),
     "fps": (changed("labels", "fps = 5.0\nlabels"), r"field sources\[0\]\.fps does not apply to pictures; remove it"),
     "label": (changed("indoor = true", "indoor = [1]"), r"labels\.indoor is \[1\]; expected text, a number"),
+    "label number": (changed("indoor = true", "indoor = nan"), r"labels\.indoor = nan is not a finite number"),
+    "many seeds": (changed("sensors", "seeds = 2000000000\nsensors"), "field seeds = 2000000000 is not a whole number"),
     "table": (changed("labels =", 'label_table = "none.csv"\nlabels ='), "none.csv: no such file"),
     "twice found": (lambda text: text + PICTURES, r"sources\[1\] names pictures/disc/0\.png, as does"),
     "world": (lambda text: text + '[[sources]]\nworlds = ["roon"]', r"\[1\]\.worlds is 'roon'; choose among room"),
@@ -378,6 +380,7 @@ def test_a_wrong_call_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert "none.toml: no such file" in run(place / "none.toml", *words[1:]).stderr
     both = run(*words, "--workers", "2", "--scheduler", "tcp://127.0.0.1:1").stderr
     assert "workers = 2 applies to local processes" in both
+    assert "--dry-run samples on this machine" in run(*words, "--dry-run", "--scheduler", "tcp://127.0.0.1:1").stderr
     assert "device 'cuda:7' is not available" in run(*words[:2], "--device", "cuda:7").stderr
     (place / "full").mkdir()
     (place / "full" / "thesis.doc").write_text("")

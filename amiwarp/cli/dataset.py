@@ -11,6 +11,7 @@ import typer
 from amiwarp.cli import say
 from amiwarp.cli.console import progress, report
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
+from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
     from amiwarp.studies.dataset.plan import DatasetPlan
@@ -36,7 +37,10 @@ def run(
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core on the CPU."),
+        typer.Option(
+            min=1,
+            help="Number of local processes. Default: one for each GPU, or for each core without GPU.",
+        ),
     ] = None,
     common: Common,
 ) -> None:
@@ -48,6 +52,8 @@ def run(
     """
     device = common.device or _default_device()
     if dry_run:
+        if scheduler is not None:
+            raise AmiwarpError("--dry-run samples on this machine; leave --scheduler out, and give --workers instead")
         from amiwarp.studies.dataset.plan import plan_dataset
 
         with progress("sampling") as advance:
@@ -87,7 +93,7 @@ def _plan_lines(plan: DatasetPlan) -> list[str]:
     ]
     if plan.missing:
         lines += [
-            f"about {plan.events:.3g} events and {plan.bytes / 1e9:.3g} GB to write",
+            f"about {plan.events:.3g} events and {plan.size_bytes / 1e9:.3g} GB to write",
             f"about {duration_text(plan.seconds)} (± {100 * plan.uncertainty:.0f} %) with {plan.workers} workers on "
             f"{plan.device}, estimated from {plan.samples} samples",
         ]
@@ -116,5 +122,5 @@ def _speed(done: DatasetSummary) -> str:
     per_s = done.made / done.seconds
     return (
         f"{done.made:,} made in {done.seconds:,.1f} s: {per_s:.3g} per second, {done.events / done.seconds / 1e6:.3g} "
-        f"Mev/s, {done.bytes / 1e9:.3g} GB, {done.workers} workers"
+        f"Mev/s, {done.size_bytes / 1e9:.3g} GB, {done.workers} workers"
     )

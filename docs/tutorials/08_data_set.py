@@ -77,7 +77,7 @@ licence = "CC0-1.0"
 """)
 
 plan = amiwarp.plan_dataset(specification, folder / "shapes", workers=1)
-print(f"{plan.missing} recordings, about {plan.bytes / 1e6:.2g} MB")
+print(f"{plan.missing} recordings, about {plan.size_bytes / 1e6:.2g} MB")
 
 # %%
 # The data set

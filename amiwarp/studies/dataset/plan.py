@@ -37,7 +37,7 @@ class DatasetPlan:
     --------
     >>> plan = amiwarp.DatasetPlan(
     ...     recordings=12, missing=10, splits={"train": 12}, sources={"pictures": 12}, samples=6, uncertainty=0.1,
-    ...     events=1e6, bytes=1e7, worker_seconds=30.0, workers=2, device="cpu")
+    ...     events=1e6, size_bytes=1e7, worker_seconds=30.0, workers=2, device="cpu")
     >>> plan.seconds
     15.0
     """
@@ -56,7 +56,7 @@ class DatasetPlan:
     """Standard error of the expected time, relative to it, from the spread of the samples."""
     events: float
     """Expected number of events of the missing recordings."""
-    bytes: float
+    size_bytes: float
     """Expected size of the missing recordings [bytes]."""
     worker_seconds: float
     """Expected time of the missing recordings, added over the workers [s]."""
@@ -126,6 +126,7 @@ def plan_dataset(
     Examples
     --------
     >>> import pathlib
+    >>> _ = pathlib.Path("step.pgm").write_text("P2 4 2 255 0 255 0 255 255 0 255 0")
     >>> _ = pathlib.Path("small.toml").write_text('''
     ... format = "amiwarp-dataset-specification"
     ... version = 1
@@ -133,11 +134,11 @@ def plan_dataset(
     ... camera = {size = [16, 12]}
     ... prisms = [{apex_deg = 1.0}]
     ... speeds_rpm = [720.0]
-    ... seeds = 50
-    ... sources = [{worlds = ["room"], trajectories = ["still"]}]
+    ... seeds = 10
+    ... sources = [{pictures = "*.pgm"}]
     ... ''')
     >>> amiwarp.plan_dataset("small.toml", "small", workers=2).missing
-    50
+    10
     """
     out = Path(out)
     items = list_items(load_specification(specification))
@@ -148,16 +149,7 @@ def plan_dataset(
         by_kind[item.kind].append(item)
     count = worker_count(workers, device)
     threads = threads_of_worker(device, count)
-    total, samples, variance = _Cost(), 0, 0.0
-    # the folder of the data set may not exist yet, and its disk is the one that matters
-    near = next(folder for folder in (out.resolve(), *out.resolve().parents) if folder.is_dir())
-    with scratch_folder(near) as scratch:
-        for of_kind in by_kind.values():
-            found = _sample(of_kind, scratch, "cuda:0" if device == ANY_GPU else device, threads, progress or silent)
-            for cost in found:
-                total = total.plus(cost, len(of_kind) / len(found))
-            samples += len(found)
-            variance += len(of_kind) ** 2 * _variance_of_mean([cost.seconds for cost in found], len(of_kind))
+    total, samples, variance = _sample_all(list(by_kind.values()), out, device, threads, progress or silent)
     return DatasetPlan(
         recordings=len(items),
         missing=len(todo),
@@ -166,11 +158,31 @@ def plan_dataset(
         samples=samples,
         uncertainty=variance**0.5 / total.seconds if total.seconds else 0.0,
         events=total.events,
-        bytes=total.bytes,
+        size_bytes=total.bytes,
         worker_seconds=total.seconds,
         workers=count,
         device=device,
     )
+
+
+def _sample_all(
+    groups: Sequence[Sequence[Item]], out: Path, device: str, threads: int | None, progress: Progress
+) -> tuple[_Cost, int, float]:
+    """Return the expected cost of all recordings, the number of samples, and the variance of the expected time [s²].
+
+    Each group holds the recordings of one kind of source.
+    """
+    total, samples, variance = _Cost(), 0, 0.0
+    # the folder of the data set may not exist yet, and its disk is the one that matters
+    near = next(folder for folder in (out.resolve(), *out.resolve().parents) if folder.is_dir())
+    with scratch_folder(near) as scratch:
+        for group in groups:
+            found = _sample(group, scratch, "cuda:0" if device == ANY_GPU else device, threads, progress)
+            for cost in found:
+                total = total.plus(cost, len(group) / len(found))
+            samples += len(found)
+            variance += len(group) ** 2 * _variance_of_mean([cost.seconds for cost in found], len(group))
+    return total, samples, variance
 
 
 def _sample(items: Sequence[Item], scratch: Path, device: str, threads: int | None, progress: Progress) -> list[_Cost]:
@@ -203,10 +215,10 @@ def _variance_of_mean(values: Sequence[float], of: int) -> float:
 
 def _whole_cost(item: Item, scratch: Path, device: str) -> _Cost:
     """Return the cost of a recording, extrapolated from two short ones if it is long."""
-    if item.kind == "recordings":
-        return _cost(item, scratch, device, None)
-    whole = simulation_of(item, device).duration_s
-    if whole <= LONGEST_SAMPLE_S:
+    whole = item.recipe.get("duration_s")
+    if whole is None and item.kind == "videos":
+        whole = simulation_of(item, device).duration_s
+    if whole is None or whole <= LONGEST_SAMPLE_S:
         return _cost(item, scratch, device, None)
     short, long = (_cost(item, scratch, device, s) for s in (0.5 * LONGEST_SAMPLE_S, LONGEST_SAMPLE_S))
     slope = long.plus(short, -1.0)

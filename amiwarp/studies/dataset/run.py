@@ -34,7 +34,7 @@ class DatasetSummary:
     --------
     >>> summary = amiwarp.DatasetSummary(
     ...     recordings=12, made=11, kept=0, failed={"train/a-1.h5": "no such file"}, not_in_specification=(),
-    ...     splits={"train": 11}, events=10, bytes=100, seconds=2.0, worker_seconds=3.0,
+    ...     splits={"train": 11}, events=10, size_bytes=100, seconds=2.0, worker_seconds=3.0,
     ...     processor_seconds=2.5, workers=2)
     >>> summary.made + summary.kept + len(summary.failed) == summary.recordings
     True
@@ -54,7 +54,7 @@ class DatasetSummary:
     """Number of finished recordings of each split."""
     events: int
     """Number of events in the recordings that were made."""
-    bytes: int
+    size_bytes: int
     """Size of the recordings that were made [bytes]."""
     seconds: float
     """Elapsed time [s]."""
@@ -127,6 +127,7 @@ def make_dataset(
     Examples
     --------
     >>> import pathlib
+    >>> _ = pathlib.Path("step.pgm").write_text("P2 4 2 255 0 255 0 255 255 0 255 0")
     >>> _ = pathlib.Path("small.toml").write_text('''
     ... format = "amiwarp-dataset-specification"
     ... version = 1
@@ -134,7 +135,7 @@ def make_dataset(
     ... camera = {size = [16, 12]}
     ... prisms = [{apex_deg = 1.0}]
     ... speeds_rpm = [720.0, 1800.0]
-    ... sources = [{worlds = ["room"], trajectories = ["still"]}]
+    ... sources = [{pictures = "*.pgm"}]
     ... ''')
     >>> amiwarp.make_dataset("small.toml", "small", workers=1).made
     2
@@ -295,7 +296,7 @@ def _summary(items: Sequence[Item], journal: Journal, state: _Run, kept: int, se
         not_in_specification=tuple(journal.others(items)),
         splits=dict(Counter(item.split for item in items if item.key in journal.made)),
         events=state.events,
-        bytes=state.bytes,
+        size_bytes=state.bytes,
         seconds=seconds,
         worker_seconds=state.worker_seconds,
         processor_seconds=state.processor_seconds,

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import errors_name, note_input
-from amiwarp.io.json_files import at_field, build, fields_of, read_toml
+from amiwarp.io.json_files import LARGEST_INTEGER, at_field, build, fields_of, read_toml
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import LONGEST_S, PrismMotion
@@ -26,6 +26,8 @@ KINDS = ("pictures", "videos", "recordings", "world_files", "worlds")
 """Fields of a source that name its files or worlds; each source has exactly one of them."""
 LARGEST_SEED = 2**31 - 1
 """Largest seed of a recording."""
+MOST_SEEDS = 1_000_000
+"""Largest number of seeds."""
 
 Entry = TypeVar("Entry")
 
@@ -209,7 +211,7 @@ def _seeds(value: Any) -> tuple[int, ...]:
         seeds = tuple(whole(seed, f"field seeds[{k}]", 0, LARGEST_SEED) for k, seed in enumerate(value))
         _check_distinct(seeds, "seeds")
         return seeds
-    return tuple(range(whole(value, "field seeds", 1, LARGEST_SEED, "; give their number, or a list of them")))
+    return tuple(range(whole(value, "field seeds", 1, MOST_SEEDS, "; give their number, or a list of them")))
 
 
 _MAKERS: dict[str, Callable[[], SensorModel]] = {"default": SensorModel, "ideal": SensorModel.ideal}
@@ -246,9 +248,22 @@ def _source(data: Any, where: str) -> SourceGroup:
     if not isinstance(labels, dict):
         raise AmiwarpError(f"field {where}.labels is {shown(labels)}; expected a table")
     for name, value in labels.items():
-        if not isinstance(value, str | int | float | bool):
-            raise AmiwarpError(f"field {where}.labels.{name} is {shown(value)}; expected text, a number or true/false")
+        _check_label(value, f"field {where}.labels.{name}")
     entry = build(SourceEntry, given, where)
+    _check_source(entry, where)
+    return SourceGroup(entry, labels)
+
+
+def _check_label(value: Any, what: str) -> None:
+    """Raise :class:`AmiwarpError` for a value that cannot be a label."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        real(value, what, -LARGEST_INTEGER, LARGEST_INTEGER)
+    elif not isinstance(value, str | bool):
+        raise AmiwarpError(f"{what} is {shown(value)}; expected text, a number or true/false")
+
+
+def _check_source(entry: SourceEntry, where: str) -> None:
+    """Raise :class:`AmiwarpError` for fields of a source that do not belong together, and for values out of range."""
     kinds = [kind for kind in KINDS if getattr(entry, kind) is not None]
     if len(kinds) != 1:
         raise AmiwarpError(f"field {where} has {' and '.join(kinds) or 'no source'}; give one of {', '.join(KINDS)}")
@@ -264,4 +279,3 @@ def _source(data: Any, where: str) -> SourceGroup:
             _check_distinct(getattr(entry, name), f"{where}.{name}")
     if entry.duration_s is not None:
         real(entry.duration_s, f"field {where}.duration_s", 1e-3, LONGEST_S, " s")
-    return SourceGroup(entry, labels)
