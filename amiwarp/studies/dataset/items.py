@@ -92,14 +92,13 @@ def _recipes(specification: Specification, source: Source) -> Iterator[dict[str,
         base |= {"duration_s": entry.duration_s or specification.duration_s}
     if entry.kind in ("worlds", "world_files"):
         base |= {"truth_hz": specification.truth_hz}
+    prisms = [asdict(prism) for prism in specification.prisms]
+    sensors = [{"name": name, **asdict(sensor)} for name, sensor in specification.sensors.items()]
     axes = itertools.product(
-        _trajectories(specification, source), specification.prisms, specification.speeds_rpm,
-        specification.sensors.items(), specification.seeds,
-    )  # fmt: skip
-    for trajectory, prism, rpm, (name, sensor), seed in axes:
-        yield base | trajectory | {
-            "prism": asdict(prism), "rpm": rpm, "sensor": {"name": name, **asdict(sensor)}, "seed": seed,
-        }  # fmt: skip
+        _trajectories(specification, source), prisms, specification.speeds_rpm, sensors, specification.seeds
+    )
+    for trajectory, prism, rpm, sensor, seed in axes:
+        yield base | trajectory | {"prism": prism, "rpm": rpm, "sensor": sensor, "seed": seed}
 
 
 def _trajectories(specification: Specification, source: Source) -> list[dict[str, Any]]:
