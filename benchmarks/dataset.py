@@ -5,9 +5,9 @@
 Each row makes the same recordings of random pictures in a new folder, with another number of workers. Its speed is
 that after each worker has made its second recording, so that start and compilation do not count. ``--device cuda``
 compares one GPU with all GPUs of the machine, with one and with several workers each. ``stages`` says what one
-recording spends its time on, and ``plan`` computes 100,000 recordings on 16 GPUs, or on 32 CPU cores, from the
-fastest row. Without pyarrow the tables are left out. Writes benchmarks/results/dataset_cpu.json or dataset_cuda.json.
-The exit status is 1 if a recording differs.
+recording spends its time on. ``plan`` computes 100,000 recordings on 16 GPUs, or on 32 CPU cores. Without pyarrow the
+tables are left out. Writes benchmarks/results/dataset_cpu.json or dataset_cuda.json. The exit status is 1 if a
+recording differs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -158,44 +158,51 @@ def add_scaling(rows: list[dict[str, Any]]) -> None:
 
 
 def stages(item: Item, folder: Path, device: str) -> dict[str, float]:
-    """Return the time of each stage of one recording [s]: the second of two passes, each on its own."""
+    """Return the time of each stage of one recording [s]: the second of two passes, each stage on its own.
+
+    On the CPU, it is the processor time, so that other programs do not count.
+    """
     path = folder / "stages.h5"
+    clock = time.process_time if device == "cpu" else time.perf_counter
     times: dict[str, float] = {}
     with limited_cpu_threads(threads_of_worker(device, 1)):
         for _ in range(2):
-            began = time.perf_counter()
+            began = clock()
             simulation = simulation_of(item, device)
-            times["prepare"] = time.perf_counter() - began
-            times["simulate"] = passed(simulation, device, to_host=False)
-            times["copy to the host"] = passed(simulation, device, to_host=True) - times["simulate"]
-            began = time.perf_counter()
+            times["prepare"] = clock() - began
+            times["simulate"] = passed(simulation, device, clock, to_host=False)
+            times["copy to the host"] = passed(simulation, device, clock, to_host=True) - times["simulate"]
+            began = clock()
             simulation.write(path, overwrite=True)
-            rest = time.perf_counter() - began - times["simulate"] - times["copy to the host"]
+            rest = clock() - began - times["simulate"] - times["copy to the host"]
             times["encode and write"] = rest
-            began = time.perf_counter()
+            began = clock()
             content_digest(path)
-            times["checksum"] = time.perf_counter() - began
+            times["checksum"] = clock() - began
     return {name: max(0.0, seconds) for name, seconds in times.items()}
 
 
-def passed(simulation: Any, device: str, to_host: bool) -> float:
+def passed(simulation: Any, device: str, clock: Callable[[], float], to_host: bool) -> float:
     """Return the duration of a simulation [s], with its events left on the device or copied to the host."""
-    began = time.perf_counter()
+    began = clock()
     engine = Engine(simulation)
     for block in engine.run():
         if to_host:
             block.to_host()
             block.truth()
     wp.synchronize_device(device)
-    return time.perf_counter() - began
+    return clock() - began
 
 
 def plan(rows: list[dict[str, Any]], of: list[dict[str, Any]], kind: str) -> dict[str, Any]:
-    """Return the time and size of many recordings on many devices, and the stage that limits them."""
+    """Return the time and size of many recordings on many devices, and the stage that limits them.
+
+    GPUs take the speed of the fastest row with all GPUs; CPU cores the processor time of the row with most workers.
+    """
     units = PLANNED_DEVICES[kind]
     most = max(row["gpus"] or row["workers"] for row in rows)
-    best = max(rows, key=lambda row: ((row["gpus"] or row["workers"]) == most, row["items_per_s"]))
-    rate = units * best["items_per_s"] / max(1, best["gpus"] or best["workers"])
+    best = max((row for row in rows if (row["gpus"] or row["workers"]) == most), key=lambda row: row["items_per_s"])
+    rate = units * (best["items_per_s"] / best["gpus"] if best["gpus"] else 1.0 / best["processor_s_per_item"])
     (one,) = (row for row in of if row["source"] == "pictures")
     slowest = max((name for name in one if isinstance(one[name], float)), key=lambda name: one[name])
     return {

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import distributed
@@ -26,11 +27,13 @@ import amiwarp
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_lines import append_line, create_journal, read_lines
+from amiwarp.kernels import quiet_start
+from amiwarp.studies import cluster
 from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
 from amiwarp.studies.dataset.items import list_items
 from amiwarp.studies.dataset.making import simulation_of
 from amiwarp.studies.dataset.manifest import JOURNAL, MANIFEST, TABLE
-from amiwarp.studies.dataset.run import DatasetSummary, duration_text, make_dataset
+from amiwarp.studies.dataset.run import DatasetSummary, duration_text, make_dataset, threads_of_worker
 from amiwarp.studies.dataset.specification import load_specification
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'
@@ -256,8 +259,8 @@ def test_a_cluster_makes_the_same_files(place: Path) -> None:
     alone = checksums(place)
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-    ) as cluster:
-        words = (place / "spec.toml", place / "other", "--scheduler", cluster.scheduler_address, "--device", "cpu")
+    ) as local:
+        words = (place / "spec.toml", place / "other", "--scheduler", local.scheduler_address, "--device", "cpu")
         result = run(*words, "--json")
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)
@@ -456,3 +459,17 @@ def test_recordings_are_those_of_the_simulator_on_each_device(place: Path, devic
         assert (row["device"], row["events"]) == (device, len(expected))
         np.testing.assert_array_equal(recording.events.slice(0, 10**9).t, expected.slice(0, 10**9).t)
         np.testing.assert_array_equal(recording.events.slice(0, 10**9).x, expected.slice(0, 10**9).x)
+
+
+def test_each_local_worker_sees_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quiet_start, "start_quietly", lambda: ["cpu", "cuda:0", "cuda:1"])
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert cluster._visible_gpus() == ("0", "1")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    assert (gpus := cluster._visible_gpus()) == ("3", "5")
+    seen = []
+    for name in range(5):
+        cluster._prepare(gpus, False, SimpleNamespace(name=name))
+        seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
+    assert seen == ["3", "5", "3", "5", "3"]
+    assert [threads_of_worker(*of) for of in (("cpu", 8), (ANY_GPU, None), (ANY_GPU, 10**6))] == [1, None, 1]

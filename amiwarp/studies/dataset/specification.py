@@ -100,7 +100,7 @@ class Specification:
 
     path: Path
     data: Mapping[str, Any]
-    """Fields of the file, as they are."""
+    """Fields of the file, unchanged."""
     name: str
     duration_s: float
     camera: CameraEntry
