@@ -466,7 +466,8 @@ def test_each_local_worker_sees_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     assert cluster._visible_gpus() == ("0", "1")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
-    assert (gpus := cluster._visible_gpus()) == ("3", "5")
+    gpus = cluster._visible_gpus()
+    assert gpus == ("3", "5")
     seen = []
     for name in range(5):
         cluster._prepare(gpus, False, SimpleNamespace(name=name))
