@@ -334,7 +334,7 @@ def changed(old: str, new: str) -> Callable[[str], str]:
 WRONG: dict[str, tuple[Callable[[str], str], str]] = {
     "no TOML": (lambda text: text + "[", "cannot be read as a specification of a data set"),
     "version": (changed("version = 1", "version = 2"), "are 'amiwarp-dataset-specification' and 2; expected"),
-    "unknown": (changed("speeds_rpm", "speed_rpm"), "field speeds_rpm is missing; add it"),
+    "unknown": (changed("speeds_rpm", "speed_rpm"), "field speeds_rpm is missing; add"),
     "near": (changed("sensors", "sensor"), r"field sensor is unknown; .*; did you mean sensors\?"),
     "prism": (changed("flat_side = ", "flatside = "), r"prisms\[1\]\.flatside is unknown.* did you mean flat_side\?"),
     "apex": (changed("apex_deg = 1.0", "apex_deg = 40.0"), r"field prisms\[0\]: prism apex = 0\.698.* 0 \.\. 30 deg"),

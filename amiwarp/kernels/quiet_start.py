@@ -22,7 +22,7 @@ def start_quietly() -> list[str]:
 
 @contextlib.contextmanager
 def _without(line: str) -> Iterator[None]:
-    """Remove one expected line from what native code writes to stderr; print the rest."""
+    """Print what native code writes to stderr, except for one expected line."""
     sys.stderr.flush()
     original = os.dup(2)
     with tempfile.TemporaryFile() as caught:

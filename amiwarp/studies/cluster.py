@@ -64,7 +64,7 @@ def start_workers(command: str, extra: str, scheduler: str | None, count: int, d
     scheduler does not answer.
     """
     try:
-        distributed: Any = importlib.import_module("distributed")  # has no type hints
+        distributed: Any = importlib.import_module("distributed")  # distributed has no type hints
     except ModuleNotFoundError as error:
         raise AmiwarpError(f"'{command}' needs Dask; run: pip install 'amiwarp[{extra}]'") from error
     with contextlib.ExitStack() as stack:
@@ -79,7 +79,7 @@ def start_workers(command: str, extra: str, scheduler: str | None, count: int, d
         try:
             client = stack.enter_context(distributed.Client(where, timeout=20))
         except (OSError, ValueError) as error:
-            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); "
+            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers at this address ({error}); "
                                "start one with: dask scheduler") from error  # fmt: skip
         gpus = _visible_gpus() if scheduler is None and device == ANY_GPU else ()
         client.register_worker_callbacks(functools.partial(_prepare, gpus, scheduler is None))
@@ -101,7 +101,7 @@ def gpu_count(devices: Iterable[str]) -> int:
 
 
 def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
-    """Prepare a worker: choose its GPU, silence Warp; a local worker leaves Ctrl-C to its parent process."""
+    """Prepare a worker: choose its GPU and silence Warp. A local worker also leaves Ctrl-C to its parent process."""
     if gpus:  # before CUDA starts in this process
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(dask_worker.name) % len(gpus)]
     if local:

@@ -1,4 +1,4 @@
-"""Worlds and camera trajectories by the names that users give: of a built-in world, or of files."""
+"""Worlds and camera trajectories by name: built-in worlds, or files."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world_files import load_world
 
 WORLD_FILES = (".toml", ".json")
-"""Endings of world files."""
+"""File suffixes of world files."""
 POSE_FILES = (".txt", ".csv", ".tum")
-"""Endings of files of poses."""
+"""File suffixes of files with poses."""
 
 
 def open_world(name: str, trajectory: str | None, *, seed: int, duration_s: float) -> tuple[World, Trajectory]:
