@@ -108,4 +108,8 @@ from .simulation.worlds.scene import World as World
 from .simulation.worlds.trajectory import Trajectory as Trajectory
 from .simulation.worlds.world_files import load_world as load_world
 from .simulation.worlds.world_scene import WorldScene as WorldScene
+from .studies.dataset.plan import DatasetPlan as DatasetPlan
+from .studies.dataset.plan import plan_dataset as plan_dataset
+from .studies.dataset.run import DatasetSummary as DatasetSummary
+from .studies.dataset.run import make_dataset as make_dataset
 from .viewer.app import view as view

@@ -16,7 +16,7 @@ from amiwarp.compensation.recordings import PIECE
 from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Vote
 from benchmarks import __main__ as runner
-from benchmarks import cases, compensate, ours, report, scenes, truth
+from benchmarks import cases, compensate, dataset, ours, report, scenes, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Missing
 from benchmarks.scenes import SECONDS, TURNS_PER_S, EventScene, RecordingScene, event_scene
@@ -259,3 +259,26 @@ def test_the_page_shows_the_files() -> None:
     text = report.PAGE.read_text()
     assert report.page(text, results) == text
     assert not [row["name"] for r in results for row in r["rows"] if row.get("wrong")]
+
+
+def test_the_plan_of_data_sets_follows_from_the_fastest_row() -> None:
+    counts = [(1, 1, 4.0), (2, 2, 6.0), (1, 4, 10.0), (2, 8, 18.0)]
+    rows = [
+        {"gpus": gpus, "workers": workers, "items_per_s": rate, "bytes_per_item": 2e6, "events_per_item": 1e6}
+        for gpus, workers, rate in counts
+    ]
+    dataset.add_scaling(rows)
+    assert [row["scaling"] for row in rows] == [1.0, 1.5, 1.0, 1.8]
+    planned = dataset.plan(rows, [{"source": "pictures", "simulate": 0.1, "encode and write": 0.3}], "cuda")
+    assert (planned["recordings"], planned["devices"], planned["workers_per_device"]) == (100_000, 16, 4)
+    assert planned["hours"] == pytest.approx(100_000 / (16 * 9.0) / 3600.0, rel=1e-12)
+    assert planned["terabytes"] == pytest.approx(0.2, rel=1e-12)
+    assert planned["disk_mb_per_s"] == pytest.approx(288.0, rel=1e-12)
+    assert (planned["bottleneck"], planned["bottleneck_share"]) == ("encode and write", pytest.approx(0.75, rel=1e-12))
+
+
+def test_the_results_of_data_sets_have_equal_files() -> None:
+    results = [json.loads(path.read_text()) for path in sorted(dataset.RESULTS.glob("dataset_*.json"))]
+    assert len(results) == 2
+    for result in results:
+        assert {row["equal_to_one_worker"] for row in result["rows"]} == ({True} if result["measured"] else {None})

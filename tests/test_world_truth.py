@@ -7,7 +7,6 @@ import signal
 import struct
 import subprocess
 import sys
-import types
 import zlib
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import MAPS
 from amiwarp.io.chunks import CHUNK
+from amiwarp.simulation.worlds import open_world
 from amiwarp.simulation.worlds.recorded_truth import chosen_instants
 
 ROOT = Path(__file__).parents[1]
@@ -74,18 +74,14 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Named worlds and world files that give the stub world, in a working folder."""
-    package: Any = types.ModuleType("amiwarp.simulation.worlds.named")
-    files: Any = types.ModuleType("amiwarp.simulation.worlds.world_files")
 
     def named_world(name: str, trajectory: str = "handheld", *, seed: int = 0, duration_s: float = 1.0) -> Any:
         if name != "room" or trajectory not in ("still", "handheld"):
             raise AmiwarpError(f"world {name!r} or trajectory {trajectory!r} is unknown")
         return stub_world(seed, name)
 
-    package.named_world = named_world
-    files.load_world = lambda path: (stub_world(name=Path(path).stem)[0], None)
-    monkeypatch.setitem(sys.modules, package.__name__, package)
-    monkeypatch.setitem(sys.modules, files.__name__, files)
+    monkeypatch.setattr(open_world, "named_world", named_world)
+    monkeypatch.setattr(open_world, "load_world", lambda path: (stub_world(name=Path(path).stem)[0], None))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

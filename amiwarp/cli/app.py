@@ -18,6 +18,7 @@ from amiwarp.cli import (
     chart,
     compensate,
     convert,
+    dataset,
     demo,
     design,
     emulate,
@@ -86,8 +87,8 @@ def _version(
 
 
 for module in (
-    demo, info, view, convert, simulate, translate, calibrate, compensate, reconstruct, chart, design, stability,
-    truth, motor, record, live, emulate,
+    demo, info, view, convert, simulate, translate, dataset, calibrate, compensate, reconstruct, chart, design,
+    stability, truth, motor, record, live, emulate,
 ):  # fmt: skip
     command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import os
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -16,7 +14,6 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from amiwarp.cli import say
 from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError, printable
 from amiwarp.progress import Progress
@@ -27,34 +24,13 @@ def choose_device(name: str | None) -> str:
 
     Raises :class:`AmiwarpError` if the named device is not available.
     """
-    import warp as wp
+    from amiwarp.kernels.quiet_start import start_quietly
 
-    wp.config.log_level = wp.LOG_ERROR
-    with _without("Could not find or load the NVIDIA CUDA driver"):
-        wp.init()
-    known = [device.alias for device in wp.get_devices()]
+    known = start_quietly()
     chosen = name or ("cuda:0" if "cuda:0" in known else "cpu")
     if chosen not in known:
         raise AmiwarpError(f"device {chosen!r} is not available; choose one of {', '.join(known)}")
     return chosen
-
-
-@contextlib.contextmanager
-def _without(line: str) -> Iterator[None]:
-    """Print what native code writes to stderr, except for one expected line."""
-    sys.stderr.flush()
-    original = os.dup(2)
-    with tempfile.TemporaryFile() as caught:
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(original, 2)
-            os.close(original)
-            caught.seek(0)
-            for text in caught.read().decode(errors="replace").splitlines():
-                if line not in text:
-                    say(text)
 
 
 @contextlib.contextmanager

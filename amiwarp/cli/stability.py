@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
-import importlib
-import logging
-import signal
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -21,6 +17,7 @@ from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import make_folder, own_folder
 from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.studies.cluster import start_workers
 
 if TYPE_CHECKING:
     from amiwarp.studies.stability import Atlas, Axis, Method, Stored
@@ -154,35 +151,14 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
 
     Raises :class:`AmiwarpError` if Dask is not installed, the scheduler does not answer, or workers die.
     """
-    try:
-        distributed: Any = importlib.import_module("distributed")  # distributed has no type hints
-    except ModuleNotFoundError as error:
-        raise AmiwarpError("'amiwarp stability' needs Dask; run: pip install 'amiwarp[cluster]'") from error
-    with contextlib.ExitStack() as stack:
-        where: Any = scheduler
-        if scheduler is None:
-            where = stack.enter_context(distributed.LocalCluster(
-                n_workers=cpu_threads(), threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=None,
-                silence_logs=logging.CRITICAL,  # a worker that dies is reported by the executor
-            ))  # fmt: skip
+    with start_workers("amiwarp stability", "cluster", scheduler, cpu_threads(), device) as workers:
+        from distributed import KilledWorker
+
         try:
-            client = stack.enter_context(distributed.Client(where, timeout=20))
-        except (OSError, ValueError) as error:
-            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers at this address ({error}); "
-                               "start one with: dask scheduler") from error  # fmt: skip
-        client.register_worker_callbacks(functools.partial(_prepare, device, scheduler is None))
-        try:
-            yield stack.enter_context(client.get_executor())
-        except distributed.KilledWorker as error:
+            yield workers.executor
+        except KilledWorker as error:
             raise AmiwarpError(f"workers died during a single run (cell), out of memory or killed: {error}; "
                                "run the same command again to continue") from error  # fmt: skip
-
-
-def _prepare(device: str, local: bool) -> None:
-    """Prepare a worker: silence Warp. A local worker also leaves Ctrl-C to its parent process."""
-    if local:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    choose_device(device)
 
 
 def _about(cells: Sequence[Stored]) -> dict[str, Any]:

@@ -14,15 +14,9 @@ from amiwarp.simulation.worlds.choices import Seeing
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
-    from amiwarp.simulation.worlds.scene import World
-    from amiwarp.simulation.worlds.trajectory import Trajectory
     from amiwarp.simulation.worlds.world_scene import WorldScene
 
 _WORLD = "World"
-WORLD_FILES = (".toml", ".json")
-"""File suffixes of world files."""
-POSE_FILES = (".txt", ".csv", ".tum")
-"""File suffixes of files with poses."""
 
 
 @dataclass(frozen=True)
@@ -105,33 +99,12 @@ class WorldOptions:
 
     def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
         """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""
+        from amiwarp.simulation.worlds.open_world import open_world
         from amiwarp.simulation.worlds.world_scene import WorldScene
 
-        world, trajectory = self._load(duration_s, seed)
+        world, trajectory = open_world(self.world or "", self.trajectory, seed=seed, duration_s=duration_s)
         given = {name: value for name in ("seeing", "motion_px") if (value := getattr(self, name)) is not None}
         return WorldScene(world, trajectory, blur=blur, **given)
-
-    def _load(self, duration_s: float, seed: int) -> tuple[World, Trajectory]:
-        from amiwarp.simulation.worlds.trajectory import Trajectory
-
-        name, way = self.world or "", self.trajectory
-        poses = Trajectory.from_file(way) if way is not None and way.lower().endswith(POSE_FILES) else None
-        if not name.lower().endswith(WORLD_FILES):
-            from amiwarp.simulation.worlds.named import named_world
-
-            kind = "still" if poses is not None else way or "handheld"
-            world, trajectory = named_world(name, kind, seed=seed, duration_s=duration_s)
-            return world, poses or trajectory
-        from amiwarp.simulation.worlds.world_files import load_world
-
-        world, stored = load_world(Path(name))
-        if way is not None and poses is None:
-            raise AmiwarpError(f"--trajectory {way} belongs to named worlds; give a file of poses for {name}")
-        if poses is None and stored is None:
-            raise AmiwarpError(f"{name}: has no trajectory of the camera; give a file of poses as --trajectory")
-        chosen = poses or stored
-        assert chosen is not None
-        return world, chosen
 
     def draw_preview(self, simulation: Simulation) -> None:
         """Write the preview figure if an option asks for it."""

@@ -1,13 +1,15 @@
-"""Reader of untrusted JSON files: limited in size, strict, and converted to dataclasses field by field."""
+"""Reader of untrusted JSON and TOML files: limited in size, strict, and converted to dataclasses field by field."""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import math
 import os
+import tomllib
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
@@ -60,6 +62,19 @@ def read_json(path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST
     return data
 
 
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Return the fields of a TOML file of at most :data:`MOST_BYTES`.
+
+    ``what`` says what the file should contain, for messages, such as "a world". Raises :class:`AmiwarpError` if the
+    file cannot be read, is larger or is not TOML.
+    """
+    with errors_name(path, lambda: f"cannot be read as {what}"):
+        check_regular(path)
+        if path.stat().st_size > MOST_BYTES:
+            raise AmiwarpError(f"is larger than {MOST_BYTES >> 20} MiB; give another file")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
 def parse_json(text: bytes) -> Any:
     """Return the value of JSON text. Raises :class:`AmiwarpError` for invalid JSON and non-finite numbers."""
     try:
@@ -101,10 +116,20 @@ def fields_of(data: Any, where: str, *needed: str, optional: tuple[str, ...] = (
             raise AmiwarpError(f"field {prefix}{name} is missing; add this field")
     for name in data:
         if name not in needed and name not in optional:
-            raise AmiwarpError(
-                f"field {prefix}{shown(name)[1:-1]} is unknown; expected {', '.join((*needed, *optional))}"
-            )
+            known = (*needed, *optional)
+            near = difflib.get_close_matches(str(name), known, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise AmiwarpError(f"field {prefix}{shown(name)[1:-1]} is unknown; expected {', '.join(known)}{hint}")
     return data
+
+
+def at_field(where: str, make: Callable[[], Made]) -> Made:
+    """Return the result of ``make``, and add the field to the message of an :class:`AmiwarpError`."""
+    try:
+        return make()
+    except AmiwarpError as error:
+        message = str(error)
+        raise AmiwarpError(message if f"field {where}" in message else f"field {where}: {message}") from error
 
 
 def build(kind: type[Made], data: Any, where: str) -> Made:

@@ -257,7 +257,7 @@ class Simulation:
         truth_times_us: ArrayLike | None = None,
         progress: Progress | None = None,
         overwrite: bool = False,
-    ) -> None:
+    ) -> int:
         """Simulate the whole recording to a file, in constant memory.
 
         Parameters
@@ -273,6 +273,11 @@ class Simulation:
             Called with the finished share.
         overwrite : bool, optional
             Replace an existing file.
+
+        Returns
+        -------
+        int
+            Number of events.
         """
         recorded = RecordedTruth(self, chosen_instants(self.duration_us, truth_hz, truth_times_us))
         with RecordingWriter(
@@ -294,6 +299,7 @@ class Simulation:
                 poses = recorded.poses_before(now_us)
                 if poses is not None:
                     writer.append_poses(poses)
+        return len(writer)
 
 
 def simulate(

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import errors_name, note_input
-from amiwarp.io.json_files import MOST_BYTES, build, fields_of, read_json
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.json_files import at_field, build, fields_of, read_json, read_toml
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.worlds.mesh_files import LoadedMesh, load_mesh
 from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Sky, Sun, World
@@ -22,7 +20,6 @@ from amiwarp.validation import one_of, real, shown
 FORMAT, VERSION = "amiwarp-world", 1
 """Values of the fields ``format`` and ``version``."""
 
-Made = TypeVar("Made")
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -125,11 +122,7 @@ def _read(path: Path) -> dict[str, Any]:
     if kind == ".json":
         data = read_json(path, "a world")
     elif kind == ".toml":
-        with errors_name(path, lambda: "cannot be read as a world"):
-            check_regular(path)
-            if path.stat().st_size > MOST_BYTES:
-                raise AmiwarpError(f"is larger than {MOST_BYTES >> 20} MiB; give another file")
-            data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = read_toml(path, "a world")
     else:
         raise AmiwarpError(f"{path}: has the suffix {path.suffix!r}; a world file ends in .toml or .json")
     note_input(path)
@@ -147,11 +140,12 @@ class _Reader:
         if "ambient" in given:
             options["ambient"] = real(given["ambient"], "field ambient", 0.0)
         if "sun" in given:
-            options["sun"] = _at("sun", lambda: build(Sun, given["sun"], "sun"))
+            options["sun"] = at_field("sun", lambda: build(Sun, given["sun"], "sun"))
         if "sky" in given:
-            options["sky"] = _at("sky", lambda: self._sky(given["sky"]))
+            options["sky"] = at_field("sky", lambda: self._sky(given["sky"]))
         options["lamps"] = [
-            _at(where, partial(build, Lamp, entry, where)) for where, entry in _entries(given.get("lamps", []), "lamps")
+            at_field(where, partial(build, Lamp, entry, where))
+            for where, entry in _entries(given.get("lamps", []), "lamps")
         ]
         bodies: list[Body] = []
         for where, entry in _entries(given["bodies"], "bodies"):
@@ -187,16 +181,16 @@ class _Reader:
         real(entry.scale, f"field {where}.scale", 1e-9, 1e9)
         material = build(MaterialEntry, given.get("material", {}), f"{where}.material")
         trajectory = self._body_trajectory(given, entry, where)
-        parts = _at(f"{where}.mesh", lambda: load_mesh(self._folder / entry.mesh, up=entry.up, scale=entry.scale))
+        parts = at_field(f"{where}.mesh", lambda: load_mesh(self._folder / entry.mesh, up=entry.up, scale=entry.scale))
         names = _part_names(entry.name, parts)
-        texture = None if material.texture is None else _at(
+        texture = None if material.texture is None else at_field(
             f"{where}.material.texture", lambda: self._picture(str(material.texture))
         )  # fmt: skip
         return [
             Body(
                 name=name,
                 mesh=part.mesh,
-                material=_at(f"{where}.material", partial(_material, part, material, texture, where)),
+                material=at_field(f"{where}.material", partial(_material, part, material, texture, where)),
                 trajectory=trajectory,
                 category=entry.category,
                 instance=entry.instance or entry.name,
@@ -215,29 +209,20 @@ class _Reader:
         if entry.position is None and entry.rotation is None:
             return None
         position, rotation = entry.position or (0.0, 0.0, 0.0), entry.rotation or (0.0, 0.0, 0.0, 1.0)
-        return _at(where, lambda: Trajectory.still(position, rotation=rotation))
+        return at_field(where, lambda: Trajectory.still(position, rotation=rotation))
 
     def _trajectory(self, data: Any, where: str) -> Trajectory:
         """Return a trajectory from the name of a CSV or TUM file, or from a list of key poses."""
         if isinstance(data, str):
             note_input(self._folder / data)
-            return _at(where, lambda: Trajectory.from_file(self._folder / data))
+            return at_field(where, lambda: Trajectory.from_file(self._folder / data))
         poses = [
             build(PoseEntry, entry, place) for place, entry in _entries(data, where, "the name of a file or a list")
         ]
         if not poses:
             raise AmiwarpError(f"field {where} is empty; give at least one pose")
         turns = [_rotation(pose, f"{where}[{k}]") for k, pose in enumerate(poses)]
-        return _at(where, lambda: Trajectory([pose.t for pose in poses], [pose.position for pose in poses], turns))
-
-
-def _at(where: str, make: Callable[[], Made]) -> Made:
-    """Return the result of ``make``, and add the field to the message of an :class:`AmiwarpError`."""
-    try:
-        return make()
-    except AmiwarpError as error:
-        message = str(error)
-        raise AmiwarpError(message if f"field {where}" in message else f"field {where}: {message}") from error
+        return at_field(where, lambda: Trajectory([pose.t for pose in poses], [pose.position for pose in poses], turns))
 
 
 def _text(value: Any, where: str) -> str:
@@ -259,7 +244,7 @@ def _rotation(pose: PoseEntry, where: str) -> Any:
         return pose.rotation or (0.0, 0.0, 0.0, 1.0)
     if pose.rotation is not None:
         raise AmiwarpError(f"field {where} has both rotation and look_at; give one of them")
-    return _at(where, lambda: looking_at(pose.position, pose.look_at or ()).as_quat())
+    return at_field(where, lambda: looking_at(pose.position, pose.look_at or ()).as_quat())
 
 
 def _part_names(name: str, parts: list[LoadedMesh]) -> list[str]:

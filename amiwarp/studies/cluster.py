@@ -1,0 +1,136 @@
+"""Workers that run jobs in parallel: local processes, or a Dask cluster by its address."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import logging
+import os
+import signal
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from amiwarp.errors import AmiwarpError
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+WAITING = 2
+"""Jobs given out for each worker: the one that it runs, and the next."""
+ANY_GPU = "cuda"
+"""Name of the device for all CUDA GPUs: each local worker uses one of them."""
+
+LOCAL_CONFIGURATION = {
+    "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
+    "distributed.worker.profile.enabled": False,
+}
+"""Dask's configuration of local workers.
+
+By default Dask also makes the allocator return memory early, which costs a quarter more processor time here, and
+samples the stack of each worker.
+"""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Running workers."""
+
+    executor: Executor
+    """Executor that runs its jobs on them."""
+    count: Callable[[], int]
+    """Function that returns the present number of workers."""
+
+
+@contextlib.contextmanager
+def single_worker() -> Iterator[Workers]:
+    """Yield one worker, which is a thread of this process."""
+    with ThreadPoolExecutor(1, thread_name_prefix="amiwarp-worker") as pool:
+        yield Workers(pool, lambda: 1)
+
+
+@contextlib.contextmanager
+def start_workers(command: str, extra: str, scheduler: str | None, count: int, device: str) -> Iterator[Workers]:
+    """Yield the workers of a scheduler, or ``count`` local processes without one.
+
+    With the device :data:`ANY_GPU`, local workers share the GPUs evenly, and each sees one, as ``cuda:0``. A local
+    worker that uses more than its share of the memory is restarted. ``command`` and ``extra`` are the names of the
+    command and of its optional dependency for messages. Raises :class:`AmiwarpError` if Dask is not installed or the
+    scheduler does not answer.
+    """
+    try:
+        distributed: Any = importlib.import_module("distributed")  # distributed has no type hints
+    except ModuleNotFoundError as error:
+        raise AmiwarpError(f"'{command}' needs Dask; run: pip install 'amiwarp[{extra}]'") from error
+    with contextlib.ExitStack() as stack:
+        where: Any = scheduler
+        if scheduler is None:
+            stack.enter_context(importlib.import_module("dask").config.set(LOCAL_CONFIGURATION))
+            where = stack.enter_context(distributed.LocalCluster(
+                n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0",
+                memory_limit=distributed.system.MEMORY_LIMIT // count,
+                silence_logs=logging.CRITICAL,  # a worker that dies is reported by the executor
+            ))  # fmt: skip
+        try:
+            client = stack.enter_context(distributed.Client(where, timeout=20))
+        except (OSError, ValueError) as error:
+            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers at this address ({error}); "
+                               "start one with: dask scheduler") from error  # fmt: skip
+        gpus = _visible_gpus() if scheduler is None and device == ANY_GPU else ()
+        client.register_worker_callbacks(functools.partial(_prepare, gpus, scheduler is None))
+        yield Workers(stack.enter_context(client.get_executor()), lambda: len(client.nthreads()))
+
+
+def _visible_gpus() -> tuple[str, ...]:
+    """Return the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    from amiwarp.kernels.quiet_start import start_quietly
+
+    given = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    count = gpu_count(start_quietly())
+    return tuple(given.split(",")[:count]) if given else tuple(map(str, range(count)))
+
+
+def gpu_count(devices: Iterable[str]) -> int:
+    """Return the number of CUDA GPUs among the names of Warp's devices."""
+    return sum(name.startswith("cuda") for name in devices)
+
+
+def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
+    """Prepare a worker: choose its GPU and silence Warp. A local worker also leaves Ctrl-C to its parent process."""
+    if gpus:  # before CUDA starts in this process
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(dask_worker.name) % len(gpus)]
+    if local:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from amiwarp.kernels.quiet_start import start_quietly
+
+    start_quietly()
+
+
+def run_jobs(
+    workers: Workers, function: Callable[[Job], Result], jobs: Iterable[Job]
+) -> Generator[tuple[Job, Future[Result]], None, None]:
+    """Yield each job and its finished future, in the order in which they finish.
+
+    Only a few jobs for each worker are given out at a time, so that memory use does not depend on their number. When
+    the generator is closed, jobs that did not begin are cancelled.
+    """
+    waiting: dict[Future[Result], Job] = {}
+    left = iter(jobs)
+    try:
+        while True:
+            for job in left:
+                waiting[workers.executor.submit(function, job)] = job
+                if len(waiting) >= WAITING * max(1, workers.count()):
+                    break
+            if not waiting:
+                return
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                yield waiting.pop(future), future
+    finally:
+        for future in waiting:
+            future.cancel()

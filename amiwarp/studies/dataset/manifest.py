@@ -1,0 +1,178 @@
+"""Files that describe a data set: the journal of finished recordings, and the manifest as JSON and as Parquet."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from amiwarp._version import __version__
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.atomic_output import NewFile, write_text
+from amiwarp.io.json_lines import append_line, create_journal, read_lines
+from amiwarp.io.recorded_dataset import FORMAT, MANIFEST, VERSION
+from amiwarp.studies.dataset.items import Item
+from amiwarp.studies.dataset.making import Failed, Made
+from amiwarp.studies.dataset.sources import content_digest
+from amiwarp.studies.dataset.specification import Specification
+
+JOURNAL, TABLE = "journal.jsonl", "manifest.parquet"
+"""Names of the files in the folder of a data set."""
+
+
+def require_pyarrow() -> Any:
+    """Return pyarrow. Raises :class:`AmiwarpError` if it is not installed."""
+    try:
+        return importlib.import_module("pyarrow")
+    except ModuleNotFoundError as error:
+        raise AmiwarpError("'amiwarp dataset' needs pyarrow; run: pip install 'amiwarp[dataset]'") from error
+
+
+def check_folder(out: Path) -> None:
+    """Raise :class:`AmiwarpError` if a folder holds other files than a data set."""
+    if out.is_dir() and not (out / JOURNAL).exists():
+        other = sorted(p.name for p in out.iterdir() if not p.name.startswith("."))
+        if other:
+            raise AmiwarpError(f"{out}: holds other files, such as {other[0]}; give a new folder")
+
+
+class Journal:
+    """Recordings that were made, on disk. A later entry replaces an earlier one of the same key."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._path = out, out / JOURNAL
+        found = (Made.from_json(data) for data in read_lines(self._path))
+        self.made = {made.key: made for made in found if made is not None}
+        """Recordings by the key of their item."""
+        self._touched: list[Made] = []
+
+    def create(self) -> None:
+        """Create the journal unless it exists. It marks the folder as a data set."""
+        create_journal(self._path)
+
+    def add(self, made: Made) -> None:
+        """Add a recording."""
+        self.made[made.key] = made
+        append_line(self._path, asdict(made))
+
+    def intact(self, item: Item) -> Made | None:
+        """Return the recording of an item, or None if its file is missing or damaged.
+
+        A file with the recorded size and time of change is taken as undamaged. If only the time differs, the checksum
+        is computed.
+        """
+        made = self.made.get(item.key)
+        if made is None or made.file != item.file:
+            return None
+        path = self._out / made.file
+        if not path.is_file() or path.stat().st_size != made.bytes:
+            return None
+        changed = path.stat().st_mtime_ns
+        if changed != made.mtime_ns:
+            if content_digest(path) != made.sha256:
+                return None
+            made = replace(made, mtime_ns=changed)
+            self._touched.append(made)
+        return made
+
+    def note_touched(self) -> None:
+        """Record the times of undamaged files whose time of change differed, so that they are not read again."""
+        while self._touched:
+            self.add(self._touched.pop())
+
+    def others(self, items: Sequence[Item]) -> list[str]:
+        """Return the existing recordings that belong to none of the items, for example of an earlier specification."""
+        files = {item.file for item in items}
+        return sorted(made.file for made in self.made.values()
+                      if made.file not in files and (self._out / made.file).exists())  # fmt: skip
+
+
+def write_manifest(
+    out: Path, specification: Specification, items: Sequence[Item], journal: Journal, failed: Sequence[Failed]
+) -> None:
+    """Write the manifest of the recordings that are finished, as JSON and as Parquet."""
+    rows = [_row(item, journal.made[item.key]) for item in items if item.key in journal.made]
+    by_key = {item.key: item for item in items}
+    licences = Counter((item.source, item.licence) for item in items if item.key in journal.made)
+    head = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": specification.name,
+        "amiwarp": __version__,
+        "date": time.strftime("%Y-%m-%d"),
+        "specification": specification.data,
+        "complete": len(rows) == len(items),
+        "recordings": len(items),
+        "events": sum(row["events"] for row in rows),
+        "bytes": sum(row["bytes"] for row in rows),
+        "splits": dict(Counter(row["split"] for row in rows)),
+        "licences": _licences(licences),
+        "failed": [{"file": by_key[f.key].file, "source": by_key[f.key].source, "error": f.error} for f in failed],
+        "not_in_specification": journal.others(items),
+    }
+    text = json.dumps(head, indent=1, default=str).removesuffix("\n}")
+    lines = ",\n".join("  " + json.dumps(row) for row in rows)  # one line for each recording
+    write_text(out / MANIFEST, f'{text},\n "items": [\n{lines}\n ]\n}}\n', overwrite=True)
+    _write_table(out / TABLE, rows)
+
+
+def _licences(counts: Mapping[tuple[str, str], int]) -> list[dict[str, Any]]:
+    """Return the licences with the number of their sources and recordings."""
+    names = sorted({licence for _, licence in counts})
+    return [
+        {
+            "licence": name or "not stated",
+            "sources": sum(licence == name for _, licence in counts),
+            "recordings": sum(count for (_, licence), count in counts.items() if licence == name),
+        }
+        for name in names
+    ]
+
+
+def _row(item: Item, made: Made) -> dict[str, Any]:
+    """Return the entry of a recording in the manifest. Settings that it does not have are None."""
+    recipe = item.recipe
+    prism = recipe.get("prism") or {}
+    return {
+        "file": made.file,
+        "sha256": made.sha256,
+        "bytes": made.bytes,
+        "split": item.split,
+        "labels": dict(item.labels),
+        "events": made.events,
+        "duration_s": made.duration_s,
+        "width": made.width,
+        "height": made.height,
+        "seed": None if item.kind == "recordings" else item.seed,
+        "source": item.source,
+        "source_kind": item.kind,
+        "source_sha256": recipe["source"]["sha256"],
+        "licence": item.licence,
+        "apex_deg": prism.get("apex_deg"),
+        "index": prism.get("index"),
+        "flat_side": prism.get("flat_side"),
+        "rpm": recipe.get("rpm"),
+        "sensor": (recipe.get("sensor") or {}).get("name"),
+        "variant": recipe.get("seed"),
+        "trajectory": recipe.get("trajectory"),
+        "device": made.device,
+        "amiwarp": made.amiwarp,
+    }
+
+
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write the entries as Parquet. Each label becomes a column ``label_NAME``; the others keep their name."""
+    pyarrow = require_pyarrow()
+    parquet = importlib.import_module("pyarrow.parquet")
+    labels = sorted({name for row in rows for name in row["labels"]})
+    flat = [
+        {**{k: v for k, v in row.items() if k != "labels"}, **{f"label_{n}": row["labels"].get(n) for n in labels}}
+        for row in rows
+    ]
+    with NewFile(path, overwrite=True) as new:
+        parquet.write_table(pyarrow.Table.from_pylist(flat), new.part)

@@ -1,0 +1,304 @@
+"""Making of a data set on local processes or a cluster. What is there already is kept."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.atomic_output import make_folder, scratch_folder
+from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.progress import Progress, silent
+from amiwarp.studies.cluster import ANY_GPU, Workers, gpu_count, run_jobs, single_worker, start_workers
+from amiwarp.studies.dataset.items import Item, list_items
+from amiwarp.studies.dataset.making import Failed, Job, Made, make
+from amiwarp.studies.dataset.manifest import Journal, check_folder, require_pyarrow, write_manifest
+from amiwarp.studies.dataset.specification import load_specification
+from amiwarp.validation import whole
+
+MOST_WORKERS = 4096
+"""Largest number of local workers."""
+
+
+@dataclass(frozen=True)
+class DatasetSummary:
+    """What :func:`make_dataset` did.
+
+    Examples
+    --------
+    >>> summary = amiwarp.DatasetSummary(
+    ...     recordings=12, made=11, kept=0, failed={"train/a-1.h5": "no such file"}, not_in_specification=(),
+    ...     splits={"train": 11}, events=10, size_bytes=100, seconds=2.0, worker_seconds=3.0,
+    ...     processor_seconds=2.5, workers=2)
+    >>> summary.made + summary.kept + len(summary.failed) == summary.recordings
+    True
+    """
+
+    recordings: int
+    """Number of recordings that the specification describes."""
+    made: int
+    """Number of recordings that were made."""
+    kept: int
+    """Number of recordings that were there already."""
+    failed: Mapping[str, str]
+    """Error message of each recording that could not be made, by its file."""
+    not_in_specification: tuple[str, ...]
+    """Recordings in the folder that the specification does not describe. They are kept, but not in the manifest."""
+    splits: Mapping[str, int]
+    """Number of finished recordings of each split."""
+    events: int
+    """Number of events in the recordings that were made."""
+    size_bytes: int
+    """Size of the recordings that were made [bytes]."""
+    seconds: float
+    """Elapsed time [s]."""
+    worker_seconds: float
+    """Time that the workers spent on recordings, added up [s]."""
+    processor_seconds: float
+    """Processor time that they spent, added up [s]."""
+    workers: int
+    """Largest number of workers; 0 if there was nothing to make."""
+
+
+@dataclass
+class _Run:
+    """State of a run."""
+
+    made: int = 0
+    events: int = 0
+    bytes: int = 0
+    worker_seconds: float = 0.0
+    processor_seconds: float = 0.0
+    workers: int = 0
+    failed: list[Failed] = field(default_factory=list)
+
+
+def make_dataset(
+    specification: str | Path,
+    out: str | Path,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> DatasetSummary:
+    """Make the recordings of a data set that are missing, and write its manifest.
+
+    A recording that cannot be made is reported in the manifest and does not stop the others.
+
+    Parameters
+    ----------
+    specification : str or Path
+        TOML file that describes the data set.
+    out : str or Path
+        Folder of the data set: a new folder, or one that an earlier call made.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``. By default, processes of this machine do the
+        work. All workers need access to ``out`` and to the sources under the same paths.
+    workers : int, optional
+        Number of local processes. By default one for each core, or for each GPU. One worker runs in this process, and
+        needs no Dask.
+    device : str, optional
+        ``cpu``; ``cuda`` for all GPUs, which the workers share evenly; or one GPU, such as ``cuda:0``.
+    progress : Progress, optional
+        Called with the state and the finished share.
+
+    Returns
+    -------
+    DatasetSummary
+        Numbers of recordings, failures and the speed.
+
+    Raises
+    ------
+    AmiwarpError
+        If the specification is wrong, a source is not found, the folder holds other files, or workers are missing.
+
+    Notes
+    -----
+    Several local workers are processes that import the running script. Call this function under
+    ``if __name__ == "__main__":`` in a script.
+
+    Examples
+    --------
+    >>> import pathlib
+    >>> _ = pathlib.Path("step.pgm").write_text("P2 4 2 255 0 255 0 255 255 0 255 0")
+    >>> _ = pathlib.Path("small.toml").write_text('''
+    ... format = "amiwarp-dataset-specification"
+    ... version = 1
+    ... duration_s = 0.002
+    ... camera = {size = [16, 12]}
+    ... prisms = [{apex_deg = 1.0}]
+    ... speeds_rpm = [720.0, 1800.0]
+    ... sources = [{pictures = "*.pgm"}]
+    ... ''')
+    >>> amiwarp.make_dataset("small.toml", "small", workers=1).made
+    2
+    """
+    began = time.perf_counter()
+    out = Path(out)
+    spec = load_specification(specification)
+    require_pyarrow()
+    check_folder(out)
+    items = list_items(spec)
+    count = _local_workers(scheduler, workers, device)
+    make_folder(out)
+    journal = Journal(out)
+    journal.create()
+    state = _Run()
+    todo = missing(journal, items)
+    journal.note_touched()
+    try:
+        if todo:
+            jobs = _Jobs(out.resolve(), device, threads_of_worker(device, count))
+            _make_all(todo, jobs, journal, state, _workers(scheduler, count, device), progress or silent)
+    finally:
+        write_manifest(out, spec, items, journal, state.failed)
+    return _summary(items, journal, state, len(items) - len(todo), time.perf_counter() - began)
+
+
+def missing(journal: Journal, items: Sequence[Item]) -> list[Item]:
+    """Return the items without an undamaged recording, in an order that depends on their keys alone.
+
+    The order mixes long and short recordings, so that the speed so far predicts the rest.
+    """
+    todo = []
+    for item in items:
+        if journal.intact(item) is None:
+            journal.made.pop(item.key, None)
+            todo.append(item)
+    return sorted(todo, key=lambda item: item.key)
+
+
+def worker_count(workers: int | None, device: str) -> int:
+    """Return the number of local workers; by default one for each GPU or each core."""
+    if workers is not None:
+        return whole(workers, "workers", 1, MOST_WORKERS)
+    if device != ANY_GPU:
+        return cpu_threads() if device == "cpu" else 1
+    from amiwarp.kernels.quiet_start import start_quietly
+
+    return max(1, gpu_count(start_quietly()))
+
+
+def threads_of_worker(device: str, workers: int | None) -> int | None:
+    """Return the number of CPU threads of each of ``workers`` local workers; None for all, in a cluster.
+
+    On the CPU each worker runs on one thread. Workers with a GPU share the cores, which encode and write the events.
+    """
+    if device == "cpu":
+        return 1
+    return None if workers is None else max(1, cpu_threads() // workers)
+
+
+def _workers(scheduler: str | None, count: int | None, device: str) -> AbstractContextManager[Workers]:
+    """Return the workers, which begin when the context is entered. ``count`` is that of local workers."""
+    if count == 1:
+        return single_worker()
+    return start_workers("amiwarp dataset", "dataset", scheduler, count or 0, device)
+
+
+def _local_workers(scheduler: str | None, workers: int | None, device: str) -> int | None:
+    """Return the number of local workers; None with a scheduler.
+
+    Raises :class:`AmiwarpError` if this machine lacks their device.
+    """
+    if scheduler is not None:
+        if workers is not None:
+            raise AmiwarpError(f"workers = {workers} applies to local processes; leave it out with a scheduler")
+        return None
+    from amiwarp.kernels.quiet_start import start_quietly
+
+    known = start_quietly()
+    if device not in (*known, *([ANY_GPU] if gpu_count(known) else [])):
+        raise AmiwarpError(f"device {device!r} is not available; choose one of {', '.join(known)}")
+    return worker_count(workers, device)
+
+
+@dataclass(frozen=True)
+class _Jobs:
+    """What all jobs of a run share."""
+
+    out: Path
+    device: str
+    threads: int | None
+
+
+def _make_all(
+    todo: Sequence[Item], shared: _Jobs, journal: Journal, state: _Run, workers: AbstractContextManager[Workers],
+    progress: Progress,
+) -> None:  # fmt: skip
+    """Make all recordings, and record each in the journal when it is finished."""
+    began = time.perf_counter()
+    with scratch_folder(shared.out) as scratch, workers as running:
+        jobs = (Job(item, shared.out, scratch, shared.device, shared.threads) for item in todo)
+        results = run_jobs(running, make, jobs)
+        progress(f"0 of {len(todo):,} recordings", 0.0)
+        with contextlib.closing(results):
+            for done, (job, future) in enumerate(results, 1):
+                _keep(journal, state, _result(job, future))
+                state.workers = max(state.workers, running.count())
+                progress(_line(state, done, len(todo), time.perf_counter() - began), done / len(todo))
+
+
+def _result(job: Job, future: Future[Made | Failed]) -> Made | Failed:
+    """Return the result of a job. A worker that dies, for example for want of memory, is a failure of its recording."""
+    if future.cancelled():
+        raise AmiwarpError("the scheduler stopped or dropped the work; run the same command again to continue")
+    try:
+        return future.result()
+    except AmiwarpError:
+        raise
+    except Exception as error:
+        return Failed(job.item.key, f"the worker died or lost its connection: {type(error).__name__}: {error}"[:500])
+
+
+def _keep(journal: Journal, state: _Run, result: Made | Failed) -> None:
+    if isinstance(result, Failed):
+        state.failed.append(result)
+        return
+    journal.add(result)
+    state.made += 1
+    state.events += result.events
+    state.bytes += result.bytes
+    state.worker_seconds += result.seconds
+    state.processor_seconds += result.processor_s
+
+
+def _line(state: _Run, done: int, total: int, seconds: float) -> str:
+    """Return the state of a run as text, with the time left at the mean speed so far."""
+    left = (total - done) * seconds / done
+    failed = f", {len(state.failed):,} failed" if state.failed else ""
+    speed = f"{state.events / seconds / 1e6:.3g} Mev/s"
+    return f"{done:,} of {total:,} recordings{failed}, {speed}, {duration_text(left)} left"
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration with the unit in which it reads best."""
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _summary(items: Sequence[Item], journal: Journal, state: _Run, kept: int, seconds: float) -> DatasetSummary:
+    files = {item.key: item.file for item in items}
+    return DatasetSummary(
+        recordings=len(items),
+        made=state.made,
+        kept=kept,
+        failed={files[one.key]: one.error for one in state.failed},
+        not_in_specification=tuple(journal.others(items)),
+        splits=dict(Counter(item.split for item in items if item.key in journal.made)),
+        events=state.events,
+        size_bytes=state.bytes,
+        seconds=seconds,
+        worker_seconds=state.worker_seconds,
+        processor_seconds=state.processor_seconds,
+        workers=state.workers,
+    )

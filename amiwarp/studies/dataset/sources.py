@@ -1,0 +1,163 @@
+"""Sources of a data set: files found by their patterns, named worlds, and the labels that they carry."""
+
+from __future__ import annotations
+
+import csv
+import glob
+import hashlib
+import io
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.input_files import errors_name, note_input
+from amiwarp.io.json_files import read_json, read_toml
+from amiwarp.io.regular_file import check_regular
+from amiwarp.simulation.worlds.named.catalogue import WORLDS
+from amiwarp.studies.dataset.specification import SourceEntry, SourceGroup, Specification
+from amiwarp.validation import one_of
+
+MOST_TABLE_BYTES = 256 << 20
+"""Largest table of labels that is read [bytes]."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One picture, video, recording, world file or named world."""
+
+    entry: SourceEntry
+    """Entry of the specification that it belongs to."""
+    name: str
+    """Path relative to the folder of the specification, or name of a world."""
+    path: Path | None
+    """File; None for a named world."""
+    digest: str
+    """SHA-256 of the content, in hexadecimal; empty for a named world."""
+    labels: Mapping[str, Any]
+    """Labels by name."""
+
+
+def find_sources(specification: Specification) -> list[Source]:
+    """Return all sources. Raises :class:`AmiwarpError` for a pattern without files and for a file found twice."""
+    found: dict[str, tuple[int, Source]] = {}
+    kinds: dict[str, tuple[type, int]] = {}
+    for k, group in enumerate(specification.sources):
+        with errors_name(specification.path, lambda k=k: f"field sources[{k}]"):  # type: ignore[misc]
+            for source in _of_group(specification.folder, group, f"sources[{k}]"):
+                if source.name in found:
+                    raise AmiwarpError(
+                        f"field sources[{k}] names {source.name}, as does sources[{found[source.name][0]}]; "
+                        "change one of them, so that each recording is made once"
+                    )
+                found[source.name] = (k, source)
+                _check_label_types(source.labels, kinds, k)
+    return [source for _, source in found.values()]
+
+
+def _check_label_types(labels: Mapping[str, Any], kinds: dict[str, tuple[type, int]], k: int) -> None:
+    """Raise :class:`AmiwarpError` if a label has values of two types. ``kinds`` holds the type of each label so far."""
+    for name, value in labels.items():
+        kind, first = kinds.setdefault(name, (type(value), k))
+        if kind is not type(value):
+            raise AmiwarpError(
+                f"field sources[{k}] has the label {name} = {value!r}, but in sources[{first}] it is of type "
+                f"{kind.__name__}; use one type"
+            )
+
+
+def _of_group(folder: Path, group: SourceGroup, where: str) -> Iterator[Source]:
+    """Yield the sources of one entry."""
+    entry = group.entry
+    if entry.worlds is not None:
+        for name in entry.worlds:
+            one_of(name, WORLDS, f"field {where}.worlds")
+            yield Source(entry, name, None, "", dict(group.labels))
+        return
+    pattern = getattr(entry, entry.kind)
+    names = sorted(glob.glob(pattern, root_dir=folder, recursive=True))
+    if not names:
+        raise AmiwarpError(f"field {where}.{entry.kind} is {pattern!r}, which matches no file in {folder}; change it")
+    table = None if entry.label_table is None else _read_labels(folder / entry.label_table)
+    digest: Callable[[Path], str] = _world_digest if entry.kind == "world_files" else content_digest
+    for name in names:
+        path = folder / name
+        note_input(path)
+        yield Source(entry, Path(name).as_posix(), path, digest(path), _labels(group, path, table))
+
+
+def _labels(group: SourceGroup, path: Path, table: tuple[Path, dict[Path, dict[str, Any]]] | None) -> dict[str, Any]:
+    """Return the labels of a file: constant ones, its folder's name, and those of the table."""
+    labels = dict(group.labels)
+    if group.entry.label_from_folder is not None:
+        labels[group.entry.label_from_folder] = path.absolute().parent.name
+    if table is not None:
+        row = table[1].get(path.resolve())
+        if row is None:
+            raise AmiwarpError(f"{table[0]}: has no row for {path}; add it, or change the pattern of the source")
+        labels |= row
+    return labels
+
+
+def _read_labels(path: Path) -> tuple[Path, dict[Path, dict[str, Any]]]:
+    """Return the labels of each file of a CSV table, whose column ``file`` is relative to the folder of the table.
+
+    A column of numbers becomes numbers; any other column is text.
+    """
+    with errors_name(path, lambda: "is no table of labels"):
+        check_regular(path)
+        with path.open("rb") as file:
+            text = file.read(MOST_TABLE_BYTES + 1)
+        if len(text) > MOST_TABLE_BYTES:
+            raise AmiwarpError(f"is larger than {MOST_TABLE_BYTES >> 20} MiB; divide it among several sources")
+        reader = csv.DictReader(io.StringIO(text.decode("utf-8"), newline=""))
+        names = [name for name in reader.fieldnames or () if name != "file"]
+        if "file" not in (reader.fieldnames or ()) or not names:
+            raise AmiwarpError("has no column 'file' or no other column; write a header such as file,class")
+        rows = list(reader)
+        for k, row in enumerate(rows):
+            if None in row or None in row.values():
+                raise AmiwarpError(f"row {k + 1} has more or fewer cells than the header; correct it")
+        columns = {name: _column([row[name] for row in rows]) for name in names}
+        files = [(path.parent / row["file"]).resolve() for row in rows]
+        return path, {file: {name: columns[name][k] for name in names} for k, file in enumerate(files)}
+
+
+def _column(values: list[str]) -> list[Any]:
+    """Return the values of a column as whole numbers, as numbers, or as text. Numbers like 007 are text."""
+    if all(re.fullmatch(r"-?(0|[1-9]\d{0,17})", value) for value in values):
+        return [int(value) for value in values]
+    if all(re.fullmatch(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d{1,2})?", value) for value in values):
+        return [float(value) for value in values]
+    return list(values)
+
+
+def content_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, or of the names and contents of the files in a folder."""
+    with errors_name(path, lambda: "cannot be read"):
+        if path.is_dir():
+            total = hashlib.sha256()
+            for file in sorted(p for p in path.iterdir() if p.is_file()):
+                total.update(f"{file.name}\0{content_digest(file)}\n".encode())
+            return total.hexdigest()
+        check_regular(path)
+        with path.open("rb") as opened:
+            return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _world_digest(path: Path) -> str:
+    """Return the SHA-256 of a world file and of the files that it names."""
+    data = read_json(path, "a world") if path.suffix.lower() == ".json" else read_toml(path, "a world")
+    named = {path.parent / text for text in _texts(data)}
+    digests = [content_digest(file) for file in [path, *sorted(file for file in named if file.is_file())]]
+    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
+
+
+def _texts(data: Any) -> Iterator[str]:
+    """Yield all texts among the values of JSON data."""
+    if isinstance(data, str):
+        yield data
+    for value in data.values() if isinstance(data, dict) else data if isinstance(data, list) else ():
+        yield from _texts(value)

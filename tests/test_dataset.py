@@ -1,0 +1,476 @@
+"""Data sets in bulk: what a specification makes, what is kept, and what a wrong specification or a failure says."""
+
+import hashlib
+import json
+import math
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import distributed
+import matplotlib.pyplot as plt
+import numpy as np
+import pyarrow.parquet
+import pytest
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+import amiwarp
+from amiwarp.cli.app import app
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.json_lines import append_line, create_journal, read_lines
+from amiwarp.kernels import quiet_start
+from amiwarp.studies import cluster
+from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
+from amiwarp.studies.dataset.items import list_items
+from amiwarp.studies.dataset.making import simulation_of
+from amiwarp.studies.dataset.manifest import JOURNAL, MANIFEST, TABLE
+from amiwarp.studies.dataset.run import DatasetSummary, duration_text, make_dataset, threads_of_worker
+from amiwarp.studies.dataset.specification import load_specification
+
+HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'
+PICTURES = """
+[[sources]]
+pictures = "pictures/*/*.png"
+label_from_folder = "class"
+labels = {indoor = true}
+licence = "CC0-1.0"
+"""
+BASE = (
+    HEAD
+    + """
+duration_s = 0.01
+prisms = [{apex_deg = 1.0}, {apex_deg = 2.0, flat_side = "camera"}]
+speeds_rpm = [1800.0]
+sensors = ["ideal"]
+camera = {size = [24, 18], fov_deg = 40.0}
+"""
+)
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """Folder with six pictures in two folders, and a specification of 12 recordings."""
+    rng = np.random.default_rng(5)
+    for k in range(6):
+        folder = tmp_path / "pictures" / ("disc", "square")[k % 2]
+        folder.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.kron(rng.integers(0, 256, (6, 8)), np.ones((8, 8))).astype(np.uint8)).save(
+            folder / f"{k}.png"
+        )
+    (tmp_path / "spec.toml").write_text(BASE + PICTURES)
+    return tmp_path
+
+
+def make(place: Path, **options: Any) -> DatasetSummary:
+    return make_dataset(place / "spec.toml", place / "out", workers=1, **options)
+
+
+def manifest(place: Path) -> dict[str, Any]:
+    found = json.loads((place / "out" / MANIFEST).read_text())
+    assert isinstance(found, dict)
+    return found
+
+
+def checksums(place: Path) -> dict[str, str]:
+    """Return the checksums of the recordings in the folder, computed here, by their path."""
+    out = place / "out"
+    return {p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in out.rglob("*.h5")}
+
+
+def run(*args: str | Path) -> Result:
+    return CliRunner().invoke(app, ["dataset", *(str(arg) for arg in args)])
+
+
+def test_manifest_describes_every_file(place: Path) -> None:
+    calls: list[tuple[str, float]] = []
+    done = make(place, progress=lambda *a: calls.append(a))
+    assert (done.recordings, done.made, done.kept, done.failed, done.workers) == (12, 12, 0, {}, 1)
+    assert calls[0] == ("0 of 12 recordings", 0.0)
+    assert calls[-1][1] == 1.0
+    assert calls[-1][0].startswith("12 of 12 recordings, ")
+    found = manifest(place)
+    assert (found["format"], found["version"], found["complete"]) == ("amiwarp-dataset", 1, True)
+    assert found["licences"] == [{"licence": "CC0-1.0", "sources": 6, "recordings": 12}]
+    assert found["splits"] == dict(done.splits)
+    assert {item["file"]: item["sha256"] for item in found["items"]} == checksums(place)
+    for item in found["items"]:
+        recording = amiwarp.open_recording(place / "out" / item["file"])
+        assert len(recording.events) == item["events"]
+        assert recording.metadata["seed"] == item["seed"]
+        assert recording.prism is not None
+        assert math.degrees(recording.prism.apex) == pytest.approx(item["apex_deg"], abs=1e-12)
+        assert recording.events.size == (item["width"], item["height"]) == (24, 18)
+        assert item["labels"] == {"indoor": True, "class": Path(item["source"]).parent.name}
+        assert (item["duration_s"], item["rpm"], item["sensor"]) == (0.01, 1800.0, "ideal")
+        assert item["file"].startswith(f"{item['split']}/")
+    assert sum(item["events"] for item in found["items"]) == found["events"] == done.events > 1000
+
+
+def test_parquet_equals_json(place: Path) -> None:
+    make(place)
+    rows = pyarrow.parquet.read_table(place / "out" / TABLE).to_pylist()
+    items = manifest(place)["items"]
+    assert [{**r, "labels": {"indoor": r["label_indoor"], "class": r["label_class"]}} for r in rows] == [
+        {**item, "label_indoor": item["labels"]["indoor"], "label_class": item["labels"]["class"]} for item in items
+    ]
+
+
+def test_seeds_depend_on_the_recording_alone(place: Path) -> None:
+    before = {item.key: item for item in list_items(load_specification(place / "spec.toml"))}
+    assert len({item.seed for item in before.values()}) == 12
+    (place / "pictures" / "disc" / "00.png").write_bytes((place / "pictures" / "disc" / "0.png").read_bytes())
+    more = BASE.replace("[1800.0]", "[60.0, 1800.0]").replace('["ideal"]', '["davis346", "ideal"]')
+    (place / "spec.toml").write_text("seeds = [4, 0]\n" + more + PICTURES)
+    after = {item.key: item for item in list_items(load_specification(place / "spec.toml"))}
+    assert len(after) == 7 * 2 * 2 * 2 * 2
+    assert {key: item.seed for key, item in after.items() if key in before} == {k: i.seed for k, i in before.items()}
+    assert {key: item.file for key, item in after.items() if key in before} == {k: i.file for k, i in before.items()}
+
+
+def test_a_source_lies_in_one_split(place: Path) -> None:
+    worlds = '[[sources]]\nworlds = ["room", "desk"]\ntrajectories = ["still", "fast"]\n'
+    copy = place / "pictures" / "square" / "copy.png"
+    copy.write_bytes((place / "pictures" / "disc" / "0.png").read_bytes())
+    (place / "spec.toml").write_text("seeds = 200\n" + BASE + PICTURES + worlds)
+    items = list_items(load_specification(place / "spec.toml"))
+    splits: dict[str, set[str]] = {}
+    for item in items:
+        of = f"{item.source} {item.recipe['seed']}" if item.kind == "worlds" else item.recipe["source"]["sha256"]
+        splits.setdefault(of, set()).add(item.split)
+    assert {len(found) for found in splits.values()} == {1}
+    assert len(splits) == 6 + 2 * 200
+    assert {item.split for item in items if item.source.endswith(("disc/0.png", "copy.png"))} == splits[
+        hashlib.sha256(copy.read_bytes()).hexdigest()
+    ]
+    train = sum(found == {"train"} for found in splits.values())
+    assert train == pytest.approx(0.8 * 406, abs=30)
+    other = BASE.replace("duration_s", "split_seed = 1\nduration_s", 1)
+    (place / "spec.toml").write_text("seeds = 200\n" + other + PICTURES + worlds)
+    assert [i.split for i in list_items(load_specification(place / "spec.toml"))] != [i.split for i in items]
+
+
+def test_what_is_there_is_kept_and_damage_is_repaired(place: Path) -> None:
+    make(place)
+    before, written = checksums(place), {p: p.stat().st_mtime_ns for p in (place / "out").rglob("*.h5")}
+    files = sorted(written)
+    again = make(place)
+    assert (again.made, again.kept, again.workers) == (0, 12, 0)
+    files[0].unlink()
+    files[1].write_bytes(files[1].read_bytes()[:-10])
+    damaged = bytearray(files[2].read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    files[2].write_bytes(damaged)
+    os.utime(files[3])  # copied, and undamaged
+    repaired = make(place)
+    assert (repaired.made, repaired.kept) == (3, 9)
+    assert checksums(place) == before
+    assert all(file.stat().st_mtime_ns == written[file] for file in files[4:])
+    assert (make(place).made, manifest(place)["complete"]) == (0, True)
+
+
+def test_what_a_changed_specification_leaves_is_reported(place: Path) -> None:
+    make(place)
+    first = checksums(place)
+    (place / "spec.toml").write_text(BASE.replace("apex_deg = 1.0", "apex_deg = 1.5") + PICTURES)
+    changed = make(place)
+    assert (changed.made, changed.kept, len(changed.not_in_specification)) == (6, 6, 6)
+    found = manifest(place)
+    assert found["not_in_specification"] == list(changed.not_in_specification)
+    assert not {item["file"] for item in found["items"]} & set(changed.not_in_specification)
+    assert len(found["items"]) == 12
+    assert first.items() < checksums(place).items()
+    picture = place / "pictures" / "disc" / "0.png"
+    Image.fromarray(np.full((48, 64), 99, np.uint8)).save(picture)
+    assert make(place).made == 2
+
+
+def test_a_failure_is_reported_and_does_not_stop_the_rest(place: Path) -> None:
+    (place / "pictures" / "disc" / "bad.png").write_bytes(b"no picture")
+    result = run(place / "spec.toml", place / "out", "--workers", "1", "--device", "cpu", "--json")
+    assert result.exit_code == 1, result.output
+    data = json.loads(result.stdout)
+    assert (data["made"], data["recordings"], len(data["failed"])) == (12, 14, 2)
+    found = manifest(place)
+    assert found["complete"] is False
+    assert {f["file"]: f["error"] for f in found["failed"]} == data["failed"]
+    assert all("bad.png cannot be read as a picture" in f["error"] for f in found["failed"])
+    Image.fromarray(np.eye(48, 64, dtype=np.uint8) * 255).save(place / "pictures" / "disc" / "bad.png")
+    done = run(place / "spec.toml", place / "out", "--workers", "1", "--device", "cpu")
+    assert done.exit_code == 0, done.output
+    assert "14 of 14 recordings" in done.stdout
+    assert "12 of them kept" in done.stdout
+    assert manifest(place)["complete"]
+
+
+def test_a_killed_run_is_continued(place: Path) -> None:
+    (place / "spec.toml").write_text("seeds = 10\n" + BASE + PICTURES)
+    journal = place / "out" / JOURNAL
+    command = ["dataset", str(place / "spec.toml"), str(place / "out"), "--workers", "1", "--device", "cpu"]
+    with subprocess.Popen([sys.executable, "-m", "amiwarp", *command], stderr=subprocess.DEVNULL) as process:
+        end = time.monotonic() + 60.0
+        while process.poll() is None and (not journal.exists() or len(journal.read_bytes().splitlines()) < 3):
+            assert time.monotonic() < end
+            time.sleep(0.005)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    kept = len(list(read_lines(journal)))
+    assert 3 <= kept < 120
+    append_line(journal, {"key": "cut off"})
+    journal.write_bytes(journal.read_bytes()[:-4])
+    assert any(p.name.startswith(".scratch") for p in (place / "out").iterdir())
+    done = make(place)
+    assert (done.kept, done.made) == (kept, 120 - kept)
+    assert {item["file"]: item["sha256"] for item in manifest(place)["items"]} == checksums(place)
+    assert not any(p.name.startswith(".") for p in (place / "out").iterdir())
+    assert make(place).kept == 120
+
+
+def test_a_dry_run_makes_nothing(place: Path) -> None:
+    result = run(place / "spec.toml", place / "out", "--dry-run", "--workers", "2", "--device", "cpu", "--json")
+    assert result.exit_code == 0, result.output
+    plan = json.loads(result.stdout)
+    assert (plan["recordings"], plan["missing"], plan["sources"]) == (12, 12, {"pictures": 12})
+    assert (plan["samples"], plan["workers"]) == (12, 2)
+    assert plan["seconds"] == pytest.approx(plan["worker_seconds"] / 2, rel=1e-12)
+    assert {p.name for p in place.iterdir()} == {"pictures", "spec.toml"}
+    done = make(place)
+    assert (plan["events"], plan["size_bytes"]) == (done.events, done.size_bytes)
+    text = run(place / "spec.toml", place / "out", "--dry-run", "--device", "cpu").stdout
+    assert "12 recordings (12 of pictures), 0 of them missing" in text
+    (place / "spec.toml").write_text(BASE.replace("0.01", "0.4").replace("24, 18", "16, 12") + PICTURES)
+    long = amiwarp.plan_dataset(place / "spec.toml", place / "out", workers=1)
+    made = make(place)
+    assert long.events == pytest.approx(made.events, rel=0.1)
+    assert long.size_bytes == pytest.approx(made.size_bytes, rel=0.1)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
+def test_a_cluster_makes_the_same_files(place: Path) -> None:
+    make(place)
+    alone = checksums(place)
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+    ) as local:
+        words = (place / "spec.toml", place / "other", "--scheduler", local.scheduler_address, "--device", "cpu")
+        result = run(*words, "--json")
+    assert result.exit_code == 0, result.output
+    data = json.loads(result.stdout)
+    assert (data["made"], data["workers"]) == (12, 2)
+    found = json.loads((place / "other" / MANIFEST).read_text())
+    assert {item["file"]: item["sha256"] for item in found["items"]} == alone
+
+
+def test_few_jobs_wait_and_the_rest_is_not_read() -> None:
+    taken: list[int] = []
+
+    def jobs() -> Any:
+        for k in range(1000):
+            taken.append(k)
+            yield k
+
+    with single_worker() as alone:
+        results = run_jobs(Workers(alone.executor, lambda: 3), str, jobs())
+        job, future = next(results)
+        assert future.result() == str(job)
+        assert len(taken) == 6
+        results.close()
+        assert len(taken) == 6
+        assert sorted(f.result() for _, f in run_jobs(alone, str, range(5))) == list("01234")
+
+
+def test_other_sources(place: Path, recording: amiwarp.Recording) -> None:
+    video = place / "films" / "one"
+    video.mkdir(parents=True)
+    for k in range(3):
+        Image.fromarray(np.kron(np.eye(3, 4, k - 1) * 255, np.ones((8, 8))).astype(np.uint8)).save(video / f"{k}.png")
+    amiwarp.save_recording(place / "real.h5", recording)
+    (place / "poses.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,1.2,0,0,0,1\n1,0,0,1.3,0,0,0,1\n")
+    (place / "tile.obj").write_text("v -1 -1 3\nv 1 -1 3\nv 0 1 3\nf 1 3 2\n")
+    (place / "tile.toml").write_text(
+        'format = "amiwarp-world"\nversion = 1\nbodies = [{name = "tile", mesh = "tile.obj"}]\n'
+    )
+    (place / "labels.csv").write_text("file,speed,code,name\nreal.h5,1.5,007,a\nother.h5,2,1,b\n")
+    (place / "spec.toml").write_text(
+        HEAD + "duration_s = 0.01\nprisms = [{apex_deg = 1.0}]\nspeeds_rpm = [900.0]\ntruth_hz = 200.0\n"
+        'sensors = [{name = "mine", preset = "gen4", refractory_us = 5.0}]\n'
+        '[[sources]]\nvideos = "films/*"\nfps = 200.0\n[[sources]]\nrecordings = "*.h5"\nlabel_table = "labels.csv"\n'
+        'licence = "CC-BY-4.0"\n[[sources]]\nworld_files = "tile.toml"\ntrajectories = ["poses.csv"]\n'
+        "[camera]\nsize = [24, 18]\n"
+    )
+    assert make(place).failed == {}
+    film, real, world = manifest(place)["items"]
+    assert (world["trajectory"], world["source_kind"]) == ("poses.csv", "world_files")
+    seen = amiwarp.open_recording(place / "out" / world["file"]).truth
+    assert seen is not None
+    assert seen.frames is not None
+    assert seen.frames.t.tolist() == [0, 5000, 10_000]
+    assert (film["source"], film["duration_s"], film["sensor"], film["labels"]) == ("films/one", 0.015, "mine", {})
+    opened = amiwarp.open_recording(place / "out" / real["file"])
+    events = recording.events
+    assert real["labels"] == {"speed": 1.5, "code": "007", "name": "a"}
+    assert (real["events"], real["seed"], real["apex_deg"]) == (len(events), None, None)
+    assert real["duration_s"] == pytest.approx((events.t_last - events.t_first) * 1e-6, abs=1e-9)
+    np.testing.assert_array_equal(opened.events.slice(0, 10**9).t, events.slice(0, 10**9).t)
+    assert [one["licence"] for one in manifest(place)["licences"]] == ["not stated", "CC-BY-4.0"]
+
+
+def changed(old: str, new: str) -> Callable[[str], str]:
+    def change(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return change
+
+
+WRONG: dict[str, tuple[Callable[[str], str], str]] = {
+    "no TOML": (lambda text: text + "[", "cannot be read as a specification of a data set"),
+    "version": (changed("version = 1", "version = 2"), "are 'amiwarp-dataset-specification' and 2; expected"),
+    "unknown": (changed("speeds_rpm", "speed_rpm"), "field speeds_rpm is missing; add"),
+    "near": (changed("sensors", "sensor"), r"field sensor is unknown; .*; did you mean sensors\?"),
+    "prism": (changed("flat_side = ", "flatside = "), r"prisms\[1\]\.flatside is unknown.* did you mean flat_side\?"),
+    "apex": (changed("apex_deg = 1.0", "apex_deg = 40.0"), r"field prisms\[0\]: prism apex = 0\.698.* 0 \.\. 30 deg"),
+    "twice": (changed("[1800.0]", "[90.0, 90.0]"), r"field speeds_rpm\[1\] repeats speeds_rpm\[0\]; remove it"),
+    "none": (changed("[1800.0]", "[]"), "field speeds_rpm is empty; give at least one entry"),
+    "duration": (changed("= 0.01", '= "long"'), "field duration_s = 'long' is not a finite number"),
+    "sensor": (changed('"ideal"', '"davis"'), r"field sensors\[0\]: sensor preset is 'davis'; choose among"),
+    "sensor value": (
+        changed('"ideal"', '{name = "a", leak_hz = -1.0}'), r"field sensors\[0\]: sensor leak_hz = -1\.0 is not"
+    ),
+    "sensor field": (changed('"ideal"', '{name = "a", leak = 1.0}'), r"sensors\[0\]\.leak is unknown.* mean leak_hz\?"),
+    "seeds": (changed("sensors", "seeds = 0\nsensors"), "field seeds = 0 is not .*; give their number, or a list"),
+    "splits": (changed("sensors", "splits = {train = 0.5}\nsensors"), "sum to 0.5; change them"),
+    "split name": (changed("sensors", 'splits = {"../a" = 1.0}\nsensors'), r"has the name '\.\./a'; use letters"),
+    "camera": (changed("fov_deg = 40.0", "fov_deg = 190.0"), "field camera: "),
+    "no files": (changed("*.png", "*.jpg"), r"field sources\[0\]\.pictures is 'pictures/\*/\*\.jpg', which matches no"),
+    "two kinds": (changed("[[sources]]", "[[sources]]\nworlds = ['room']"), r"\[0\] has pictures and worlds; give"),
+    "no kind": (changed('pictures = "pictures/*/*.png"', ""), r"\[0\] has no source; give one of pictures"),
+    "fps": (changed("labels", "fps = 5.0\nlabels"), r"field sources\[0\]\.fps does not apply to pictures; remove it"),
+    "label": (changed("indoor = true", "indoor = [1]"), r"labels\.indoor is \[1\]; expected text, a number"),
+    "label number": (changed("indoor = true", "indoor = nan"), r"labels\.indoor = nan is not a finite number"),
+    "many seeds": (changed("sensors", "seeds = 2000000000\nsensors"), "field seeds = 2000000000 is not a whole number"),
+    "table": (changed("labels =", 'label_table = "none.csv"\nlabels ='), "none.csv: no such file"),
+    "twice found": (lambda text: text + PICTURES, r"sources\[1\] names pictures/disc/0\.png, as does"),
+    "world": (lambda text: text + '[[sources]]\nworlds = ["roon"]', r"\[1\]\.worlds is 'roon'; choose among room"),
+    "label type": (
+        lambda text: text + '[[sources]]\nworlds = ["room"]\nlabels = {indoor = "yes"}',
+        r"sources\[1\] has the label indoor = 'yes', but in sources\[0\] it is of type bool; use one type",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_specification_is_named(place: Path, case: str) -> None:
+    change, message = WRONG[case]
+    (place / "spec.toml").write_text(change(BASE + PICTURES))
+    with pytest.raises(AmiwarpError, match=message) as caught:
+        make(place)
+    assert "spec.toml" in str(caught.value) or case == "table"
+    assert "\n" not in str(caught.value)
+    assert not (place / "out").exists()
+
+
+def test_a_wrong_call_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = (place / "spec.toml", place / "out", "--device", "cpu")
+    assert "none.toml: no such file" in run(place / "none.toml", *words[1:]).stderr
+    both = run(*words, "--workers", "2", "--scheduler", "tcp://127.0.0.1:1").stderr
+    assert "workers = 2 applies to local processes" in both
+    assert "--dry-run samples on this machine" in run(*words, "--dry-run", "--scheduler", "tcp://127.0.0.1:1").stderr
+    assert "device 'cuda:7' is not available" in run(*words[:2], "--device", "cuda:7").stderr
+    (place / "full").mkdir()
+    (place / "full" / "thesis.doc").write_text("")
+    assert "full: holds other files, such as thesis.doc" in run(words[0], place / "full", *words[2:]).stderr
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "pip install 'amiwarp[dataset]'" in run(*words, "--workers", "2").stderr
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert "pip install 'amiwarp[dataset]'" in run(*words).stderr
+
+
+def test_journal_leaves_out_what_was_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    assert list(read_lines(path)) == []
+    create_journal(path)
+    for k in range(3):
+        append_line(path, {"k": k})
+    path.write_bytes(path.read_bytes()[:-3])
+    append_line(path, {"k": 3})
+    assert list(read_lines(path)) == [{"k": 0}, {"k": 1}, {"k": 3}]
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(5.4, "5 s"), (119.0, "119 s"), (150.0, "2.5 min"), (3e5, "3.5 days")])
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert duration_text(seconds) == text
+
+
+def test_the_tutorial_s_classifier_beats_chance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tempfile, "mkdtemp", lambda: str(tmp_path))
+    monkeypatch.setattr(plt, "show", lambda: None)
+    found = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "tutorials" / "08_data_set.py"))
+    plt.close("all")
+    tested = int((~found["train"]).sum())
+    assert tested >= 15
+    assert found["chance"] < 0.6
+    assert found["accuracy"] > found["chance"] + 3.0 * math.sqrt(found["chance"] * (1.0 - found["chance"]) / tested)
+    assert f"accuracy {found['accuracy']:.0%}" in capsys.readouterr().out
+
+
+def test_a_mesh_or_a_file_of_poses_that_changed_is_seen(place: Path) -> None:
+    (place / "spec.toml").write_text(BASE + '[[sources]]\nworld_files = "w.toml"\ntrajectories = ["poses.csv"]\n')
+    (place / "w.toml").write_text('bodies = [{mesh = "tile.obj"}]\n')
+    keys = set()
+    for mesh, poses in (("a", "a"), ("b", "a"), ("b", "b"), ("b", "b")):
+        (place / "tile.obj").write_text(mesh)
+        (place / "poses.csv").write_text(poses)
+        keys |= {item.key for item in list_items(load_specification(place / "spec.toml"))}
+    assert len(keys) == 3 * 2
+
+
+def test_the_specification_of_the_guide(place: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "how-to" / "dataset.md").read_text()
+    (place / "shapes.toml").write_text(page.partition("```toml\n")[2].partition("```")[0])
+    items = list_items(load_specification(place / "shapes.toml"))
+    assert len(items) == (6 + 2) * 2 * 2 * 2 * 2
+    assert {item.labels["background"] for item in items} == {"grey", "room"}
+    fast = [item.recipe["sensor"] for item in items if item.recipe["sensor"]["name"] == "fast"]
+    assert {sensor["refractory_us"] for sensor in fast} == {20.0}
+    (made,) = [line for line in page.splitlines() if line.startswith("Each item has ")]
+    make(place)
+    named = page[page.index(made) :].partition("Above")[0]
+    assert [name for name in manifest(place)["items"][0] if f"`{name}`" not in named] == []
+
+
+def test_recordings_are_those_of_the_simulator_on_each_device(place: Path, device: str) -> None:
+    done = make(place, device="cpu" if device == "cpu" else ANY_GPU)
+    assert (done.made, done.failed) == (12, {})
+    items = {item.file: item for item in list_items(load_specification(place / "spec.toml"))}
+    for row in manifest(place)["items"][:3]:
+        recording = amiwarp.open_recording(place / "out" / row["file"])
+        expected = simulation_of(items[row["file"]], device).run().events
+        assert (row["device"], row["events"]) == (device, len(expected))
+        np.testing.assert_array_equal(recording.events.slice(0, 10**9).t, expected.slice(0, 10**9).t)
+        np.testing.assert_array_equal(recording.events.slice(0, 10**9).x, expected.slice(0, 10**9).x)
+
+
+def test_each_local_worker_sees_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quiet_start, "start_quietly", lambda: ["cpu", "cuda:0", "cuda:1"])
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert cluster._visible_gpus() == ("0", "1")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    gpus = cluster._visible_gpus()
+    assert gpus == ("3", "5")
+    seen = []
+    for name in range(5):
+        cluster._prepare(gpus, False, SimpleNamespace(name=name))
+        seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
+    assert seen == ["3", "5", "3", "5", "3"]
+    assert [threads_of_worker(*of) for of in (("cpu", 8), (ANY_GPU, None), (ANY_GPU, 10**6))] == [1, None, 1]
