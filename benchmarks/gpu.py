@@ -19,7 +19,7 @@ from pathlib import Path
 PICTURE = "china.jpg"
 TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
-    "simulate", "translate", "benchmarks",
+    "simulate", "translate", "benchmarks", "worlds", "sensor", "reconstruct", "auto", "arrays", "dataset",
 )  # fmt: skip
 """Names of the test files that use a device and need neither the packages of the command line nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
@@ -38,6 +38,11 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
         "chart": [*module, "benchmarks.chart", picture, *device, "--out", str(out / "chart")],
         "stream": [*module, "benchmarks.stream", *device, "--picture", picture, "--out", str(out / "stream_cuda.json")],
         "simulate": [*module, "benchmarks.simulate", *device, "--picture", picture],
+        "worlds": [*module, "benchmarks.worlds", *device, "--out", str(out / "worlds_cuda.json")],
+        "worlds_calibration": [*module, "benchmarks.worlds_calibration", *device,
+                               "--out", str(out / "worlds_calibration_cuda.json")],
+        "dataset": [*module, "benchmarks.dataset", "--device", "cuda", "--limit-s", str(limit),
+                    "--out", str(out / "dataset_cuda.json")],
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,
                    "--limit-s", str(limit)]

@@ -20,9 +20,9 @@ from amiwarp.imaging.choices import Sharpness
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import CAMERA_NUMBERS, Camera
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
+from amiwarp.optics.lens import DISTORTIONS
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import one_of, real, shown
@@ -38,8 +38,6 @@ NEEDED = ("format", "version", "model", "camera", "prism", "parameters", "sharpn
           "events", "seconds", "warnings", "stages")  # fmt: skip
 OPTIONAL = ("middle_us", "ladder")
 """Fields of the calibration file that files of earlier versions lack."""
-CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
-LENSES: dict[str, type[Distortion]] = {"radial_tangential": RadialTangential, "fisheye": Fisheye}
 SHARPNESS = [kind.value for kind in Sharpness]
 
 
@@ -316,7 +314,7 @@ def constant_speed(rpm: float, t_first: int, t_last: int, zero_us: int) -> Encod
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """Return a camera as a JSON object."""
-    out = {name: getattr(camera, name) for name in CAMERA}
+    out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
     if camera.distortion is not None:
         kind = "fisheye" if isinstance(camera.distortion, Fisheye) else "radial_tangential"
         out["distortion"] = {"kind": kind, **asdict(camera.distortion)}
@@ -328,14 +326,14 @@ def camera_from_json(data: Any, where: str = "") -> Camera:
 
     ``where`` is the object's name in messages. Raises :class:`AmiwarpError` naming the field.
     """
-    given = fields_of(data, where, *CAMERA, optional=("distortion",))
+    given = fields_of(data, where, *CAMERA_NUMBERS, optional=("distortion",))
     prefix, lens = f"{where}." if where else "", given.get("distortion")
     distortion: Distortion | None = None
     if lens is not None:
         numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, f"{prefix}distortion")
-        kind = one_of(numbers.pop("kind", None), LENSES, f"field {prefix}distortion.kind")
-        distortion = build(LENSES[kind], numbers, f"{prefix}distortion")
-    return Camera(**{name: given[name] for name in CAMERA}, distortion=distortion)
+        kind = one_of(numbers.pop("kind", None), DISTORTIONS, f"field {prefix}distortion.kind")
+        distortion = build(DISTORTIONS[kind], numbers, f"{prefix}distortion")
+    return Camera(**{name: given[name] for name in CAMERA_NUMBERS}, distortion=distortion)
 
 
 def cost_surface(stages: tuple[StageSummary, ...], size: str) -> NDArray[np.float64]:

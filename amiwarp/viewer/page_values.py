@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 
 JPEG_QUALITY = 90
-_pixels = number(0, 65536)
+_pixels = number(0, LARGEST_SIZE)
 SETTABLE: dict[str, Check] = {
     **dict.fromkeys(NAMES, number()), "start_ms": number(), "region_x": list_of(_pixels, _pixels),
     "region_y": list_of(_pixels, _pixels), "point_size": number(0.1, 20.0), "opacity": number(0.0, 1.0),

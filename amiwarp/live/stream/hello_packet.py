@@ -9,9 +9,8 @@ import json
 from typing import Any, NoReturn
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.optics.camera import LARGEST_SIZE
 
-LARGEST_PX = 65536
-"""Largest accepted width or height of a sensor [px]."""
 LARGEST = 1e9
 """Largest accepted absolute value of all numbers other than sizes."""
 MOST_COEFFICIENTS = 5
@@ -70,11 +69,11 @@ def _check_size(where: str, fields: dict[str, Any]) -> None:
     for name in ("width", "height"):
         value = fields.get(name)
         if isinstance(value, bool) or not isinstance(value, int):
-            _raise_wrong(where, name, value, f"a whole number of pixels, 1 .. {LARGEST_PX}")
+            _raise_wrong(where, name, value, f"a whole number of pixels, 1 .. {LARGEST_SIZE}")
     width, height = fields["width"], fields["height"]
-    if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
+    if not (1 <= width <= LARGEST_SIZE and 1 <= height <= LARGEST_SIZE):
         size = f"{_shown(width)}x{_shown(height)}"
-        raise AmiwarpError(f"{where} has a size of {size}; expected 1 .. {LARGEST_PX} pixels each way")
+        raise AmiwarpError(f"{where} has a size of {size}; expected 1 .. {LARGEST_SIZE} pixels each way")
 
 
 def _check_numbers(where: str, fields: dict[str, Any], *names: str) -> None:
