@@ -33,6 +33,7 @@ from .events.truth import EventTruth as EventTruth
 from .events.truth import EventValues as EventValues
 from .events.truth import FrameStore as FrameStore
 from .events.truth import FrameTruth as FrameTruth
+from .events.truth import KnownStore as KnownStore
 from .events.truth import Poses as Poses
 from .events.truth import PoseStore as PoseStore
 from .events.truth import WorldLabels as WorldLabels
@@ -88,7 +89,6 @@ from .simulation.sequences import PictureStack as PictureStack
 from .simulation.sequences import VideoFile as VideoFile
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate
-from .simulation.translator import translate as translate
 from .simulation.worlds.frame_truth import TruthRenderer as TruthRenderer
 from .simulation.worlds.named.catalogue import named_world as named_world
 from .simulation.worlds.scene import Body as Body
@@ -102,4 +102,7 @@ from .simulation.worlds.trajectory import Trajectory as Trajectory
 from .simulation.worlds.world_files import load_world as load_world
 from .simulation.worlds.world_scene import Seeing as Seeing
 from .simulation.worlds.world_scene import WorldScene as WorldScene
+from .translation.datasets import DataSet as DataSet
+from .translation.interpolation import Interpolation as Interpolation
+from .translation.translator import translate as translate
 from .viewer.app import view as view

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,6 +71,8 @@ class Simulation:
     """Seed of all random numbers."""
     device: str = "cpu"
     """Device to compute on."""
+    source: Mapping[str, MetadataValue] = field(default_factory=dict)
+    """What the scene was made from; it becomes part of the recording's metadata."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
@@ -145,9 +147,9 @@ class Simulation:
         Returns
         -------
         dict
-            Seed and duration.
+            Seed and duration, and :attr:`source`.
         """
-        return {"simulated": True, "seed": self.seed, "duration_us": self.duration_us}
+        return {"simulated": True, "seed": self.seed, "duration_us": self.duration_us, **self.source}
 
     def blocks(
         self, *, chunk_us: int | None = None, progress: Progress | None = None
@@ -298,6 +300,8 @@ class Simulation:
                 writer.append(events, truth=truth)
                 for frame in recorded.frames_before(now_us):
                     writer.append_frame(frame)
+                for t_us, mask in recorded.known.take():
+                    writer.append_known(t_us, mask)
                 poses = recorded.poses_before(now_us)
                 if poses is not None:
                     writer.append_poses(poses)
