@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.reconstruction.choices import CONTRAST
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.sequences import Pictures
 from amiwarp.translation.datasets import MvsecPictures
@@ -160,6 +161,8 @@ class EventPictures:
             instruments = np.stack([np.maximum(change, 0.0), np.minimum(change, 0.0)])
             left += instruments @ (counts * np.array([1.0, -1.0])[:, None, None]).reshape(2, -1).T
             right += instruments @ change
+        if not right.any():  # nothing changes between the pictures
+            return CONTRAST, CONTRAST
         contrasts = np.linalg.lstsq(left, right, rcond=None)[0]
         low, high = CONTRAST_LIMITS
         if not (low <= contrasts.min() and contrasts.max() <= high):

@@ -35,7 +35,7 @@ from amiwarp.translation.datasets import (
     saccades,
 )
 from amiwarp.translation.event_pictures import EventPictures
-from amiwarp.translation.interpolation import Interpolation, interpolated
+from amiwarp.translation.interpolation import Interpolation, MotionPictures
 from amiwarp.translation.reconstructed_pictures import ReconstructedPictures
 from amiwarp.translation.rectified import RectifiedPictures, centred, is_centred
 
@@ -89,7 +89,7 @@ def open_input(
     )
     if events is not None:
         return _with_events(pictures, _recording(events), interpolation)
-    frames = interpolated(pictures, interpolation)
+    frames = MotionPictures(pictures, interpolation)
     about: dict[str, MetadataValue] = {"translated_from": "pictures", "interpolation": interpolation.value}
     return TranslatorInput(frames, pictures.duration_us, Camera.from_fov(*pictures.size, DEFAULT_FOV), about=about)
 

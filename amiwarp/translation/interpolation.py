@@ -49,10 +49,10 @@ class Interpolation(enum.StrEnum):
 class MotionPictures:
     """Pictures of a sequence, and pictures in between that follow the optical flow (:class:`amiwarp.Frames`)."""
 
-    def __init__(self, pictures: Pictures, largest_px: float, way: Interpolation = Interpolation.AUTO) -> None:
-        """``largest_px``: largest motion between two pictures [px], as far as known."""
+    def __init__(self, pictures: Pictures, way: Interpolation = Interpolation.AUTO) -> None:
+        """Find out how much the pictures move."""
         self._pictures, self._way = pictures, way
-        self._parts = _parts(largest_px)
+        self._parts = _parts(sampled_motion(pictures, way))
         self._known: list[tuple[int, NDArray[np.bool_]]] = []
 
     @property
@@ -106,10 +106,10 @@ class PicturePair:
         forward, back, consistent = flows(first, second)
         if consistent.mean() >= LEAST_CONSISTENT:
             self.motion_px = float(np.percentile(np.hypot(forward[..., 0], forward[..., 1])[consistent], PERCENTILE))
+        else:
+            self.known = consistent
         if self.motion_px > SMALL_MOTION_PX or way is Interpolation.MOTION:
             self._flows, self.known = (forward, back), consistent
-        elif self.motion_px == 0.0:
-            self.known = consistent
 
     def at(self, part: float) -> NDArray[np.float32]:
         """Return the log intensity at a time between the pictures, 0 .. 1.
@@ -125,8 +125,10 @@ class PicturePair:
         return np.asarray(rest * seen[0] + part * seen[1], np.float32)
 
 
-def sampled_motion(pictures: Pictures) -> float:
-    """Return the largest motion in some pairs of successive pictures [px]. All pictures are read."""
+def sampled_motion(pictures: Pictures, way: Interpolation) -> float:
+    """Return the largest motion in some pairs of successive pictures [px]; 0 if they are to be blended."""
+    if way is Interpolation.BLEND:
+        return 0.0
     every = max(1, round(pictures.duration_us / pictures.interval_us / SAMPLES))
     largest, last = 0.0, None
     for k, (_, light) in enumerate(pictures.read()):
@@ -134,11 +136,6 @@ def sampled_motion(pictures: Pictures) -> float:
             largest = max(largest, PicturePair(last, light).motion_px)
         last = light
     return largest
-
-
-def interpolated(pictures: Pictures, way: Interpolation) -> Pictures | MotionPictures:
-    """Return the pictures themselves if they are to be blended, else :class:`MotionPictures`."""
-    return pictures if way is Interpolation.BLEND else MotionPictures(pictures, sampled_motion(pictures), way)
 
 
 def light_of(log: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -53,7 +53,7 @@ def translation(
     if not duration > 0.0:
         raise AmiwarpError(f"{source} does not state its duration; give duration_s")
     return Simulation(
-        Scene(given.frames, fov),
+        Scene(given.frames, fov, blur=0.0),  # the camera that took the pictures has blurred them
         given.camera,
         prism,
         duration,
