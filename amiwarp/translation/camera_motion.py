@@ -35,6 +35,8 @@ MOST_EVENTS = 30_000
 """Largest number of events per window whose sharpness is measured; more are thinned evenly."""
 LEAST_EVENTS = 200
 """Smallest number of events in a window from which a motion is found."""
+LEAST_PX = 1.0
+"""Motion of the image in a window below which the next search starts from all directions, and nothing is known [px]."""
 STARTS_PX = (2.0, 5.0, 10.0)
 """Motions of the image in a window that are tried in eight directions [px]."""
 SMOOTHING_PX = COARSE_PX, FINE_PX = 2.0, 1.0
@@ -67,6 +69,12 @@ class Window:
         """Rotation of the camera about the middle."""
         return CameraRotation(self.rates, self.acceleration, self.middle_us)
 
+    def moves_px(self, camera: Camera) -> float:
+        """Return the motion of the image in the window [px]."""
+        x, y, z = self.rates
+        speed = math.hypot(camera.fy * x, camera.fx * y) + 0.25 * camera.width * abs(z)
+        return speed * self.length_us * 1e-6
+
     @property
     def middle_us(self) -> int:
         """Middle [us]."""
@@ -90,14 +98,16 @@ def find_motion(
     search = _Search(camera, device)
     windows: list[Window] = []
     start, length = first, min(FIRST_US, max(last - first, 1))
-    while not windows or start + length // 2 < last:
+    while not windows or start < last - windows[-1].length_us // 2:
         events = recording.events.between(start, start + length)
-        rates = search.run(events, start, length, windows[-1].rates if windows else None)
-        windows.append(Window(start, length, rates))
-        start += length // 2
-        speed = float(np.hypot(camera.fy * rates[0], camera.fx * rates[1])) + 0.25 * camera.width * abs(rates[2])
-        wanted = MOTION_PX / speed * 1e6 if speed > 0.0 else WINDOW_US[1]
-        length = round(float(np.clip(wanted, *WINDOW_US)))
+        last_rates = windows[-1].rates if windows and windows[-1].moves_px(camera) > LEAST_PX else None
+        window = Window(start, length, search.run(events, start, length, last_rates))
+        speed = window.moves_px(camera) / length  # px per microsecond
+        length = round(float(np.clip(MOTION_PX / max(speed, 1e-9), *WINDOW_US)))
+        if not windows and length >= 2 * window.length_us and last - first > window.length_us:
+            continue  # the first window was too short to find a motion
+        windows.append(window)
+        start += window.length_us // 2
         if progress is not None:
             progress("finding the motion", min(1.0, (start - first) / max(last - first, 1)))
     return _with_acceleration(windows)

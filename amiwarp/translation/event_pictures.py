@@ -147,8 +147,24 @@ class EventPictures:
         """Return the contrasts c for which ΔL = c_on N_on - c_off N_off holds from the first picture to later ones.
 
         Events are whole numbers, so a least-squares fit to them would find contrasts that are too small. The rises and
-        the falls of log intensity are the instruments instead (two equations, summed over pixels).
+        the falls of log intensity are the instruments instead (two equations, summed over pixels). Pixels that the
+        first fit does not explain are left out of the second.
         """
+        contrasts = self._fit(np.full(2, np.inf))
+        if not contrasts.any():  # nothing changes between the pictures
+            return CONTRAST, CONTRAST
+        on, off = self._fit(contrasts).tolist()
+        low, high = CONTRAST_LIMITS
+        if not (low <= min(on, off) and max(on, off) <= high):
+            raise AmiwarpError(
+                f"the pictures do not change as the events say: the fitted contrasts are {on:.3g} (ON) and {off:.3g} "
+                "(OFF); check that pictures and events have one clock and one camera, or translate the pictures "
+                "without the events"
+            )
+        return on, off
+
+    def _fit(self, guess: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the contrasts that fit the pixels explained by a guess; zeros if nothing changes."""
         first: NDArray[np.float32] | None = None
         counts, last = np.zeros((2, *self.size[::-1])), 0
         left, right = np.zeros((2, 2)), np.zeros(2)
@@ -156,19 +172,11 @@ class EventPictures:
             log = np.log(light + np.float32(DARK)).astype(np.float64)
             first = log if first is None else first
             counts, last = counts + self._counts(last, t), t
-            change = (log - first).ravel()
+            change, signed = (log - first).ravel(), counts.reshape(2, -1).T * np.array([1.0, -1.0])
             change[np.abs(change) < FIT_CHANGE] = 0.0
+            if np.isfinite(guess).all():
+                change[np.abs(change - signed @ guess) > LARGEST_REST * np.abs(guess).max()] = 0.0
             instruments = np.stack([np.maximum(change, 0.0), np.minimum(change, 0.0)])
-            left += instruments @ (counts * np.array([1.0, -1.0])[:, None, None]).reshape(2, -1).T
+            left += instruments @ signed
             right += instruments @ change
-        if not right.any():  # nothing changes between the pictures
-            return CONTRAST, CONTRAST
-        contrasts = np.linalg.lstsq(left, right, rcond=None)[0]
-        low, high = CONTRAST_LIMITS
-        if not (low <= contrasts.min() and contrasts.max() <= high):
-            raise AmiwarpError(
-                f"the pictures do not change as the events say: the fitted contrasts are {contrasts[0]:.3g} (ON) and "
-                f"{contrasts[1]:.3g} (OFF); check that pictures and events have one clock and one camera, or translate "
-                "the pictures without the events"
-            )
-        return float(contrasts[0]), float(contrasts[1])
+        return np.asarray(np.linalg.lstsq(left, right, rcond=None)[0])

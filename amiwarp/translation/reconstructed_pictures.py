@@ -14,7 +14,7 @@ from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.choices import CONTRAST
 from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.translation.camera_motion import Window, still_encoder
+from amiwarp.translation.camera_motion import LEAST_PX, Window, still_encoder
 from amiwarp.translation.interpolation import light_of
 from amiwarp.translation.optical_flow import warped
 from amiwarp.translation.rectified import centred, looking, pixel_grid
@@ -30,8 +30,6 @@ STEP_PX = 0.5
 """Largest motion between two fast pictures [px]."""
 INTERVAL_US = (100.0, 5000.0)
 """Shortest and longest time between two fast pictures [us]."""
-SMALLEST_MOTION_PX = 1.0
-"""Motion of the image in a window below which the window determines nothing [px]."""
 
 View = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
 """Time [us], log intensity and mask of known pixels of a picture."""
@@ -107,8 +105,7 @@ class ReconstructedPictures:
         """Return the picture of a window; an even grey without known pixels if its events determine nothing."""
         t = window.middle_us - self._start_us
         nothing = t, np.full(self.size[::-1], np.log(MEDIAN_LIGHT), np.float32), np.zeros(self.size[::-1], np.bool_)
-        moved = np.hypot(self._source.fy * window.rates[0], self._source.fx * window.rates[1]) * window.length_us * 1e-6
-        if moved < SMALLEST_MOTION_PX:
+        if window.moves_px(self._source) < LEAST_PX:
             return nothing
         self._work.camera_rotation = window.rotation
         try:
