@@ -2,11 +2,11 @@
 
     python -m benchmarks.translators [--worlds room desk] [--trajectories still handheld fast] [--out FILE.json]
 
-A camera without a prism (160 × 120, 60°) records each world: its events, and 30 pictures per second of 8 bits (10, too,
-if the camera moves fast). From
-these, each translator makes the recording through a prism (apex angle 1°, 720 turns per minute). The truth is the
-recording that the same camera with the prism makes of the same world. Translated recordings have another seed, so that
-the noise of the truth cannot help; the row ``truth, other seed`` is the best that any translator could reach.
+A camera without a prism (160 × 120, 60°) records each world: its events, and 30 pictures per second of 8 bits. If the
+camera moves fast, there are also 10 pictures per second. Finer pictures have twice its resolution. From these, each
+translator makes the recording through a prism (apex angle 1°, 720 turns per minute). The truth is the recording that
+the same camera with the prism makes of the same world. Translated recordings have another seed, so that the noise of
+the truth cannot help; the row ``truth, other seed`` is the best that any translator could reach.
 
 ``rate_ratio`` and ``rate_correlation`` compare the numbers of events in tiles of 10 × 10 px. ``found`` is the share of
 true signal events for which the translated recording has an event of the same pixel and polarity within 2 ms,
@@ -49,6 +49,7 @@ from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.translation.translator import translation
@@ -59,6 +60,8 @@ TRUE_MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.0)
 DURATION_S = 0.25
 FPS = {"still": (30,), "handheld": (30,), "fast": (30, 10)}
 """Pictures per second, by trajectory."""
+FINE = 2
+"""Resolution of the fine pictures, relative to the camera."""
 BLUR_PX = math.sqrt(0.5**2 - 1.0 / 12.0)
 """Blur of the pictures [px]: with that of the square pixels it is 0.5 px, that of the simulated event camera."""
 TILE, NEAR_US = 10, 2000
@@ -74,7 +77,7 @@ class Source:
     plain: Recording
     """Its events."""
     folder: Path
-    """Folder with its pictures, in one folder per number of pictures per second."""
+    """Folder with its pictures: one folder per number of pictures per second, and ``fine`` for finer ones."""
     truth: Recording
     """The recording through the prism."""
     again: Recording
@@ -97,15 +100,24 @@ def record(world: str, trajectory: str, folder: Path) -> Source:
     frames = {int(t): recorded.truth.frames[k].intensity for k, t in enumerate(recorded.truth.frames.t)}
     frames = {t: gaussian_filter(light, BLUR_PX) for t, light in frames.items()}
     for fps, instants in times.items():
-        (folder / f"{fps}").mkdir()
-        with (folder / f"{fps}" / "times.csv").open("w", newline="") as file:
-            table = csv.writer(file)
-            table.writerow(["file", "t_us"])
-            for k, t in enumerate(instants.tolist()):
-                Image.fromarray(encoded(frames[round(t)])).save(folder / f"{fps}" / f"{k}.png")
-                table.writerow([f"{k}.png", round(t)])
+        write_pictures(folder / f"{fps}", {round(t): frames[round(t)] for t in instants.tolist()})
+    wide = Camera.from_fov(FINE * CAMERA.width, FINE * CAMERA.height, CAMERA.fov)
+    finer = TruthRenderer(replace(plain, camera=wide))
+    fine = {round(t): finer.at(round(t)).intensity for t in times[30].tolist()}
+    write_pictures(folder / "fine", {t: gaussian_filter(light, FINE * BLUR_PX) for t, light in fine.items()})
     log = np.log(frames[middle] + np.float32(DARK))
     return Source(recorded, folder, prism.run(), replace(prism, seed=1).run(), log)
+
+
+def write_pictures(folder: Path, pictures: dict[int, NDArray[np.float32]]) -> None:
+    """Write pictures by their times [us] to a new folder, with the table of times."""
+    folder.mkdir()
+    with (folder / "times.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["file", "t_us"])
+        for t, light in pictures.items():
+            Image.fromarray(encoded(light)).save(folder / f"{t}.png")
+            table.writerow([f"{t}.png", t])
 
 
 def encoded(light: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -117,11 +129,13 @@ def encoded(light: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def translated(source: Source, way: str, fps: int) -> Recording:
     """Return the recording that a translator makes."""
-    given: Any = source.plain if way == "events" else source.folder / f"{fps}"
+    folder = "fine" if way == FINER else f"{fps}"
+    given: Any = source.plain if way == "events" else source.folder / folder
     settings: dict[str, Any] = {
         "pictures, blended": {"interpolation": "blend"},
         "pictures, by motion": {"interpolation": "auto"},
         "pictures and events": {"events": source.plain},
+        FINER: {"interpolation": "auto"},
         "events": {},
     }[way]
     work = translation(
@@ -130,7 +144,9 @@ def translated(source: Source, way: str, fps: int) -> Recording:
     return work.run()
 
 
-WAYS = ("pictures, blended", "pictures, by motion", "pictures and events", "events")
+FINER = "finer pictures, by motion"
+WAYS = ("pictures, blended", "pictures, by motion", "pictures and events")
+"""Translators of pictures, for each number of pictures per second."""
 
 
 def columns(recording: Recording) -> dict[str, NDArray[Any]]:
@@ -213,8 +229,8 @@ def rows_of(world: str, trajectory: str) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         source = record(world, trajectory, Path(folder))
         given = {"truth": source.truth, "truth, other seed": source.again}
-        cases = [*((way, None) for way in given), *((way, fps) for fps in FPS[trajectory] for way in WAYS[:-1])]
-        for way, fps in [*cases, (WAYS[-1], None)]:
+        cases = [*((way, None) for way in given), *((way, fps) for fps in FPS[trajectory] for way in WAYS)]
+        for way, fps in [*cases, (FINER, 30), ("events", None)]:
             began = time.process_time()
             found = given.get(way) or translated(source, way, fps or 0)
             seconds = None if way in given else time.process_time() - began
@@ -229,7 +245,7 @@ def rows_of(world: str, trajectory: str) -> list[dict[str, Any]]:
 def line(row: dict[str, Any]) -> str:
     """Return a row as text."""
     values = ("     –" if row[name] is None else f"{row[name]:6.2f}" for name in COLUMNS)
-    return f"{row['world']:5} {row['trajectory']:9} {row['fps'] or '':3} {row['way']:20} " + " ".join(values)
+    return f"{row['world']:5} {row['trajectory']:9} {row['fps'] or '':3} {row['way']:25} " + " ".join(values)
 
 
 def main() -> None:
@@ -239,7 +255,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
-    print(" " * 41 + " ".join(name[:6].rjust(6) for name in COLUMNS))
+    print(" " * 46 + " ".join(name[:6].rjust(6) for name in COLUMNS))
     began = time.process_time()
     rows = [row for w in arguments.worlds for t in arguments.trajectories for row in rows_of(w, t)]
     about = {
