@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
     from amiwarp.optics.camera import Camera
 
-MOTION_PX = 8.0
+MOTION_PX = 6.0
 """Wanted motion of the image in a window [px]: enough for each pixel to see several parts of the scene."""
 WINDOW_US = (10_000, 250_000)
 """Shortest and longest window [us]."""
@@ -104,7 +104,8 @@ def find_motion(
         window = Window(start, length, search.run(events, start, length, last_rates))
         speed = window.moves_px(camera) / length  # px per microsecond
         length = round(float(np.clip(MOTION_PX / max(speed, 1e-9), *WINDOW_US)))
-        if not windows and length >= 2 * window.length_us and last - first > window.length_us:
+        small = window.moves_px(camera) < 2.0 * LEAST_PX
+        if not windows and small and length >= 2 * window.length_us and last - first > window.length_us:
             continue  # the first window was too short to find a motion
         windows.append(window)
         start += window.length_us // 2
