@@ -36,6 +36,7 @@ from .events.truth import EventTruth as EventTruth
 from .events.truth import EventValues as EventValues
 from .events.truth import FrameStore as FrameStore
 from .events.truth import FrameTruth as FrameTruth
+from .events.truth import KnownStore as KnownStore
 from .events.truth import Poses as Poses
 from .events.truth import PoseStore as PoseStore
 from .events.truth import WorldLabels as WorldLabels
@@ -94,7 +95,6 @@ from .simulation.sequences import PictureStack as PictureStack
 from .simulation.sequences import VideoFile as VideoFile
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate
-from .simulation.translator import translate as translate
 from .simulation.worlds.choices import Seeing as Seeing
 from .simulation.worlds.frame_truth import TruthRenderer as TruthRenderer
 from .simulation.worlds.named.catalogue import named_world as named_world
@@ -112,4 +112,7 @@ from .studies.dataset.plan import DatasetPlan as DatasetPlan
 from .studies.dataset.plan import plan_dataset as plan_dataset
 from .studies.dataset.run import DatasetSummary as DatasetSummary
 from .studies.dataset.run import make_dataset as make_dataset
+from .translation.datasets import DataSet as DataSet
+from .translation.interpolation import Interpolation as Interpolation
+from .translation.translator import translate as translate
 from .viewer.app import view as view

@@ -87,6 +87,7 @@ def write_truth(path: Path) -> None:
             writer.append_frame(
                 FrameTruth(t, **maps, rotation=np.eye(3), position=np.ones(3), joints={"a": np.ones(3)})
             )
+            writer.append_known(t, rng.random((height, width)) < 0.5)
         writer.append_poses(Poses(np.arange(3) * 1000, poses, {"ball": poses}, {"a": poses[:, :3]}))
 
 
@@ -162,6 +163,9 @@ def read_recording(path: Path) -> None:
         for index in range(0 if recording.truth.frames is None else len(recording.truth.frames.t)):
             assert recording.truth.frames is not None
             assert recording.truth.frames[index].depth.shape == recording.events.size[::-1]
+        for index in range(0 if recording.truth.known is None else len(recording.truth.known.t)):
+            assert recording.truth.known is not None
+            assert recording.truth.known[index].shape == recording.events.size[::-1]
         if recording.truth.poses is not None:
             assert len(recording.truth.poses[:]) == len(recording.truth.poses)
     json.dumps(describe(recording, str(path)), ensure_ascii=False).encode()

@@ -17,7 +17,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import open_pictures
-from amiwarp.simulation.translator import translate, translation
+from amiwarp.translation.translator import translate, translation
 
 CLEAR = Prism(0.0, 1.5)  # no deflection
 WEDGE = Prism(math.radians(2.0), 1.55)

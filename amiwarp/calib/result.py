@@ -316,7 +316,7 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
     """Return a camera as a JSON object."""
     out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
     if camera.distortion is not None:
-        kind = "fisheye" if isinstance(camera.distortion, Fisheye) else "radial_tangential"
+        [kind] = (name for name, lens in DISTORTIONS.items() if isinstance(camera.distortion, lens))
         out["distortion"] = {"kind": kind, **asdict(camera.distortion)}
     return out
 
@@ -328,7 +328,7 @@ def camera_from_json(data: Any, where: str = "") -> Camera:
     """
     given = fields_of(data, where, *CAMERA_NUMBERS, optional=("distortion",))
     prefix, lens = f"{where}." if where else "", given.get("distortion")
-    distortion: Distortion | None = None
+    distortion = None
     if lens is not None:
         numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, f"{prefix}distortion")
         kind = one_of(numbers.pop("kind", None), DISTORTIONS, f"field {prefix}distortion.kind")

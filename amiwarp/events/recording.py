@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.events import EventSource
-from amiwarp.events.truth import EventTruth, EventValues, FrameStore, PoseStore, WorldLabels
+from amiwarp.events.truth import EventTruth, EventValues, FrameStore, KnownStore, PoseStore, WorldLabels
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -59,6 +59,8 @@ class Truth:
     """Ground truth of all pixels at chosen instants, or None."""
     poses: PoseStore | None = None
     """Poses of the camera, the moving bodies and the joints over time, or None."""
+    known: KnownStore | None = None
+    """Pixels without the prism whose scene the source of a translated recording determines, over time; None for all."""
 
     def points(self, start: int, stop: int) -> NDArray[np.float32] | None:
         """Return the true points of the events with ``start <= index < stop``.
@@ -74,6 +76,37 @@ class Truth:
             Pixels without the prism [px], shape (n, 2), or None if they are not stored.
         """
         return None if self.stored_points is None else self.stored_points[max(start, 0) : max(stop, 0)]
+
+    def known_at(self, t_us: ArrayLike, xy: ArrayLike) -> NDArray[np.bool_]:
+        """Return whether the scene is known at pixels without the prism.
+
+        The times and :meth:`points` of events tell which events the source of a translated recording determines.
+
+        Parameters
+        ----------
+        t_us : array_like
+            Times [us], shape ``(n,)``.
+        xy : array_like
+            Pixels without the prism [px], shape ``(n, 2)``.
+
+        Returns
+        -------
+        numpy.ndarray
+            Whether each pixel is known at its time, shape ``(n,)``. Pixels outside the image, NaN and times before the
+            first mask are unknown. Everything is known if no masks are stored.
+        """
+        times, pixels = np.asarray(t_us), np.asarray(xy, np.float64)
+        if self.known is None:
+            return np.ones(len(times), np.bool_)
+        row = np.searchsorted(self.known.t, times, side="right") - 1
+        found = np.zeros(len(times), np.bool_)
+        for index in np.unique(row[row >= 0]).tolist():
+            mask, which = self.known[index], np.flatnonzero(row == index)
+            inside = np.isfinite(pixels[which].sum(axis=1))
+            x, y = np.rint(np.where(inside[:, None], pixels[which], -1.0)).astype(np.int64).T
+            inside &= (x >= 0) & (x < mask.shape[1]) & (y >= 0) & (y < mask.shape[0])
+            found[which[inside]] = mask[y[inside], x[inside]]
+        return found
 
     def of_events(self, start: int, stop: int) -> EventTruth:
         """Return all ground truth of the events with ``start <= index < stop``.

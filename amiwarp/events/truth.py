@@ -254,6 +254,31 @@ def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
 
 
+class KnownStore(Protocol):
+    """Masks of the pixels whose scene is known, at several times: in memory, or a file that is read on demand."""
+
+    @property
+    def t(self) -> NDArray[np.int64]:
+        """Times from which the masks hold, each until the next, rising [us], shape ``(k,)``."""
+
+    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
+        """Return the mask that holds from ``t[index]``, shape ``(height, width)``."""
+
+
+class MemoryMasks:
+    """Masks of known pixels that are held in memory, as bits."""
+
+    def __init__(self, t: Sequence[int], masks: Sequence[NDArray[np.bool_]]) -> None:
+        self.t = np.array(t, np.int64)
+        """Times from which the masks hold [us], shape ``(k,)``."""
+        self._shape = masks[0].shape if masks else (0, 0)
+        self._bits = [np.packbits(mask) for mask in masks]
+
+    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
+        rows, columns = self._shape
+        return np.unpackbits(self._bits[index], count=rows * columns).reshape(self._shape).astype(np.bool_)
+
+
 class PoseStore(Protocol):
     """Poses that are indexed by slices: :class:`amiwarp.Poses`, or a file that is read on demand (protocol)."""
 

@@ -33,7 +33,10 @@ def copy_events(recording: Recording, writer: RecordingWriter, progress: Progres
 
 
 def _copy_world_truth(truth: Truth, writer: RecordingWriter) -> None:
-    """Append the ground truth of instants, and the poses, to a writer."""
+    """Append to a writer the ground truth of instants, the masks of known pixels, and the poses."""
+    if truth.known is not None:
+        for index, t in enumerate(truth.known.t.tolist()):
+            writer.append_known(t, truth.known[index])
     if truth.frames is not None:
         for index in range(len(truth.frames.t)):
             writer.append_frame(truth.frames[index])

@@ -48,6 +48,7 @@ COLUMNS = {
     **{f"truth/frames/{name}": "iu" for name in ("t", "instance")},
     **{f"truth/frames/{name}": "f" for name in ("pose", "joints", "depth", "normal", "intensity", "flow")},
     **{f"truth/frames/{name}_with_prism": "f" for name in ("intensity", "flow")},
+    **{f"truth/known/{name}": "iu" for name in ("t", "mask")},
     "truth/poses/t": "iu",
     "truth/poses/camera": "f",
     "truth/poses/bodies": "f",
@@ -61,13 +62,14 @@ DIMENSIONS = {
     **{f"truth/{name}": 2 for name in ("events/place", "frames/pose", "poses/camera")},
     **{f"truth/{name}": 3 for name in ("frames/joints", "poses/bodies", "joints/position")},
     **{f"truth/frames/{name}": 3 for name in ("depth", "instance", "intensity", "intensity_with_prism")},
+    "truth/known/mask": 3,
     **{f"truth/frames/{name}": 4 for name in ("normal", "flow", "flow_with_prism")},
 }
 """Numbers of dimensions of the datasets that do not have exactly one dimension."""
 
 READ_AT_ONCE = (
-    "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "truth/frames/t", "truth/world/instances",
-    "truth/world/categories", "truth/poses/body_names", "truth/joints/names",
+    "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "truth/frames/t", "truth/known/t",
+    "truth/world/instances", "truth/world/categories", "truth/poses/body_names", "truth/joints/names",
 )  # fmt: skip
 """Datasets that are read into memory at once, and therefore have stricter size limits."""
 

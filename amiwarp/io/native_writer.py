@@ -280,6 +280,19 @@ class RecordingWriter:
         with errors_name(self.path, lambda: f"truth of the instant {frame.t_us} us"):
             self._open_truth().append_frame(frame)
 
+    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
+        """Append a mask of the pixels whose scene is known.
+
+        Parameters
+        ----------
+        t_us : int
+            Time from which the mask holds [us], later than that of the mask before.
+        mask : numpy.ndarray
+            Whether the scene at each pixel without the prism is known, shape ``(height, width)``.
+        """
+        with errors_name(self.path, lambda: f"mask at {t_us} us"):
+            self._open_truth().append_known(t_us, mask)
+
     def append_poses(self, poses: Poses) -> None:
         """Append true poses of camera, bodies and joints.
 

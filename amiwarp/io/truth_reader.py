@@ -40,6 +40,7 @@ def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) ->
         labels=_labels(path, file),
         frames=_StoredFrames(path, file, size) if "truth/frames/t" in file.columns else None,
         poses=_StoredPoses(path, file) if "truth/poses/t" in file.columns else None,
+        known=_StoredMasks(path, file, size) if "truth/known/t" in file.columns else None,
     )
 
 
@@ -126,12 +127,9 @@ class _StoredFrames:
 
     def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
         self._path, self._file = path, file
-        times = file.columns["truth/frames/t"]
-        self.t = as_times(times.read(0, len(times)))
+        self.t = _rising_times(path, file, "truth/frames/t")
         """Times of the instants [us], shape ``(k,)``."""
-        if (np.diff(self.t) <= 0).any():
-            raise AmiwarpError(f"{path}: truth/frames/t does not increase; the file is damaged")
-        count, (width, height) = len(times), size
+        count, (width, height) = len(self.t), size
         self._maps = {
             name: _column(file, f"truth/frames/{name}", count, (height, width, *tail))
             for name, (_, tail) in MAPS.items()
@@ -150,6 +148,29 @@ class _StoredFrames:
             joints = np.zeros((0, 3)) if self._joints is None else self._joints.read(at, at + 1)[0].astype(np.float64)
             named = dict(zip(self._joint_names, joints, strict=True))
             return FrameTruth(t_us=int(self.t[at]), **maps, rotation=rotation_of(pose), position=pose[:3], joints=named)
+
+
+def _rising_times(path: Path, file: Hdf5File, name: str) -> NDArray[np.int64]:
+    """Return the times of a dataset [us]. Raises :class:`AmiwarpError` if they do not rise."""
+    times = as_times(file.columns[name].read(0, len(file.columns[name])))
+    if (np.diff(times) <= 0).any():
+        raise AmiwarpError(f"{path}: {name} does not increase; the file is damaged")
+    return times
+
+
+class _StoredMasks:
+    """Masks of known pixels, read on demand."""
+
+    def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
+        self._path, self._file = path, file
+        self.t = _rising_times(path, file, "truth/known/t")
+        """Times from which the masks hold [us], shape ``(k,)``."""
+        self._masks = _column(file, "truth/known/mask", len(self.t), size[::-1])
+
+    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
+        at = range(len(self.t))[index]
+        with errors_name(self._path, lambda: f"truth/known {index}"):
+            return self._masks.read(at, at + 1)[0] != 0
 
 
 class _StoredPoses:

@@ -95,6 +95,15 @@ class TruthWriter:
             self._keep_names("truth/poses/body_names", poses.bodies)
             self._append("truth/poses/bodies", np.stack(list(poses.bodies.values()), axis=1), POSE_ROWS)
 
+    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
+        """Append a mask of known pixels, which holds from a time later than those before."""
+        width, height = self._size
+        if mask.shape != (height, width):
+            raise AmiwarpError(f"{self._path}: mask at {t_us} us has shape {mask.shape}; expected {(height, width)}")
+        self._check_later("truth/known/t", t_us)
+        self._append("truth/known/t", np.array([t_us], np.int64), POSE_ROWS)
+        self._append("truth/known/mask", np.asarray(mask, np.uint8)[None], 1)
+
     def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
         if joints:
             self._keep_names("truth/joints/names", joints)

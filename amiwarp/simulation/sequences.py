@@ -50,6 +50,8 @@ class PictureFolder:
     """Time of each picture [us], shape (n,), starting at 0 and increasing."""
     size: tuple[int, int]
     """Width and height of each picture [px]."""
+    start_us: int | None = None
+    """Time of the first picture in ``times.csv`` [us], or None if the times come from a rate."""
 
     @property
     def interval_us(self) -> float:
@@ -259,7 +261,8 @@ def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
             f"{table}: t_us of picture {at} ({times[at]}) is not later than the one before; sort the rows"
         )
     height, width = read_picture(files[0]).shape
-    return PictureFolder(tuple(files), times - times[0], (width, height))
+    start_us = None if fps is not None else int(times[0])
+    return PictureFolder(tuple(files), times - times[0], (width, height), start_us)
 
 
 def _natural(file: Path) -> list[tuple[int, int, str]]:

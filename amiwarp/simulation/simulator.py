@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,6 +72,8 @@ class Simulation:
     """Seed of all random numbers of the simulation."""
     device: str = "cpu"
     """Device that computes, such as ``cpu`` or ``cuda:0``."""
+    source: Mapping[str, MetadataValue] = field(default_factory=dict)
+    """Description of what the scene was made from; it becomes part of the recording's metadata."""
 
     def __post_init__(self) -> None:
         check_values(self)
@@ -119,9 +121,9 @@ class Simulation:
         Returns
         -------
         dict
-            Seed and duration.
+            Seed and duration, and :attr:`source`.
         """
-        return {"simulated": True, "seed": self.seed, "duration_us": self.duration_us}
+        return {"simulated": True, "seed": self.seed, "duration_us": self.duration_us, **self.source}
 
     def blocks(
         self, *, chunk_us: int | None = None, progress: Progress | None = None
@@ -296,6 +298,8 @@ class Simulation:
                 writer.append(block.events(), truth=block.truth())
                 for frame in recorded.frames_before(now_us):
                     writer.append_frame(frame)
+                for t_us, mask in recorded.known.take():
+                    writer.append_known(t_us, mask)
                 poses = recorded.poses_before(now_us)
                 if poses is not None:
                     writer.append_poses(poses)

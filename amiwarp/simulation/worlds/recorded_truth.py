@@ -1,4 +1,4 @@
-"""Ground truth that a simulation records of its world next to the events: labels, chosen instants and poses."""
+"""Ground truth that a simulation records next to the events: labels, instants and poses of its world, known pixels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Truth
-from amiwarp.events.truth import EventTruth, FrameTruth, MemoryFrames, Poses, WorldLabels, as_poses
+from amiwarp.events.truth import EventTruth, FrameTruth, MemoryFrames, MemoryMasks, Poses, WorldLabels, as_poses
+from amiwarp.simulation.known import KnownPixels
 from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.validation import array, real
@@ -61,6 +62,9 @@ class RecordedTruth:
         self._events: list[EventTruth] = []
         self._frames: list[FrameTruth] = []
         self._poses: list[Poses] = []
+        self._masks: list[tuple[int, NDArray[np.bool_]]] = []
+        self.known = KnownPixels(simulation)
+        """Masks of known pixels, if the pictures have some."""
 
     @property
     def labels(self) -> WorldLabels | None:
@@ -92,6 +96,7 @@ class RecordedTruth:
         """Keep in memory the ground truth of a block of events, and what belongs to the time before ``t_us``."""
         self._events.append(truth)
         self._frames.extend(self.frames_before(t_us))
+        self._masks.extend(self.known.take())
         poses = self.poses_before(t_us)
         if poses is not None:
             self._poses.append(poses)
@@ -101,8 +106,9 @@ class RecordedTruth:
         known = EventTruth.concatenate(self._events)
         frames = MemoryFrames(self._frames) if self._frames else None
         poses = Poses.concatenate(self._poses) if self._poses else None
+        masks = MemoryMasks(*zip(*self._masks, strict=True)) if self._masks else None
         columns = known.points, known.cause, known.instance, known.depth, known.place
-        return Truth(parameters, *columns, self.labels, frames, poses)
+        return Truth(parameters, *columns, self.labels, frames, poses, masks)
 
 
 def poses_at(scene: WorldScene, t_us: NDArray[np.int64]) -> Poses:

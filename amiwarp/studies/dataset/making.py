@@ -18,13 +18,13 @@ from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.simulation.translator import translation
 from amiwarp.simulation.worlds.open_world import POSE_FILES, open_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.studies.cluster import ANY_GPU
 from amiwarp.studies.dataset.items import Item
 from amiwarp.studies.dataset.sources import content_digest
 from amiwarp.studies.dataset.specification import CameraEntry, PrismEntry
+from amiwarp.translation.translator import translation
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera

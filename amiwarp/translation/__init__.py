@@ -1,0 +1,1 @@
+"""Translation of pictures and of recordings of plain event cameras to recordings through the prism."""
