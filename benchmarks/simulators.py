@@ -2,11 +2,12 @@
 
     python -m benchmarks.simulators [--seconds 0.1] [--fps 1000] [--size 640 480] [--out FILE.json]
 
-The frames show the world `room` from a camera in a hand. eventcv gets the frames; amiwarp gets the frames, and the
-world itself. The error is the share of bright pixels whose net number of events differs by more than one from the
-change of their log intensity between the first and the last frame. eventcv, as v2e, uses a linear scale below a
-luminance of 20/255; darker pixels are left out. v2e itself cannot be installed from a package index; its authors report
-50 to 200 times the simulated time.
+The frames show the world `room` from a handheld camera without a prism. eventcv simulates from the frames; amiwarp
+simulates from the frames and, in a further row, from the world itself. The error is the fraction of bright pixels whose
+net number of events (ON minus OFF) differs by more than one from the change of their log intensity between the first
+and the last frame, in units of the contrast threshold. eventcv, like v2e, replaces the logarithm by a linear scale
+below a luminance of 20/255; darker pixels are therefore left out. v2e is not included, because it cannot be installed
+from a package index; its authors report 50 to 200 times the simulated time.
 """
 
 from __future__ import annotations
@@ -37,27 +38,29 @@ from amiwarp.simulation.worlds.named import named_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
 CONTRAST = 0.2
+"""Contrast threshold of ON and OFF events [natural log intensity]."""
 DARKEST = 25.0 / 255.0
-"""Smallest linear luminance of a pixel that is judged."""
+"""Smallest linear luminance of the pixels that are compared."""
 Counts = tuple[int, NDArray[np.float64]]
+"""Number of events, and number of ON minus OFF events of each pixel, shape (height, width)."""
 
 
 def linear_to_srgb(light: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return the 8-bit sRGB codes of linear luminance."""
+    """Return the 8-bit sRGB codes of linear luminance from 0 to 1."""
     codes = np.arange(256, dtype=np.uint8)
     levels = srgb_to_linear(codes / 255.0)
     return codes[np.clip(np.searchsorted((levels[1:] + levels[:-1]) / 2.0, light), 0, 255)]
 
 
 def net(x: Any, y: Any, p: Any, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the number of ON minus OFF events of each pixel."""
+    """Return the number of ON minus OFF events of each pixel, shape ``shape``."""
     out = np.zeros(shape)
     np.add.at(out, (np.asarray(y, np.int64), np.asarray(x, np.int64)), np.where(np.asarray(p) > 0, 1.0, -1.0))
     return out
 
 
 def by_eventcv(frames: NDArray[np.uint8], fps: float) -> Counts:
-    """Simulate with eventcv."""
+    """Simulate events of frames, shape (n, height, width), with eventcv."""
     stream = eventcv.simulate(frames, fps=fps, pos_thres=CONTRAST, neg_thres=CONTRAST, sigma_thres=0.0,
                               refractory_us=0, cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0)  # fmt: skip
     events = stream.numpy()
@@ -66,7 +69,7 @@ def by_eventcv(frames: NDArray[np.uint8], fps: float) -> Counts:
 
 
 def by_amiwarp(simulation: Simulation) -> Counts:
-    """Simulate with amiwarp."""
+    """Run a simulation of amiwarp and count its events."""
     total, out = 0, np.zeros((simulation.camera.height, simulation.camera.width))
     for events, _ in simulation.blocks():
         total += len(events)
@@ -77,7 +80,11 @@ def by_amiwarp(simulation: Simulation) -> Counts:
 def row(
     name: str, run: Callable[[], Counts], change: NDArray[np.float64], bright: Any, seconds: float
 ) -> dict[str, Any]:
-    """Time the second of two runs, and compare its events with the change of log intensity."""
+    """Return time and error of a simulator. The simulator runs twice; only the second run is timed.
+
+    ``change``: change of the log intensity from the first to the last frame; ``bright``: mask of the pixels to compare;
+    ``seconds``: simulated time [s].
+    """
     run()
     began, began_processor = time.perf_counter(), time.process_time()
     events, counts = run()
@@ -88,6 +95,7 @@ def row(
 
 
 def main() -> None:
+    """Run the benchmark, print each row, and write the rows to a file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=0.1)
     parser.add_argument("--fps", type=float, default=1000.0)

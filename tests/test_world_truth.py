@@ -541,7 +541,7 @@ def test_world_files_and_files_of_poses(named: Path) -> None:
     ok("simulate", "r.h5", "--world", "room", "--trajectory", "way.txt", *SHORT)
     for args, message in (
         (("--world", "mine.toml"), "has no trajectory"),
-        (("--world", "mine.toml", "--trajectory", "fast"), "belongs to named worlds"),
+        (("--world", "mine.toml", "--trajectory", "fast"), "applies only to named worlds"),
         (("--world", "cellar"), "cellar"),
         (("--world", "room", "--rotate-deg-s", "0,5,0"), "--rotate-deg-s"),
         (("--world", "room", "--preview", "seen.jpg"), "ends in .png"),

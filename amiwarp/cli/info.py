@@ -1,4 +1,4 @@
-"""``amiwarp info``: the content of a recording."""
+"""Command ``amiwarp info``: description of the content of a recording."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp info recording.h5"
 MOST_NAMES = 16
-"""Number of instances, bodies and joints that are named; ``--json`` names all."""
+"""Largest number of instances, bodies or joints whose names are printed. ``--json`` prints all names."""
 
 
 def run(file: Annotated[Path, typer.Argument(help="Recording in any supported format.")], *, common: Common) -> None:
     """Show a recording's format, events, encoder, camera, prism, ground truth and repairs.
 
-    The file is read once, in blocks.
+    The file is read once, block by block.
     """
     recording = open_recording(file)
     data = describe(recording, str(file))
@@ -38,7 +38,7 @@ def run(file: Annotated[Path, typer.Argument(help="Recording in any supported fo
 
 
 def describe(recording: Recording, file: str) -> dict[str, Any]:
-    """Return the description of a recording, with angles in degrees."""
+    """Return the description of a recording for ``--json``, with angles in degrees."""
     source = recording.events
     width, height = source.size
     data: dict[str, Any] = {
@@ -64,6 +64,7 @@ def describe(recording: Recording, file: str) -> dict[str, Any]:
 
 
 def _events(source: EventSource) -> dict[str, Any]:
+    """Return number, times, rate and polarity of the events; read all events once."""
     n, on, outside = len(source), 0, 0
     compensated = False
     with progress("reading") as advance:
@@ -92,6 +93,7 @@ def _events(source: EventSource) -> dict[str, Any]:
 
 
 def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
+    """Return a description of the encoder's samples, gaps and slip."""
     slip = encoder.slip()
     first, last = encoder.coverage
     return {
@@ -110,6 +112,7 @@ def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
 
 
 def _camera(recording: Recording) -> dict[str, Any]:
+    """Return the camera's intrinsics and its field of view [deg]."""
     from amiwarp.calib.result import camera_to_json
 
     camera = recording.camera
@@ -118,7 +121,10 @@ def _camera(recording: Recording) -> dict[str, Any]:
 
 
 def _world(truth: Truth, count: int) -> dict[str, Any] | None:
-    """Return a description of the ground truth that is stored in addition to the parameters, or None."""
+    """Return a description of the ground truth of events and of a world, or None if neither is stored.
+
+    ``count``: number of events.
+    """
     stores = {"cause": truth.stored_causes, "instance": truth.stored_instances, "depth": truth.stored_depths,
               "place": truth.stored_places}  # fmt: skip
     stored = [name for name, store in stores.items() if store is not None]
@@ -140,7 +146,7 @@ def _world(truth: Truth, count: int) -> dict[str, Any] | None:
 
 
 def _causes(truth: Truth, count: int) -> dict[str, int] | None:
-    """Return the number of events by cause; None if the causes are not stored."""
+    """Return the number of events of each cause; None if the recording does not store causes."""
     if truth.stored_causes is None:
         return None
     totals = np.zeros(256, np.int64)
@@ -150,7 +156,7 @@ def _causes(truth: Truth, count: int) -> dict[str, int] | None:
 
 
 def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return table rows about the ground truth of events and of a world."""
+    """Return the rows of the table about the ground truth of events and of a world."""
     rows = []
     if d["causes"] is not None:
         total = max(sum(d["causes"].values()), 1)
@@ -173,17 +179,19 @@ def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _list(names: list[str]) -> str:
-    """Return the first :data:`MOST_NAMES` names, and the number of further ones."""
+    """Return the first :data:`MOST_NAMES` names as text, and the number of further names."""
     more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
     return ", ".join(names[:MOST_NAMES]) + more
 
 
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
+    """Return the true parameters of the prism with angles in degrees, under names that end in ``_deg``."""
     angles = ("apex", "phase", "tilt_x", "tilt_y")
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
 
 
 def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows of the printed table: names and texts."""
     n = d["events"]
     kind = f"{d['format']}, compensated ({d['outside']:,} outside)" if d["compensated"] else str(d["format"])
     rows = [("file", d["file"]), ("format", kind), ("size", f"{d['width']} x {d['height']} px"), ("events", f"{n:,}")]
@@ -209,6 +217,7 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _prism_text(p: dict[str, Any] | None) -> str:
+    """Return the description of the nominal prism as text."""
     if p is None:
         return "unknown"
     apex = "apex unknown" if p["apex_deg"] is None else f"nominal apex {p['apex_deg']:.5g} deg"
@@ -216,6 +225,7 @@ def _prism_text(p: dict[str, Any] | None) -> str:
 
 
 def _encoder_text(e: dict[str, Any] | None) -> str:
+    """Return the description of the encoder as text."""
     if e is None:
         return "none"
     parts = [f"{e['samples']:,} samples, {e['rpm']:.6g} rpm, {e['turns']:.4g} turns"]

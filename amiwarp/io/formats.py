@@ -1,4 +1,4 @@
-"""Formats of recordings, detected from the file's content, and the function that opens all of them."""
+"""Detection of the format of a recording from its content, and a function that opens recordings of all formats."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from amiwarp.validation import choice
 
 
 class Format(enum.StrEnum):
-    """Formats of recordings that can be read."""
+    """File formats of recordings that amiwarp reads."""
 
     HDF5 = "hdf5"
-    """Native recording, or event file of DSEC."""
+    """HDF5 file: native recording of amiwarp, or event file of the DSEC data set."""
     EVT = "evt"
-    """Prophesee RAW, EVT 2.0 and 3.0."""
+    """Prophesee RAW file with the encoding EVT 2.0 or EVT 3.0."""
     DAT = "dat"
-    """Prophesee DAT."""
+    """Prophesee DAT file."""
     AEDAT4 = "aedat4"
-    """iniVation AEDAT 4.0."""
+    """iniVation AEDAT 4.0 file."""
     ES = "es"
-    """Event Stream."""
+    """Event Stream (.es) file."""
     TEXT = "text"
-    """Text of the Event Camera Dataset: lines ``t x y p``, with t in seconds."""
+    """Text file in the format of the Event Camera Dataset: lines of ``t x y p``, with t in seconds."""
     NPZ = "npz"
     """NumPy archive with the arrays x, y, t and p."""
 
 
 def detect_format(path: Path) -> Format:
-    """Return the format of a file from its first bytes. Raises :class:`AmiwarpError` for an unknown format."""
+    """Return the format of a file from the first bytes. Raises :class:`AmiwarpError` for an unknown format."""
     check_regular(path)
     with errors_name(path, lambda: "opening"), path.open("rb") as file:
         head = file.read(4096)
@@ -59,11 +59,13 @@ def detect_format(path: Path) -> Format:
 
 
 def _is_evt(head: bytes) -> bool:
+    """Return whether the first bytes of a Prophesee file are the header of a RAW (EVT) file."""
     lines = head.split(b"\n")
     return any(line.startswith((b"% evt ", b"% format EVT")) for line in lines)
 
 
 def _looks_like_text(head: bytes) -> bool:
+    """Return whether the first line without a comment consists of two or four numbers."""
     line = next((line for line in head.split(b"\n") if line.strip() and not line.lstrip().startswith(b"#")), b"")
     try:
         return len([float(word) for word in line.split()]) in (2, 4)
@@ -80,19 +82,19 @@ def open_recording(path: str | os.PathLike[str], *, format: Format | str | None 
     Parameters
     ----------
     path : str or path-like
-        The file.
+        Recording to open.
     format : Format or str, optional
-        The format. By default it is detected from the content.
+        Format of the file. By default, the format is detected from the content.
 
     Returns
     -------
     Recording
-        The recording. Its events are read on demand.
+        The recording, whose events are read on demand.
 
     Raises
     ------
     AmiwarpError
-        If the file cannot be read. The message gives the file and the position.
+        If the file cannot be read. The message names the file and the position in the file.
 
     Examples
     --------
@@ -108,8 +110,8 @@ def open_recording(path: str | os.PathLike[str], *, format: Format | str | None 
 
 
 def _opener(chosen: Format) -> Callable[[Path], Recording]:
-    """Return the function that opens a format."""
-    # Each reader is imported on use, because its library takes time to load.
+    """Return the function that opens recordings of a format."""
+    # Each reader is imported when it is needed, because the libraries of the readers take time to load.
     if chosen is Format.HDF5:
         from amiwarp.io.native_reader import open_native as opener
     elif chosen is Format.EVT:

@@ -103,8 +103,8 @@ def meet_near(
 ) -> Met:
     """Return the nearest face that a ray hits among the faces of a texel and its eight neighbours.
 
-    If the ray hits none of these faces, or if the texels see several bodies, the distance is FAR: the ray may then hit a
-    face that lies between texels. ``width``: width of a map [texels].
+    The distance is FAR if the ray hits none of these faces, or if the texels see several bodies: the ray may then hit
+    a face that lies between texels. ``width``: width of a map [texels].
     """
     met = Met()
     met.face = -1

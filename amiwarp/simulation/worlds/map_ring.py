@@ -75,12 +75,12 @@ class WorldMapRing:
 
     @property
     def maps(self) -> wp.array:
-        """Bilinear pieces of log intensity of all maps, slot by slot."""
+        """Coefficients of bilinear interpolation of the log intensity at each texel of all maps, slot by slot."""
         return self._slots.arrays[0]
 
     @property
     def faces(self) -> wp.array:
-        """Face that each texel of all maps sees, slot by slot; -1 for the sky."""
+        """Number of the face that each texel of all maps sees, slot by slot; -1 for the sky."""
         return self._slots.arrays[1]
 
     @property

@@ -22,7 +22,7 @@ SWAY_HZ = (0.15, 0.55)
 TREMOR_HZ = (1.5, 2.8)
 """Range of frequencies of the tremor in handheld motion [Hz]. Each of its sines has a relative amplitude of 0.03."""
 FAST_RATE, FAST_REACH = 4.0, 2.5
-"""Frequency and amplitude of fast trajectories relative to handheld ones. The speed is their product, 10, times as high."""
+"""Frequency and amplitude of fast trajectories relative to handheld ones. Their product, 10, is the ratio of speeds."""
 
 
 @dataclass(frozen=True)
