@@ -92,7 +92,7 @@ class WorldOptions:
     ] = None
 
     def check(self) -> None:
-        """Raise :class:`AmiwarpError` if options are given that do not apply, or that exclude each other."""
+        """Raise :class:`AmiwarpError` if a given option does not apply, or two options are incompatible."""
         given = {"--trajectory": self.trajectory, "--seeing": self.seeing, "--motion-px": self.motion_px,
                  "--truth-hz": self.truth_hz, "--preview": self.preview}  # fmt: skip
         if self.world is None:

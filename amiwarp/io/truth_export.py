@@ -242,9 +242,7 @@ def encode_png16(picture: NDArray[np.uint16]) -> bytes:
     """Encode a picture as PNG with three channels of 16 bits, which Pillow cannot write."""
     height, width, _ = picture.shape
     rows = picture.astype(">u2").reshape(height, -1).view(np.uint8)
-    lines = np.concatenate(
-        [np.zeros((height, 1), np.uint8), rows], axis=1
-    )  # PNG: each row begins with its filter type, 0
+    lines = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)  # each row begins with PNG filter type 0
     header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
     parts = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(_png_part(kind, data) for kind, data in parts)

@@ -51,7 +51,7 @@ class _StoredRows:
 
     def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
         self._path, self._name, self._count, self._read = path, name, count, read
-        self._file = file  # keeps the file open, because its columns refer to it weakly
+        self._file = file  # keeps the file open: the columns hold only a weak reference to the file
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
         start, stop, _ = which.indices(self._count)

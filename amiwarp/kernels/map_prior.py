@@ -5,7 +5,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
-EXTRA = wp.constant(2)  # number of unknowns after those of the map: leak and OFF threshold
+EXTRA = wp.constant(2)  # number of unknowns that follow the map nodes: leak and OFF threshold
 
 
 @wp.struct

@@ -100,8 +100,8 @@ def level_at(view: View, step: Step, u: float, v: float) -> float:
 def prism_shift(m: ExactParams, along: float, z: float) -> float:
     """Return the distance by which the prism shifts a bearing along the azimuth; NaN if no light passes.
 
-    The formula is that of kernels/optics.py. ``along`` and ``z`` are the components of the bearing along the azimuth
-    and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number gives
+    The formula is the same as in kernels/refraction.py. ``along`` and ``z`` are the components of the bearing along the
+    azimuth and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number gives
     NaN, which propagates to the result.
     """
     inside = m.index2 - 1.0

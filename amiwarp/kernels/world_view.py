@@ -32,7 +32,7 @@ def instance_of(world: World, face: int) -> int:
 
 @wp.kernel
 def find_surfaces(world: World, instant: int, rays: wp.array(dtype=wp.vec3), pose: Pose, start: int, out: Surfaces):
-    """Find the surfaces that unit rays from a camera hit. A ray of NaN gives NaN.
+    """Find the surfaces that unit rays from a camera hit. A ray of NaN counts as seeing the sky.
 
     ``rays``: directions in the camera's frame; ``pose``: pose of the camera.
     """

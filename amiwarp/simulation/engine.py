@@ -1,7 +1,4 @@
-"""Engine of the event simulator: tables on the host, kernel launches, and sorting of events.
-
-:class:`amiwarp.Simulation` is the public interface.
-"""
+"""Engine of the event simulator :class:`amiwarp.Simulation`: tables on the host, kernel launches, sorting of events."""
 
 from __future__ import annotations
 
@@ -75,10 +72,7 @@ class DeviceBlock:
     count: int
     """Number of events."""
     look: Callable[[], Any] | None = None
-    """Function that finds the surfaces that the events saw; None for a picture scene.
-
-    Valid until the engine simulates the next chunk.
-    """
+    """Function that finds the surfaces that the events saw, valid until the next chunk; None for a picture scene."""
 
     def events(self) -> Events:
         """Return the events in host memory."""

@@ -70,7 +70,7 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
-        raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}")
+        raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; expected one of {', '.join(FORMATS)}")
     up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
     turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
     check_regular(path)
@@ -142,7 +142,7 @@ def _check_picture(data: bytes) -> None:
 def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64], name: str, kind: str) -> LoadedMesh:
     """Return one geometry of the file as a mesh with a material.
 
-    ``matrix`` and ``offset``: pose of its node in the world; ``kind``: suffix of the file.
+    ``matrix`` and ``offset``: transformation from the geometry to the world; ``kind``: suffix of the file.
     """
     vertices = np.asarray(part.vertices, np.float64) @ matrix.T + offset
     faces = np.asarray(part.faces)
@@ -176,7 +176,7 @@ def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], k
 
 
 def _luminance(picture: Any) -> NDArray[np.float32]:
-    """Return the linear luminance of a Pillow picture. A picture of one row or column gets a second, equal one."""
+    """Return the linear luminance of a Pillow picture. A single row or column is duplicated."""
     if picture.width * picture.height > MOST_PIXELS:
         raise AmiwarpError(
             f"a texture has {picture.width}x{picture.height} pixels, more than {MOST_PIXELS}; give a smaller picture"

@@ -21,8 +21,10 @@ from amiwarp.simulation.worlds.device_world import DeviceWorld
 SMALLEST_LAUNCH = 1 << 10
 """Smallest number of rays that one CPU thread handles."""
 ROTATED_GRID = [(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375)]
-"""Positions of four samples relative to the pixel's centre [px]. They are fixed: random positions
-would change from map to map and cause events."""
+"""Positions of four samples relative to the pixel's centre [px].
+
+The positions are fixed, because random positions would differ between maps and cause events.
+"""
 TILE = int(world_maps.TILE)
 """Side of a tile of a map [texels]."""
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 LARGEST_SPEED = 1e3
 """Largest speed of a body or camera [m/s]. A higher speed is refused as a jump."""
 LARGEST_TURN_RATE = 1e3
-"""Largest angular velocity of a body or camera [rad/s]. A higher one is refused as a jump."""
+"""Largest angular velocity of a body or camera [rad/s]. A higher angular velocity is refused as a jump."""
 COLUMNS = 8
 """Number of columns of a table of poses: t, x, y, z, qx, qy, qz, qw."""
 

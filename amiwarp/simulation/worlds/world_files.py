@@ -284,7 +284,9 @@ def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) 
     """
     own = part.material
     if texture is not None and part.mesh.uv is None:
-        raise AmiwarpError(f"field {where}.material.texture needs texture coordinates; the mesh has none; remove it")
+        raise AmiwarpError(
+            f"field {where}.material.texture needs texture coordinates, but the mesh has none; remove it"
+        )
     reflectance = own.reflectance if texture is None else 1.0
     return Material(
         reflectance if entry.reflectance is None else entry.reflectance,

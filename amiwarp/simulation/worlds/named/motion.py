@@ -20,9 +20,9 @@ SHAKE_DEG = 1.5
 SWAY_HZ = (0.15, 0.55)
 """Range of frequencies of the slow part of handheld motion [Hz]."""
 TREMOR_HZ = (1.5, 2.8)
-"""Range of frequencies of the tremor in handheld motion [Hz]. Each of its sines has a relative amplitude of 0.03."""
+"""Range of frequencies of the tremor in handheld motion [Hz]. Each tremor sine has a relative amplitude of 0.03."""
 FAST_RATE, FAST_REACH = 4.0, 2.5
-"""Frequency and amplitude of fast trajectories relative to handheld ones. Their product, 10, is the ratio of speeds."""
+"""Ratios of frequency and amplitude of fast to handheld trajectories. Their product, 10, is the ratio of speeds."""
 
 
 @dataclass(frozen=True)

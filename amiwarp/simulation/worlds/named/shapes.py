@@ -18,7 +18,7 @@ BOX_SIDES = (
     ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
     ((0, 0, -1), (1, 0, 0), (0, -1, 0)),
 )
-"""Outward normal of each side of a box, and its directions to the right and up as seen from outside."""
+"""Sides of a box: outward normal, and directions to the right and up as seen from outside."""
 
 
 def panel(corner: ArrayLike, right: ArrayLike, up: ArrayLike, *, tile_m: float | None = None) -> Mesh:
