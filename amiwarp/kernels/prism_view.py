@@ -101,8 +101,8 @@ def prism_shift(m: ExactParams, along: float, z: float) -> float:
     """Return the distance by which the prism shifts a bearing along the azimuth; NaN if no light passes.
 
     The formula is the same as in kernels/refraction.py. ``along`` and ``z`` are the components of the bearing along the
-    azimuth and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number gives
-    NaN, which propagates to the result.
+    azimuth and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number
+    gives NaN, which propagates to the result.
     """
     inside = m.index2 - 1.0
     if m.flat_to_scene == 1:

@@ -70,7 +70,7 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
-        raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; expected one of {', '.join(FORMATS)}")
+        raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}")
     up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
     turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
     check_regular(path)
