@@ -40,7 +40,7 @@ def chosen_instants(
         count = int(duration_us * 1e-6 * rate) + 1
         if count > MOST_INSTANTS:
             raise AmiwarpError(
-                f"truth_hz {rate:g} gives {count} instants; the limit is {MOST_INSTANTS}; give a lower truth_hz"
+                f"truth_hz {rate:g} gives {count} instants; the limit is {MOST_INSTANTS}; give a lower rate"
             )
         return np.unique(np.minimum(np.rint(np.arange(count) * (1e6 / rate)), duration_us).astype(np.int64))
     times = array([] if truth_times_us is None else truth_times_us, "truth_times_us")
