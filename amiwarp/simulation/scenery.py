@@ -178,7 +178,7 @@ class MapRing:
         self._frames = scene.frames.read()
         self._device = simulation.device
         self._texels = placement.width * placement.height
-        self._held: list[tuple[int, int]] = []  # time [us], slot
+        self._held: list[tuple[int, int]] = []  # time [us] and slot of each map
         self._slots = MapSlots(self._texels, wp.vec4, device=self._device)
 
     @property

@@ -52,6 +52,7 @@ class DeviceWorld:
         self.set_instants(np.zeros(1))
 
     def _mesh(self, vertices: Sequence[NDArray[np.float64]], bodies: Sequence[Body]) -> Any:
+        """Return one Warp mesh of several bodies, whose vertices are given [m]."""
         starts = np.cumsum([0, *(len(v) for v in vertices)])
         faces = [np.asarray(body.mesh.faces) + start for body, start in zip(bodies, starts, strict=False)]
         points = wp.array(np.concatenate(vertices).astype(np.float32), dtype=wp.vec3, device=self.device)
@@ -81,6 +82,7 @@ class DeviceWorld:
         p.density = wp.array(np.concatenate(density).astype(np.float32), dtype=float, device=self.device)
 
     def _upload_light(self) -> None:
+        """Upload ambient light, sun and the positions of lamps."""
         p, world = self.params, self.world
         p.ambient, p.sun = world.ambient, wp.vec3(0.0, 0.0, 1.0)
         if world.sun is not None:
@@ -94,6 +96,7 @@ class DeviceWorld:
         p.lamps = wp.array(lamps, dtype=kernels.Lamp, device=self.device)
 
     def _upload_movers(self, first: int) -> None:
+        """Upload the meshes of the moving bodies. ``first``: number of the first face of the first moving body."""
         movers = []
         for body in self.movers:
             mover = kernels.Mover()

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from amiwarp.simulation.worlds.world_scene import WorldScene
 
 MARGIN_PX = 24.0
-"""Border of a map around the view of a moving camera [px]. If the camera rotates further, a map is rendered anew."""
+"""Border of a map around the view of a moving camera [px]. If the camera rotates further, the
+orientation of the maps changes."""
 LONGEST_S = 0.5
 """Longest time between two successive maps if the camera or a body moves, or a lamp flickers [s]."""
 SAMPLES = 4
@@ -48,10 +49,11 @@ class HeldMap:
 class WorldMapRing:
     """Maps of a world for the current span of time, in slots of device memory.
 
-    Successive maps share one orientation until the camera's view leaves the map. The camera's rotation is therefore
-    exact; only the effects of its translation and of moving bodies are interpolated. Whole maps follow the camera's
-    translation. On a CPU, if bodies move faster than that, further maps are inserted between two whole maps. An
-    inserted map is rendered only where bodies move, and interpolated elsewhere.
+    Successive maps share one orientation until the camera's view leaves the map. The effect of the camera's rotation is
+    therefore exact; only the effects of the camera's translation and of moving bodies are interpolated in time. The
+    interval between two whole maps depends on the speed of the camera's translation. On a CPU, if bodies move faster in
+    the image, further maps are inserted between two whole maps. An inserted map is rendered only where bodies move, and
+    interpolated elsewhere.
     """
 
     def __init__(
@@ -148,7 +150,7 @@ class WorldMapRing:
         longest = min(LONGEST_S, flicker_interval_s(scene.world))
         whole, between = (min(longest, scene.motion_px / max(v, 1e-9)) for v in (parallax, parallax + movers))
         if not self._world.device.is_cpu:
-            whole = between  # a GPU renders a whole map faster than the host finds the tiles that change
+            whole = between  # a GPU renders a whole map faster than the host finds the tiles in which bodies move
         return max(whole, 1e-6), max(between, 1e-6)
 
     def _fits(self, turned: NDArray[np.float64]) -> bool:

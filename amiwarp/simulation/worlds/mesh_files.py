@@ -111,9 +111,13 @@ def _named_files(path: Path) -> Any:
     from trimesh.resolvers import FilePathResolver
 
     class NamedFiles(FilePathResolver):
+        """Resolver of the files that a mesh file refers to."""
+
         missing: str | None = None
+        """First file that cannot be read, with the reason, for a message."""
 
         def get(self, name: str) -> bytes:
+            """Return the content of a file; its name is relative to the folder of the mesh file."""
             file = path.parent / name.replace("\\", "/")
             file = file if file.exists() else path.parent / urllib.parse.unquote(name)
             try:

@@ -34,7 +34,7 @@ def chosen_instants(
     :class:`AmiwarpError` if times lie outside the recording or do not increase.
     """
     if truth_hz is not None and truth_times_us is not None:
-        raise AmiwarpError("truth_hz and truth_times_us are both given; give only one of them")
+        raise AmiwarpError("truth_hz and truth_times_us are both given; give one of them")
     if truth_hz is not None:
         rate = real(truth_hz, "truth_hz", 1e-3, 1e6, " 1/s")
         count = int(duration_us * 1e-6 * rate) + 1
