@@ -37,9 +37,11 @@ from amiwarp.simulation.worlds.named import named_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
 CONTRAST = 0.2
+"""Contrast threshold of ON and OFF events [natural log intensity]."""
 DARKEST = 25.0 / 255.0
-"""Smallest linear luminance of a pixel that is judged."""
+"""Smallest linear luminance of the pixels that are compared."""
 Counts = tuple[int, NDArray[np.float64]]
+"""Number of events, and number of ON minus OFF events of each pixel, shape (height, width)."""
 
 
 def linear_to_srgb(light: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -49,7 +51,7 @@ def linear_to_srgb(light: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def net(x: Any, y: Any, p: Any, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the number of ON minus OFF events of each pixel."""
+    """Return the number of ON minus OFF events of each pixel, shape ``shape``."""
     out = np.zeros(shape)
     np.add.at(out, (np.asarray(y, np.int64), np.asarray(x, np.int64)), np.where(np.asarray(p) > 0, 1.0, -1.0))
     return out
@@ -65,7 +67,7 @@ def by_eventcv(frames: NDArray[np.float32], fps: float) -> Counts:
 
 
 def by_amiwarp(simulation: Simulation) -> Counts:
-    """Simulate with amiwarp."""
+    """Run a simulation of amiwarp and count its events."""
     total, out = 0, np.zeros((simulation.camera.height, simulation.camera.width))
     for events, _ in simulation.blocks():
         total += len(events)
@@ -76,7 +78,11 @@ def by_amiwarp(simulation: Simulation) -> Counts:
 def row(
     name: str, run: Callable[[], Counts], change: NDArray[np.float64], bright: Any, seconds: float
 ) -> dict[str, Any]:
-    """Time the second of two runs, and compare its events with the change of log intensity."""
+    """Return time and error of a simulator. The simulator runs twice; only the second run is timed.
+
+    ``change``: change of the log intensity from the first to the last frame; ``bright``: mask of the pixels to compare;
+    ``seconds``: simulated time [s].
+    """
     run()
     began, began_processor = time.perf_counter(), time.process_time()
     events, counts = run()
@@ -87,6 +93,7 @@ def row(
 
 
 def main() -> None:
+    """Run the benchmark, print each row, and write the rows to a file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=0.1)
     parser.add_argument("--fps", type=float, default=1000.0)

@@ -1,10 +1,10 @@
-"""Speed of simulated worlds, each row with the reprojection error of the events of its own run.
+"""Speed of the simulation of worlds. Each row gives the time and the reprojection error of the same run.
 
     python -m benchmarks.worlds [--device cuda:0] [--quick] [--out FILE.json]
 
-The error is the distance [px] between the place of an event without the prism, and the projection of the world point
-that the event saw, computed in float64 at the time of its crossing. The first run of each kind, which compiles, is not
-counted.
+The reprojection error of an event is the distance [px] between the pixel at which its scene point would appear without
+the prism, and the projection, computed in float64, of the world point that the event saw. The first run of each scene,
+which compiles kernels, is not counted.
 """
 
 from __future__ import annotations
@@ -32,15 +32,18 @@ from amiwarp.simulation.worlds.world_scene import WorldScene
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))
 WIDE = math.radians(72.0)
-"""Field of view of the picture at infinity [rad]: that of the camera, and of the prism's deflection around it."""
+"""Horizontal field of view of the picture at infinity [rad].
+
+The picture covers the field of view of the camera and a border for the prism's deflection.
+"""
 SOME = 101
-"""One event in this many is checked."""
+"""Interval of the events whose reprojection error is computed: every 101st event."""
 LATENCY_S = 1e-4
-"""Mean latency of the simulated sensor [s]; single latencies scatter by 30 us."""
+"""Mean latency of the simulated sensor [s]. The latencies of events scatter by 30 us."""
 
 
 def reprojection(scene: WorldScene, events: Events, truth: EventTruth) -> np.ndarray:
-    """Return distances [px] of some events."""
+    """Return the reprojection errors [px] of every :data:`SOME`-th event."""
     assert truth.place is not None
     assert truth.points is not None
     places = truth.place[::SOME].astype(np.float64)
@@ -54,9 +57,10 @@ def reprojection(scene: WorldScene, events: Events, truth: EventTruth) -> np.nda
 
 
 def timed(scene: Any, seconds: float, device: str, errors: list[np.ndarray] | None) -> tuple[float, float, int, Engine]:
-    """Simulate; return wall and processor time without the first map [s], the events, and the engine.
+    """Simulate a scene; return wall time [s], processor time [s], number of events, and the engine.
 
-    With ``errors``, the ground truth of each event is found too, and its reprojection errors are appended untimed.
+    The times do not include the first map. If ``errors`` is a list, the times include the ground truth of all events.
+    The reprojection errors are then appended to the list, which is not timed.
     """
     engine = Engine(Simulation(scene, CAMERA, PRISM, seconds, device=device))
     if engine._maps is not None:
@@ -76,8 +80,8 @@ def timed(scene: Any, seconds: float, device: str, errors: list[np.ndarray] | No
 
 
 def measure(name: str, scene: Any, seconds: float, device: str) -> dict[str, Any]:
-    """Simulate without and with the ground truth of events; return the row."""
-    timed(scene, 0.01, device, [])  # compiles
+    """Return the result of a scene, simulated without and with the ground truth of events."""
+    timed(scene, 0.01, device, [])  # compiles the kernels
     wall, processor, events, _ = timed(scene, seconds, device, None)
     errors: list[np.ndarray] = []
     wall_truth, processor_truth, _, engine = timed(scene, seconds, device, errors)
@@ -89,7 +93,7 @@ def measure(name: str, scene: Any, seconds: float, device: str) -> dict[str, Any
 
 
 def as_picture(name: str) -> Scene:
-    """Return the first view of a world as a picture at infinity, of twice the resolution."""
+    """Return the first view of a built-in world as a picture at infinity with about twice the camera's resolution."""
     world, path = named_world(name, "still")
     wide = Camera.from_fov(1600, 1200, WIDE)
     truth = TruthRenderer(Simulation(WorldScene(world, path, samples=4, blur=0.5), wide, Prism(0.0), 0.01)).at(0)
@@ -97,9 +101,10 @@ def as_picture(name: str) -> Scene:
 
 
 def main() -> None:
+    """Run the benchmark, print each row, and write the rows to a file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--quick", action="store_true", help="a tenth of the simulated time")
+    parser.add_argument("--quick", action="store_true", help="simulate a tenth of the time")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR

@@ -1,10 +1,10 @@
-"""Calibrate simulated worlds, with a camera at rest, in a hand, and in fast motion.
+"""Calibrate recordings of simulated worlds with a camera at rest, handheld, and in fast motion.
 
     python -m benchmarks.worlds_calibration [--device cuda:0] [--size 320 240] [--out FILE.json]
 
-The error is the rms distance [px] between the displacement of the calibrated model and that of the true prism, over
-the image and a turn. A camera that translates gives parallax, which no model of calibration has. Its largest speed in
-the image is given next to the error, as a share of the mean speed that the prism gives the image.
+The error is the rms difference [px] between the displacements of the calibrated model and of the true prism, over the
+image and a turn. A camera that translates causes parallax, which no calibration model describes. Each row therefore
+gives the largest speed of parallax in the image, and its ratio to the mean speed that the prism gives the image.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, named_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
 SECONDS, APEX, RPM = 0.4, math.radians(1.0), 720.0
+"""Length of a recording [s], true apex angle [rad], and speed of the prism [turns/min]."""
 NOMINAL = 1.1
-"""Nominal over true apex angle, so that the search range is not centred on the truth."""
+"""Ratio of the nominal to the true apex angle. It is not 1, so that the search does not start at the truth."""
 
 
 def image_speeds(scene: WorldScene, camera: Camera, device: str) -> tuple[float, float]:
-    """Return the largest speeds that the camera's translation and moving bodies give the image [px/s]."""
+    """Return the largest speeds in the image [px/s] due to the camera's translation and due to moving bodies."""
     world, t = DeviceWorld(scene.world, device), np.linspace(0.0, SECONDS, 9)
     world.set_instants(t)
     parallax = max(parallax_speed(world, camera, scene.trajectory, float(at), k) for k, at in enumerate(t))
@@ -45,7 +46,7 @@ def image_speeds(scene: WorldScene, camera: Camera, device: str) -> tuple[float,
 
 
 def row(name: str, trajectory: str, size: tuple[int, int], device: str) -> dict[str, Any]:
-    """Simulate and calibrate one recording."""
+    """Return the result of the calibration of one simulated recording."""
     camera, prism = Camera.from_fov(*size, math.radians(60.0)), Prism(APEX)
     world, path = named_world(name, trajectory, duration_s=SECONDS)
     scene = WorldScene(world, path)
@@ -70,6 +71,7 @@ def row(name: str, trajectory: str, size: tuple[int, int], device: str) -> dict[
 
 
 def main() -> None:
+    """Run the benchmark, print each row, and write the rows to a file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240))

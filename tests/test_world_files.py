@@ -125,7 +125,7 @@ MISTAKES: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "unknown in a body": (changed(body__color=1), r"field bodies\[1\].color is unknown; expected name, mesh"),
     "unknown in a lamp": (changed(lamp__power=1), r"field lamps\[0\].power is unknown"),
     "unknown in the sun": (changed(sun__colour=1), "field sun.colour is unknown"),
-    "name twice": (changed(body__name="board"), "several bodies named 'board'; give each its own name"),
+    "name twice": (changed(body__name="board"), "several bodies named 'board'; give unique names"),
     "mesh missing": (changed(body__mesh="no.ply"), r"field bodies\[1\].mesh: .*no\.ply: no such file"),
     "mesh of unknown format": (changed(body__mesh="toy.fbx"), r"unknown mesh format '.fbx'; give one of glb"),
     "scale": (changed(body__scale=0), r"field bodies\[1\].scale = 0.* is not a finite number in"),

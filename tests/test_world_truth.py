@@ -354,7 +354,7 @@ def test_instants() -> None:
     np.testing.assert_array_equal(chosen_instants(10_000, None, [5, 7000]), [5, 7000])
     assert chosen_instants(10_000).size == 0
     for given in ([-1], [10_001], [5, 5], [[1]]):
-        with pytest.raises(AmiwarpError, match="rising times within"):
+        with pytest.raises(AmiwarpError, match="must increase and lie within"):
             chosen_instants(10_000, None, given)
     with pytest.raises(AmiwarpError, match="give one of them"):
         chosen_instants(10_000, 10.0, [0])
@@ -440,7 +440,7 @@ def test_flow_as_mvsec_stores_it(recording: amiwarp.Recording, tmp_path: Path) -
             expected = np.nan_to_num(frames[2].flow_with_prism[..., axis], nan=0.0) * 0.01
             np.testing.assert_allclose(found[name][2], expected, rtol=1e-6, atol=1e-6)
     one = simulation().run(truth_times_us=[0])
-    with pytest.raises(AmiwarpError, match="needs ground truth of two instants, there are 1"):
+    with pytest.raises(AmiwarpError, match="needs ground truth of two instants, but there are 1"):
         amiwarp.save_flow_mvsec(tmp_path / "one.npz", frames_of(one))
 
 
@@ -536,8 +536,8 @@ def test_world_files_and_files_of_poses(named: Path) -> None:
     assert ok("info", "w.h5")["world"]["name"] == "mine"
     ok("simulate", "r.h5", "--world", "room", "--trajectory", "way.txt", *SHORT)
     for args, message in (
-        (("--world", "mine.toml"), "has no trajectory"),
-        (("--world", "mine.toml", "--trajectory", "fast"), "belongs to named worlds"),
+        (("--world", "mine.toml"), "has no camera trajectory"),
+        (("--world", "mine.toml", "--trajectory", "fast"), "applies only to named worlds"),
         (("--world", "cellar"), "cellar"),
         (("--world", "room", "--rotate-deg-s", "0,5,0"), "--rotate-deg-s"),
         (("--world", "room", "--preview", "seen.jpg"), "ends in .png"),

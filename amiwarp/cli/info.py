@@ -1,4 +1,4 @@
-"""``amiwarp info``: the content of a recording."""
+"""Command ``amiwarp info``: description of the content of a recording."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp info recording.h5"
 MOST_NAMES = 16
-"""Number of instances, bodies and joints that are named; ``--json`` names all."""
+"""Largest number of instances, bodies or joints whose names are printed. ``--json`` prints all names."""
 
 
 LARGE_BYTES = 1 << 28
@@ -131,6 +131,7 @@ def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
 
 
 def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
+    """Return a description of the encoder's samples, gaps and slip."""
     slip = encoder.slip()
     first, last = encoder.coverage
     return {
@@ -149,6 +150,7 @@ def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
 
 
 def _camera(recording: Recording) -> dict[str, Any]:
+    """Return the camera's intrinsics and its field of view [deg]."""
     from amiwarp.calib.result import camera_to_json
 
     camera = recording.camera
@@ -189,7 +191,7 @@ def _causes(truth: Truth, count: int | None) -> dict[str, int] | None:
 
 
 def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return table rows about the ground truth of events and of a world."""
+    """Return the rows of the table about the ground truth of events and of a world."""
     rows = []
     if d["causes"] is not None:
         total = max(sum(d["causes"].values()), 1)
@@ -212,17 +214,19 @@ def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _list(names: list[str]) -> str:
-    """Return the first :data:`MOST_NAMES` names, and the number of further ones."""
+    """Return the first :data:`MOST_NAMES` names as text, and the number of further names."""
     more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
     return ", ".join(names[:MOST_NAMES]) + more
 
 
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
+    """Return the true parameters of the prism with angles in degrees, under names that end in ``_deg``."""
     angles = ("apex", "phase", "tilt_x", "tilt_y")
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
 
 
 def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows of the printed table: names and texts."""
     n = d["events"]
     kind = f"{d['format']}, compensated ({d['outside']:,} outside)" if d["compensated"] else str(d["format"])
     takes = "" if d["count_s"] is None else f", in about {d['count_s']:.0f} s"
@@ -255,6 +259,7 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _prism_text(p: dict[str, Any] | None) -> str:
+    """Return the description of the nominal prism as text."""
     if p is None:
         return "unknown"
     apex = "apex unknown" if p["apex_deg"] is None else f"nominal apex {p['apex_deg']:.5g} deg"
@@ -262,6 +267,7 @@ def _prism_text(p: dict[str, Any] | None) -> str:
 
 
 def _encoder_text(e: dict[str, Any] | None) -> str:
+    """Return the description of the encoder as text."""
     if e is None:
         return "none"
     parts = [f"{e['samples']:,} samples, {e['rpm']:.6g} rpm, {e['turns']:.4g} turns"]

@@ -1,4 +1,4 @@
-"""``amiwarp truth``: export of the ground truth of a simulated world to the file formats of other data sets."""
+"""Command ``amiwarp truth``: export of a simulated world's ground truth to the formats of public data sets."""
 
 from __future__ import annotations
 
@@ -23,28 +23,31 @@ EXAMPLE = "amiwarp truth recording.h5 exported --flow dsec --poses tum"
 
 
 def run(
-    recording: Annotated[Path, typer.Argument(help="Native recording of a simulated world (.h5).")],
-    out: Annotated[Path, typer.Argument(help="Folder to write to."), OUTPUT_FOLDER],
+    recording: Annotated[Path, typer.Argument(help="Recording of a simulated world, in amiwarp's format (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Folder for the exported files."), OUTPUT_FOLDER],
     *,
     flow: Annotated[
         Literal["dsec", "mvsec"] | None,
         typer.Option(
-            help="Optical flow between the recorded instants. dsec: flow/forward/*.png of 16 bits and "
-            "flow/forward_timestamps.txt; mvsec: NAME_gt_flow_dist.npz."
+            help="Export optical flow between the recorded instants. dsec: writes 16-bit flow/forward/*.png and "
+            "flow/forward_timestamps.txt; mvsec: writes NAME_gt_flow_dist.npz."
         ),
     ] = None,
     with_prism: Annotated[
-        bool, typer.Option("--with-prism", help="Write the flow that is seen through the turning prism.")
+        bool, typer.Option("--with-prism", help="Export the optical flow as seen through the turning prism.")
     ] = False,
     poses: Annotated[
         Literal["tum"] | None,
-        typer.Option(help="Poses of the camera and the moving bodies. tum: poses/camera.txt, poses/body_NAME.txt."),
+        typer.Option(
+            help="Export the poses of the camera and the moving bodies. tum: writes poses/camera.txt and "
+            "poses/body_NAME.txt."
+        ),
     ] = None,
     common: Common,
 ) -> None:
-    """Export the ground truth of a simulated world: optical flow as DSEC or MVSEC store it, poses as TUM files.
+    """Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.
 
-    Flow needs a recording that was simulated with --truth-hz.
+    Flow requires a recording that was simulated with --truth-hz.
     """
     began = time.perf_counter()
     if flow is None and poses is None:
@@ -54,7 +57,7 @@ def run(
     if truth is None or (truth.frames is None and truth.poses is None):
         raise AmiwarpError(f"{recording}: holds no ground truth of a world; simulate a recording with --world")
     if flow is not None and truth.frames is None:
-        raise AmiwarpError(f"{recording}: holds no ground truth of instants; simulate the recording with --truth-hz")
+        raise AmiwarpError(f"{recording}: holds no optical flow; simulate the recording with --truth-hz")
     make_folder(out)
     data: dict[str, Any] = {"folder": str(out), "flow_maps": 0, "pose_files": 0}
     with progress("writing flow") as advance:

@@ -1,4 +1,4 @@
-"""``amiwarp view``: event clouds before and after compensation, in a window, in a browser or as a picture."""
+"""Command ``amiwarp view``: event clouds before and after compensation, in a window, a browser or a picture."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LEAST_PX, MOST_PX = 100, 8000
 
 @dataclass(frozen=True)
 class ScreenshotOptions:
-    """Options for a screenshot that is written instead of opening the page."""
+    """Options of a screenshot, which is written instead of opening the inspector's page."""
 
     screenshot: Annotated[
         Path | None,
@@ -45,14 +45,15 @@ class ScreenshotOptions:
     colour: Annotated[
         Colour,
         typer.Option(
-            help="Quantity shown by colour. Cause, instance and depth need the ground truth of a simulation.",
+            help="Quantity shown by colour. Cause, instance and depth need a simulated recording with ground truth.",
             rich_help_panel=_PICTURE,
         ),
     ] = Colour.POLARITY
     axis: Annotated[
         Axis | None,
         typer.Option(
-            help="Third axis of the plot. Default: the angle if known, otherwise time.", rich_help_panel=_PICTURE
+            help="Third axis of the plot. Default: the prism angle if known, otherwise the time.",
+            rich_help_panel=_PICTURE,
         ),
     ] = None
     dark: Annotated[bool, typer.Option("--dark", help="Use a dark background.", rich_help_panel=_PICTURE)] = False
@@ -64,7 +65,7 @@ class ScreenshotOptions:
     ] = "1400x620"
 
     def write(self, inspector: Inspector, path: Path) -> dict[str, Any]:
-        """Write the picture and return what it shows, for ``--json``.
+        """Write the picture; return a description of its content for ``--json``.
 
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
@@ -101,9 +102,9 @@ class StreamOptions:
 
     @contextlib.contextmanager
     def follow(self, source: str) -> Iterator[Callable[[], Recording] | None]:
-        """Follow the stream while the ``with`` block runs; yield a function that returns its last seconds.
+        """Follow a stream while the ``with`` block runs; yield a function that returns the stream's last seconds.
 
-        Without ``--live`` None is yielded. Waits until the stream holds one turn of the prism.
+        Waits until the stream holds one turn of the prism. Without ``--live``, yields None.
         """
         if not self.live:
             yield None
@@ -123,7 +124,7 @@ class StreamOptions:
 
 @dataclass(frozen=True)
 class PageOptions:
-    """Options for the page that shows the events."""
+    """Options of the inspector's page."""
 
     web: Annotated[
         bool,
@@ -136,7 +137,7 @@ class PageOptions:
         ),
     ] = "127.0.0.1"
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port to serve on; 0: any free port.", rich_help_panel=_SERVER)
+        int, typer.Option(min=0, max=65535, help="Port to serve on; 0 for any free port.", rich_help_panel=_SERVER)
     ] = 0
     out_dir: Annotated[
         Path | None,
@@ -149,7 +150,10 @@ class PageOptions:
     ] = None
 
     def show(self, new_inspector: Callable[[], Inspector], *, name: str, folder: Path, common: Common) -> None:
-        """Show the page in a window, or serve it for a browser, until it is closed or interrupted."""
+        """Show the inspector's page in a window, or serve the page for a browser, until closed or interrupted.
+
+        ``name``: name of the recording; ``folder``: folder for exported files.
+        """
         from amiwarp.viewer.app import has_display, open_window, serve_panel
 
         in_browser = self.web or not has_display()
@@ -167,7 +171,7 @@ class PageOptions:
 
 @dataclass(frozen=True)
 class StartOptions:
-    """Options for the parameters and the time window that the page shows first."""
+    """Options of the parameters and the time window that the inspector shows first."""
 
     calibration: Annotated[Path | None, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")] = None
     window: Annotated[
@@ -183,7 +187,10 @@ class StartOptions:
     ] = None
 
     def build(self, recording: Recording, device: str, latest: Callable[[], Recording] | None) -> Inspector:
-        """Return an inspector of the recording. ``latest`` returns the latest events of a stream."""
+        """Return an inspector of a recording.
+
+        ``latest``: function that returns the latest events of a live stream, or None.
+        """
         from amiwarp.calib import Calibration
         from amiwarp.viewer.inspector import Inspector
 
@@ -199,6 +206,7 @@ class StartOptions:
 
 
 def _checked_model(name: str) -> str:
+    """Return the name of a prism model; raise :class:`AmiwarpError` if the name is unknown."""
     from amiwarp.optics.models import MODELS
 
     if name not in MODELS:
@@ -232,7 +240,7 @@ def run(
             opened = open_recording(recording) if latest is None else latest()
             return start.build(complete(opened, camera, prism), device, latest)
 
-        waiting = [new_inspector()]  # made before the page opens, so that bad input is reported now
+        waiting = [new_inspector()]  # created before the page opens, so that bad input is reported at once
         if picture.screenshot is not None:
             data = {**picture.write(waiting[0], picture.screenshot), "device": device}
             report(common, data, _lines(data))
@@ -246,5 +254,6 @@ def run(
 
 
 def _lines(d: dict[str, Any]) -> list[str]:
+    """Return the lines that are printed about a written picture."""
     gain = f"sharpness {d['sharpness_before']:.3f} as recorded, {d['sharpness_after']:.3f} compensated"
     return [*d["notes"], f"{d['file']}: {d['events']:,} events, {d['drawn']:,} drawn; {gain}"]

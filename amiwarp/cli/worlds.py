@@ -1,4 +1,4 @@
-"""Options for simulated worlds: the world, the camera's trajectory in it, and the ground truth to record and draw."""
+"""Command-line options for simulated worlds: world, camera trajectory, and ground truth to record and draw."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _WORLD = "World"
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """Options for a three-dimensional world instead of a picture."""
+    """Options of a simulation in a three-dimensional world instead of a picture."""
 
     world: Annotated[
         str | None,
         typer.Option(
-            help="World instead of a picture: room, desk, corridor, street, ball, person, or a world file (.toml, "
-            ".json).",
+            help="Simulate a 3-D world instead of a picture: room, desk, corridor, street, ball, person, or a world "
+            "file (.toml, .json).",
             metavar="NAME|FILE",
             rich_help_panel=_WORLD,
         ),
@@ -35,8 +35,8 @@ class WorldOptions:
     trajectory: Annotated[
         str | None,
         typer.Option(
-            help="Camera's way through the world: still, handheld or fast, or a file of poses (.txt as TUM, .csv). "
-            "Default: that of the world file, or handheld.",
+            help="Camera motion in the world: still, handheld, fast, or a file of poses (.txt in TUM format, .csv). "
+            "Default: the trajectory in the world file, or handheld for a named world.",
             metavar="NAME|FILE",
             rich_help_panel=_WORLD,
         ),
@@ -45,39 +45,40 @@ class WorldOptions:
         bool,
         typer.Option(
             "--no-prism",
-            help="Take the prism out: the same scene, sensor and seed with a plain event camera. The recording then "
-            "has no encoder.",
+            help="Simulate the same scene, sensor and seed with a plain event camera without a prism. The recording "
+            "then has no encoder.",
             rich_help_panel=_WORLD,
         ),
     ] = False
     seeing: Annotated[
         Seeing | None,
         typer.Option(
-            help="How pixels see the world: maps (pictures of the world, blended between) or rays (through the prism "
-            "into the world, exact, and slow on a CPU). Default: maps.",
+            help="How the light of each pixel is computed: maps (look-up in pre-rendered pictures of the world) or "
+            "rays (ray casting through the prism: exact, but slow on a CPU). Default: maps.",
             rich_help_panel=_WORLD,
         ),
     ] = None
     motion_px: Annotated[
         float | None,
         typer.Option(
-            help="Largest motion between two maps, 0.01 to 2 (px). Smaller is more accurate and slower. Default: 0.5.",
+            help="Largest motion of the image between two maps, 0.01 to 2 (px). A smaller value is more accurate and "
+            "slower. Default: 0.5.",
             rich_help_panel=_WORLD,
         ),
     ] = None
     truth_hz: Annotated[
         float | None,
         typer.Option(
-            help="Rate at which depth, normals, instances, optical flow and intensity are recorded (1/s). Default: "
-            "never.",
+            help="Rate at which depth, normals, instances, optical flow and intensity of all pixels are recorded "
+            "(1/s). Default: not recorded.",
             rich_help_panel=_WORLD,
         ),
     ] = None
     preview: Annotated[
         Path | None,
         typer.Option(
-            help="Figure to write (.png): what the camera sees in the middle of the recording, with and without the "
-            "prism, and the depth and optical flow.",
+            help="Figure to write (.png): the view of the camera in the middle of the recording, with and without the "
+            "prism, with depth and optical flow.",
             metavar="<path>",
             rich_help_panel=_WORLD,
         ),
@@ -85,7 +86,7 @@ class WorldOptions:
     ] = None
 
     def check(self) -> None:
-        """Raise :class:`AmiwarpError` for options that do not apply."""
+        """Raise :class:`AmiwarpError` if a given option does not apply, or two options are incompatible."""
         given = {"--trajectory": self.trajectory, "--seeing": self.seeing, "--motion-px": self.motion_px,
                  "--truth-hz": self.truth_hz, "--preview": self.preview}  # fmt: skip
         if self.world is None:
@@ -95,7 +96,7 @@ class WorldOptions:
         if self.motion_px is not None and self.seeing is Seeing.RAYS:
             raise AmiwarpError("--motion-px applies to maps; give --seeing maps, or remove --motion-px")
         if self.preview is not None and self.preview.suffix.lower() != ".png":
-            raise AmiwarpError(f"{self.preview}: a preview is a PNG file; give a name that ends in .png")
+            raise AmiwarpError(f"{self.preview}: --preview writes a PNG file; give a name that ends in .png")
 
     def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
         """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""
@@ -107,7 +108,7 @@ class WorldOptions:
         return WorldScene(world, trajectory, blur=blur, **given)
 
     def draw_preview(self, simulation: Simulation) -> None:
-        """Write the preview figure if an option asks for it."""
+        """Write the preview figure if ``--preview`` is given."""
         if self.preview is None:
             return
         from amiwarp.plotting.world_preview import draw_preview

@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError
 
 
 class Cause(enum.StrEnum):
-    """Cause of a simulated event. Arrays hold its code: the position in this list, from 0.
+    """Cause of a simulated event. Arrays and files hold the code of a cause: its position in this list, from 0.
 
     Examples
     --------
@@ -25,33 +25,36 @@ class Cause(enum.StrEnum):
     """
 
     SIGNAL = "signal"
-    """Change of the light by the contrast threshold. Code 0."""
+    """Change of the light that reaches the contrast threshold. Code 0."""
     SHOT_NOISE = "shot_noise"
     """Shot noise of the photons. Code 1."""
     LEAK = "leak"
-    """Drift of the pixel's stored reference level (leak). Code 2."""
+    """Leak: drift of the pixel's stored reference level. Code 2."""
     HOT_PIXEL = "hot_pixel"
-    """Additional random events of a hot pixel. Code 3."""
+    """Additional random event of a hot pixel. Code 3."""
 
     @property
     def code(self) -> int:
-        """Number that stands for the cause in arrays and files."""
+        """Number that represents the cause in arrays and files."""
         return list(Cause).index(self)
 
 
 class EventValues(Protocol):
-    """Array with one row per event that is indexed by slices: in memory, or in a file read on demand (protocol)."""
+    """Protocol of arrays with one row per event, in memory or in a file that is read on demand.
+
+    The rows are read by slicing.
+    """
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
-        """Return the rows of a slice, shape ``(n,)`` or ``(n, k)``."""
+        """Return the rows in a slice of events, shape ``(n,)`` or ``(n, k)``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EventTruth:
-    """Ground truth of a block of events. An array is None if it is not known.
+    """Ground truth of a block of events. An array is None if its values are not known.
 
-    An event's surface is what its pixel saw through the prism at the time of the event, before the sensor's latency.
-    Events of noise have a surface too.
+    The surface of an event is the surface that the event's pixel saw through the prism when the light crossed the
+    threshold, before the latency of the sensor. Events caused by noise have a surface too.
 
     Examples
     --------
@@ -62,29 +65,29 @@ class EventTruth:
     """
 
     points: NDArray[np.float32] | None = None
-    """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``."""
+    """Position in the image at which each event's scene point would appear without the prism [px], shape ``(n, 2)``."""
     cause: NDArray[np.uint8] | None = None
-    """Code of the cause of each event, see :class:`amiwarp.Cause`, shape ``(n,)``."""
+    """Code of each event's cause, see :class:`amiwarp.Cause`, shape ``(n,)``."""
     instance: NDArray[np.uint16] | None = None
-    """Instance number of the surface, shape ``(n,)``: 0 is the sky, i + 1 is ``WorldLabels.instances[i]``."""
+    """Instance number of each event's surface, shape ``(n,)``: 0 is the sky, i + 1 is ``WorldLabels.instances[i]``."""
     depth: NDArray[np.float32] | None = None
-    """Depth of the surface along the camera's axis [m], shape ``(n,)``; infinite for the sky."""
+    """Depth of each event's surface along the optical axis [m], shape ``(n,)``; infinite for the sky."""
     place: NDArray[np.float32] | None = None
-    """Point on the surface in the world's frame [m], shape ``(n, 3)``; NaN for the sky."""
+    """Point that each event saw, in the world's frame [m], shape ``(n, 3)``; NaN for the sky."""
 
     @classmethod
     def concatenate(cls, blocks: Sequence[EventTruth]) -> EventTruth:
-        """Return the ground truth of successive blocks as one.
+        """Join the ground truth of successive blocks of events.
 
         Parameters
         ----------
         blocks : sequence of EventTruth
-            The blocks, at least one, with the same arrays.
+            At least one block. Arrays that are None in any block are None in the result.
 
         Returns
         -------
         EventTruth
-            The joined arrays.
+            Ground truth of all events.
         """
         joined: dict[str, NDArray[Any]] = {}
         for name in ("points", "cause", "instance", "depth", "place"):
@@ -96,7 +99,7 @@ class EventTruth:
 
 @dataclass(frozen=True, slots=True)
 class WorldLabels:
-    """Names of the instances in a simulated world, and their classes.
+    """Names and classes of the instances in a simulated world.
 
     Examples
     --------
@@ -110,7 +113,7 @@ class WorldLabels:
     instances: tuple[str, ...]
     """Labels of the instances. The label at index i has the instance number i + 1; number 0 is the sky."""
     categories: tuple[str, ...]
-    """Class label of each instance, in the same order; empty for an instance without a class."""
+    """Class label of each instance, in the order of ``instances``; an empty string for an instance without a class."""
 
     def __post_init__(self) -> None:
         if len(self.categories) != len(self.instances):
@@ -122,32 +125,35 @@ class WorldLabels:
 class FrameTruth:
     """Ground truth of all pixels at one instant.
 
-    Depth, normals and instances are those that the pixel would see without the prism. The arrays cover the camera's
-    image of (height, width) pixels.
+    Depth, normals and instances are given for the view without the prism. The arrays cover the camera's image of
+    (height, width) pixels.
     """
 
     t_us: int
     """Time of the instant, on the clock of the events [us]."""
     depth: NDArray[np.float32]
-    """Depth along the camera's axis [m], shape ``(height, width)``; infinite for the sky."""
+    """Depth along the optical axis [m], shape ``(height, width)``; infinite for the sky."""
     normal: NDArray[np.float32]
-    """Unit normals in the world's frame, towards the camera, shape ``(height, width, 3)``; zero for the sky."""
+    """Unit normals of the surfaces in the world's frame, shape ``(height, width, 3)``; zero for the sky.
+
+    The normals point to the side of the camera.
+    """
     instance: NDArray[np.uint16]
     """Instance numbers, shape ``(height, width)``: 0 is the sky, i + 1 is ``WorldLabels.instances[i]``."""
     flow: NDArray[np.float32]
-    """Optical flow without the prism [px/s], shape ``(height, width, 2)``; NaN where a point leaves the image plane."""
+    """Optical flow without the prism [px/s], shape ``(height, width, 2)``; NaN where a point cannot be projected."""
     flow_with_prism: NDArray[np.float32]
-    """Optical flow of the scene that the pixel sees through the turning prism [px/s], shape ``(height, width, 2)``."""
+    """Optical flow that the pixels see through the turning prism [px/s], shape ``(height, width, 2)``."""
     intensity: NDArray[np.float32]
     """Linear luminance without the prism, shape ``(height, width)``."""
     intensity_with_prism: NDArray[np.float32]
     """Linear luminance through the prism, shape ``(height, width)``."""
     rotation: NDArray[np.float64]
-    """Orientation of the camera: matrix from its frame to the world's, shape ``(3, 3)``."""
+    """Rotation matrix from the camera's frame to the world's frame, shape ``(3, 3)``."""
     position: NDArray[np.float64]
     """Position of the camera in the world [m], shape ``(3,)``."""
     joints: dict[str, NDArray[np.float64]]
-    """Positions of the world's joints by name [m], shape ``(3,)`` each."""
+    """Positions of the named points of the world, such as the joints of a figure [m], shape ``(3,)`` each."""
 
 
 MAPS = {
@@ -159,11 +165,11 @@ MAPS = {
     "intensity": (np.float32, ()),
     "intensity_with_prism": (np.float32, ()),
 }
-"""Data types of the maps of :class:`FrameTruth`, and their shapes after (height, width)."""
+"""Arrays of :class:`FrameTruth` with one value per pixel: data type, and shape after (height, width)."""
 
 
 class FrameStore(Protocol):
-    """Ground truth of several instants, in memory or in a file that is read on demand (protocol)."""
+    """Protocol of the ground truth of several instants, in memory or in a file that is read on demand."""
 
     @property
     def t(self) -> NDArray[np.int64]:
@@ -174,7 +180,7 @@ class FrameStore(Protocol):
 
 
 class MemoryFrames:
-    """Ground truth of several instants that is held in memory."""
+    """Ground truth of several instants, held in memory."""
 
     def __init__(self, frames: list[FrameTruth]) -> None:
         self._frames = frames
@@ -190,10 +196,10 @@ class MemoryFrames:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses of a camera, of the bodies that move and of joints at several times.
+    """Poses of a camera and of moving bodies, and positions of joints, at several times.
 
-    A pose has seven numbers: position x, y, z in the world [m], and orientation as a unit quaternion x, y, z, w, from
-    the frame of the camera or body to the world's.
+    A pose has seven numbers: the position x, y, z in the world [m], and the orientation as a unit quaternion x, y, z,
+    w. The quaternion rotates from the frame of the camera or body to the world's frame.
 
     Examples
     --------
@@ -204,22 +210,22 @@ class Poses:
     """
 
     t: NDArray[np.int64]
-    """Times of the poses on the clock of the events [us], increasing, shape ``(k,)``."""
+    """Times of the poses, on the clock of the events [us], increasing, shape ``(k,)``."""
     camera: NDArray[np.float64]
     """Poses of the camera, shape ``(k, 7)``."""
     bodies: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Poses of the moving bodies by name, shape ``(k, 7)`` each."""
     joints: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    """Positions of the joints by name [m], shape ``(k, 3)`` each."""
+    """Positions of named points in the world, such as joints [m], shape ``(k, 3)`` each."""
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Poses]) -> Poses:
-        """Return successive tables of poses as one.
+        """Join successive tables of poses.
 
         Parameters
         ----------
         blocks : sequence of Poses
-            The tables, at least one, with the same bodies and joints.
+            At least one table. All tables have the same bodies and joints.
 
         Returns
         -------
@@ -280,10 +286,13 @@ class MemoryMasks:
 
 
 class PoseStore(Protocol):
-    """Poses that are indexed by slices: :class:`amiwarp.Poses`, or a file that is read on demand (protocol)."""
+    """Protocol of tables of poses: :class:`amiwarp.Poses`, or a file that is read on demand.
+
+    The poses are read by slicing.
+    """
 
     def __len__(self) -> int:
-        """Return the number of times for which there are poses."""
+        """Return the number of times."""
 
     def __getitem__(self, which: slice, /) -> Poses:
         """Return the poses at the times in a slice."""

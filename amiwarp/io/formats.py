@@ -1,4 +1,4 @@
-"""Formats of recordings, detected from the file's content, and the function that opens all of them."""
+"""Detection of the format of a recording from its content, and a function that opens recordings of all formats."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from amiwarp.validation import choice
 
 
 class Format(enum.StrEnum):
-    """Formats of recordings that can be read."""
+    """File formats of recordings that amiwarp reads."""
 
     HDF5 = "hdf5"
-    """Native recording, or event file of DSEC, TUM-VIE, M3ED, MVSEC or Prophesee."""
+    """HDF5 file: native recording of amiwarp, or event file of DSEC, TUM-VIE, M3ED, MVSEC or Prophesee."""
     EVT = "evt"
-    """Prophesee RAW, EVT 2.0, 2.1 and 3.0."""
+    """Prophesee RAW file with the encoding EVT 2.0, 2.1 or 3.0."""
     DAT = "dat"
-    """Prophesee DAT."""
+    """Prophesee DAT file."""
     AEDAT4 = "aedat4"
-    """iniVation AEDAT 4.0."""
+    """iniVation AEDAT 4.0 file."""
     AEDAT3 = "aedat3"
-    """iniVation AEDAT 3.1."""
+    """iniVation AEDAT 3.1 file."""
     AEDAT2 = "aedat2"
-    """jAER AEDAT 2.0 of the DVS128 and the DAVIS cameras."""
+    """AEDAT 2.0 file, which jAER records with the DVS128 and the DAVIS cameras."""
     ROSBAG = "rosbag"
-    """Bag of ROS 1, or of ROS 2 (SQLite or MCAP)."""
+    """ROS 1 bag, or ROS 2 bag (SQLite or MCAP)."""
     ES = "es"
-    """Event Stream."""
+    """Event Stream (.es) file."""
     TEXT = "text"
-    """Text of the Event Camera Dataset: lines ``t x y p``, with t in seconds."""
+    """Text file in the format of the Event Camera Dataset: lines of ``t x y p``, with t in seconds."""
     NPZ = "npz"
-    """NumPy archive with the arrays x, y, t and p, or of N-ImageNet or EV-IMO."""
+    """NumPy archive with the arrays x, y, t and p, or with those of N-ImageNet or EV-IMO."""
     EVIMO = "evimo"
-    """Folder of EV-IMO2."""
+    """Folder of NumPy files of the EV-IMO2 data set."""
     BIN = "bin"
-    """Events of 5 bytes of N-MNIST and N-Caltech101."""
+    """Binary file of the N-MNIST and N-Caltech101 data sets, with 5 bytes per event."""
 
 
 SIGNATURES = (
@@ -57,10 +57,10 @@ SIGNATURES = (
     (b"Event Stream", Format.ES),
     (b"PK\x03\x04", Format.NPZ),
 )
-"""First bytes of the formats that have a signature."""
+"""Pairs of a file's first bytes and the format that they identify."""
 
 FOLDERS = (("metadata.yaml", Format.ROSBAG), ("dataset_events_t.npy", Format.EVIMO))
-"""Files by which the formats are recognised that are folders."""
+"""Pairs of the name of a file in a folder and the format that the file identifies."""
 
 
 def detect_format(path: Path) -> Format:
@@ -93,11 +93,13 @@ def detect_format(path: Path) -> Format:
 
 
 def _is_evt(head: bytes) -> bool:
+    """Return whether the first bytes of a Prophesee file are the header of a RAW (EVT) file."""
     lines = head.split(b"\n")
     return any(line.startswith((b"% evt ", b"% format EVT")) for line in lines)
 
 
 def _looks_like_text(head: bytes) -> bool:
+    """Return whether the first line without a comment consists of two or four numbers."""
     line = next((line for line in head.split(b"\n") if line.strip() and not line.lstrip().startswith(b"#")), b"")
     try:
         return len([float(word) for word in line.split()]) in (2, 4)
@@ -116,22 +118,22 @@ def open_recording(
     Parameters
     ----------
     path : str or path-like
-        The file.
+        Recording to open.
     format : Format or str, optional
-        The format. By default it is detected from the content.
+        Format of the file. By default, the format is detected from the content.
     topic : str, optional
-        The topic of a ROS bag, or the camera of an HDF5 file, if the file holds several: for example ``/dvs/events`` or
-        ``davis/left``. The error without it lists them.
+        Topic of a ROS bag, or camera of an HDF5 file, if the file holds several: for example ``/dvs/events`` or
+        ``davis/left``. The error for a missing topic lists all topics of the file.
 
     Returns
     -------
     Recording
-        The recording. Its events are read on demand.
+        The recording, whose events are read on demand.
 
     Raises
     ------
     AmiwarpError
-        If the file cannot be read. The message gives the file and the position.
+        If the file cannot be read. The message names the file and the position in the file.
 
     Examples
     --------
@@ -164,7 +166,7 @@ OPENERS = {
     Format.EVIMO: "npz:open_evimo",
     Format.BIN: "nmnist:open_bin",
 }
-"""Modules of amiwarp.io and their functions that open the formats."""
+"""Function that opens each format, as ``module:function`` within :mod:`amiwarp.io`."""
 
 
 def _opener(chosen: Format) -> Callable[..., Recording]:

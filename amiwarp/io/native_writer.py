@@ -118,14 +118,11 @@ class RecordingWriter:
         self._new: NewFile | None = None
         self._spare = contextlib.ExitStack()
         self._pending: list[Columns] = []
-        self._pending_count = 0
-        self._written = 0
+        self._written = self._pending_count = 0
         self._columns: dict[str, np.dtype[Any]] | None = None
-        self._t_offset = 0
+        self._t_offset = self._next_ms = self._ms_count = 0
         self._t_last: int | None = None
-        self._next_ms = 0
         self._ms: list[NDArray[np.int64]] = []
-        self._ms_count = 0
 
     def __len__(self) -> int:
         return self._written + self._pending_count
@@ -375,12 +372,8 @@ class RecordingWriter:
 
     def _write_header(self) -> None:
         write_header(self._file, self._size, self._camera, self._prism, self._metadata)
-        if self._truth_parameters is not None:
-            group = self._file.create_group("truth")
-            for name, value in self._truth_parameters.items():
-                group.attrs[name] = float(value)
-        if self._truth_labels is not None and self._truth is not None:
-            self._truth.write_labels(self._truth_labels)
+        if self._truth is not None:
+            self._truth.write_header(self._truth_parameters, self._truth_labels)
 
     def _finish(self) -> None:
         self._flush(whole=self._pending_count)

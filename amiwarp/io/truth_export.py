@@ -1,6 +1,6 @@
-"""Ground truth in the files of other data sets: optical flow as in DSEC and MVSEC, poses as in TUM.
+"""Export of ground truth to the formats of public data sets: optical flow for DSEC and MVSEC, poses for TUM.
 
-The conventions are described in ``docs/reference/recording-format.md``.
+``docs/reference/recording-format.md`` describes the conventions.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from amiwarp.io.atomic_output import NewFile, make_folder
 from amiwarp.progress import Progress
 
 DSEC_SCALE, DSEC_ZERO = 128.0, 1 << 15
-"""Steps per pixel of displacement in DSEC's flow pictures, and the number that stands for displacement 0."""
+"""Encoding of displacements in DSEC's flow pictures: levels per pixel, and the level of displacement 0."""
 
 POSE_ROWS = 1 << 14
-"""Number of poses that are written at a time."""
+"""Number of poses that are read and written at a time."""
 
 
 def save_flow_dsec(
@@ -38,12 +38,12 @@ def save_flow_dsec(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> int:
-    """Write optical flow as DSEC stores it: ``forward/000000.png`` ... and ``forward_timestamps.txt``.
+    """Write optical flow in the DSEC format: ``forward/000000.png`` ... and ``forward_timestamps.txt``.
 
     Parameters
     ----------
     folder : str or path-like
-        Folder to write to. It is created if it does not exist.
+        Folder to write to, which is created if necessary.
     frames : FrameStore
         Ground truth of at least two instants.
     with_prism : bool, default False
@@ -51,12 +51,12 @@ def save_flow_dsec(
     overwrite : bool, default False
         Whether existing files may be replaced.
     progress : callable, optional
-        Called with the name of the step and the finished fraction.
+        Function that is called with the name of the present step and the finished fraction.
 
     Returns
     -------
     int
-        Number of pictures: one per interval between two instants.
+        Number of written pictures: one per interval between two instants.
 
     Raises
     ------
@@ -65,9 +65,9 @@ def save_flow_dsec(
 
     Notes
     -----
-    A picture has 16 bits and three channels: x and y displacement, times 128, plus 2¹⁵, and 1 for known pixels. The
-    displacement is that from the first instant of the interval to the second: the flow at the first, times the
-    interval. Displacements of 256 px and more do not fit and count as unknown.
+    A picture has three channels of 16 bits: x and y displacement, each times 128 plus 2¹⁵, and 1 for known pixels. The
+    displacement over an interval is the flow at the first instant times the length of the interval. Displacements of
+    256 px and more do not fit into the format and count as unknown.
 
     Examples
     --------
@@ -83,7 +83,7 @@ def save_flow_dsec(
     intervals = _intervals(frames)
     folder = Path(folder)
     make_folder(folder / "forward")
-    with contextlib.ExitStack() as files:  # all files appear at the end, or none
+    with contextlib.ExitStack() as files:  # either all files appear at the end, or no file
         lines = ["# from_timestamp_us, to_timestamp_us"]
         for index, (start, stop) in enumerate(intervals):
             moved = _displacement(frames, index, stop - start, with_prism=with_prism)
@@ -105,12 +105,12 @@ def save_flow_mvsec(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> int:
-    """Write optical flow as MVSEC stores it: a .npz file with ``timestamps``, ``x_flow_dist`` and ``y_flow_dist``.
+    """Write optical flow in the MVSEC format: arrays ``timestamps``, ``x_flow_dist``, ``y_flow_dist`` in a .npz file.
 
     Parameters
     ----------
     path : str or path-like
-        File to write, ending in .npz.
+        File to write, with the suffix .npz.
     frames : FrameStore
         Ground truth of at least two instants.
     with_prism : bool, default False
@@ -118,12 +118,12 @@ def save_flow_mvsec(
     overwrite : bool, default False
         Whether an existing file may be replaced.
     progress : callable, optional
-        Called with the name of the step and the finished fraction.
+        Function that is called with the name of the present step and the finished fraction.
 
     Returns
     -------
     int
-        Number of maps: one per instant.
+        Number of written flow maps: one per instant.
 
     Raises
     ------
@@ -132,9 +132,9 @@ def save_flow_mvsec(
 
     Notes
     -----
-    ``timestamps`` are in seconds, shape (k,). The maps have shape (k, height, width) and hold displacements [px] from
-    an instant to the next: the flow at the instant, times the interval. The last map takes the last interval again.
-    Unknown pixels hold 0, which MVSEC's evaluations leave out.
+    ``timestamps`` are in seconds, shape (k,). The flow maps have shape (k, height, width) and hold displacements [px]
+    from an instant to the next: the flow at the instant, times the interval. For the last instant, the last interval is
+    used again. Unknown pixels hold 0, which evaluations on MVSEC ignore.
 
     Examples
     --------
@@ -149,7 +149,7 @@ def save_flow_mvsec(
     """
     path = Path(path)
     if path.suffix.lower() != ".npz":
-        raise AmiwarpError(f"{path}: MVSEC's flow is a .npz file; give a name that ends in .npz")
+        raise AmiwarpError(f"{path}: MVSEC stores flow in a .npz file; give a name that ends in .npz")
     intervals = _intervals(frames)
     lengths = [stop - start for start, stop in intervals]
     lengths.append(lengths[-1])
@@ -174,23 +174,23 @@ def save_flow_mvsec(
 def save_poses_tum(
     path: str | os.PathLike[str], poses: PoseStore, *, body: str | None = None, overwrite: bool = False
 ) -> None:
-    """Write poses as a TUM file: lines of ``timestamp tx ty tz qx qy qz qw``.
+    """Write poses to a TUM file: lines of ``timestamp tx ty tz qx qy qz qw``.
 
     Parameters
     ----------
     path : str or path-like
         File to write.
     poses : PoseStore
-        The poses.
+        Poses of the camera and of moving bodies.
     body : str, optional
-        Name of the body whose poses are written. By default the camera's are.
+        Name of the body whose poses are written. By default, the poses of the camera are written.
     overwrite : bool, default False
         Whether an existing file may be replaced.
 
     Raises
     ------
     AmiwarpError
-        If there is no such body, or the file cannot be written.
+        If no poses of this body are stored, or the file cannot be written.
 
     Examples
     --------
@@ -216,18 +216,21 @@ def _intervals(frames: FrameStore) -> list[tuple[int, int]]:
     """Return the intervals between instants [us]; raise :class:`AmiwarpError` if there are fewer than two instants."""
     t = [int(at) for at in frames.t]
     if len(t) < 2:
-        raise AmiwarpError(f"flow needs ground truth of two instants, there are {len(t)}; simulate with --truth-hz")
+        raise AmiwarpError(f"flow needs ground truth of two instants, but there are {len(t)}; simulate with --truth-hz")
     return list(itertools.pairwise(t))
 
 
 def _displacement(frames: FrameStore, index: int, length_us: int, *, with_prism: bool) -> NDArray[np.float64]:
-    """Return the displacement of each pixel's point within ``length_us`` [px], shape (height, width, 2)."""
+    """Return the displacement [px] of the point that each pixel sees, within ``length_us`` [us].
+
+    The shape is (height, width, 2).
+    """
     frame = frames[index]
     return np.asarray((frame.flow_with_prism if with_prism else frame.flow).astype(np.float64) * (length_us * 1e-6))
 
 
 def dsec_picture(displacement: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Return displacements as a flow picture of DSEC, shape (height, width, 3)."""
+    """Encode displacements [px], shape (height, width, 2), as a flow picture of DSEC, shape (height, width, 3)."""
     known: NDArray[np.bool_] = np.asarray(np.isfinite(displacement).all(axis=2))
     levels = np.rint(np.where(known[..., None], displacement, 0.0) * DSEC_SCALE) + DSEC_ZERO
     known &= np.asarray(((levels >= 0) & (levels < 1 << 16)).all(axis=2))
@@ -239,13 +242,14 @@ def encode_png16(picture: NDArray[np.uint16]) -> bytes:
     """Encode a picture as PNG with three channels of 16 bits, which Pillow cannot write."""
     height, width, _ = picture.shape
     rows = picture.astype(">u2").reshape(height, -1).view(np.uint8)
-    lines = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)  # each line begins with its filter: none
+    lines = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)  # each row begins with PNG filter type 0
     header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
     parts = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(_png_part(kind, data) for kind, data in parts)
 
 
 def _png_part(kind: bytes, data: bytes) -> bytes:
+    """Return a chunk of a PNG file: length, kind, data and checksum."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 

@@ -1,6 +1,6 @@
-"""Reader of the ground truth in native recordings. Events, instants and poses are read on demand.
+"""Reader of the ground truth in native recordings, which reads events, instants and poses on demand.
 
-The format is described in ``docs/reference/recording-format.md``.
+``docs/reference/recording-format.md`` describes the format.
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ from amiwarp.io.input_files import errors_name
 from amiwarp.io.truth_writer import EVENT_COLUMNS
 
 Read = Callable[[int, int], NDArray[Any]]
-"""Function that reads rows from ``start`` up to ``stop`` (excluded) of a dataset."""
+"""Function that returns the rows of a dataset from ``start`` up to ``stop`` (excluded)."""
 
 
 def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
-    """Return the ground truth of a file of ``count`` events of a sensor of ``size`` (width, height) [px]."""
+    """Return the ground truth of a file with ``count`` events.
+
+    ``size``: width and height of the sensor [px].
+    """
     attributes = file.attributes("truth") or {}
     values = {name: _event_values(path, file, name, count) for name in EVENT_COLUMNS}
     return Truth(
@@ -45,11 +48,11 @@ def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) ->
 
 
 class _StoredRows:
-    """Rows of a dataset, or of several datasets as columns, that are read on demand."""
+    """Rows of a dataset, or of several datasets side by side, that are read on demand."""
 
     def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
         self._path, self._name, self._count, self._read = path, name, count, read
-        self._file = file  # keeps the file open, because its columns refer to it weakly
+        self._file = file  # keeps the file open: the columns hold only a weak reference to the file
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
         start, stop, _ = which.indices(self._count)
@@ -58,19 +61,24 @@ class _StoredRows:
 
 
 def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
+    """Return the true points of the events, or None if they are not stored."""
     if "truth/x" not in file.columns:
         return None
     x, y = (_column(file, f"truth/{name}") for name in ("x", "y"))
     if len(x) != count or len(y) != count:
-        raise AmiwarpError(f"{path}: truth has {len(x)} and {len(y)} points for {count} events; the file is damaged")
+        raise AmiwarpError(
+            f"{path}: truth/x and truth/y have {len(x)} and {len(y)} rows for {count} events; the file is damaged"
+        )
     return _StoredRows(path, "truth", count, partial(_read_points, x, y), file)
 
 
 def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.float32]:
+    """Return rows of two datasets as points [px], shape (n, 2)."""
     return np.stack([x.read(start, stop), y.read(start, stop)], axis=1).astype(np.float32, copy=False)
 
 
 def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> EventValues | None:
+    """Return the values of the dataset ``truth/events/name``, or None if the dataset is missing."""
     column = file.columns.get(f"truth/events/{name}")
     if column is None:
         return None
@@ -94,6 +102,7 @@ def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
 
 
 def _labels(path: Path, file: Hdf5File) -> WorldLabels | None:
+    """Return the names and classes of the instances, or None if they are not stored."""
     if "truth/world/instances" not in file.columns:
         return None
     name = attribute(file.attributes("truth/world") or {}, f"{path}: /truth/world", "name", str, "")
@@ -103,7 +112,7 @@ def _labels(path: Path, file: Hdf5File) -> WorldLabels | None:
 
 
 def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
-    """Return the names in a dataset; none if the dataset is missing."""
+    """Return the names in a dataset; an empty tuple if the dataset is missing."""
     column = file.columns.get(name)
     if column is None:
         return ()
@@ -111,9 +120,12 @@ def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
 
 
 def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
-    """Return a dataset; raise :class:`AmiwarpError` if it is missing or does not have the expected shape."""
+    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
+
+    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
+    """
     if name not in file.columns:
-        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
+        raise AmiwarpError(f"dataset '{name}' is missing; the file is incomplete")
     column = file.columns[name]
     shape = (len(column), *column.row)
     expected = (len(column) if count is None else count, *(column.row if row is None else row))
@@ -123,7 +135,7 @@ def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int,
 
 
 class _StoredFrames:
-    """Ground truth of all pixels at several instants, read on demand."""
+    """Ground truth of all pixels at several instants, read from a file on demand."""
 
     def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
         self._path, self._file = path, file
@@ -174,7 +186,7 @@ class _StoredMasks:
 
 
 class _StoredPoses:
-    """Poses of camera, bodies and joints, read on demand."""
+    """Poses of camera, bodies and joints, read from a file on demand."""
 
     def __init__(self, path: Path, file: Hdf5File) -> None:
         self._path, self._file = path, file

@@ -1,6 +1,6 @@
-"""Writer of the ground truth of worlds into native recordings: of each event, of chosen instants, and poses.
+"""Writer of a simulated world's ground truth into native recordings: of each event, of chosen instants, and poses.
 
-The format is described in ``docs/reference/recording-format.md``.
+``docs/reference/recording-format.md`` describes the format.
 """
 
 from __future__ import annotations
@@ -23,14 +23,17 @@ EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
     "depth": (np.float32, ()),
     "place": (np.float32, (3,)),
 }
-"""Datasets of ``truth/events``: their data types, and the shapes of their rows."""
+"""Names of the datasets in ``truth/events``, with the data type and the shape of a row."""
 
 POSE_ROWS = 1024
-"""Number of rows per chunk of the datasets of poses."""
+"""Number of rows per HDF5 chunk in the datasets of poses."""
 
 
 def event_columns(truth: EventTruth, count: int) -> Columns:
-    """Return the datasets of the ground truth of ``count`` events; raise :class:`AmiwarpError` for other lengths."""
+    """Return the ground truth of ``count`` events as datasets.
+
+    Raises :class:`AmiwarpError` for arrays of another length or shape.
+    """
     columns: Columns = {}
     if truth.points is not None:
         points = np.asarray(truth.points, np.float32)
@@ -50,7 +53,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
 class TruthWriter:
     """Writer of labels, instants and poses into an open HDF5 file.
 
-    Each instant and each table of poses must have the same arrays as the first.
+    All instants must have the same joints. All tables of poses must have the same bodies and joints.
     """
 
     def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
@@ -59,14 +62,20 @@ class TruthWriter:
         self._datasets: dict[str, Any] = {}
         self._names: dict[str, tuple[str, ...]] = {}
 
-    def write_labels(self, labels: WorldLabels) -> None:
-        """Write the names of a world's instances and their classes."""
+    def write_header(self, parameters: Mapping[str, float] | None, labels: WorldLabels | None) -> None:
+        """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
+        if parameters is not None:
+            group = self._file.create_group("truth")
+            for name, value in parameters.items():
+                group.attrs[name] = float(value)
+        if labels is None:
+            return
         self._file.require_group("truth/world").attrs["name"] = labels.name
         self._write_names("truth/world/instances", labels.instances)
         self._write_names("truth/world/categories", labels.categories)
 
     def append_frame(self, frame: FrameTruth) -> None:
-        """Append the ground truth of an instant, which must be later than those before."""
+        """Append the ground truth of an instant, which must be later than the previous instants."""
         width, height = self._size
         rows: dict[str, NDArray[Any]] = {}
         for name, (dtype, tail) in MAPS.items():
@@ -84,7 +93,7 @@ class TruthWriter:
             self._append(f"truth/frames/{name}", values[None], 1)
 
     def append_poses(self, poses: Poses) -> None:
-        """Append poses, which must be later than those before."""
+        """Append a table of poses, which must be later than the previous poses."""
         if not len(poses):
             return
         self._check_later("truth/poses/t", int(poses.t[0]))
@@ -105,12 +114,13 @@ class TruthWriter:
         self._append("truth/known/mask", np.asarray(mask, np.uint8)[None], 1)
 
     def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
+        """Append the positions of joints [m], shape (k, 3) each, to the dataset ``name``."""
         if joints:
             self._keep_names("truth/joints/names", joints)
             self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), POSE_ROWS)
 
     def _keep_names(self, name: str, given: Iterable[str]) -> None:
-        """Write names at the first call, and check that later calls give the same names."""
+        """Write the names at the first call, and check that later calls give the same names."""
         names = tuple(given)
         if name not in self._names:
             self._names[name] = names
@@ -119,6 +129,7 @@ class TruthWriter:
             raise AmiwarpError(f"{self._path}: {name} changed between calls; give the same names in the same order")
 
     def _write_names(self, name: str, names: tuple[str, ...]) -> None:
+        """Write names to a dataset of UTF-8 strings."""
         import h5py
 
         encoded = [text.encode("utf-8", "replace") for text in names]
@@ -126,6 +137,7 @@ class TruthWriter:
         self._file.create_dataset(name, data=np.array(encoded, kind))
 
     def _check_later(self, name: str, t: int) -> None:
+        """Raise :class:`AmiwarpError` if the time ``t`` [us] does not follow the last time in a dataset."""
         stored = self._datasets.get(name)
         if stored is not None and t <= int(stored[-1]):
             raise AmiwarpError(
@@ -133,7 +145,7 @@ class TruthWriter:
             )
 
     def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
-        """Append rows to a dataset through HDF5."""
+        """Append rows to a dataset, which is created at the first call with ``chunk_rows`` rows per chunk."""
         if name not in self._datasets:
             self._datasets[name] = make_dataset(
                 self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec

@@ -11,7 +11,7 @@ FISHEYE = wp.constant(2)
 NEWTON_STEPS = wp.constant(12)
 LARGEST_RESIDUAL = wp.constant(
     1.0e-6
-)  # largest error of a converged inverse relative to 1 + radius: 1e-3 px at f = 1000 px
+)  # largest error of a converged inverse relative to 1 + radius: 1e-3 px at a focal length of 1000 px
 NAN = wp.constant(float("nan"))
 
 

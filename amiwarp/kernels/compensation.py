@@ -20,7 +20,7 @@ from amiwarp.kernels.vector_code import (
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-BLOCK = wp.constant(64)  # events per CPU thread, which displaces eight at a time
+BLOCK = wp.constant(64)  # number of events per CPU thread, which displaces eight at a time
 
 
 @wp.struct

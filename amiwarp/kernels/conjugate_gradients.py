@@ -11,21 +11,21 @@ from amiwarp.kernels.map_prior import Prior, prior_diagonal, prior_product
 
 wp.set_module_options({"enable_backward": False})
 
-FIXED = wp.constant(wp.float64(4294967296.0))  # 2**32: unit of the sums
+FIXED = wp.constant(wp.float64(4294967296.0))  # 2**32: fixed-point units per 1 in the sums
 NO_PREVIOUS = wp.constant(
     wp.float64(1.0e300)
 )  # initial value of the previous r·z, so that the first search direction is z
-CPU_WIDTH = 4096  # unknowns per CPU thread
+CPU_WIDTH = 4096  # number of unknowns per CPU thread
 
 
 @wp.struct
 class Unknowns:
     """Vectors of the conjugate-gradient method, with one element per unknown that is solved for."""
 
-    diagonal: wp.array(dtype=float)  # of the operator, prior included
-    residual: wp.array(dtype=float)  # r, of the normal equations
+    diagonal: wp.array(dtype=float)  # diagonal of the operator, prior included
+    residual: wp.array(dtype=float)  # r, the residual of the normal equations
     direction: wp.array(dtype=float)  # p, the search direction
-    product: wp.array(dtype=float)  # q: the operator's times p
+    product: wp.array(dtype=float)  # q, the product of the operator and p
 
 
 @wp.struct
@@ -33,7 +33,7 @@ class Dots:
     """Dot products of the conjugate-gradient method on the device."""
 
     scalars: wp.array(dtype=wp.float64)  # r·z of the present search direction, and of the next
-    pq: wp.array(dtype=wp.float64)  # partial sums
+    pq: wp.array(dtype=wp.float64)  # partial sums of p·q
     rz: wp.array(dtype=wp.float64)
 
 

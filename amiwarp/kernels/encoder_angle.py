@@ -20,7 +20,7 @@ class EncoderParams:
     """
 
     origin: wp.int64  # event time at the start of the first bucket [us]
-    shift: int  # a bucket is 2**shift us long
+    shift: int  # base-2 logarithm of the length of a bucket of time [us]
     first: wp.array(dtype=int)  # index of the piece at the start of each bucket; shape (buckets + 1,)
     start: wp.array(dtype=wp.int64)  # first event time of each piece, relative to the origin [us]
     angle: wp.array(dtype=wp.uint64)  # prism angle at the start of each piece [2**-64 turn]

@@ -20,41 +20,41 @@ from amiwarp.kernels.prism_view import (
 
 wp.set_module_options({"enable_backward": False})
 
-TICKS = wp.constant(16)  # per microsecond
+TICKS = wp.constant(16)  # ticks per microsecond
 HALF_TICKS = wp.constant(8)
 TICK_BITS = wp.constant(4)
 LOW_BITS = wp.constant(22)  # lowest bits of a key: lag (19), cause (2), polarity (1); pixel and time are above them
 LOW_MASK = wp.constant((1 << 22) - 1)
-SIGNAL = wp.constant(0)  # causes of an event
+SIGNAL = wp.constant(0)  # codes of the causes of an event, as in amiwarp.Cause
 SHOT_NOISE = wp.constant(1)
 LEAK = wp.constant(2)
 HOT_PIXEL = wp.constant(3)
-LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the step rises by less than this many drifts
+LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the level rises by less than this multiple of the drift
 LARGEST_LAG = wp.constant((1 << 19) - 1)
 LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time stamp may make the lag slightly negative
 NEVER = wp.constant(wp.int64(-(1 << 60)))
 NO_NOISE = wp.constant(wp.int64(1 << 60))
-SMALLEST_THRESHOLD = wp.constant(0.1)  # relative to the nominal threshold, so that mismatch cannot remove a threshold
-PAST_STEP = wp.constant(2.0)  # a fraction of the step beyond its end
+SMALLEST_THRESHOLD = wp.constant(0.1)  # smallest threshold relative to the nominal one, which mismatch cannot undercut
+PAST_STEP = wp.constant(2.0)  # fraction of a step that means: after the end of the step
 
 
 @wp.struct
 class SensorParams:
     """Sensor parameters in the units of the simulator."""
 
-    on: float  # nominal ON and OFF thresholds [log intensity]
-    off: float
+    on: float  # nominal ON threshold [log intensity]
+    off: float  # nominal OFF threshold [log intensity]
     mismatch: float  # relative standard deviation of both thresholds
-    leak: float  # thresholds per step
+    leak: float  # mean leak [thresholds per step]
     leak_jitter: float  # relative standard deviation of the leak between two events of a pixel
     noise: float  # shot noise in the dark [events per tick]
     noise_white: float  # shot noise at white, relative to that in the dark
     spread: float  # standard deviation of ln(leak) and ln(shot noise) between pixels
-    hot_fraction: float
-    hot: float  # events per tick
-    refractory: wp.int64  # ticks
-    latency: float  # ticks
-    jitter: float  # ticks, standard deviation
+    hot_fraction: float  # fraction of the pixels that are hot
+    hot: float  # rate of additional random events of hot pixels [events per tick]
+    refractory: wp.int64  # refractory period [ticks]
+    latency: float  # mean latency [ticks]
+    jitter: float  # standard deviation of the latency [ticks]
     bandwidth: float  # photoreceptor's angular cut-off frequency per unit of exp(level) [1/step]
     dark: float  # luminance added before the logarithm
 
@@ -65,24 +65,24 @@ class Pixel:
 
     level: float  # level at the last step, after the photoreceptor [log intensity]
     reference: float  # reference level [log intensity]
-    on: float  # ON and OFF thresholds of this pixel [log intensity]
-    off: float
-    leak: float  # of this pixel, without jitter [thresholds per step]
+    on: float  # ON threshold of this pixel [log intensity]
+    off: float  # OFF threshold of this pixel [log intensity]
+    leak: float  # leak of this pixel, without jitter [thresholds per step]
     noise: float  # shot noise of this pixel in the dark [events per tick]
-    hot: float  # additional noise of a hot pixel [events per tick]; 0 for others
-    rng: wp.uint32
+    hot: float  # rate of additional random events if the pixel is hot [events per tick], else 0
+    rng: wp.uint32  # state of the random number generator
     blind_until: wp.int64  # end of the refractory period; NEVER if it has passed
-    next_noise: wp.int64
-    last_stamp: wp.int64  # [us]
+    next_noise: wp.int64  # time of the next random event; NO_NOISE for none
+    last_stamp: wp.int64  # time stamp of the pixel's last event [us]
 
 
 @wp.struct
 class Interval:
     """Time interval over which a pixel is advanced: a step, or one of the equal pieces of a step."""
 
-    ticks: int
-    per_tick: float  # intervals per tick
-    drift: float  # of the reference, caused by leakage [log intensity]
+    ticks: int  # length of the interval [ticks]
+    per_tick: float  # length of a tick in units of the interval
+    drift: float  # change of the reference in the interval, caused by the leak [log intensity]
     shift: int  # bit position of the time in a key
 
 
@@ -94,9 +94,9 @@ class Sink:
     counter for all pixels, or for all of a warp, would be the bottleneck.
     """
 
-    keys: wp.array2d(dtype=wp.int64)  # by segment and position
+    keys: wp.array2d(dtype=wp.int64)  # keys of the events; axes: segment, position in the segment
     count: wp.array2d(dtype=int)  # first column: events of each segment, including those that did not fit
-    run: int  # consecutive pixels in a segment
+    run: int  # number of consecutive pixels that share a segment
 
 
 @wp.func

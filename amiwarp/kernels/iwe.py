@@ -14,13 +14,13 @@ from amiwarp.kernels.votes import Canvas, Cells
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-VARIANCE = wp.constant(0)  # sharpness measures
+VARIANCE = wp.constant(0)  # numbers of the sharpness measures
 GRADIENT = wp.constant(1)
 LAPLACIAN = wp.constant(2)
 PAPER_J = wp.constant(3)
 ENTROPY = wp.constant(4)
-STRIP = wp.constant(16)  # rows summed by one thread
-CPU_WIDTH = 64  # pixels per CPU thread
+STRIP = wp.constant(16)  # number of rows that one thread sums
+CPU_WIDTH = 64  # number of pixels per CPU thread
 
 
 @wp.struct
@@ -29,10 +29,10 @@ class Frame:
 
     rows: int
     columns: int
-    stride: int  # elements from one row to the next
-    layer: int  # elements from one layer to the next
+    stride: int  # distance from one row to the next [elements]
+    layer: int  # distance from one layer to the next [elements]
     first: int  # index of the first pixel
-    blocks: int  # per row
+    blocks: int  # number of blocks per row
 
 
 @wp.func

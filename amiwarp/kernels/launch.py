@@ -13,7 +13,7 @@ import warp as wp
 
 from amiwarp.kernels.cpu_threads import cpu_threads
 
-SMALLEST_SLICE = 1 << 15  # threads; launching a smaller slice takes longer than running it
+SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
 
 
 @cache

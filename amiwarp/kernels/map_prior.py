@@ -5,7 +5,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
-EXTRA = wp.constant(2)  # unknowns after the map: leak, OFF threshold
+EXTRA = wp.constant(2)  # number of unknowns that follow the map nodes: leak and OFF threshold
 
 
 @wp.struct
@@ -15,7 +15,7 @@ class Prior:
     damping: float
     linked: int  # 1 if there are links, else 0
     columns: int
-    held: int  # unknowns from this index on are fixed
+    held: int  # index from which on the unknowns are fixed
     smooth: wp.array(dtype=float)  # one element: weight of a link between equal neighbours
     right: wp.array(dtype=float)  # weight of the link to the next node; 0 in a tile's last column
     down: wp.array(dtype=float)  # weight of the link to the node below; 0 in a tile's last row

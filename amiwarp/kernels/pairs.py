@@ -34,13 +34,13 @@ class Sorted:
 class Window:
     """Times of the window, and delays of the sensor."""
 
-    start: wp.int64  # of the window [us]
-    stop: wp.int64
-    middle: wp.int64
-    late_first: wp.float64  # added to the time of the first event [us]
-    late_second: wp.float64  # added to the time of the second event [us]
+    start: wp.int64  # start of the time window [us]
+    stop: wp.int64  # end of the time window [us]
+    middle: wp.int64  # middle of the time window [us]
+    late_first: wp.float64  # correction added to the time of the first event [us]
+    late_second: wp.float64  # correction added to the time of the second event [us]
     longest: wp.int64  # longest gap between the two events of a pair [us]
-    shortest: wp.float64  # the gap must be longer than this [us]
+    shortest: wp.float64  # length that the gap between the two events must exceed [us]
 
 
 @wp.kernel

@@ -15,7 +15,7 @@ from amiwarp.kernels.vector_code import load_float, load_int, load_uint8, store_
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = wp.constant(64)  # pairs per CPU thread; arrays are padded to whole blocks
+BLOCK = wp.constant(64)  # number of pairs per CPU thread; arrays are padded to whole blocks
 # Bits of a pair's ``on``: bit 0 is the polarity; bit 1, no event at the second time; bit 2, no event at the first time;
 # bit 3, held out, with weight 0.
 ON = wp.constant(wp.uint8(1))
@@ -64,8 +64,8 @@ class Geometry:
     """Position of both events of a pair on the map: index of the upper left node, and the fraction to the next node."""
 
     stride: int
-    cell: wp.array(dtype=int)  # nodes of all first, then of all second events; -1 if either event is off its tile
-    part: wp.array(dtype=float)  # fractions: x of all first events, y of them, x of all second events, y of them
+    cell: wp.array(dtype=int)  # nodes of first, then of second events; -1 if either event is outside its tile
+    part: wp.array(dtype=float)  # fractions in the cells: x of first events, y of first, x of second, y of second
 
 
 # -- one equation
@@ -287,7 +287,7 @@ def weigh(
     residual[i] = wp.where(on_map, r, NAN)
     cauchy = 1.0 / (1.0 + (r / scale[0]) * (r / scale[0]))
     if pairs.on[i] > ON:
-        cauchy = pairs.weak / (1.0 + r * r)  # accurate to within one threshold
+        cauchy = pairs.weak / (1.0 + r * r)  # the scale of residuals is one threshold, the accuracy of such pairs
     if (pairs.on[i] & HELD) != wp.uint8(0):
         cauchy = 0.0
     weight[i] = wp.where(on_map, cauchy, 0.0)

@@ -31,19 +31,19 @@ from amiwarp.kernels.prism_view import (
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_PIECES = wp.constant(16)  # of a step: divides its number of ticks, which are 16 per microsecond
-LARGEST_BEND = wp.constant(0.01)  # of the level between the ends of a piece [ON thresholds]
-SMALLEST_LEAK = wp.constant(0.1)  # relative to the mean leak, so that jitter cannot stop a leak
+MOST_PIECES = wp.constant(16)  # largest number of pieces per step; divides the ticks of a step, a multiple of 16
+LARGEST_BEND = wp.constant(0.01)  # largest deviation of the level from a straight line within a piece [ON thresholds]
+SMALLEST_LEAK = wp.constant(0.1)  # smallest leak relative to the mean leak, so that jitter cannot stop the leak
 SMALL_ANGLE = wp.constant(0.1)  # duration [time constants] below which a series is more precise in float32
-SMALL_CHANGE = wp.constant(0.3)  # of the log intensity, below which a series is more precise in float32
+SMALL_CHANGE = wp.constant(0.3)  # change of the log intensity below which a series is more precise in float32
 
 
 @wp.struct
 class Input:
     """Input of a photoreceptor at one instant: the light on its pixel."""
 
-    level: float  # log intensity
-    light: float  # its exponential
+    level: float  # log intensity of the light
+    light: float  # exponential of the level
 
 
 @wp.func

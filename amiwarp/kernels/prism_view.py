@@ -7,12 +7,12 @@ from amiwarp.kernels.refraction import ExactParams, trace
 
 wp.set_module_options({"enable_backward": False})
 
-AHEAD = wp.constant(16)  # instants that a CPU computes together: number of columns of the next four types
+AHEAD = wp.constant(16)  # number of instants that a CPU computes together: columns of the next four types
 Instants = wp.types.matrix(shape=(11, 16), dtype=float)  # rows: cos and sin of the azimuth, then to_texel
 TexelCoordinates = wp.types.matrix(shape=(2, 16), dtype=float)  # rows: x and y, texel coordinates
 TexelPieces = wp.types.matrix(shape=(3, 16), dtype=float)  # rows: texel index (bits of an int), x and y in it
-Levels = wp.types.vector(length=16, dtype=float)  # log intensities
-SMALLEST_DEPTH = wp.constant(1.0e-3)  # of a scene point in front of the camera
+Levels = wp.types.vector(length=16, dtype=float)  # log intensity at each instant
+SMALLEST_DEPTH = wp.constant(1.0e-3)  # smallest z of a direction that counts as in front of the camera
 
 
 @wp.struct
@@ -21,19 +21,19 @@ class View:
 
     camera: CameraParams
     prism: ExactParams
-    maps: wp.array(dtype=wp.vec4)  # coefficients of log intensity in each texel's bilinear piece; slot by slot
-    width: int  # of a map [texels]
-    height: int
+    maps: wp.array(dtype=wp.vec4)  # coefficients of bilinear interpolation of log intensity at each texel, slot by slot
+    width: int  # width of a map [texels]
+    height: int  # height of a map [texels]
 
 
 @wp.struct
 class Step:
     """Instant: the end of one step and the start of the next."""
 
-    azimuth: wp.vec2  # cos, sin of the true tilt azimuth
-    to_texel: wp.mat33  # prism's frame to homogeneous texel coordinates
-    before: int  # slots of the maps before and after this time
-    after: int
+    azimuth: wp.vec2  # cosine and sine of the true azimuth of the prism
+    to_texel: wp.mat33  # matrix from the prism's frame to homogeneous texel coordinates
+    before: int  # slot of the map before this time
+    after: int  # slot of the map after this time
     weight: float  # weight of the map after this time
 
 
@@ -42,13 +42,13 @@ class Steps:
     """Table of the equally spaced instants of a chunk; entry ``margin`` is the start of the chunk."""
 
     at: wp.array(dtype=Step)
-    ahead: wp.array(dtype=Instants)  # CPU only: the ends of the chunk's steps, the last one repeated
-    angle: wp.array(dtype=float)  # true tilt azimuth [rad]
+    ahead: wp.array(dtype=Instants)  # ends of the steps in blocks of 16, for CPUs; the last end is repeated
+    angle: wp.array(dtype=float)  # true azimuth of the prism [rad]
     turn: wp.array(dtype=float)  # change of the azimuth until the next instant [rad]
-    margin: int
-    count: int
-    ticks: int  # ticks per step
-    per_tick: float  # steps per tick
+    margin: int  # number of instants before the start of the chunk
+    count: int  # number of steps in the chunk
+    ticks: int  # length of a step [ticks]
+    per_tick: float  # length of a tick [steps]
     shift: int  # bit position of the time in a key, above the bits of the pixel
 
 
@@ -100,9 +100,9 @@ def level_at(view: View, step: Step, u: float, v: float) -> float:
 def prism_shift(m: ExactParams, along: float, z: float) -> float:
     """Return the distance by which the prism shifts a bearing along the azimuth; NaN if no light passes.
 
-    The formula is that of kernels/optics.py. ``along`` and ``z`` are the components of the bearing along the azimuth
-    and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number gives
-    NaN, which propagates to the result.
+    The formula is the same as in kernels/refraction.py. ``along`` and ``z`` are the components of the bearing along the
+    azimuth and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number
+    gives NaN, which propagates to the result.
     """
     inside = m.index2 - 1.0
     if m.flat_to_scene == 1:

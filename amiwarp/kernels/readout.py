@@ -17,7 +17,7 @@ class RowScan:
     row_ps: wp.int64  # time to read a row [ps]
     scan_ps: wp.int64  # time to read all rows [ps]
     origin: wp.int64  # time of a key's tick 0 since the first scan [us]
-    width: int  # of the sensor [px]
+    width: int  # width of the sensor [px]
     shift: int  # bit position of the time in a key
 
 

@@ -30,21 +30,21 @@ INVERSION_STEPS = wp.constant(8)
 class CircleParams:
     """Circle model: rotation of each bearing by a constant deflection."""
 
-    sine: float  # of the deflection; positive if the flat face looks to the scene
-    versine: float  # 1 - cosine
-    phase: float  # of the prism angle [rad], with its cosine and sine
-    phase_cos: float
-    phase_sin: float
+    sine: float  # sine of the deflection; positive if the flat face looks to the scene
+    versine: float  # 1 - cosine of the deflection
+    phase: float  # phase of the prism angle [rad]
+    phase_cos: float  # cosine of the phase
+    phase_sin: float  # sine of the phase
 
 
 @wp.struct
 class RadialCircleParams:
     """Radial circle model: the deflection grows with the angle from the axis."""
 
-    deflection: float  # on the axis [rad]; negative if the flat face looks to the camera
-    phase: float  # of the prism angle [rad], with its cosine and sine
-    phase_cos: float
-    phase_sin: float
+    deflection: float  # deflection on the optical axis [rad]; negative if the flat face looks to the camera
+    phase: float  # phase of the prism angle [rad]
+    phase_cos: float  # cosine of the phase
+    phase_sin: float  # sine of the phase
     index: float  # refractive index
 
 
@@ -52,12 +52,12 @@ class RadialCircleParams:
 class ExactParams:
     """Exact model: refraction at both faces of the prism."""
 
-    sin_apex: float  # of the apex angle
-    cos_apex: float
+    sin_apex: float  # sine of the apex angle
+    cos_apex: float  # cosine of the apex angle
     index2: float  # square of the refractive index
-    phase: float  # of the prism angle [rad], with its cosine and sine
-    phase_cos: float
-    phase_sin: float
+    phase: float  # phase of the prism angle [rad]
+    phase_cos: float  # cosine of the phase
+    phase_sin: float  # sine of the phase
     flat_to_scene: int  # 1 if the flat face looks to the scene, else 0
     tilted: int  # 1 if the prism's axis differs from the optical axis, else 0
     axis: wp.mat33  # columns: axes of the prism's frame in the camera's frame
@@ -67,9 +67,9 @@ class ExactParams:
 class EllipseParams:
     """Ellipse model: table of the displacement's offset and first harmonic for each pixel."""
 
-    phase: float  # of the prism angle [rad], with its cosine and sine
-    phase_cos: float
-    phase_sin: float
+    phase: float  # phase of the prism angle [rad]
+    phase_cos: float  # cosine of the phase
+    phase_sin: float  # sine of the phase
     table: wp.array3d(dtype=float)  # per pixel [px]: offset (x, y), factor of cos (x, y), factor of sin (x, y)
 
 

@@ -46,7 +46,7 @@ def sum_costs(
     thread = start + wp.tid()
     total = wp.float64(0.0)
     number = wp.float64(0.0)
-    product = wp.float64(1.0)  # product of several terms, which need one logarithm only
+    product = wp.float64(1.0)  # product of several terms: one logarithm serves them all
     for i in range(thread * width, wp.min((thread + 1) * width, count)):
         r = replace_nan(residual[i], missing) / scale
         if r == r and (int(on[i]) & mask) == mask:

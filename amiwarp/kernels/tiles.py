@@ -20,12 +20,12 @@ from amiwarp.kernels.votes import Canvas, dither_offset
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 TILE = 32  # width and height of a tile [sensor px]
-COLUMNS = wp.constant(61)  # of a window [canvas px]; odd, so that a column spreads over all memory banks
-ROWS = wp.constant(64)  # of a window [canvas px]
-SIZE = wp.constant(4 * 61 * 64)  # of a window [bytes]
-THREADS = wp.constant(256)  # per block
-BLOCKS = 4  # resident blocks per multiprocessor
-AT_ONCE = wp.constant(3)  # candidates that share the reading of an event; their windows fill 48 KiB
+COLUMNS = wp.constant(61)  # columns of a window [canvas px]; odd, so that a column spreads over all memory banks
+ROWS = wp.constant(64)  # rows of a window [canvas px]
+SIZE = wp.constant(4 * 61 * 64)  # size of a window [bytes]
+THREADS = wp.constant(256)  # number of threads per block
+BLOCKS = 4  # number of resident blocks per multiprocessor
+AT_ONCE = wp.constant(3)  # number of candidates voted per reading of an event; their windows fill 48 KiB
 CHUNK = 1 << 17  # events per chunk: at most 63 * 2**25 votes of 1/256, so that no word of the window overflows
 
 
@@ -35,10 +35,10 @@ class Chunk:
 
     start: int
     stop: int
-    x: int  # first pixel of the tile on the sensor
-    y: int
-    column: int  # first pixel of the window on the canvas
-    row: int
+    x: int  # first column of the tile on the sensor
+    y: int  # first row of the tile on the sensor
+    column: int  # first column of the window on the canvas
+    row: int  # first row of the window on the canvas
     layer: int
 
 
@@ -51,7 +51,7 @@ class TileEvents:
 
     packed: wp.array(dtype=wp.uint32)
     slope: wp.array(dtype=float)  # derivative of theta_u16 by the drift, or empty
-    time: wp.array(dtype=float)  # from the middle of the time window [s], or empty
+    time: wp.array(dtype=float)  # time from the middle of the time window [s], or empty
     chunks: wp.array(dtype=Chunk)
 
 
@@ -59,10 +59,10 @@ class TileEvents:
 class UnpackedEvent:
     """Event that was unpacked from :class:`TileEvents`."""
 
-    x: float  # on the sensor [px]
+    x: float  # position on the sensor [px]
     y: float
-    corner_x: float  # offset from scaled sensor coordinates to the window [canvas px];
-    corner_y: float  # with dither it includes the random offset of the event
+    corner_x: float  # offset in x from scaled sensor coordinates to the window, dither included [canvas px]
+    corner_y: float  # offset in y from scaled sensor coordinates to the window, dither included [canvas px]
     scale: float
     turn: int
     weight: int
@@ -72,7 +72,7 @@ class UnpackedEvent:
 class Still:
     """Candidate parameter sets that differ only in their models."""
 
-    nothing: int  # unused: Warp requires a field
+    nothing: int  # unused field, because a Warp struct needs at least one
 
 
 @wp.struct
@@ -234,7 +234,7 @@ def cast_nearest(window: int, weight: int, u: float, v: float) -> int:
     c = to_int(u)
     r = to_int(v)
     inside = wp.uint32(c) < wp.uint32(COLUMNS) and wp.uint32(r) < wp.uint32(ROWS)
-    # no branch: a vote outside adds 0 to the first word
+    # without a branch: a vote outside the window adds 0 to the first word
     add_to_word(window + wp.where(inside, 4 * (r * COLUMNS + c), 0), wp.where(inside, weight << 8, 0))
     return wp.where(inside, 0, 1)
 
@@ -338,7 +338,7 @@ def vote_tiles(
     packed = int(load_uint32(events.packed, wp.min(chunk.start + thread, chunk.stop - 1)))
     for i in range(chunk.start + thread, chunk.stop, THREADS):
         event = unpack(packed, chunk, canvas, layout, i)
-        # load the next event while this one is voted
+        # load the next event while the present event is voted
         packed = int(load_uint32(events.packed, wp.min(i + THREADS, chunk.stop - 1)))
         left = cast_event(a, camera, motion, events, canvas.nearest, words, first, i, event)
         if many > 1:

@@ -21,9 +21,9 @@ from amiwarp.kernels.vector_code import add_word, load_float, load_uint8, load_u
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-BLOCK = wp.constant(64)  # events per CPU thread, which displaces eight at a time and then votes
-TRASH = wp.constant(4096)  # words after the cells for votes outside the image; many, so that none overflows
-CAPACITY = wp.constant(1024)  # number of events that overflows a word
+BLOCK = wp.constant(64)  # number of events per CPU thread, which displaces eight at a time and then votes
+TRASH = wp.constant(4096)  # number of words for votes outside the image; so many that none overflows
+CAPACITY = wp.constant(1024)  # number of events at which a word overflows
 FIELD_CARRY = wp.constant(wp.int64(1 << 18))  # value of a carry out of the fields fx, fy, b
 MIX_1 = wp.constant(wp.uint32(0x85EBCA6B))  # multipliers of MurmurHash3's finaliser
 MIX_2 = wp.constant(wp.uint32(0xC2B2AE35))
@@ -53,13 +53,13 @@ class EventArrays:
 class Canvas:
     """Geometry of the votes: the image grown by ``pad`` pixels on each side, scaled, with a border of one pixel."""
 
-    pad: float  # [px]
+    pad: float  # border around the sensor [px]
     scale: float  # canvas pixels per sensor pixel
     nearest: int  # 1: nearest votes, 0: bilinear votes
     dither: float  # 1: events get a random offset in their pixels; 0: they lie at the centres
-    rows: int  # of cells, the border included
+    rows: int  # number of rows of cells, including the border
     columns: int
-    layer: int  # cells from one image to the next; 0: one image for all events
+    layer: int  # distance from one image to the next [cells]; 0: one image for all events
 
 
 @wp.struct

@@ -1,18 +1,18 @@
-"""Rays in a world: the nearest surface along a ray, and the luminance that the ray sees."""
+"""Ray casting in a simulated world: the nearest surface along a ray, and the luminance that the ray sees."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-FAR = wp.constant(1.0e6)  # [m]
-LIFT = wp.constant(1.0e-4)  # height above its surface at which a shadow ray starts, as a share of the distance + 0.1 m
-EDGE = wp.constant(1.0e-5)  # width of a face's border that still belongs to the face, in barycentric coordinates
+FAR = wp.constant(1.0e6)  # distance of the sky [m]
+LIFT = wp.constant(1.0e-4)  # height above a surface at which shadow rays start, per (distance to the camera + 0.1 m)
+EDGE = wp.constant(1.0e-5)  # barycentric distance outside of a face at which a ray still counts as a hit
 PI = wp.constant(3.14159265358979)
 
 
 @wp.struct
 class Pose:
-    """Pose of a body or a camera: maps coordinates in its own frame to the world's frame."""
+    """Pose of a body or a camera: transformation from the frame of the body or camera to the world's frame."""
 
     rotation: wp.mat33
     position: wp.vec3
@@ -20,79 +20,82 @@ class Pose:
 
 @wp.struct
 class Mover:
-    """Mesh of a moving body, in the body's frame."""
+    """Mesh of a moving body."""
 
-    mesh: wp.uint64
-    first_face: int  # number of its first face among the faces of the world
-    radius: float  # radius of its bounding sphere [m]
-    lower: wp.vec3  # corners of its bounding box, in the body's frame [m]
-    upper: wp.vec3
+    mesh: wp.uint64  # id of the Warp mesh, whose vertices are in the body's frame
+    first_face: int  # number of the body's first face among the faces of the world
+    radius: float  # radius of the bounding sphere [m]
+    lower: wp.vec3  # corner of the bounding box with the smallest x, y, z, in the body's frame [m]
+    upper: wp.vec3  # corner of the bounding box with the largest x, y, z, in the body's frame [m]
 
 
 @wp.struct
 class Surface:
     """Material of a body."""
 
-    reflectance: float
-    emission: float
-    texel: int  # first texel of its texture pyramid; -1 for none
-    width: int
-    height: int
-    levels: int
-    instance: int
+    reflectance: float  # fraction of the light that the surface reflects
+    emission: float  # luminance that the surface emits
+    texel: int  # index of the first texel of the texture pyramid; -1 without a texture
+    width: int  # width of the texture [texels]
+    height: int  # height of the texture [texels]
+    levels: int  # number of levels of the texture pyramid
+    instance: int  # instance number of the body
 
 
 @wp.struct
 class Lamp:
-    """Position of a lamp, and whether bodies cast shadows in its light."""
+    """Point light source."""
 
-    position: wp.vec3
-    shadows: int
+    position: wp.vec3  # position in the world's frame [m]
+    shadows: int  # 1 if bodies cast shadows in the light of this lamp, else 0
 
 
 @wp.struct
 class World:
-    """Geometry, materials and light of a world. The faces of bodies at rest come first, then those of each mover."""
+    """Geometry, materials and light of a world, at one or more instants.
 
-    still: wp.uint64  # mesh of all bodies at rest; 0 for none
-    movers: wp.array(dtype=Mover)
-    first_mover: int  # number of the first moving body among all bodies
+    A mover is a moving body. The faces of bodies at rest come first, followed by the faces of each mover.
+    """
+
+    still: wp.uint64  # id of the Warp mesh of all bodies at rest; 0 if all bodies move
+    movers: wp.array(dtype=Mover)  # meshes of the moving bodies
+    first_mover: int  # number of the first mover among all bodies
     poses: wp.array2d(dtype=Pose)  # pose of each mover at each instant; axes: instant, mover
-    centres: wp.array2d(dtype=wp.vec3)  # centre of each mover's bounding sphere in the world's frame; instant, mover
+    centres: wp.array2d(dtype=wp.vec3)  # centre of each mover's bounding sphere in the world [m]; instant, mover
     body: wp.array(dtype=int)  # number of the body of each face
     corners: wp.array(dtype=wp.vec3)  # the three corners of each face, in the frame of its mesh [m]
     uv: wp.array(dtype=wp.vec2)  # texture coordinates at the three corners of each face
     shade: wp.array(dtype=float)  # factor of the reflectance at the three corners of each face
     density: wp.array(dtype=float)  # texels per metre on each face
-    surfaces: wp.array(dtype=Surface)
-    texels: wp.array(dtype=float)
-    ambient: float
+    surfaces: wp.array(dtype=Surface)  # material of each body
+    texels: wp.array(dtype=float)  # texels of all texture pyramids and of the panorama
+    ambient: float  # luminance of a white surface in the shade
     sun: wp.vec3  # unit vector towards the sun
-    sun_light: float
-    sun_shadows: int
-    lamps: wp.array(dtype=Lamp)
+    sun_light: float  # luminance that the sun gives to a white surface that faces the sun; 0 without a sun
+    sun_shadows: int  # 1 if bodies cast shadows in sunlight, else 0
+    lamps: wp.array(dtype=Lamp)  # point light sources
     lamp_light: wp.array2d(dtype=float)  # intensity of each lamp at each instant; axes: instant, lamp
-    sky: float
-    panorama: int  # first texel of the panorama; -1 for none
-    panorama_width: int
-    panorama_height: int
+    sky: float  # luminance of an even sky, or factor of the panorama
+    panorama: int  # index of the first texel of the sky's panorama; -1 for an even sky
+    panorama_width: int  # width of the panorama [texels]
+    panorama_height: int  # height of the panorama [texels]
 
 
 @wp.struct
 class Hit:
-    """Nearest surface along a ray."""
+    """Nearest surface that a ray hits."""
 
-    distance: float  # [m]; FAR for the sky
-    face: int  # -1 for the sky
-    u: float  # barycentric weights of the face's first two corners
-    v: float
-    mover: int  # number of the moving body; -1 for a body at rest
+    distance: float  # distance along the ray [m]; FAR for the sky
+    face: int  # number of the face; -1 for the sky
+    u: float  # barycentric weight of the face's first corner
+    v: float  # barycentric weight of the face's second corner
+    mover: int  # number of the mover; -1 for a body at rest or the sky
     normal: wp.vec3  # unit normal in the world's frame, on the side of the ray's origin
 
 
 @wp.func
 def body_of(world: World, face: int) -> int:
-    """Return the body of a face; -1 for the sky."""
+    """Return the number of the body to which a face belongs; -1 for the sky (face -1)."""
     if face < 0:
         return -1
     return world.body[face]
@@ -115,7 +118,10 @@ def meets_sphere(origin: wp.vec3, direction: wp.vec3, centre: wp.vec3, radius: f
 
 @wp.func
 def nearer(hit: Hit, q: wp.MeshQueryRay, first_face: int, mover: int, direction: wp.vec3) -> Hit:
-    """Return the surface that a query found, or ``hit`` if it found none; ``direction`` is in the mesh's frame."""
+    """Return the surface that a ray query found, or ``hit`` if the query found no surface nearer than ``hit``.
+
+    ``direction``: direction of the ray in the mesh's frame; ``mover``: number of the mover, or -1.
+    """
     if q.result:
         hit.distance = q.t
         hit.face = first_face + q.face
@@ -128,7 +134,7 @@ def nearer(hit: Hit, q: wp.MeshQueryRay, first_face: int, mover: int, direction:
 
 @wp.func
 def cast(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: float) -> Hit:
-    """Return the nearest surface within ``far`` [m] along a unit vector."""
+    """Return the nearest surface within ``far`` [m] of ``origin`` along a unit vector, at an instant."""
     hit = Hit()
     hit.distance = far
     hit.face = -1
@@ -149,7 +155,7 @@ def cast(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: f
 
 @wp.func
 def blocked(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far: float) -> bool:
-    """Return whether any surface lies within ``far`` [m] along a unit vector."""
+    """Return whether any surface lies within ``far`` [m] of ``origin`` along a unit vector, at an instant."""
     if world.still != wp.uint64(0):
         if wp.mesh_query_ray_anyhit(world.still, origin, direction, far):
             return True
@@ -168,7 +174,7 @@ def blocked(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far
 
 @wp.func
 def texel(world: World, first: int, width: int, height: int, col: int, row: int) -> float:
-    """Return a texel of a repeated texture."""
+    """Return a texel of a repeating texture, whose first texel has the index ``first``."""
     c = col % width
     r = row % height
     return world.texels[first + wp.where(r < 0, r + height, r) * width + wp.where(c < 0, c + width, c)]
@@ -190,7 +196,7 @@ def bilinear(world: World, first: int, width: int, height: int, x: float, y: flo
 
 @wp.func
 def level_at(world: World, s: Surface, uv: wp.vec2, level: int) -> float:
-    """Interpolate one level of a texture pyramid."""
+    """Interpolate one level of a texture pyramid at texture coordinates; level 0 is the full resolution."""
     first = int(s.texel)
     width = int(s.width)
     height = int(s.height)
@@ -205,7 +211,7 @@ def level_at(world: World, s: Surface, uv: wp.vec2, level: int) -> float:
 
 @wp.func
 def textured(world: World, s: Surface, uv: wp.vec2, footprint: float) -> float:
-    """Return the texture's factor of the reflectance, averaged over ``footprint`` texels."""
+    """Return the factor that a texture applies to the reflectance, averaged over a width of ``footprint`` [texels]."""
     depth = wp.clamp(wp.log2(wp.max(footprint, 1.0)), 0.0, float(s.levels - 1))
     level = int(depth)
     value = level_at(world, s, uv, level)
@@ -216,7 +222,7 @@ def textured(world: World, s: Surface, uv: wp.vec2, footprint: float) -> float:
 
 @wp.func
 def reflectance(world: World, hit: Hit, direction: wp.vec3, cone: float) -> float:
-    """Return the reflectance where a ray of angular width ``cone`` [rad] meets a face."""
+    """Return the reflectance of the surface that a ray of angular width ``cone`` [rad] hits."""
     k = 3 * hit.face
     w = 1.0 - hit.u - hit.v
     s = world.surfaces[world.body[hit.face]]
@@ -246,7 +252,7 @@ def sky(world: World, direction: wp.vec3) -> float:
 
 @wp.func
 def lamp_light(world: World, instant: int, k: int, place: wp.vec3, normal: wp.vec3) -> float:
-    """Return the luminance that a lamp adds to a white surface."""
+    """Return the luminance that lamp ``k`` adds to a white surface at ``place`` with a unit normal."""
     lamp = world.lamps[k]
     to = lamp.position - place
     distance = wp.length(to)
@@ -261,7 +267,7 @@ def lamp_light(world: World, instant: int, k: int, place: wp.vec3, normal: wp.ve
 
 @wp.func
 def light_at(world: World, instant: int, place: wp.vec3, normal: wp.vec3) -> float:
-    """Return the luminance of a white surface."""
+    """Return the luminance of a white surface at ``place`` with a unit normal, in the light of all sources."""
     light = float(world.ambient)
     toward = wp.dot(normal, world.sun)
     if world.sun_light > 0.0 and toward > 0.0:
@@ -277,7 +283,7 @@ def light_at(world: World, instant: int, place: wp.vec3, normal: wp.vec3) -> flo
 
 @wp.func
 def illumination(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, hit: Hit) -> float:
-    """Return the luminance of a white surface where a ray hits, or that of the sky if it hits nothing."""
+    """Return the luminance of a white surface where a ray hits, or the luminance of the sky if the ray hits no body."""
     if hit.face < 0:
         return sky(world, direction)
     place = origin + hit.distance * direction + LIFT * (hit.distance + 0.1) * hit.normal
@@ -286,7 +292,10 @@ def illumination(world: World, instant: int, origin: wp.vec3, direction: wp.vec3
 
 @wp.func
 def luminance(world: World, direction: wp.vec3, hit: Hit, cone: float, white: float) -> float:
-    """Return the luminance of a hit whose :func:`illumination` is ``white``; ``cone``: angular width [rad]."""
+    """Return the luminance that a ray of angular width ``cone`` [rad] sees at a hit.
+
+    ``white``: :func:`illumination` of the hit.
+    """
     if hit.face < 0:
         return white
     return world.surfaces[world.body[hit.face]].emission + reflectance(world, hit, direction, cone) * white
@@ -294,17 +303,20 @@ def luminance(world: World, direction: wp.vec3, hit: Hit, cone: float, white: fl
 
 @wp.func
 def radiance(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, cone: float) -> float:
-    """Return the luminance along a unit vector, averaged over the angular width ``cone`` [rad]."""
+    """Return the luminance that a ray along a unit vector sees; ``cone``: angular width of the ray [rad]."""
     hit = cast(world, instant, origin, direction, FAR)
     return luminance(world, direction, hit, cone, illumination(world, instant, origin, direction, hit))
 
 
-# -- single faces: cheaper than the whole mesh if the face is known
+# -- intersection with one known face, which is cheaper than a search of the whole mesh
 
 
 @wp.func
 def meet_triangle(o: wp.vec3, d: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
-    """Return the distance from ``o`` along ``d`` to the triangle with the corners 0, ``u`` and ``v``, or FAR."""
+    """Return the distance from ``o`` along ``d`` to the triangle with the corners 0, ``u`` and ``v``.
+
+    If the ray does not hit the triangle, return FAR. Uses Cramer's rule.
+    """
     p = wp.cross(d, v)
     q = wp.cross(o, u)
     det = wp.dot(u, p)
@@ -320,7 +332,7 @@ def meet_triangle(o: wp.vec3, d: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
 
 @wp.func
 def meet_face(world: World, instant: int, face: int, origin: wp.vec3, direction: wp.vec3) -> float:
-    """Return the distance [m] at which a ray along a unit vector meets a face; FAR if it does not (Cramer's rule)."""
+    """Return the distance [m] at which a ray along a unit vector hits a face; FAR if the ray misses the face."""
     o = origin
     d = direction
     m = world.body[face] - world.first_mover

@@ -1,4 +1,4 @@
-"""Device side of worlds: pixels that look into a world through the prism at every step, some rays at a time."""
+"""Event simulation in a world by ray casting: each pixel casts rays through the prism at every time step."""
 
 import warp as wp
 
@@ -23,19 +23,19 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RayView:
-    """Camera, prism and pose for every instant of a chunk."""
+    """Camera and prism, and the camera's pose at every instant of a chunk of simulated time."""
 
-    camera: CameraParams
-    prism: ExactParams
-    poses: wp.array(dtype=Pose)  # the camera's at each instant
-    aperture: wp.array(dtype=wp.vec3)  # of a pixel's rays: x and y from its centre [px], and the weight
+    camera: CameraParams  # camera model
+    prism: ExactParams  # prism model
+    poses: wp.array(dtype=Pose)  # pose of the camera at each instant
+    aperture: wp.array(dtype=wp.vec3)  # rays of a pixel: x and y relative to the pixel's centre [px], and weight
     cone: float  # angular width of a ray [rad]
-    dark: float  # added to the luminance before the logarithm
+    dark: float  # luminance that is added before the logarithm
 
 
 @wp.func
 def see_world(world: World, view: RayView, steps: Steps, k: int, i: int) -> float:
-    """Log intensity that a pixel sees through the prism at instant ``k``."""
+    """Return the log intensity that pixel ``i`` sees through the prism at instant ``k``."""
     row = i / view.camera.width
     col = i - row * view.camera.width
     w = steps.at[k].azimuth
@@ -54,7 +54,7 @@ def start_world_pixels(
     world: World, view: RayView, steps: Steps, sensor: SensorParams, seed: int, start: int,
     pixels: wp.array(dtype=Pixel),
 ):  # fmt: skip
-    """Every pixel at the start of the recording."""
+    """Set the state of every pixel at the start of the recording."""
     i = start + wp.tid()
     pixels[i] = new_pixel(sensor, seed, i, see_world(world, view, steps, steps.margin, i))
 
@@ -69,7 +69,10 @@ def run_world_pixels(
     start: int,
     sink: Sink,
 ):
-    """Walk through the steps of a chunk, as :func:`amiwarp.kernels.event_generation.run_pixels` does."""
+    """Simulate pixels that cast rays over the steps of a chunk, and write the keys of their events to ``sink``.
+
+    Counterpart of :func:`amiwarp.kernels.event_generation.run_pixels`, which uses maps.
+    """
     i = start + wp.tid()
     p = pixels[i]
     span = whole_step(steps, p)
@@ -92,7 +95,10 @@ def run_filtered_world_pixels(
     start: int,
     sink: Sink,
 ):
-    """Do the same as :func:`run_world_pixels` with photoreceptors of limited bandwidth; ``seen``: their last inputs."""
+    """Simulate pixels that cast rays and whose photoreceptors have limited bandwidth, over the steps of a chunk.
+
+    ``seen``: last log intensity that entered each photoreceptor.
+    """
     i = start + wp.tid()
     p = pixels[i]
     before = last_input(seen[i])
@@ -110,6 +116,6 @@ def run_filtered_world_pixels(
 
 @wp.kernel
 def see_pixels(world: World, view: RayView, steps: Steps, k: int, start: int, out: wp.array(dtype=float)):
-    """Luminance that each pixel sees through the prism at instant ``k``."""
+    """Compute the luminance that each pixel sees through the prism at instant ``k``."""
     i = start + wp.tid()
     out[i] = wp.exp(see_world(world, view, steps, k, i)) - view.dark

@@ -1,6 +1,7 @@
-"""Maps of a world: rendering, anti-aliasing, blur, and interpolation between two maps.
+"""Maps of a simulated world: rendering, anti-aliasing, blur, and interpolation between two maps.
 
-A map is rendered in tiles of 8 by 8 texels, so that only the tiles in which something changes need work.
+A map is a picture of the world without the prism. A map is rendered in tiles of 8 by 8 texels, so that a renderer can
+skip the tiles in which no body moves.
 """
 
 import warp as wp
@@ -10,42 +11,42 @@ from amiwarp.kernels.world import FAR, Pose, World, body_of, cast, illumination,
 wp.set_module_options({"enable_backward": False})
 
 TILE = wp.constant(8)  # side of a tile [texels]
-CONTRAST = wp.constant(0.1)  # contrast (difference over sum) of the illumination above which a texel is anti-aliased
-LEAST_LIGHT = wp.constant(0.04)  # added to the sum, so that noise in the dark is no contrast
-SAME_PLANE = wp.constant(0.95)  # cosine between the normals of neighbouring texels below which they are anti-aliased
-LEAST_SLANT = wp.constant(0.1)  # smallest cosine between a ray and a normal for which footprints are computed
+CONTRAST = wp.constant(0.1)  # contrast (difference over sum) of illumination above which texels are anti-aliased
+LEAST_LIGHT = wp.constant(0.04)  # luminance added to this sum, so that small differences in the dark do not count
+SAME_PLANE = wp.constant(0.95)  # cosine between normals of neighbouring texels below which texels are anti-aliased
+LEAST_SLANT = wp.constant(0.1)  # lower limit of the cosine between a ray and a normal in the size of footprints
 
 
 @wp.struct
 class MapFrame:
-    """Image plane at distance 1 from the camera, the texels on it, and the tiles to work on."""
+    """Image plane of a map at distance 1 from the camera, the grid of texels on the plane, and the tiles to render."""
 
     pose: Pose  # pose of the plane's frame; its z axis is the plane's normal
-    left: float  # plane coordinates of the map's corner
-    top: float
-    pitch_x: float  # texels per unit of the plane
-    pitch_y: float
-    width: int  # [texels]
-    height: int
+    left: float  # x coordinate of the map's left edge on the plane
+    top: float  # y coordinate of the map's top edge on the plane
+    pitch_x: float  # texels per unit of x on the plane
+    pitch_y: float  # texels per unit of y on the plane
+    width: int  # width of the map [texels]
+    height: int  # height of the map [texels]
     offsets: wp.array(dtype=wp.vec2)  # positions of a texel's samples relative to its centre [texels]
     cone: float  # angular width of a sample [rad]
-    instant: int  # row of the world's poses
+    instant: int  # number of the instant that is rendered: row of World.poses
     first: int  # index of the map's first texel in the arrays of all maps
-    tiles: wp.array(dtype=int)  # numbers of the tiles to work on, row by row
+    tiles: wp.array(dtype=int)  # numbers of the tiles to render, counted row by row
 
 
 @wp.struct
 class FirstHits:
-    """Result of the first ray of each texel."""
+    """Result of the ray through the centre of each texel."""
 
-    light: wp.array(dtype=float)  # luminance
+    light: wp.array(dtype=float)  # luminance that the ray sees
     white: wp.array(dtype=float)  # illumination: luminance of a white surface in the same place
-    normal: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)  # unit normal of the surface in the world's frame; zero for the sky
 
 
 @wp.func
 def texel_of_tile(f: MapFrame, k: int) -> int:
-    """Return the texel that thread ``k`` works on; -1 if it lies outside of the map."""
+    """Return the index of the texel that thread ``k`` computes; -1 if the texel lies outside of the map."""
     across = (f.width + TILE - 1) / TILE
     tile = f.tiles[k / (TILE * TILE)]
     inner = k % (TILE * TILE)
@@ -63,7 +64,7 @@ def map_direction(f: MapFrame, x: float, y: float) -> wp.vec3:
 
 @wp.kernel
 def render_map(world: World, f: MapFrame, start: int, faces: wp.array(dtype=int), out: FirstHits):
-    """Cast one ray through the centre of each texel."""
+    """Cast one ray through the centre of each texel of the tiles, and store the result and the face."""
     i = texel_of_tile(f, start + wp.tid())
     if i < 0:
         return
@@ -79,7 +80,7 @@ def render_map(world: World, f: MapFrame, start: int, faces: wp.array(dtype=int)
 
 @wp.func
 def differs(world: World, f: MapFrame, faces: wp.array(dtype=int), hits: FirstHits, i: int, j: int) -> bool:
-    """Return whether two texels see other bodies, surfaces of other slant, or light of clear contrast."""
+    """Return whether texels ``i`` and ``j`` see different bodies, differently inclined surfaces, or different light."""
     apart = wp.abs(hits.white[i] - hits.white[j])
     if apart > CONTRAST * (hits.white[i] + hits.white[j] + LEAST_LIGHT):
         return True
@@ -109,7 +110,7 @@ def smooth_edges(
 ):
     """Replace the luminance of texels on edges by the mean of several rays.
 
-    Textures need no more rays, because each ray averages the texture over its angular width.
+    Textures need no further rays, because each ray averages the texture over the ray's angular width.
     """
     i = texel_of_tile(f, start + wp.tid())
     if i < 0:
@@ -130,7 +131,10 @@ def blur_lines(
     f: MapFrame, image: wp.array(dtype=float), weights: wp.array(dtype=float), across: int, start: int,
     out: wp.array(dtype=float),
 ):  # fmt: skip
-    """Convolve rows (``across`` 0) or columns (``across`` 1); texels on the border are repeated."""
+    """Convolve the rows (``across`` 0) or columns (``across`` 1) of an image with ``weights``.
+
+    Texels on the border are repeated.
+    """
     i = texel_of_tile(f, start + wp.tid())
     if i < 0:
         return
@@ -147,13 +151,16 @@ def blur_lines(
 
 @wp.func
 def log_texel(f: MapFrame, light: wp.array(dtype=float), col: int, row: int, dark: float) -> float:
-    """Return the log intensity of a texel; texels on the border are repeated."""
+    """Return the log intensity of a texel; texels on the right and lower border are repeated."""
     return wp.log(light[wp.min(row, f.height - 1) * f.width + wp.min(col, f.width - 1)] + dark)
 
 
 @wp.kernel
 def log_pieces(f: MapFrame, light: wp.array(dtype=float), dark: float, start: int, out: wp.array(dtype=wp.vec4)):
-    """Compute the log intensity as the four coefficients of each texel's bilinear piece."""
+    """Compute the four coefficients of bilinear interpolation of the log intensity at each texel.
+
+    The coefficients are the factors of 1, x, y and xy between the texel and its right and lower neighbours.
+    """
     i = texel_of_tile(f, start + wp.tid())
     if i < 0:
         return
@@ -166,7 +173,7 @@ def log_pieces(f: MapFrame, light: wp.array(dtype=float), dark: float, start: in
     out[f.first + i] = wp.vec4(a, b, c, d)
 
 
-# -- maps between two others, which are rendered only where bodies move
+# -- maps between an earlier and a later map, which are rendered only where bodies move
 
 
 @wp.kernel
@@ -174,7 +181,10 @@ def interpolate_maps(
     maps: wp.array(dtype=wp.vec4), faces: wp.array(dtype=int), before: int, after: int, weight: float, to: int,
     start: int,
 ):  # fmt: skip
-    """Interpolate log intensities, and copy the faces of the nearer map; all maps are given by their first texels."""
+    """Interpolate a map between two maps: the log intensities linearly, the faces from the map nearer in time.
+
+    ``before``, ``after``, ``to``: indices of the first texels of the three maps; ``weight``: weight of ``after``.
+    """
     i = start + wp.tid()
     a = maps[before + i]
     maps[to + i] = a + weight * (maps[after + i] - a)
@@ -183,7 +193,7 @@ def interpolate_maps(
 
 @wp.func
 def meets_ball(origin: wp.vec3, direction: wp.vec3, centre: wp.vec3, radius: float) -> bool:
-    """Return whether a ray along a unit vector meets a ball, or starts in it."""
+    """Return whether a ray along a unit vector hits a ball or starts inside the ball."""
     to = centre - origin
     along = wp.max(wp.dot(to, direction), 0.0)
     return wp.length_sq(to - along * direction) <= radius * radius
@@ -191,7 +201,10 @@ def meets_ball(origin: wp.vec3, direction: wp.vec3, centre: wp.vec3, radius: flo
 
 @wp.func
 def meets_box(o: wp.vec3, d: wp.vec3, lower: wp.vec3, upper: wp.vec3, slack: float) -> bool:
-    """Return whether a ray meets a box that is larger by ``slack`` on all sides, or starts in it."""
+    """Return whether a ray hits a box, enlarged by ``slack`` [m] on all sides, or starts inside the box.
+
+    ``o``, ``d``: origin and direction of the ray in the frame of the box.
+    """
     enters = float(0.0)
     leaves = float(FAR)
     for k in range(3):
@@ -205,9 +218,9 @@ def meets_box(o: wp.vec3, d: wp.vec3, lower: wp.vec3, upper: wp.vec3, slack: flo
 
 @wp.func
 def passes_mover(world: World, instants: int, origin: wp.vec3, direction: wp.vec3, slack: float, spread: float) -> bool:
-    """Return whether a ray passes any mover at any of the first instants.
+    """Return whether a ray passes near any moving body at any of the first ``instants`` instants.
 
-    ``slack``: added to the mover on all sides [m]; ``spread``: added per distance [m/m].
+    ``slack``: margin around the body [m]; ``spread``: additional margin per distance from the origin [m/m].
     """
     for k in range(instants):
         for m in range(world.movers.shape[0]):
@@ -223,7 +236,10 @@ def passes_mover(world: World, instants: int, origin: wp.vec3, direction: wp.vec
 
 @wp.func
 def shadow_passes_mover(world: World, instants: int, place: wp.vec3, slack: float) -> bool:
-    """Return whether the shadow of any mover falls near a place at any of the first instants."""
+    """Return whether the shadow of any moving body falls near a place at any of the first ``instants`` instants.
+
+    ``slack``: margin around the body [m].
+    """
     if world.sun_light > 0.0 and world.sun_shadows == 1:
         if passes_mover(world, instants, place, world.sun, slack, 0.0):
             return True
@@ -237,7 +253,10 @@ def shadow_passes_mover(world: World, instants: int, place: wp.vec3, slack: floa
 
 @wp.func
 def mover_changes(world: World, f: MapFrame, instants: int, face: int, direction: wp.vec3) -> bool:
-    """Return whether a mover, or its shadow, comes near a direction at any of the first instants."""
+    """Return whether a moving body or its shadow is seen near a direction at any of the first ``instants`` instants.
+
+    ``face``: number of the face that is seen in this direction; -1 for the sky.
+    """
     origin = f.pose.position
     spread = float(TILE) * f.cone
     if passes_mover(world, instants, origin, direction, 0.0, spread):
@@ -257,9 +276,9 @@ def mover_changes(world: World, f: MapFrame, instants: int, face: int, direction
 def mark_tiles(
     world: World, f: MapFrame, faces: wp.array(dtype=int), instants: int, start: int, marks: wp.array(dtype=wp.uint8)
 ):
-    """Mark the tiles in which a mover or its shadow changes anything at the first instants of the world.
+    """Mark the tiles that a moving body or its shadow may touch at any of the first ``instants`` instants.
 
-    Each tile is judged at its centre with the faces of the map at ``f.first``. Every length has a margin of a tile.
+    Each tile is tested at its centre, with the faces of the map at ``f.first`` and margins of the width of a tile.
     """
     tile = start + wp.tid()
     across = (f.width + TILE - 1) / TILE

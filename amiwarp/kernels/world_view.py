@@ -1,4 +1,4 @@
-"""Surfaces that rays meet in a world: those of all pixels without the prism, and those that events saw."""
+"""Visible surfaces of a simulated world: the surface at each pixel, and the surface that each event saw."""
 
 import warp as wp
 
@@ -13,12 +13,12 @@ NAN = wp.constant(float("nan"))
 
 @wp.struct
 class Surfaces:
-    """Surface that each ray meets."""
+    """Surface that each ray hits first."""
 
-    depth: wp.array(dtype=float)  # distance along the camera's axis [m]; infinite for the sky
-    normal: wp.array(dtype=wp.vec3)  # unit normal in the world's frame
-    instance: wp.array(dtype=int)
-    mover: wp.array(dtype=int)  # number of the moving body; -1 for a body at rest
+    depth: wp.array(dtype=float)  # distance along the optical axis [m]; infinite for the sky
+    normal: wp.array(dtype=wp.vec3)  # unit normal in the world's frame; zero for the sky
+    instance: wp.array(dtype=int)  # instance number of the body; 0 for the sky
+    mover: wp.array(dtype=int)  # number of the moving body; -1 for a body at rest or the sky
     place: wp.array(dtype=wp.vec3)  # point in the world's frame [m]
 
 
@@ -32,7 +32,10 @@ def instance_of(world: World, face: int) -> int:
 
 @wp.kernel
 def find_surfaces(world: World, instant: int, rays: wp.array(dtype=wp.vec3), pose: Pose, start: int, out: Surfaces):
-    """Find the surfaces that unit rays in the camera's frame meet; an invalid ray gives NaN."""
+    """Find the surfaces that unit rays from a camera hit. A ray of NaN counts as seeing the sky.
+
+    ``rays``: directions in the camera's frame; ``pose``: pose of the camera.
+    """
     i = start + wp.tid()
     ray = rays[i]
     direction = pose.rotation * ray
@@ -51,22 +54,25 @@ def find_surfaces(world: World, instant: int, rays: wp.array(dtype=wp.vec3), pos
 class SeenSurfaces:
     """Surface that the pixel of each event saw through the prism when it fired."""
 
-    instance: wp.array(dtype=wp.uint16)  # 0 for the sky
-    depth: wp.array(dtype=float)  # distance along the camera's axis [m]; infinite for the sky
+    instance: wp.array(dtype=wp.uint16)  # instance number of the body; 0 for the sky
+    depth: wp.array(dtype=float)  # distance along the optical axis [m]; infinite for the sky
     place: wp.array(dtype=wp.vec3)  # point in the world's frame [m]; NaN for the sky
 
 
 @wp.struct
 class Met:
-    """Face that a ray meets, and its distance."""
+    """Face that a ray hits, and the distance to this face."""
 
-    face: int  # -1 for the sky
-    distance: float  # [m]
+    face: int  # number of the face; -1 for the sky
+    distance: float  # distance along the ray [m]; FAR for the sky, or if the face is not yet known
 
 
 @wp.func
 def between(a: Pose, b: Pose, share: float) -> Pose:
-    """Interpolate between two poses close to each other; the rotation's error is of third order in its angle."""
+    """Interpolate between two poses that differ little.
+
+    ``share``: fraction of the way from ``a`` to ``b``. The error of the rotation is of third order in the angle.
+    """
     p = Pose()
     p.position = a.position + share * (b.position - a.position)
     r = a.rotation + share * (b.rotation - a.rotation)
@@ -79,7 +85,10 @@ def between(a: Pose, b: Pose, share: float) -> Pose:
 
 @wp.func
 def texel_near(view: View, steps: Steps, k: int, ray: wp.vec3) -> int:
-    """Return the texel of all maps nearest to a ray of the camera, at instant ``k``, in the map nearest in time."""
+    """Return the index, in the array of all maps, of the texel nearest to a ray of the camera.
+
+    The texel belongs to the map nearest in time to instant ``k``. ``ray``: direction in the camera's frame.
+    """
     at = steps.at[k]
     h = at.to_texel * (wp.transpose(view.prism.axis) * ray)
     col = wp.clamp(int(h[0] / h[2] + 0.5), 1, view.width - 2)
@@ -92,9 +101,10 @@ def texel_near(view: View, steps: Steps, k: int, ray: wp.vec3) -> int:
 def meet_near(
     world: World, instant: int, faces: wp.array(dtype=int), texel: int, width: int, origin: wp.vec3, direction: wp.vec3
 ) -> Met:
-    """Return the nearest face among those of a texel and its eight neighbours; distance FAR if that is uncertain.
+    """Return the nearest face that a ray hits among the faces of a texel and its eight neighbours.
 
-    It is uncertain if none is met, or if the texels see several bodies: the ray may then meet a face between texels.
+    The distance is FAR if the ray hits none of these faces, or if the texels see several bodies: the ray may then hit
+    a face that lies between texels. ``width``: width of a map [texels].
     """
     met = Met()
     met.face = -1
@@ -117,7 +127,7 @@ def meet_near(
 
 @wp.func
 def meet_anywhere(world: World, instant: int, origin: wp.vec3, direction: wp.vec3) -> Met:
-    """Return the nearest face of the whole world."""
+    """Return the nearest face of the whole world that a ray hits."""
     hit = cast(world, instant, origin, direction, FAR)
     met = Met()
     met.face = hit.face
@@ -139,9 +149,9 @@ def find_seen_surfaces(
 ):
     """Find the surface that each event saw at the time of its threshold crossing.
 
-    ``poses``: the camera's at each instant of ``steps``; ``faces``: those of all maps, empty without maps; ``points``:
-    the pixel of each event without the prism; ``ticks``: times since the first instant. Moving bodies have their poses
-    at the nearest instant, half a pixel away at most.
+    ``poses``: pose of the camera at each instant of ``steps``; ``faces``: face of each texel of all maps, empty without
+    maps; ``points``: pixel without the prism of each event's scene point [px]; ``ticks``: time of each crossing since
+    the first instant. Moving bodies have the pose of the nearest instant, which displaces them by half a pixel at most.
     """
     i = start + wp.tid()
     k = wp.clamp(ticks[i] / steps.ticks, 0, steps.margin + steps.count - 1)

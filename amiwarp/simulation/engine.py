@@ -1,4 +1,4 @@
-"""The simulator's engine behind :class:`amiwarp.Simulation`: tables on the host, kernel launches, and sorting."""
+"""Engine of the event simulator :class:`amiwarp.Simulation`: tables on the host, kernel launches, sorting of events."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FRAMES_PER_CHUNK = 8
 """Largest number of pictures of a sequence that one chunk of simulated time contains."""
 
 MAPS_PER_CHUNK = 32
-"""Approximate largest number of a world's maps per chunk."""
+"""Approximate largest number of maps of a simulated world per chunk of simulated time."""
 
 CHUNK_US = {True: 100_000, False: 500_000}
 """Length of a chunk of simulated time [us] on a CPU (True) and on CUDA (False), for up to 640x480 pixels; shorter for
@@ -55,23 +55,25 @@ CUDA_SEGMENTS = 1024
 """Number of event buffers on CUDA; buffer k gets the events of pixels k, k + 1024, k + 2048, …"""
 
 CACHE_LINE = 64
-"""Distance of the counters of CPU threads in memory [bytes]. Threads whose counters share a cache line would wait for
-each other."""
+"""Distance between the event counters of CPU threads in memory [bytes].
+
+Threads whose counters share a cache line would slow each other down.
+"""
 
 EVENTS_PER_PIXEL = 128
-"""Initial capacity of the event buffer of a chunk [events per pixel]; the buffer grows if necessary."""
+"""Initial capacity of the event buffer of a chunk [events per pixel]. The buffer grows if necessary."""
 
 
 @dataclass(slots=True)
 class DeviceBlock:
-    """Sorted events of one time span on the device."""
+    """Sorted events of one chunk of simulated time, in device memory."""
 
     arrays: Any
     """Columns of the events: the kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     count: int
     """Number of events."""
     look: Callable[[], Any] | None = None
-    """Finds the surfaces that the events saw in a world; valid until the engine goes on."""
+    """Function that finds the surfaces that the events saw, valid until the next chunk; None for a picture scene."""
 
     def events(self) -> Events:
         """Return the events in host memory."""
@@ -91,7 +93,10 @@ class DeviceBlock:
         return DeviceEvents(b.x, b.y, b.t, b.p), b.points
 
     def truth(self) -> EventTruth:
-        """Return the ground truth of the events. In a world, call it before the engine goes on."""
+        """Return the ground truth of the events.
+
+        In a world, call this method before the engine simulates the next chunk.
+        """
         cause = self.arrays.cause.numpy() if self.count else np.empty(0, np.uint8)
         if self.look is None:
             return EventTruth(self.points(), cause)
@@ -151,12 +156,15 @@ class Engine:
         self.now_us = 0
 
     def _steps_per_chunk(self, chunk_us: int | None, longest: float) -> int:
-        """Return the number of steps per chunk; ``longest``: upper bound of its span [us]."""
+        """Return the number of time steps per chunk.
+
+        ``chunk_us``: length of a chunk [us], None for the default; ``longest``: upper bound of the length [us].
+        """
         span = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
         return max(1, int(min(span, longest)) // self._step)
 
     def prepare(self) -> None:
-        """Read the first pictures and load the kernels, which otherwise happens in the first chunk."""
+        """Load the kernels and read or render the first maps, which otherwise happens in the first chunk."""
         launching.load(self._kernel(), self._device)
         if self._maps is not None:
             self._maps.cover(0, self._chunk_steps * self._step)
@@ -176,7 +184,10 @@ class Engine:
             yield block
 
     def _tables(self, first: int, count: int) -> Any:
-        """Return the tables that kernels need for the instants of a chunk, computed in float64."""
+        """Return the kernels' tables of the instants of a chunk, computed in float64.
+
+        ``first``: number of the chunk's first step; ``count``: number of steps.
+        """
         simulation, margin = self._simulation, self._margin
         t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
         angle = simulation.motion.phase + simulation.motion.angle(t)
@@ -202,7 +213,10 @@ class Engine:
     def _fill_maps(
         self, maps: MapRing | WorldMapRing, table: NDArray[Any], t: NDArray[np.float64], first: int, count: int
     ) -> None:
-        """Fill in, for each instant, the picture maps before and after it, and the projection onto them."""
+        """Enter the maps before and after each instant, and the projection onto the maps, into ``table``.
+
+        ``t``: instants [us], shape (n,); ``first``, ``count``: number of the chunk's first step, and number of steps.
+        """
         times, slots = maps.cover(first * self._step, (first + count) * self._step)
         self._view.maps = maps.maps
         before = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
@@ -236,12 +250,12 @@ class Engine:
         inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
-        if self._filters:  # at the start, the photoreceptors' outputs have settled to the light that they see
+        if self._filters:  # at the start, the photoreceptors have settled to the light of the scene
             levels = np.ascontiguousarray(self._state[0].numpy()["level"])
             self._state.append(wp.array(levels, dtype=float, device=self._device))
 
     def _generate_keys(self, steps: Any, count: int) -> wp.array:
-        """Simulate the pixels over a chunk; return the sorted keys of the events before its end.
+        """Simulate the pixels over a chunk; return the sorted keys of the events before the end of the chunk.
 
         Later events are kept for the next chunk.
         """
@@ -265,7 +279,7 @@ class Engine:
             values = keys.numpy()[:total]  # shares the memory of keys
             values.sort()
             return int(np.searchsorted(values, limit))
-        # without a row scan, no two events of a pixel share a microsecond: the bits below the pixel need no sorting
+        # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
         lowest = int(readout.LAG_BIT) if self._readout.scans_rows else int(kernels.LOW_BITS)
         order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
         wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
@@ -274,7 +288,7 @@ class Engine:
         return int(found.numpy()[0])
 
     def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
-        """Convert sorted keys to events and their ground truth."""
+        """Convert sorted keys of events to a block of events with ground truth."""
         keys, stamps = self._readout.read(keys, steps.shift, first * self._step)
         n = len(keys)
         block = event_keys.Block()
@@ -294,7 +308,7 @@ class Engine:
 
 
 class KeyBuffer:
-    """Buffer for the event keys of a chunk, in segments of pixels. It grows if a chunk has more events."""
+    """Buffer for the event keys of a chunk, in segments of pixels. The buffer grows if a chunk has more events."""
 
     def __init__(self, pixels: int, device: Any) -> None:
         """Allocate the buffer for ``pixels`` pixels."""
@@ -362,7 +376,7 @@ class KeyBuffer:
 def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
     """Return the prism azimuths and matrices of a table of instants in blocks of 16, shape (n, 11, 16).
 
-    The last block is filled up with the last instant.
+    The last block is padded with copies of the last instant.
     """
     ahead = int(prism_view.AHEAD)
     columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9)], axis=1)
@@ -371,7 +385,7 @@ def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def sensor_params(sensor: SensorModel, step: int) -> Any:
-    """Return the sensor's parameters in the kernels' units: ticks of 1/16 us, and steps of ``step`` [us]."""
+    """Return the sensor's parameters in the kernels' units: ticks of 1/16 us, and time steps of ``step`` [us]."""
     ticks = float(kernels.TICKS)
     s = kernels.SensorParams()
     s.on, s.off, s.mismatch = sensor.contrast_on, sensor.contrast_off, sensor.mismatch

@@ -1,4 +1,4 @@
-"""Device memory of the maps that a simulation looks up."""
+"""Device memory for the maps of a simulation: pictures of the scene in which pixels look up their light."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ import warp as wp
 
 
 class MapSlots:
-    """Slots for maps in arrays that grow: slot k of an array begins at index ``k * texels``."""
+    """Arrays that are divided into slots for maps, and grow if all slots are taken.
+
+    Slot k of an array begins at index ``k * texels``.
+    """
 
     def __init__(self, texels: int, *dtypes: Any, device: Any) -> None:
-        """``dtypes``: one array of each type, with ``texels`` elements per map."""
+        """Make one empty array of each type in ``dtypes``. A slot has ``texels`` elements."""
         self._texels, self._free = texels, list[int]()
         self.arrays = [wp.empty(0, dtype=dtype, device=device) for dtype in dtypes]
-        """The arrays; others after :meth:`take` when they have grown."""
+        """Arrays of all slots. :meth:`take` replaces the arrays when they have to grow."""
 
     def take(self) -> int:
-        """Return a free slot; double their number if there is none."""
+        """Return the number of a free slot. If no slot is free, double the number of slots."""
         if not self._free:
             held = len(self.arrays[0]) // self._texels
             slots = 2 * held or 1
@@ -28,5 +31,5 @@ class MapSlots:
         return self._free.pop()
 
     def give_back(self, slot: int) -> None:
-        """Make a slot free again."""
+        """Make a slot available again."""
         self._free.append(slot)

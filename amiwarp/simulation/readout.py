@@ -1,4 +1,4 @@
-"""Readout of the simulated sensor: rows that are read in turn, and a bus with a queue that limits the event rate."""
+"""Readout of the simulated sensor: sequential readout of rows, and a bus with a queue that limits the event rate."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 LONGEST_SCAN_US = 10_000.0
-"""Longest time in which all rows may be read [us]. The keys of events hold a delay of up to 32 ms."""
+"""Longest allowed time to read all rows [us]. The integer keys of events can store a delay of up to 32 ms."""
 
 
 class Readout:
-    """Readout of one simulated sensor. It keeps the state of the bus from block to block, and needs no other memory."""
+    """Readout of one simulated sensor. Only the state of the bus is kept between blocks of events."""
 
     def __init__(self, simulation: Simulation, device: Any) -> None:
         """Set up the readout; raise :class:`AmiwarpError` if reading all rows takes too long."""
@@ -43,7 +43,7 @@ class Readout:
 
     @property
     def scans_rows(self) -> bool:
-        """Whether the sensor reads its rows in turn, instead of each event at once."""
+        """Whether the sensor reads rows one after the other, instead of every event at once."""
         return self._row_ps > 0
 
     @property
@@ -54,7 +54,7 @@ class Readout:
     def stamp_rows(self, keys: wp.array, count: int, shift: int, origin_us: int) -> None:
         """Replace the times of the first ``count`` keys by the times at which their rows are read.
 
-        ``origin_us``: time of tick 0 [us].
+        ``shift``: bit position of the time in a key; ``origin_us``: time of tick 0 of the keys [us].
         """
         if not self.scans_rows or not count:
             return
@@ -64,7 +64,9 @@ class Readout:
         launch.launch(kernels.stamp_rows, count, [scan, keys], [], device=self._device)
 
     def read(self, keys: wp.array, shift: int, origin_us: int) -> tuple[wp.array, wp.array | None]:
-        """Return the keys of the events that are read out, and their time stamps [us] if they differ from the keys'.
+        """Return the keys of the events that are read out, and their time stamps [us].
+
+        The time stamps are None if the keys already hold them.
 
         A row scan reads one event per pixel: later events of the pixel in the same scan are lost. Events that do not
         fit into the queue of the bus are lost, too.

@@ -1,4 +1,4 @@
-"""View of the simulated camera: placement of the picture, speed of its image, and picture maps on the device."""
+"""View of the simulated camera: placement of the picture, speed of the image, and maps of pictures on the device."""
 
 from __future__ import annotations
 
@@ -23,35 +23,37 @@ if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 LARGEST_MOTION = 0.5
-"""Largest motion of the image in a time step [px]."""
+"""Largest motion of the image in a time step of the simulation [px]."""
 
 LONGEST_STEP = 2000
-"""Longest time step, even if nothing moves [us]."""
+"""Longest time step of the simulation, even if nothing moves [us]."""
 
 STEPS_PER_FRAME = 4
-"""Smallest number of time steps between two pictures of a sequence."""
+"""Smallest number of time steps of the simulation between two pictures of a sequence."""
 
 TEXELS_PER_PIXEL = 1.75
 """Texels of a picture map per sensor pixel, along each axis."""
 SMALLEST_COSINE = 0.25
-"""Cosine of the largest angle between a line of sight and the picture's axis: a plane does not extend around the
-camera."""
+"""Cosine of the largest angle between a line of sight and the axis of the picture.
+
+The picture lies on a plane, which does not reach to directions beside or behind the camera.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageMotion:
-    """Largest speeds of the image by the prism and by the camera."""
+    """Largest motion of the image that a turn of the prism or of the camera by a unit angle causes."""
 
     prism: float
-    """Largest motion of the image per angle of the prism [px/rad]."""
+    """Largest motion of the image per rotation angle of the prism [px/rad]."""
     camera: NDArray[np.float64]
-    """Largest motion of the image per angle of the camera about each of its axes [px/rad], shape (3,)."""
+    """Largest motion of the image per rotation angle of the camera about each of its axes [px/rad], shape (3,)."""
 
 
 def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float = math.inf) -> int:
     """Return the length of a time step [us] in which the image moves by at most half a pixel.
 
-    ``world_speed``: speed of a world in the image [px/s]; ``longest``: upper bound [us].
+    ``world_speed``: speed of the image of a world, prism excluded [px/s]; ``longest``: upper bound of the step [us].
     """
     motion = image_motion(simulation)
     rates = simulation.camera_motion.largest_rates
@@ -68,7 +70,7 @@ def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float 
 
 
 def image_motion(simulation: Simulation) -> ImageMotion:
-    """Compute the speeds of the image on a grid of pixels that includes the corners, over one turn of the prism."""
+    """Return the largest motion of the image on a grid of pixels, corners included, over one turn of the prism."""
     camera, device = simulation.camera, simulation.device
     grid = np.stack(
         [m.ravel() for m in np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))], 1
@@ -86,7 +88,10 @@ def image_motion(simulation: Simulation) -> ImageMotion:
 
 
 def _camera_image_motion(simulation: Simulation, grid: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute the largest motion of the image per angle of the camera about each of its axes [px/rad]."""
+    """Return the largest motion of the image per rotation angle of the camera about each axis [px/rad], shape (3,).
+
+    ``grid``: pixels at which the motion is computed, shape (n, 2).
+    """
     camera = simulation.camera
     rays = camera.pixels_to_rays(wp.array(grid.astype(np.float32), dtype=wp.vec2, device=simulation.device)).numpy()
     angle = 1e-2
@@ -99,7 +104,10 @@ def _camera_image_motion(simulation: Simulation, grid: NDArray[np.float64]) -> N
 
 
 def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
-    """Return the bearings that the image's border sees over one turn, in the camera's frame, shape (n, 3)."""
+    """Return the directions that pixels on the image's border see over one turn of the prism, shape (n, 3).
+
+    The directions are in the camera's frame. Pixels without a valid ray are left out.
+    """
     camera, device = simulation.camera, simulation.device
     right, bottom = camera.width - 1.0, camera.height - 1.0
     along = np.linspace(0.0, 1.0, 33)
@@ -122,11 +130,11 @@ def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
 def place_scene(simulation: Simulation) -> Placement:
     """Place the picture so that it covers everything that the camera sees through the turning prism.
 
-    Raises :class:`AmiwarpError` if the camera turns away from it.
+    Raises :class:`AmiwarpError` if the camera turns too far away from the picture.
     """
     bearings = seen_bearings(simulation)
     if not len(bearings):
-        raise AmiwarpError("no pixel at the image's border has a ray; check the camera's distortion and the prism")
+        raise AmiwarpError("no pixel at the image's border has a valid ray; check the distortion and the prism")
     duration = simulation.duration_s
     at = simulation.camera_motion.orientation(duration)(np.linspace(0.0, duration, 400))
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -149,12 +157,15 @@ def place_scene(simulation: Simulation) -> Placement:
 def _pictures(simulation: Simulation) -> Scene:
     """Return the picture scene of a simulation; raise :class:`AmiwarpError` for a world."""
     if not isinstance(simulation.scene, Scene):
-        raise AmiwarpError("a world has no picture at infinity; give a Scene of pictures")
+        raise AmiwarpError("the scene is a world, which has no picture at infinity; give a Scene")
     return simulation.scene
 
 
 class MapRing:
-    """Maps of the pictures around the current time span on the device. Pictures are read when needed."""
+    """Maps of a picture sequence for the current span of time, in slots of device memory.
+
+    A map is the log intensity of a picture, resampled and blurred. Pictures are read when they are needed.
+    """
 
     def __init__(self, simulation: Simulation, placement: Placement) -> None:
         """Open the pictures without reading them."""
@@ -167,16 +178,16 @@ class MapRing:
         self._frames = scene.frames.read()
         self._device = simulation.device
         self._texels = placement.width * placement.height
-        self._held: list[tuple[int, int]] = []  # time [us], slot
+        self._held: list[tuple[int, int]] = []  # time [us] and slot of each map
         self._slots = MapSlots(self._texels, wp.vec4, device=self._device)
 
     @property
     def maps(self) -> wp.array:
-        """Bilinear pieces of log intensity of all maps, slot by slot."""
+        """Coefficients of bilinear interpolation of the log intensity at each texel of all maps, slot by slot."""
         return self._slots.arrays[0]
 
     def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Return the times [us] and the slots on the device of the maps around ``start`` .. ``stop`` [us].
+        """Load the maps for the span ``start`` .. ``stop`` [us]; return their times [us] and their slots.
 
         There is at least one map.
         """
@@ -196,14 +207,17 @@ class MapRing:
         return np.array(times, np.float64), np.array(slots, np.int32)
 
     def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the rotation from the camera's to the pictures' frame at times [us], shape (n, 3, 3); None at rest."""
+        """Return rotation matrices from the camera's to the pictures' frame at times ``t_us`` [us], shape (n, 3, 3).
+
+        None stands for a camera at rest.
+        """
         return None if self._orientation is None else self._orientation(np.maximum(t_us, 0.0) * 1e-6)
 
 
 def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the coefficients of bilinear interpolation between texels, shape (height, width, 4).
 
-    They are the factors of 1, x, y and xy between each texel and its right and lower neighbours.
+    The coefficients are the factors of 1, x, y and xy between each texel and its right and lower neighbours.
     """
     pieces = np.zeros((*texels.shape, 4), np.float32)
     pieces[..., 0] = texels
@@ -216,7 +230,7 @@ def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
 def log_view(simulation: Simulation) -> NDArray[np.float32]:
     """Return the first picture as the camera would see it without the prism at time 0.
 
-    The log intensity has the shape (height, width).
+    The result is the log intensity, shape (height, width).
     """
     camera, device = simulation.camera, wp.get_device(simulation.device)
     placement = place_scene(simulation)

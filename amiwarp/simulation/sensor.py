@@ -1,4 +1,4 @@
-"""The pixels of a simulated event camera."""
+"""Model of the sensor of a simulated event camera."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from amiwarp.validation import one_of, real
 class SensorModel:
     """Model of an event camera's pixels and readout.
 
-    The defaults are those of a good sensor in good light, with fast biases.
-
-    By default, the photoreceptors have unlimited bandwidth, noise does not depend on light, and every event is read out
-    at once.
+    The default values describe a good sensor in good light, with fast biases. By default, the photoreceptors have
+    unlimited bandwidth, noise does not depend on light, and every event is read out at once.
 
     Notes
     -----
@@ -37,19 +35,21 @@ class SensorModel:
     refractory_us: float = 100.0
     """Refractory period: time after an event in which the pixel is blind [us].
 
-    The pixel's new reference is the brightness at the end of this period.
+    The new reference of the pixel is the brightness at the end of this period.
     """
     latency_us: float = 100.0
     """Mean time from a brightness change to the time stamp of its event [us]."""
     latency_jitter_us: float = 30.0
     """Standard deviation of the latency [us]. The time stamps of one pixel stay in order."""
     leak_hz: float = 0.1
-    """Rate of ON events of a pixel without any change, caused by the drift of its reference [1/s]."""
+    """Rate of leak events [1/s]: ON events in constant light, caused by the drift of the pixel's reference."""
     shot_noise_hz: float = 1.0
-    """Rate of random events per pixel, half of them ON [1/s]. Each sets the pixel's reference to the present
-    brightness."""
+    """Rate of random events per pixel due to shot noise [1/s]. Half of these events are ON.
+
+    Each random event sets the pixel's reference to the present brightness.
+    """
     hot_fraction: float = 0.0002
-    """Fraction of the pixels that are hot."""
+    """Fraction of the pixels that are hot: they fire additional random events."""
     hot_hz: float = 100.0
     """Additional rate of random events of a hot pixel [1/s]."""
     cutoff_hz: float | None = 0.0
@@ -70,24 +70,24 @@ class SensorModel:
     The leak rate is drawn anew after each event of the pixel, and is never below a tenth of its mean.
     """
     noise_rate_cov_decades: float = 0.0
-    """Standard deviation of the decimal logarithm of leak and random-event rates between pixels.
+    """Standard deviation of the decimal logarithm of the rates of leak and random events between pixels.
 
-    The rates are log-normal; their medians are ``leak_hz`` and ``shot_noise_hz``.
+    The rates have a log-normal distribution whose medians are ``leak_hz`` and ``shot_noise_hz``.
     """
     row_us: float = 0.0
     """Time to read out a row [us]; 0 if every event is read out at once.
 
-    The rows are read one after the other, from the first to the last and again, without a pause. The events of a row
-    share the time stamp of their readout. A pixel that fires several times between two readouts gives one event, the
-    first. A scan of all rows must not take longer than 10 ms.
+    The rows are read one after the other, from the first to the last and then from the first again, without a pause.
+    The events of a row share the time stamp of their readout. If a pixel fires several times between two readouts, only
+    the first event is kept. A scan of all rows must not take longer than 10 ms.
     """
     bus_rate_mev_s: float = 0.0
     """Largest rate of events that the bus transmits [million events/s]; 0 for unlimited.
 
-    Events wait in a queue, and their time stamp is the time at which the bus transmits them.
+    Events wait in a queue. The time stamp of an event is the time at which the bus transmits the event.
     """
     bus_queue: float = 4096.0
-    """Number of events that the queue of the bus holds. Further events are lost."""
+    """Largest number of events that wait in the queue of the bus. Further events are lost."""
 
     def __post_init__(self) -> None:
         limits = {"mismatch": 0.5, "refractory_us": 1e6, "latency_us": 1e4, "latency_jitter_us": 1e3, "leak_hz": 1e3,
@@ -109,12 +109,12 @@ class SensorModel:
         Parameters
         ----------
         contrast : float, optional
-            Both thresholds [log intensity].
+            ON and OFF threshold [log intensity].
 
         Returns
         -------
         SensorModel
-            The sensor.
+            The sensor model.
         """
         return cls(contrast, contrast, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -130,12 +130,12 @@ class SensorModel:
         Returns
         -------
         SensorModel
-            The sensor.
+            The sensor model.
 
         Raises
         ------
         AmiwarpError
-            If there is no preset of that name.
+            If the name of the preset is unknown.
 
         Notes
         -----
@@ -185,7 +185,7 @@ class SensorModel:
 
 
 def _real_or_none(value: float | None, what: str, least: float, limit: float) -> float:
-    """Return a value between ``least`` and ``limit``; 0.0 if it is None or 0."""
+    """Return a value that must lie between ``least`` and ``limit``; return 0.0 if the value is None or 0."""
     number = 0.0 if value is None else real(value, what, 0.0, limit)
     return number if number == 0.0 else real(number, what, least, limit, " (or 0 for none)")
 

@@ -52,7 +52,7 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
 def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> tuple[NDArray[np.float64], str]:
     """Return the displayed quantity of each point, scaled to 0 … 1, and the name of its colour map.
 
-    The colour maps are perceptually uniform; that of the angle is cyclic.
+    The colour maps are perceptually uniform; the colour map of the angle is cyclic.
     """
     if colour is Colour.ANGLE:
         return shown.theta / math.tau, "twilight"

@@ -1,4 +1,4 @@
-"""Ground truth of the drawn events, read from the recording when it is first needed."""
+"""Ground truth of the events that the inspector draws, read from the recording on first use."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from amiwarp.viewer.timeline import Span
 
 STORES = {Colour.CAUSE: "stored_causes", Colour.INSTANCE: "stored_instances", Colour.DEPTH: "stored_depths"}
-"""Part of the ground truth that each of these colours shows."""
+"""Attribute of :class:`amiwarp.Truth` that each colour choice based on ground truth shows."""
 
 
 def colours_on_offer(truth: Truth | None) -> list[Colour]:
-    """Return the colours that a recording with this ground truth can show."""
+    """Return the colour choices that are possible for a recording with this ground truth."""
     return [c for c in Colour if c not in STORES or getattr(truth, STORES[c], None) is not None]
 
 
 def truth_text(truth: Truth | None) -> str:
-    """Return in one line what the ground truth holds; empty if there is none."""
+    """Return a one-line summary of the content of a ground truth; empty without ground truth."""
     if truth is None:
         return ""
     stores = {"point": truth.stored_points, **{c.value: getattr(truth, name) for c, name in STORES.items()},
@@ -42,20 +42,21 @@ def truth_text(truth: Truth | None) -> str:
 
 @dataclass(frozen=True, eq=False)
 class DrawnTruth:
-    """Ground truth of the drawn events."""
+    """Ground truth of the events that the inspector draws."""
 
     truth: Truth | None
-    """Ground truth of the recording."""
+    """Ground truth of the whole recording; None if the recording has none."""
     span: Span
-    """Events that were read."""
+    """Time span from which the drawn events are a selection."""
     positions: NDArray[np.int64]
-    """Positions of the drawn events in ``span.events``, shape ``(n,)``."""
+    """Indices of the drawn events in ``span.events``, shape ``(n,)``."""
     _read: dict[Colour, NDArray[Any]] = field(default_factory=dict)
 
     def values(self, colour: Colour) -> NDArray[Any]:
-        """Return the codes of causes, the instance numbers or the depths [m], shape ``(n,)``.
+        """Return the values of the drawn events that a colour shows, shape ``(n,)``.
 
-        Raises :class:`AmiwarpError` if the recording does not hold them.
+        The values are codes of causes, instance numbers, or depths [m]. Raises :class:`AmiwarpError` if the recording
+        does not hold this ground truth.
         """
         if colour not in self._read:
             store = getattr(self.truth, STORES[colour], None)
@@ -68,14 +69,14 @@ class DrawnTruth:
         return self._read[colour]
 
     def name(self, colour: Colour, number: int) -> str:
-        """Return the name of a cause or of an instance."""
+        """Return the name of the cause with the code ``number``, or of the instance with this number."""
         if colour is Colour.CAUSE:
             return list(Cause)[number].value.replace("_", " ") if number < len(Cause) else f"cause {number}"
         labels = () if self.truth is None or self.truth.labels is None else self.truth.labels.instances
         return "sky" if number == 0 else labels[number - 1] if number <= len(labels) else f"instance {number}"
 
     def text(self, k: int) -> str:
-        """Return what is known about the drawn event ``k``: cause, instance and depth."""
+        """Return the known ground truth of the drawn event ``k`` as text: cause, instance and depth."""
         known = [c for c in colours_on_offer(self.truth) if c in STORES]
         return "; ".join(
             f"depth {self.values(c)[k]:.3f} m" if c is Colour.DEPTH else f"{c.value} {self.name(c, self.values(c)[k])}"

@@ -1,4 +1,4 @@
-"""VTK actors of a legend: rows with a mark in a colour and its meaning."""
+"""Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ if TYPE_CHECKING:
     from amiwarp.viewer.truth_colours import Legend
 
 CORNER = (0.05, 0.985)
-"""Upper left corner of the legend, as shares of its strip's width and height from the lower left corner."""
+"""Upper left corner of the legend in the strip of the picture that is reserved for the legend.
+
+The coordinates are fractions of the width and height of the strip, from its lower left corner.
+"""
 FONT_SIZE, MARK = 12, "■"
-"""Size of the text [px], and mark of a row."""
+"""Font size of the legend [px], and character that shows the colour of a row."""
 LETTER_PX, MARGIN_PX, LARGEST_STRIP = 7.2, 48, 0.35
-"""Width of a letter and of everything else in the strip [px]; largest share of the strip in the picture."""
+"""Width of a letter, width of mark and margins [px], and largest width of the strip as a fraction of the picture."""
 ROW_PX, LEAST_ROWS, MOST_ROWS = 40, 3, 12
-"""Height of the picture for each colour [px], and limits of the number of colours."""
+"""Height of the picture per row of the legend [px], and smallest and largest number of rows."""
 
 
 def rows_in(height: int) -> int:
-    """Return how many colours a legend has at most in a picture of this height [px]."""
+    """Return the largest number of coloured rows of a legend in a picture of a given height [px]."""
     return max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX))
 
 
 def strip_share(legend: Legend, width: int) -> float:
-    """Return the share of a picture's ``width`` [px] that the legend needs; 0 for an empty legend."""
+    """Return the fraction of a picture's ``width`` [px] that a legend needs; 0 for an empty legend."""
     if not legend:
         return 0.0
     return min((MARGIN_PX + LETTER_PX * max(len(text) for _, text in legend)) / width, LARGEST_STRIP)
@@ -34,7 +37,7 @@ def legend_actors(legend: Legend, ink: str, font: Path) -> list[Any]:
     """Return the actors of a legend in the upper left corner of its strip; ``ink`` is the colour of the text."""
     actors = []
     for k, (colour, text) in enumerate(legend):
-        # all texts begin at the same corner: the rows keep their distance when the size of the picture changes
+        # all rows start at one corner, after line breaks: their distance does not depend on the picture's size
         if colour:
             actors.append(_text("\n" * k + MARK, colour, font))
         actors.append(_text("\n" * k + ("     " if colour else "") + text, ink, font))
@@ -42,6 +45,7 @@ def legend_actors(legend: Legend, ink: str, font: Path) -> list[Any]:
 
 
 def _text(text: str, colour: str, font: Path) -> Any:
+    """Return an actor that shows a text at :data:`CORNER`."""
     import pyvista
 
     actor = pyvista.Text(text)

@@ -1,12 +1,15 @@
-"""Choices for simulated worlds."""
+"""Options of simulated worlds that have a fixed set of values."""
 
 import enum
 
 
 class Seeing(enum.StrEnum):
-    """How the pixels see a world."""
+    """Method by which the simulator computes the light that each pixel receives from a world."""
 
     MAPS = "maps"
-    """Pictures of the world without the prism, rendered whenever it has moved by half a pixel, and blended between."""
+    """Look up pre-rendered pictures of the world (maps), and blend two successive maps linearly in time.
+
+    A map shows the world without the prism. A new map is rendered after the image has moved by half a pixel.
+    """
     RAYS = "rays"
-    """Rays through the prism into the world, for every pixel and step: exact, and slow on a CPU."""
+    """Cast rays from every pixel through the prism into the world at every time step: exact, but slow on a CPU."""

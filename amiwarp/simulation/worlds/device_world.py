@@ -1,4 +1,4 @@
-"""A world on a device: meshes, textures, lights, and the poses of moving bodies at given instants."""
+"""Upload of a simulated world to a device: meshes, textures, lights, and poses of moving bodies at given instants."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from amiwarp.kernels import world as kernels
 from amiwarp.simulation.worlds.scene import Body, Material, World
 
 CUDA_TREE = "cubql"
-"""Kind of the tree of faces on a GPU: rays take 0.5 to 0.65 of the time of Warp's default there, but more on a CPU."""
+"""Warp's constructor of the bounding volume hierarchy of a mesh on a GPU.
+
+Compared with Warp's default constructor, rays take 0.5 to 0.65 of the time on a GPU, but longer on a CPU.
+"""
 LARGEST_PYRAMID = 14
-"""Largest number of levels of a texture pyramid."""
+"""Largest number of levels (the texture and its halved copies) of a texture pyramid."""
 
 
 class DeviceWorld:
-    """Meshes, materials and light of a world on a device.
+    """Meshes, materials and light of a simulated world on a device.
 
     All bodies at rest form one mesh. Each moving body has its own mesh, and a pose at each instant.
     """
@@ -30,7 +33,7 @@ class DeviceWorld:
         self.movers = world.moving
         names = {body.name for body in self.movers}
         still = [body for body in world.bodies if body.name not in names]
-        bodies = [*still, *self.movers]  # the order of bodies on the device
+        bodies = [*still, *self.movers]  # the kernels number the bodies in this order
         texels = _Texels()
         numbers = {label: k + 1 for k, label in enumerate(world.instances)}
         surfaces = [_surface(body, numbers[body.instance or body.name], texels) for body in bodies]
@@ -49,6 +52,7 @@ class DeviceWorld:
         self.set_instants(np.zeros(1))
 
     def _mesh(self, vertices: Sequence[NDArray[np.float64]], bodies: Sequence[Body]) -> Any:
+        """Return one Warp mesh of several bodies, whose vertices are given [m]."""
         starts = np.cumsum([0, *(len(v) for v in vertices)])
         faces = [np.asarray(body.mesh.faces) + start for body, start in zip(bodies, starts, strict=False)]
         points = wp.array(np.concatenate(vertices).astype(np.float32), dtype=wp.vec3, device=self.device)
@@ -58,7 +62,7 @@ class DeviceWorld:
         return mesh
 
     def _upload_faces(self, bodies: Sequence[Body], surfaces: Sequence[Any]) -> None:
-        """Upload the body and the corners of each face, with their texture coordinates and reflectance factors."""
+        """Upload the body number, corners, texture coordinates and reflectance factors of each face."""
         number, corners, uv, shade, density = [], [], [], [], []
         for k, body in enumerate(bodies):
             mesh, faces = body.mesh, np.asarray(body.mesh.faces)
@@ -78,6 +82,7 @@ class DeviceWorld:
         p.density = wp.array(np.concatenate(density).astype(np.float32), dtype=float, device=self.device)
 
     def _upload_light(self) -> None:
+        """Upload ambient light, sun and the positions of lamps."""
         p, world = self.params, self.world
         p.ambient, p.sun = world.ambient, wp.vec3(0.0, 0.0, 1.0)
         if world.sun is not None:
@@ -91,6 +96,7 @@ class DeviceWorld:
         p.lamps = wp.array(lamps, dtype=kernels.Lamp, device=self.device)
 
     def _upload_movers(self, first: int) -> None:
+        """Upload the meshes of the moving bodies. ``first``: number of the first face of the first moving body."""
         movers = []
         for body in self.movers:
             mover = kernels.Mover()
@@ -103,7 +109,10 @@ class DeviceWorld:
         self.params.movers = wp.array(movers, dtype=kernels.Mover, device=self.device)
 
     def set_instants(self, t: NDArray[np.float64]) -> None:
-        """Set the poses of moving bodies and the light of flickering lamps at ``n`` instants, given by times [s]."""
+        """Set the instants at which kernels can see the world: ``t`` [s], shape (n,).
+
+        Uploads the poses of moving bodies and the light of the lamps at these times.
+        """
         poses: NDArray[Any] = np.zeros((len(t), len(self.movers)), cast("Any", kernels.Pose).numpy_dtype())
         centres = np.zeros((len(t), len(self.movers), 3), np.float32)
         for k, body in enumerate(self.movers):
@@ -120,7 +129,7 @@ class DeviceWorld:
 
 
 class _Texels:
-    """Texture pyramids, concatenated."""
+    """Texels of all texture pyramids in one array."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.float32]] = [np.zeros(1, np.float32)]
@@ -128,7 +137,7 @@ class _Texels:
         self._known: dict[int, int] = {}
 
     def add(self, texture: NDArray[np.float32], levels: int) -> int:
-        """Append a texture and its halved copies; return the index of its first texel."""
+        """Append a texture and its halved copies, ``levels`` in total; return the index of the first texel."""
         if id(texture) in self._known:
             return self._known[id(texture)]
         first = self._known[id(texture)] = self._count
@@ -140,11 +149,12 @@ class _Texels:
         return first
 
     def joined(self) -> NDArray[np.float32]:
+        """Return the texels of all pyramids."""
         return np.concatenate(self._parts)
 
 
 def _halved(texture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a texture at half the size, rounded down; each texel is the mean of those that it replaces."""
+    """Return a texture at half its size, rounded down; each texel is the mean of up to four texels."""
     rows, columns = (size // 2 * 2 for size in texture.shape)
     if rows:
         texture = (texture[0:rows:2] + texture[1:rows:2]) / np.float32(2.0)
@@ -154,12 +164,17 @@ def _halved(texture: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _levels(material: Material) -> int:
+    """Return the number of levels of the pyramid of a material's texture; 0 without a texture."""
     if material.texture is None:
         return 0
     return min(LARGEST_PYRAMID, max(material.texture.shape).bit_length())
 
 
 def _surface(body: Body, number: int, texels: _Texels) -> Any:
+    """Return the kernels' description of a body's material, and add its texture to ``texels``.
+
+    ``number``: instance number of the body.
+    """
     material, s = body.material, kernels.Surface()
     s.reflectance, s.emission, s.instance, s.texel = material.reflectance, material.emission, number, -1
     if material.texture is not None:
@@ -179,7 +194,10 @@ def _resting(body: Body) -> NDArray[np.float64]:
 
 
 def _density(mesh: Any, place: NDArray[np.float64], surface: Any) -> NDArray[np.float64]:
-    """Return the texels per metre on each face."""
+    """Return the texture resolution on each face [texels/m], shape (faces,); 0 without a texture.
+
+    ``place``: texture coordinates of the vertices, shape (n, 2).
+    """
     faces = np.asarray(mesh.faces)
     if surface.texel < 0:
         return np.zeros(len(faces))

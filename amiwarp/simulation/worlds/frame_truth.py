@@ -1,4 +1,4 @@
-"""Ground truth of a world at an instant: depth, normals, instances, optical flow, and what the sensor sees."""
+"""Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 ANGLE = 1e-3
-"""Small angle over which the image plane is taken for flat [rad]."""
+"""Half of the angle over which derivatives with respect to direction are difference quotients [rad]."""
 MOMENT_S = 1e-4
-"""Half of the time over which flow is a difference quotient [s]."""
+"""Half of the time over which optical flow is computed as a difference quotient [s]."""
 
 
 class TruthRenderer:
@@ -37,12 +37,12 @@ class TruthRenderer:
     Parameters
     ----------
     simulation : Simulation
-        The simulation, whose scene is a world.
+        Simulation whose scene is a :class:`amiwarp.WorldScene`.
 
     Raises
     ------
     AmiwarpError
-        If the scene is a picture.
+        If the scene of the simulation is a picture.
 
     Examples
     --------
@@ -57,14 +57,14 @@ class TruthRenderer:
 
     def __init__(self, simulation: Simulation) -> None:
         if not isinstance(simulation.scene, WorldScene):
-            raise AmiwarpError("the scene is a picture at infinity; depth and flow belong to worlds: give a WorldScene")
+            raise AmiwarpError("the scene is a picture at infinity, which has no depth; give a WorldScene as the scene")
         self._simulation, self._scene = simulation, simulation.scene
         self._world = DeviceWorld(self._scene.world, simulation.device)
         self._sight = WorldSight(simulation, self._scene, self._world)
         self._rays = pixel_rays(simulation.camera)
 
     def at(self, t_us: int) -> FrameTruth:
-        """Return the ground truth at a time.
+        """Return the ground truth of all pixels at a time.
 
         Parameters
         ----------
@@ -74,7 +74,8 @@ class TruthRenderer:
         Returns
         -------
         FrameTruth
-            Depth, normals, instances, flow and luminance of all pixels, the pose of the camera, and the joints.
+            Depth, normals, instances, optical flow and luminance of all pixels, the pose of the camera, and the
+            positions of the joints.
         """
         t = t_us * 1e-6
         scene, camera, motion = self._scene, self._simulation.camera, self._simulation.motion
@@ -103,7 +104,10 @@ class TruthRenderer:
         )
 
     def _flow(self, seen: SurfaceView, pixels: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-        """Speeds in the image [px/s] of the points that pixels see, shape (n, 2)."""
+        """Return the optical flow [px/s] of the points that pixels see at time ``t`` [s], shape (n, 2).
+
+        ``seen``: surfaces that appear at ``pixels`` [px] in the image without the prism.
+        """
         rays = [self._ray_at(seen, pixels, t, t + h) for h in (-MOMENT_S, MOMENT_S)]
         change = (rays[1] - rays[0]) / (2.0 * MOMENT_S)
         middle = (rays[0] + rays[1]) / 2.0
@@ -114,7 +118,10 @@ class TruthRenderer:
         return np.asarray((ends[1] - ends[0]) / (2.0 * ANGLE) * rate)
 
     def _ray_at(self, seen: SurfaceView, pixels: NDArray[np.float64], t: float, later: float) -> NDArray[np.float64]:
-        """Unit rays in the camera's frame at ``later`` [s] to the points that pixels see at ``t``."""
+        """Return unit rays from the camera at time ``later`` [s] to the points that pixels see at time ``t`` [s].
+
+        The rays are in the camera's frame, shape (n, 3).
+        """
         (r0, r1), (p0, p1) = self._scene.trajectory.poses([t, later])
         rays = self._simulation.camera.pixels_to_rays(pixels).astype(np.float64)
         distance = seen.depth.astype(np.float64) / rays[:, 2]
@@ -136,7 +143,11 @@ class TruthRenderer:
         theta: NDArray[np.float64],
         t_us: int,
     ) -> NDArray[np.float64]:
-        """Speeds [px/s] at which pixels see points move that move by ``speed`` at ``places`` without the prism."""
+        """Return the optical flow [px/s] that pixels see through the turning prism, shape (n, 2).
+
+        ``places``: points [px] that the pixels would see without the prism; ``speed``: the flow at these points without
+        the prism [px/s]; ``theta``: prism angle [rad].
+        """
         size = np.linalg.norm(speed, axis=1, keepdims=True)
         aside = speed / np.maximum(size, 1e-9)
         along = [moved_points(model.deflect_points, places + sign * aside, theta) for sign in (-1.0, 1.0)]
@@ -146,7 +157,7 @@ class TruthRenderer:
         return np.asarray((along[1] - along[0]) / 2.0 * size + (turned[1] - turned[0]) / (20.0 * ANGLE) * rate)
 
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
-        """Luminance of all pixels."""
+        """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
         simulation, device = self._simulation, self._world.device
         given = simulation.prism if prism else replace(simulation.prism, apex=0.0)
         view = prism_view.View()
@@ -164,6 +175,9 @@ class TruthRenderer:
 
 
 def moved_points(move: Callable[..., Any], xy: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points (n, 2) [px] moved by a model's method at prism angles (n,) [rad]."""
+    """Return points (n, 2) [px] after a method of an optical model has displaced them at prism angles (n,) [rad].
+
+    ``move``: method ``compensate_points`` or ``deflect_points`` of the model.
+    """
     points = wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu")
     return np.asarray(move(points, wp.array(theta.astype(np.float32), dtype=float, device="cpu")).numpy(), np.float64)

@@ -1,4 +1,4 @@
-"""Maps of a world around a span of time, rendered along the camera's trajectory."""
+"""Pre-rendered pictures (maps) of a simulated world at successive times along the camera's trajectory."""
 
 from __future__ import annotations
 
@@ -24,39 +24,42 @@ if TYPE_CHECKING:
     from amiwarp.simulation.worlds.world_scene import WorldScene
 
 MARGIN_PX = 24.0
-"""Border of a map beyond the first view of a moving camera [px]: its rotation leaves the map only beyond it."""
+"""Border of a map around the view of a moving camera [px]. If the camera rotates further, the
+orientation of the maps changes."""
 LONGEST_S = 0.5
-"""Longest time between two maps if anything moves [s]."""
+"""Longest time between two successive maps if the camera or a body moves, or a lamp flickers [s]."""
 SAMPLES = 4
-"""Default number of rays per texel."""
+"""Default number of rays per texel at edges."""
 TEXEL_VARIANCE = 1.0 / 12.0 + 1.0 / 6.0
-"""Variance of the blur by a texel's own area and by the bilinear look-up [texels squared]."""
+"""Variance of the blur that a texel's area (1/12) and bilinear interpolation (1/6) cause [texels squared]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldMap:
-    """A map on the device."""
+    """Map of a world in device memory."""
 
     time: float
-    """Time [us]."""
+    """Time that the map shows [us]."""
     slot: int
-    """Slot in the arrays of all maps."""
+    """Number of the slot that holds the map, see :class:`amiwarp.simulation.map_slots.MapSlots`."""
     orientation: NDArray[np.float64]
-    """Orientation of its plane in the world, shape (3, 3)."""
+    """Rotation matrix from the frame of the map's plane to the world's frame, shape (3, 3)."""
 
 
 class WorldMapRing:
-    """Maps around a span of time. Each has a slot on the device.
+    """Maps of a world for the current span of time, in slots of device memory.
 
-    Successive maps share one orientation until the camera's view leaves the map. The camera's rotation is therefore
-    exact; only the effects of its translation and of moving bodies are interpolated. Whole maps follow the camera's
-    translation. On a CPU, if bodies move faster, maps between two whole maps are rendered only where bodies move.
+    Successive maps share one orientation until the camera's view leaves the map. The effect of the camera's rotation is
+    therefore exact; only the effects of the camera's translation and of moving bodies are interpolated in time. The
+    interval between two whole maps depends on the speed of the camera's translation. On a CPU, if bodies move faster in
+    the image, further maps are inserted between two whole maps. An inserted map is rendered only where bodies move, and
+    interpolated elsewhere.
     """
 
     def __init__(
         self, simulation: Simulation, scene: WorldScene, world: DeviceWorld, bearings: NDArray[np.float64]
     ) -> None:
-        """``bearings``: directions in the camera's frame seen over a turn of the prism, shape (n, 3)."""
+        """Place the maps. ``bearings``: directions that the camera sees over a turn of the prism, shape (n, 3)."""
         self._scene, self._camera, self._bearings, self._world = scene, simulation.camera, bearings, world
         focal = max(self._camera.fx, self._camera.fy)
         self.placement = _placement(bearings, focal, MARGIN_PX / focal if scene.trajectory.moves else 2.0 / focal)
@@ -68,18 +71,18 @@ class WorldMapRing:
         self._texels = p.width * p.height
         self._slots = MapSlots(self._texels, wp.vec4, wp.int32, device=simulation.device)
         self._held: list[HeldMap] = []
-        self._whole: list[HeldMap] = []  # the whole maps before and after the last map held; only one at the start
+        self._whole: list[HeldMap] = []  # whole maps before and after the last held map; one at the start
         self.rendered = 0
         """Number of whole maps rendered so far."""
 
     @property
     def maps(self) -> wp.array:
-        """Bilinear pieces of log intensity of all maps, slot by slot."""
+        """Coefficients of bilinear interpolation of the log intensity at each texel of all maps, slot by slot."""
         return self._slots.arrays[0]
 
     @property
     def faces(self) -> wp.array:
-        """Face that each texel of all maps sees, slot by slot; -1 for the sky."""
+        """Number of the face that each texel of all maps sees, slot by slot; -1 for the sky."""
         return self._slots.arrays[1]
 
     @property
@@ -89,7 +92,10 @@ class WorldMapRing:
         return bool(self._scene.trajectory.moves or self._world.movers or flickers)
 
     def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Return times [us] and slots of the maps around ``start`` .. ``stop`` [us], at least one."""
+        """Render the maps for the span ``start`` .. ``stop`` [us]; return their times [us] and their slots.
+
+        There is at least one map. If anything moves, the last map is at ``stop`` or later.
+        """
         if not self._held:
             rotation, _ = self._scene.trajectory.poses([0.0])
             self._whole = [self._render(0.0, rotation[0])]
@@ -101,7 +107,7 @@ class WorldMapRing:
         return np.array([m.time for m in self._held], np.float64), np.array([m.slot for m in self._held], np.int32)
 
     def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return matrices (n, 3, 3) from the camera's frame at times [us] to the frame of the maps at those times."""
+        """Return rotation matrices from the camera's frame to the frame of the map at each time [us], (n, 3, 3)."""
         times = np.array([m.time for m in self._held])
         which = np.clip(np.searchsorted(times, t_us, side="right") - 1, 0, len(times) - 1)
         reference = np.stack([m.orientation for m in self._held])[which]
@@ -109,7 +115,7 @@ class WorldMapRing:
         return np.asarray(np.swapaxes(reference, 1, 2) @ rotation)
 
     def _next(self) -> None:
-        """Append the next whole map, or a map before it."""
+        """Append the next whole map, or the next inserted map before it."""
         last = self._held[-1]
         whole, between = self._intervals_s(last.time * 1e-6)
         if last is self._whole[-1]:
@@ -123,7 +129,11 @@ class WorldMapRing:
         self._release(before)
 
     def _following(self, last: HeldMap, interval: float) -> list[HeldMap]:
-        """Render the next whole map, after an interval [s]; a second one if the camera's view leaves the first."""
+        """Return the next whole map, ``interval`` [s] after the map ``last``.
+
+        If the camera turns so far within the interval that its view leaves the area of ``last``, return two maps of the
+        latest time before: one in the old and one in the new orientation.
+        """
         start, reference = last.time * 1e-6, last.orientation
         turned = self._scene.trajectory.poses(np.linspace(start, start + interval, 9)[1:])[0]
         if all(self._fits(reference.T @ rotation) for rotation in turned):
@@ -132,7 +142,7 @@ class WorldMapRing:
         return [self._render(at, reference), self._render(at, self._scene.trajectory.poses([at])[0][0])]
 
     def _intervals_s(self, t: float) -> tuple[float, float]:
-        """Return the time until the next whole map, and the time until the next map [s]."""
+        """Return the times [s] from ``t`` [s] until the next whole map and until the next whole or inserted map."""
         scene, camera = self._scene, self._camera
         self._world.set_instants(np.array([t]))
         parallax = parallax_speed(self._world, camera, scene.trajectory, t, 0)
@@ -140,11 +150,11 @@ class WorldMapRing:
         longest = min(LONGEST_S, flicker_interval_s(scene.world))
         whole, between = (min(longest, scene.motion_px / max(v, 1e-9)) for v in (parallax, parallax + movers))
         if not self._world.device.is_cpu:
-            whole = between  # a GPU renders a whole map faster than the host finds the tiles that change
+            whole = between  # a GPU renders a whole map faster than the host finds the tiles in which bodies move
         return max(whole, 1e-6), max(between, 1e-6)
 
     def _fits(self, turned: NDArray[np.float64]) -> bool:
-        """Return whether the view of a turned camera lies on the map."""
+        """Return whether the view of a camera, rotated by ``turned`` (3, 3) relative to the map, lies on the map."""
         x, y, z = turned @ self._bearings.T
         if z.min() < SMALLEST_COSINE:
             return False
@@ -154,7 +164,10 @@ class WorldMapRing:
         return bool((inside_x & inside_y).all())
 
     def _last_fit(self, low: float, high: float, reference: NDArray[np.float64]) -> float:
-        """Return the latest time [s] before ``high`` at which the camera's view lies on the map."""
+        """Return the latest time [s] between ``low`` and ``high`` at which the camera's view lies on the map.
+
+        ``reference``: orientation of the map, shape (3, 3).
+        """
         for _ in range(20):
             middle = (low + high) / 2.0
             rotation, _ = self._scene.trajectory.poses([middle])
@@ -162,7 +175,7 @@ class WorldMapRing:
         return low
 
     def _render(self, t: float, orientation: NDArray[np.float64]) -> HeldMap:
-        """Render the whole map at a time [s]."""
+        """Render a whole map at time ``t`` [s] with a given orientation (3, 3)."""
         _, position = self._scene.trajectory.poses([t])
         self._world.set_instants(np.array([t]))
         slot = self._slots.take()
@@ -172,7 +185,7 @@ class WorldMapRing:
         return HeldMap(t * 1e6, slot, orientation)
 
     def _render_between(self, time: float) -> HeldMap:
-        """Render the map at a time [us] between the current whole maps."""
+        """Render an inserted map at a time [us] between the current two whole maps."""
         before, after = self._whole[:2]
         _, position = self._scene.trajectory.poses([time * 1e-6])
         self._world.set_instants(np.array([time, before.time, after.time]) * 1e-6)
@@ -186,28 +199,35 @@ class WorldMapRing:
         return HeldMap(time, slot, before.orientation)
 
     def _drop(self, start: int) -> None:
-        """Drop the maps that no instant from ``start`` [us] on needs."""
+        """Drop the maps that are needed only before ``start`` [us]."""
         while len(self._held) > 1 and self._held[1].time <= start:
             self._release(self._held.pop(0))
 
     def _release(self, held: HeldMap) -> None:
-        """Give back the slot of a map that is neither held nor needed to render others."""
+        """Give back the slot of a map if the map is neither held nor a current whole map."""
         if held not in self._held and held not in self._whole:
             self._slots.give_back(held.slot)
 
 
 def map_blur(blur: float) -> float:
-    """Return the blur of a map [texels] for a total blur [px], which includes the texels' area and the look-up."""
+    """Return the standard deviation by which a map must be blurred [texels] for a total blur [px].
+
+    The total blur includes that of the texels' area and of bilinear interpolation (:data:`TEXEL_VARIANCE`).
+    """
     return math.sqrt(max((blur * TEXELS_PER_PIXEL) ** 2 - TEXEL_VARIANCE, 0.0))
 
 
 def _placement(bearings: NDArray[np.float64], focal: float, margin: float) -> Placement:
-    """Place the maps on their plane. Raises :class:`AmiwarpError` if the view is too wide for a plane."""
+    """Return the placement on their plane of maps that show all ``bearings``, shape (n, 3).
+
+    ``focal``: focal length [px]; ``margin``: border [focal lengths].
+    Raises :class:`AmiwarpError` if the view is too wide.
+    """
     x, y, z = bearings.T
     if not len(bearings) or z.min() < SMALLEST_COSINE:
         limit = 2.0 * math.degrees(math.acos(SMALLEST_COSINE))
         raise AmiwarpError(
-            f"the camera sees more than the {limit:.0f} deg that a map covers; give seeing='rays' (--seeing rays)"
+            f"the camera sees more than the {limit:.0f} deg that a map can cover; give seeing='rays' (--seeing rays)"
         )
     low_x, high_x = float((x / z).min()) - margin, float((x / z).max()) + margin
     low_y, high_y = float((y / z).min()) - margin, float((y / z).max()) + margin

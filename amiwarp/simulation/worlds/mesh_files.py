@@ -1,4 +1,4 @@
-"""Mesh files (glTF, GLB, OBJ with MTL, PLY, STL), read by trimesh. Colours become luminance."""
+"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 FORMATS = ("glb", "gltf", "obj", "ply", "stl")
-"""Supported file suffixes."""
+"""Supported suffixes of mesh files."""
 Y_UP = ("glb", "gltf")
-"""Formats whose specification says that y points up."""
+"""Suffixes of the formats in which, by specification, the y axis points up and colours are linear."""
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".gif", ".tga", ".dds", ".ktx2", ".exr")
-"""Suffixes of textures."""
+"""Suffixes of picture files that a mesh file may use as textures."""
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Rotation from y up to z up."""
+"""Rotation matrix from a frame in which y points up to a frame in which z points up."""
 DEFAULT_REFLECTANCE = 0.5
-"""Reflectance of meshes without colours."""
+"""Reflectance of meshes whose file gives neither colours nor a material."""
 
 
 class LoadedMesh(NamedTuple):
-    """One part of a mesh file."""
+    """One mesh of a mesh file, with its material."""
 
     mesh: Mesh
-    """Triangles, z up [m]."""
+    """Triangles in the frame of the file, turned so that z points up [m]."""
     material: Material
-    """Reflectance and texture."""
+    """Reflectance and texture that the file gives the mesh."""
     name: str
-    """Name in the file."""
+    """Name of the mesh's node in the file."""
 
 
 def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) -> list[LoadedMesh]:
@@ -51,11 +51,11 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     Parameters
     ----------
     path : str or Path
-        Mesh file. OBJ and glTF files may refer to other files: materials, textures and buffers.
+        Mesh file. Files that an OBJ or glTF file refers to (materials, textures, buffers) are read as well.
     up : str, optional
-        Axis of the file that points up, ``"y"`` or ``"z"``; None for y in glTF and GLB files and z in others.
+        Axis of the file that points up, ``"y"`` or ``"z"``. None means y in glTF and GLB files, and z in other files.
     scale : float
-        Metres per unit of the file.
+        Length of the file's unit [m].
 
     Returns
     -------
@@ -111,9 +111,13 @@ def _named_files(path: Path) -> Any:
     from trimesh.resolvers import FilePathResolver
 
     class NamedFiles(FilePathResolver):
+        """Resolver of the files that a mesh file refers to."""
+
         missing: str | None = None
+        """First file that cannot be read, with the reason, for a message."""
 
         def get(self, name: str) -> bytes:
+            """Return the content of a file; its name is relative to the folder of the mesh file."""
             file = path.parent / name.replace("\\", "/")
             file = file if file.exists() else path.parent / urllib.parse.unquote(name)
             try:
@@ -140,13 +144,16 @@ def _check_picture(data: bytes) -> None:
 
 
 def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64], name: str, kind: str) -> LoadedMesh:
-    """Return one geometry at one node of the scene."""
+    """Return one geometry of the file as a mesh with a material.
+
+    ``matrix`` and ``offset``: transformation from the geometry to the world; ``kind``: suffix of the file.
+    """
     vertices = np.asarray(part.vertices, np.float64) @ matrix.T + offset
     faces = np.asarray(part.faces)
     visual: Any = part.visual
     if visual.kind == "texture":
         return LoadedMesh(*_textured(visual, vertices, faces, kind), name)
-    if visual.kind == "face":  # each face has its own colour: it needs its own corners
+    if visual.kind == "face":  # faces of different colours cannot share vertices
         light = np.repeat(_reflectance(visual.face_colors, kind), 3)
         return LoadedMesh(
             Mesh(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3), None, light), Material(1.0), name
@@ -157,7 +164,7 @@ def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64
 
 
 def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], kind: str) -> tuple[Mesh, Material]:
-    """Return mesh and material of a geometry that has a material, with or without a texture."""
+    """Return mesh and material of a geometry whose file gives a material, with or without a texture."""
     material = visual.material
     pbr = hasattr(material, "baseColorFactor")
     picture = material.baseColorTexture if pbr else material.image
@@ -168,15 +175,15 @@ def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], k
     if picture is None or visual.uv is None:
         return Mesh(vertices, faces, None, light), Material(factor)
     if not pbr:
-        factor = 1.0  # an OBJ's picture takes the place of its diffuse colour
+        factor = 1.0  # in OBJ files, a texture replaces the diffuse colour
     return Mesh(vertices, faces, np.asarray(visual.uv)[:, :2], light), Material(factor, _luminance(picture))
 
 
 def _luminance(picture: Any) -> NDArray[np.float32]:
-    """Return the linear luminance of a Pillow picture; single rows and columns are doubled."""
+    """Return the linear luminance of a Pillow picture. A single row or column is duplicated."""
     if picture.width * picture.height > MOST_PIXELS:
         raise AmiwarpError(
-            f"a texture of {picture.width}x{picture.height} is over {MOST_PIXELS} pixels; make it smaller"
+            f"a texture has {picture.width}x{picture.height} pixels, more than {MOST_PIXELS}; give a smaller picture"
         )
     pixels = np.asarray(picture.convert("RGB"))
     pixels = np.repeat(pixels, 2, axis=0) if len(pixels) < 2 else pixels
@@ -184,7 +191,10 @@ def _luminance(picture: Any) -> NDArray[np.float32]:
 
 
 def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
-    """Return the luminance of colours (integers, or floats from 0 to 1): linear in glTF files, sRGB in others."""
+    """Return the luminance of colours (integers, or floats from 0 to 1), shape (n,).
+
+    Colours are linear in glTF and GLB files, and sRGB in other files.
+    """
     given = np.asarray(colours)
     values = given[:, :3].astype(np.float64) / (np.iinfo(given.dtype).max if given.dtype.kind in "iu" else 1.0)
     linear = values if kind in Y_UP else srgb_to_linear(values)

@@ -1,4 +1,7 @@
-"""Speed of a world's image. It determines the length of steps and the times of maps."""
+"""Speed at which the image of a simulated world moves.
+
+The simulator derives the length of its time steps and the times of its maps from this speed.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,15 @@ from amiwarp.simulation.worlds.scene import Body
 from amiwarp.simulation.worlds.trajectory import Trajectory
 
 PROBE = 48
-"""Columns of the grid of rays that measures distances in the world."""
+"""Number of columns of the grid of rays that measures the distances of visible surfaces."""
 NEAREST_M = 0.02
-"""Smallest distance [m] for which speeds are computed; closer surfaces count as this close."""
+"""Smallest distance for which speeds in the image are computed [m]. Nearer surfaces are treated as this far away."""
 MOMENT_S = 1e-3
-"""Time over which speeds are difference quotients [s]."""
+"""Time over which speeds are computed as difference quotients [s]."""
 FLICKER_SAMPLES = 16
-"""Smallest number of steps, and of maps, in a period of a flickering lamp."""
+"""Smallest number of time steps, and of maps, per period of a flickering lamp."""
 SAFETY = 1.2
-"""Factor of the speed measured on a coarse grid, which can miss the fastest pixel."""
+"""Factor by which a speed measured on a coarse grid is increased, because the grid can miss the fastest pixel."""
 
 
 def body_speed(body: Body, trajectory: Trajectory, focal: float, t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -46,7 +49,10 @@ def turn_rate(rotation: NDArray[np.float64], rotation_after: NDArray[np.float64]
 
 
 def parallax_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: float, instant: int) -> float:
-    """Return the largest speed in the image [px/s] that the camera's translation gives to bodies at rest."""
+    """Return the largest speed in the image [px/s] that the camera's translation causes.
+
+    ``instant``: index of the time ``t`` [s] in the last call of :meth:`DeviceWorld.set_instants`.
+    """
     before, after = (trajectory.poses([at]) for at in (t, t + MOMENT_S))
     velocity = (after[1][0] - before[1][0]) / MOMENT_S
     if not velocity.any():
@@ -73,7 +79,7 @@ def movers_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: 
 
 
 def rotation_speed(camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return an upper bound of the image speed [px/s] by the camera's rotation, at times [s], shape ``(n,)``."""
+    """Return an upper bound of the speed in the image [px/s] due to the camera's rotation at times [s], shape (n,)."""
     rate = turn_rate(*(trajectory.poses(at)[0] for at in (t, t + MOMENT_S)))
     corner = math.hypot(max(camera.cx, camera.width - 1 - camera.cx), max(camera.cy, camera.height - 1 - camera.cy))
     focal = max(camera.fx, camera.fy)
@@ -81,6 +87,9 @@ def rotation_speed(camera: Camera, trajectory: Trajectory, t: NDArray[np.float64
 
 
 def flicker_interval_s(world: Any) -> float:
-    """Return the longest time between two renderings of flickering lamps [s]; infinite without such lamps."""
+    """Return the longest time between two renderings of a world with flickering lamps [s].
+
+    The time is infinite if no lamp flickers.
+    """
     rates = [lamp.flicker_hz for lamp in world.lamps if lamp.flicker_hz and lamp.flicker_depth]
     return 1.0 / (FLICKER_SAMPLES * max(rates)) if rates else math.inf

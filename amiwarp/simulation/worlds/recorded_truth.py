@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
 
 POSE_INTERVAL_US = 1000
-"""Time between recorded poses [us]."""
+"""Time between two recorded poses [us]."""
 
 MOST_INSTANTS = 1_000_000
 """Largest number of instants whose ground truth is recorded."""
@@ -31,26 +31,31 @@ def chosen_instants(
 ) -> NDArray[np.int64]:
     """Return the instants whose ground truth is recorded [us], shape ``(k,)``.
 
-    They are at ``truth_hz`` from 0 to the end of the recording, or the given times. Raises :class:`AmiwarpError` for
-    times outside the recording, or that do not rise.
+    Instants follow at the rate ``truth_hz`` from 0 to the end of the recording, or are ``truth_times_us``. Raises
+    :class:`AmiwarpError` if times lie outside the recording or do not increase.
     """
     if truth_hz is not None and truth_times_us is not None:
-        raise AmiwarpError("truth_hz and truth_times_us both choose instants; give one of them")
+        raise AmiwarpError("truth_hz and truth_times_us are both given; give one of them")
     if truth_hz is not None:
         rate = real(truth_hz, "truth_hz", 1e-3, 1e6, " 1/s")
         count = int(duration_us * 1e-6 * rate) + 1
         if count > MOST_INSTANTS:
-            raise AmiwarpError(f"truth_hz {rate:g} gives {count} instants, over {MOST_INSTANTS}; give a lower rate")
+            raise AmiwarpError(
+                f"truth_hz {rate:g} gives {count} instants; the limit is {MOST_INSTANTS}; give a lower rate"
+            )
         return np.unique(np.minimum(np.rint(np.arange(count) * (1e6 / rate)), duration_us).astype(np.int64))
     times = array([] if truth_times_us is None else truth_times_us, "truth_times_us")
     found = np.rint(times).astype(np.int64)
     if found.ndim != 1 or (found < 0).any() or (found > duration_us).any() or (np.diff(found) <= 0).any():
-        raise AmiwarpError(f"truth_times_us are not rising times within 0 .. {duration_us} us; sort them, drop doubles")
+        raise AmiwarpError(f"truth_times_us must increase and lie within 0 .. {duration_us} us; sort the times")
     return found
 
 
 class RecordedTruth:
-    """Labels, instants and poses of a simulation, in order of time. A picture has none."""
+    """Producer of the ground truth that a simulation records, in order of time.
+
+    A world gives labels, maps of the chosen instants, and poses. A picture scene gives nothing.
+    """
 
     def __init__(self, simulation: Simulation, instants: NDArray[np.int64]) -> None:
         scene = simulation.scene
@@ -68,14 +73,17 @@ class RecordedTruth:
 
     @property
     def labels(self) -> WorldLabels | None:
-        """Names in the world, or None for a picture."""
+        """Names and classes of the instances in the world; None for a picture scene."""
         if self._scene is None:
             return None
         world = self._scene.world
         return WorldLabels(world.name, world.instances, world.categories)
 
     def frames_before(self, t_us: int) -> Iterator[FrameTruth]:
-        """Yield the ground truth of the next instants before a time, or of all at the end of the recording."""
+        """Yield the ground truth of the remaining instants before ``t_us`` [us].
+
+        At the end of the recording, yield all remaining instants.
+        """
         while self._next_instant < len(self._instants) and (
             self._instants[self._next_instant] < t_us or t_us >= self._duration_us
         ):
@@ -84,7 +92,10 @@ class RecordedTruth:
             self._next_instant += 1
 
     def poses_before(self, t_us: int) -> Poses | None:
-        """Return the next poses before a time, or up to the end of the recording; None for a picture."""
+        """Return the remaining poses before ``t_us`` [us]; None for a picture scene.
+
+        At the end of the recording, return all remaining poses.
+        """
         if self._scene is None:
             return None
         stop = self._duration_us + 1 if t_us >= self._duration_us else t_us
@@ -93,7 +104,7 @@ class RecordedTruth:
         return poses_at(self._scene, t)
 
     def keep(self, truth: EventTruth, t_us: int) -> None:
-        """Keep in memory the ground truth of a block of events, and what belongs to the time before ``t_us``."""
+        """Keep in memory the ground truth of a block of events, and the instants and poses before ``t_us`` [us]."""
         self._events.append(truth)
         self._frames.extend(self.frames_before(t_us))
         self._masks.extend(self.known.take())
@@ -102,7 +113,7 @@ class RecordedTruth:
             self._poses.append(poses)
 
     def kept(self, parameters: dict[str, float]) -> Truth:
-        """Return what :meth:`keep` kept, with the true parameters."""
+        """Return the ground truth that :meth:`keep` stored, together with the true parameters of the prism."""
         known = EventTruth.concatenate(self._events)
         frames = MemoryFrames(self._frames) if self._frames else None
         poses = Poses.concatenate(self._poses) if self._poses else None

@@ -1,4 +1,4 @@
-"""Rendering of a world without the prism: surfaces that rays meet, and maps of log intensity."""
+"""Rendering of a simulated world without the prism: surfaces that rays hit, and maps of log intensity."""
 
 from __future__ import annotations
 
@@ -19,31 +19,34 @@ from amiwarp.optics.camera import Camera
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 
 SMALLEST_LAUNCH = 1 << 10
-"""Smallest number of rays per thread on a CPU."""
+"""Smallest number of rays that one CPU thread handles."""
 ROTATED_GRID = [(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375)]
-"""Positions of four samples relative to the pixel's centre [px]. They are fixed, because random ones fire events."""
+"""Positions of four samples relative to the pixel's centre [px].
+
+The positions are fixed, because random positions would differ between maps and cause events.
+"""
 TILE = int(world_maps.TILE)
 """Side of a tile of a map [texels]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """Surfaces that rays meet."""
+    """Surface that each of n rays hits first."""
 
     depth: NDArray[np.float32]
-    """Distance along the camera's axis [m], shape (n,); infinite for the sky."""
+    """Depth of the surface along the camera's optical axis [m], shape (n,); infinite for the sky."""
     normal: NDArray[np.float32]
-    """Unit normals in the world's frame, on the camera's side, shape (n, 3); zero for the sky."""
+    """Unit normals in the world's frame, pointing to the camera's side, shape (n, 3); zero for the sky."""
     instance: NDArray[np.int32]
     """Instance numbers, shape (n,): 0 is the sky, i + 1 is ``World.instances[i]``."""
     mover: NDArray[np.int32]
-    """Index in ``World.moving``, shape (n,); -1 for bodies at rest and the sky."""
+    """Index of the body in ``World.moving``, shape (n,); -1 for bodies at rest and for the sky."""
     place: NDArray[np.float32]
-    """Points in the world's frame [m], shape (n, 3)."""
+    """Points on the surfaces, in the world's frame [m], shape (n, 3)."""
 
 
 def device_pose(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Any:
-    """Return a pose for the kernels from a matrix (3, 3) and a position [m]."""
+    """Return the kernels' pose of a rotation matrix (3, 3) and a position (3,) [m]."""
     pose = kernels.Pose()
     pose.rotation = wp.mat33(*np.asarray(rotation).ravel().tolist())
     pose.position = wp.vec3(*np.asarray(position).tolist())
@@ -57,9 +60,10 @@ def surfaces_at(
     position: NDArray[np.float64],
     instant: int = 0,
 ) -> SurfaceView:
-    """Return the surfaces that rays meet.
+    """Return the surfaces that rays from a camera hit.
 
-    ``rays``: in the camera's frame, shape (n, 3); ``instant``: a row of :meth:`DeviceWorld.set_instants`.
+    ``rays``: directions in the camera's frame, shape (n, 3); ``rotation``, ``position`` [m]: pose of the camera;
+    ``instant``: index of the time in the last call of :meth:`DeviceWorld.set_instants`.
     """
     n, device = len(rays), world.device
     out = world_view.Surfaces()
@@ -72,26 +76,31 @@ def surfaces_at(
 
 
 def pixel_rays(camera: Camera) -> NDArray[np.float64]:
-    """Return the unit rays of all pixels, row by row, shape (n, 3)."""
+    """Return the unit rays of all pixels in the camera's frame, row by row, shape (height * width, 3)."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     return camera.pixels_to_rays(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64))
 
 
 def sample_grid(samples: int, device: Any) -> wp.array:
-    """Return the positions of a pixel's samples relative to its centre [px]."""
+    """Return the positions of ``samples`` rays relative to the centre of their pixel [px], on the device."""
     centres = (np.arange(math.isqrt(samples)) + 0.5) / math.isqrt(samples) - 0.5
     places = ROTATED_GRID if samples == 4 else [(x, y) for y in centres for x in centres]
     return wp.array(np.array(places, np.float32), dtype=wp.vec2, device=device)
 
 
 class MapRenderer:
-    """Renderer of maps: planes at distance 1 from the camera, as bilinear pieces of log intensity.
+    """Renderer of maps: pictures of a world on a plane at distance 1 from the camera, without the prism.
 
-    The maps are parts of two long arrays, one of pieces and one of the face that each texel sees.
+    One array holds the log intensity of all maps, as coefficients of bilinear interpolation. A second array holds the
+    number of the face that each texel sees.
     """
 
     def __init__(self, world: DeviceWorld, frame: Any, *, blur: float, dark: float, samples: int) -> None:
-        """``frame``: a :class:`amiwarp.kernels.world_maps.MapFrame` without a pose; ``blur``: sigma [texels]."""
+        """Set up the renderer.
+
+        ``frame``: a :class:`amiwarp.kernels.world_maps.MapFrame` without a pose; ``blur``: standard deviation [texels];
+        ``dark``: luminance added before the logarithm; ``samples``: rays per texel at edges.
+        """
         self._world, self._frame, self._dark = world, frame, dark
         frame.offsets = sample_grid(samples, world.device)
         n = frame.width * frame.height
@@ -102,11 +111,11 @@ class MapRenderer:
         half = gaussian(blur)
         self._weights = wp.array(np.concatenate([half[:0:-1], half]), dtype=float, device=world.device)
         self._grid = (-(-frame.height // TILE), -(-frame.width // TILE))
-        self._reach = -(-len(half) // TILE)  # the blur, and the next texel that a bilinear piece needs [tiles]
+        self._reach = -(-len(half) // TILE)  # [tiles]: the blur, and the next texel for interpolation
         self._all = self._numbers(np.ones(self._grid, bool))
 
     def render(self, pose: Any, maps: wp.array, faces: wp.array, first: int) -> None:
-        """Render a map into the arrays of all maps, from index ``first`` on, at the world's first instant."""
+        """Render the whole map of the world's first instant into the arrays, from index ``first`` on."""
         self._frame.pose, self._frame.instant, self._frame.first = pose, 0, first
         self._cast(self._all, faces)
         self._blur(self._all, self._all, maps)
@@ -114,9 +123,10 @@ class MapRenderer:
     def render_between(
         self, pose: Any, maps: wp.array, faces: wp.array, first: int, ends: tuple[int, int], weight: float
     ) -> None:
-        """Render a map between two others, which begin at ``ends``, by interpolation where no body moves.
+        """Render a map between an earlier and a later map, which begin at the indices ``ends``.
 
-        The world's first three instants are those of this map and of the other two; ``weight``: that of the second.
+        The map is interpolated, with weight ``weight`` of the later map, and rendered only where bodies move. The
+        world's first three instants are the times of this map, of the earlier and of the later map.
         """
         frame, world = self._frame, self._world
         n = frame.width * frame.height
@@ -136,11 +146,11 @@ class MapRenderer:
         self._blur(self._numbers(cast), self._numbers(written), maps)
 
     def _numbers(self, tiles: NDArray[np.bool_]) -> wp.array:
-        """Return the numbers of tiles on the device."""
+        """Return the numbers of the marked tiles, counted row by row, on the device."""
         return wp.array(np.flatnonzero(tiles).astype(np.int32), dtype=int, device=self._world.device)
 
     def _cast(self, tiles: wp.array, faces: wp.array) -> None:
-        """Compute the luminance of tiles."""
+        """Cast the rays of tiles, and compute their luminance before the blur."""
         f, device = self._frame, self._world.device
         f.tiles = tiles
         inputs, n = [self._world.params, f], len(tiles) * TILE * TILE
@@ -152,7 +162,7 @@ class MapRenderer:
         launch(world_maps.smooth_edges, n, inputs, [self._smooth], device=device, smallest=SMALLEST_LAUNCH)
 
     def _blur(self, tiles: wp.array, written: wp.array, maps: wp.array) -> None:
-        """Blur the luminance of ``tiles``, and write the log intensities of ``written``."""
+        """Blur the luminance of ``tiles``, and write the log intensities of the tiles ``written`` to ``maps``."""
         f, device = self._frame, self._world.device
         for across, source, target in ((0, self._smooth, self._half), (1, self._half, self._smooth)):
             inputs = [f, source, self._weights, across]

@@ -1,4 +1,4 @@
-"""What a world holds: bodies with meshes and materials, light and sky."""
+"""Content of a simulated world: bodies with meshes and materials, lights and a sky."""
 
 from __future__ import annotations
 
@@ -15,38 +15,44 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import array, instance, real, vector
 
 MOST_INSTANCES = 65535
-"""Instances of a world: their numbers are stored as uint16, 0 is the sky."""
+"""Largest number of instances of a world. Instance numbers are stored as uint16, and number 0 is the sky."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles. Raises :class:`AmiwarpError` for a mesh without faces, or faces of vertices that do not exist."""
+    """Triangle mesh.
+
+    Raises :class:`AmiwarpError` if the mesh has no faces, or if a face refers to a vertex that does not exist.
+    """
 
     vertices: ArrayLike
-    """Corners in the body's frame [m], shape ``(n, 3)``."""
+    """Vertices in the body's frame [m], shape ``(n, 3)``."""
     faces: ArrayLike
-    """Indices of each triangle's corners, shape ``(m, 3)``; the outside sees them counter-clockwise."""
+    """Indices of the vertices of each triangle, shape ``(m, 3)``, counter-clockwise as seen from outside."""
     uv: ArrayLike | None = None
-    """Place of each vertex on the texture, u to the right and v up, in widths and heights of it, shape ``(n, 2)``."""
+    """Texture coordinates of each vertex, shape ``(n, 2)``.
+
+    u points to the right in units of the texture's width, v points up in units of its height.
+    """
     light: ArrayLike | None = None
-    """Factor of the reflectance at each vertex, 0 to 1, shape ``(n,)``."""
+    """Factor by which the reflectance is multiplied at each vertex, 0 to 1, shape ``(n,)``. None stands for 1."""
 
     def __post_init__(self) -> None:
         vertices = array(self.vertices, "mesh's vertices").astype(np.float64)
         faces = np.asarray(self.faces)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-            raise AmiwarpError(f"mesh's vertices have shape {vertices.shape}; give finite numbers, (n, 3)")
+            raise AmiwarpError(f"mesh's vertices have shape {vertices.shape}; give finite numbers of shape (n, 3)")
         if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
-            raise AmiwarpError(f"mesh's faces have shape {faces.shape}; give at least one triangle, (m, 3)")
+            raise AmiwarpError(f"mesh's faces have shape {faces.shape}; give at least one triangle, shape (m, 3)")
         if faces.dtype.kind not in "iu" or faces.min() < 0 or faces.max() >= len(vertices):
-            raise AmiwarpError(f"mesh's faces name vertices outside of 0 .. {len(vertices) - 1}; check the indices")
+            raise AmiwarpError(f"mesh's faces refer to vertices outside of 0 .. {len(vertices) - 1}; check the indices")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces.astype(np.int32))
         for name, shape in (("uv", (len(vertices), 2)), ("light", (len(vertices),))):
             if getattr(self, name) is not None:
                 values = array(getattr(self, name), f"mesh's {name}").astype(np.float64)
                 if values.shape != shape or not np.isfinite(values).all():
-                    raise AmiwarpError(f"mesh's {name} has shape {values.shape}; give finite numbers, {shape}")
+                    raise AmiwarpError(f"mesh's {name} has shape {values.shape}; give finite numbers of shape {shape}")
                 object.__setattr__(self, name, values)
 
     @cached_property
@@ -59,14 +65,17 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a surface reflects: evenly in all directions (Lambert)."""
+    """Material of a surface that reflects light evenly in all directions (Lambert)."""
 
     reflectance: float = 0.5
-    """Share of the light that is reflected, 0 to 1."""
+    """Fraction of the incident light that the surface reflects, 0 to 1."""
     texture: NDArray[Any] | None = None
-    """Factors of the reflectance, linear, shape (height, width), repeated over the plane of ``Mesh.uv``."""
+    """Factors by which the reflectance is multiplied, linear, shape (height, width).
+
+    The texture repeats beyond the range 0 to 1 of ``Mesh.uv``. None stands for the factor 1.
+    """
     emission: float = 0.0
-    """Luminance that the surface emits by itself; white in full light is 1."""
+    """Luminance that the surface emits, relative to a white surface in full light."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "reflectance", real(self.reflectance, "material reflectance", 0.0, 1.0))
@@ -74,38 +83,38 @@ class Material:
         if self.texture is not None:
             texture = array(self.texture, "material texture").astype(np.float32)
             if texture.ndim != 2 or min(texture.shape) < 2 or not (np.isfinite(texture).all() and texture.min() >= 0):
-                raise AmiwarpError(f"material texture has shape {texture.shape}; give numbers from 0, (height, width)")
+                raise AmiwarpError(f"material texture has shape {texture.shape}; give values >= 0, (height, width)")
             object.__setattr__(self, "texture", texture)
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body."""
+    """Rigid body of a world."""
 
     name: str
-    """Name, unique in the world."""
+    """Name of the body, unique in the world."""
     mesh: Mesh
-    """Its surface, in its own frame."""
+    """Surface of the body, in the body's frame."""
     material: Material = field(default_factory=Material)
-    """What the surface is made of."""
+    """Material of the whole surface."""
     trajectory: Trajectory | None = None
-    """Its pose over time; None for a body that rests in the world's frame."""
+    """Pose of the body's frame in the world over time. None for a body at rest whose frame is the world's."""
     category: str = ""
-    """Class label, as ``wall`` or ``person``."""
+    """Class label, for example ``wall`` or ``person``."""
     instance: str | None = None
-    """Instance label, shared by the parts of one thing; None for the name."""
+    """Instance label. Bodies with the same label count as one object. None stands for the body's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sun:
-    """Light from one direction."""
+    """Distant light source, whose light comes from one direction everywhere."""
 
     direction: tuple[float, float, float]
-    """Towards the sun, in the world's frame; of any length."""
+    """Vector towards the sun in the world's frame. The length has no effect."""
     intensity: float = 0.6
-    """Luminance of a white surface that faces it."""
+    """Luminance that the sun gives to a white surface that faces the sun."""
     shadows: bool = True
-    """Whether bodies cast shadows."""
+    """Whether bodies cast shadows in this light."""
 
     def __post_init__(self) -> None:
         direction = vector(self.direction, 3, "sun direction", real)
@@ -118,18 +127,21 @@ class Sun:
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """Light from one point."""
+    """Point light source."""
 
     position: tuple[float, float, float]
-    """In the world's frame [m]."""
+    """Position in the world's frame [m]."""
     intensity: float = 1.0
-    """Luminance of a white surface that faces it at a distance of 1 m."""
+    """Luminance that the lamp gives to a white surface that faces the lamp at a distance of 1 m."""
     flicker_hz: float = 0.0
-    """Frequency of its flicker [1/s]; 0 for none. A lamp on alternating current flickers at twice its frequency."""
+    """Frequency of the flicker [1/s]; 0 for steady light.
+
+    A lamp on alternating current flickers at twice the frequency of the current.
+    """
     flicker_depth: float = 1.0
-    """Amplitude of the flicker, a share of the intensity, 0 to 1."""
+    """Amplitude of the flicker as a fraction of the intensity, 0 to 1."""
     shadows: bool = False
-    """Whether bodies cast shadows."""
+    """Whether bodies cast shadows in this light."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", tuple(float(x) for x in vector(self.position, 3, "lamp position", real)))
@@ -139,12 +151,15 @@ class Lamp:
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """What rays that meet no body see."""
+    """Background at infinity, which is seen where no body is."""
 
     luminance: float = 0.6
-    """Its luminance, or a factor of the panorama."""
+    """Luminance of an even sky, or factor by which the panorama is multiplied."""
     panorama: NDArray[Any] | None = None
-    """Linear luminance in all directions, shape (height, 2 height): azimuth to the right, elevation up."""
+    """Linear luminance in all directions, shape (height, 2 height); None for an even sky.
+
+    The picture is equirectangular with the elevation up. Its middle column shows the direction +x, its right half -y.
+    """
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "luminance", real(self.luminance, "sky luminance", 0.0, 1e6))
@@ -155,28 +170,31 @@ class Sky:
                 or min(panorama.shape) < 2
                 or not (np.isfinite(panorama).all() and panorama.min() >= 0)
             ):
-                raise AmiwarpError(f"sky panorama has shape {panorama.shape}; give numbers from 0, (height, 2 height)")
+                raise AmiwarpError(f"sky panorama has shape {panorama.shape}; give values >= 0, (height, 2 height)")
             object.__setattr__(self, "panorama", panorama)
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Bodies, light and sky. The world's frame is right-handed with z up, in metres."""
+    """Three-dimensional scene: bodies, lights and a sky.
+
+    The world's frame is right-handed, with z up and metres as unit.
+    """
 
     name: str
-    """Name for messages and files."""
+    """Name of the world, used in messages and stored in recordings."""
     bodies: tuple[Body, ...]
-    """Everything that can be seen but the sky."""
+    """All bodies of the world, at least one."""
     ambient: float = 0.4
-    """Luminance of a white surface in the shade."""
+    """Luminance of a white surface in the shade, where only ambient light falls."""
     sun: Sun | None = None
-    """Light from one direction."""
+    """Distant light source; None for none."""
     lamps: tuple[Lamp, ...] = ()
-    """Lights at points."""
+    """Point light sources."""
     sky: Sky = field(default_factory=Sky)
-    """What lies behind everything."""
+    """Background at infinity."""
     joints: Mapping[str, Trajectory] = field(default_factory=dict)
-    """Named points that move, as the joints of a figure: their trajectories."""
+    """Trajectories of named points, such as the joints of a figure."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bodies", tuple(self.bodies))
@@ -189,13 +207,16 @@ class World:
         names = [body.name for body in self.bodies]
         doubles = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
         if doubles:
-            raise AmiwarpError(f"world {self.name!r} has several bodies named {doubles[0]!r}; give each its own name")
+            raise AmiwarpError(f"world {self.name!r} has several bodies named {doubles[0]!r}; give unique names")
         if len(self.instances) > MOST_INSTANCES:
-            raise AmiwarpError(f"world {self.name!r} has {len(self.instances)} instances; at most {MOST_INSTANCES}")
+            raise AmiwarpError(f"world {self.name!r} has {len(self.instances)} instances; give up to {MOST_INSTANCES}")
 
     @property
     def instances(self) -> tuple[str, ...]:
-        """Instance labels in the order of their bodies; the label at index i has the number i + 1, the sky has 0."""
+        """Instance labels in the order of the bodies.
+
+        The label at index i has the instance number i + 1; number 0 is the sky.
+        """
         return tuple(dict.fromkeys(body.instance or body.name for body in self.bodies))
 
     @property
@@ -208,7 +229,7 @@ class World:
 
     @property
     def moving(self) -> tuple[Body, ...]:
-        """Bodies whose pose changes."""
+        """Bodies whose pose changes over time."""
         return tuple(body for body in self.bodies if body.trajectory is not None and body.trajectory.moves)
 
     @property

@@ -1,4 +1,4 @@
-"""Interface between the simulator's engine and a world: rays of pixels, speeds, and the surfaces that events saw."""
+"""Connection of the event simulator to a world: rays of pixels, image speeds, and surfaces that events saw."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from amiwarp.simulation.worlds.world_scene import WorldScene
 
 RAYS_PER_PIXEL = 4
-"""Default number of rays per pixel."""
+"""Default number of rays per pixel if pixels see the world by rays."""
 LEAST_CONE_PX = 0.25
-"""Smallest angular width of a ray [px]."""
+"""Smallest width of the cone of a ray [px]. Textures are averaged over the cone."""
 MOMENTS = 64
-"""Number of times at which the speed of a world's image is computed."""
+"""Number of times in a simulation at which the speed of the world's image is computed."""
 
 
 def aperture(scene: WorldScene) -> NDArray[np.float32]:
-    """Return the rays of a pixel, shape (n, 3): x and y relative to its centre [px], and weights that sum to 1.
+    """Return the rays of a pixel, shape (n, 3): x and y relative to the centre [px], and weights that sum to 1.
 
-    They are the nodes of a Gauss-Hermite quadrature, whose variance is that of the optical blur.
+    The rays are the nodes of a Gauss-Hermite quadrature with the variance of the optical blur.
     """
     side = math.isqrt(scene.samples or RAYS_PER_PIXEL)
     nodes, weights = np.polynomial.hermite_e.hermegauss(side)
@@ -46,16 +46,16 @@ def aperture(scene: WorldScene) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True)
 class ImageSpeed:
-    """Upper bounds of the speed of a world's image without the prism [px/s]."""
+    """Upper bounds of the speed at which a world's image without the prism moves [px/s]."""
 
     total: float
-    """All motion together."""
+    """Speed due to all motion of the camera and the bodies [px/s]."""
     in_maps: float
-    """Motion that maps hold: everything but the camera's rotation."""
+    """Speed due to moving bodies and the camera's translation [px/s], which require new maps."""
 
 
 def image_speed(world: DeviceWorld, simulation: Simulation, scene: WorldScene) -> ImageSpeed:
-    """Compute the speed of the image over the duration of a simulation."""
+    """Return the largest speeds of a world's image over the duration of a simulation."""
     t = np.linspace(0.0, simulation.duration_s, MOMENTS)
     camera, trajectory = simulation.camera, scene.trajectory
     world.set_instants(t)
@@ -67,7 +67,7 @@ def image_speed(world: DeviceWorld, simulation: Simulation, scene: WorldScene) -
 
 
 class WorldSight:
-    """Camera and world at the instants of a chunk: inputs of the kernels that cast rays."""
+    """Inputs of the kernels that cast rays: camera and world at the instants of a chunk of simulated time."""
 
     def __init__(self, simulation: Simulation, scene: WorldScene, world: DeviceWorld) -> None:
         self._scene, self._world, device = scene, world, world.device
@@ -81,7 +81,10 @@ class WorldSight:
         self._view.dark = DARK
 
     def set_instants(self, t_us: NDArray[np.float64], view: Any) -> None:
-        """Set the poses of camera and bodies at the instants of a chunk [us]."""
+        """Set the poses of the camera and the bodies at the instants of a chunk.
+
+        ``t_us``: times [us]; ``view``: a :class:`amiwarp.kernels.prism_view.View` with the prism.
+        """
         t = np.maximum(t_us, 0.0) * 1e-6
         self._world.set_instants(t)
         poses: NDArray[Any] = np.zeros(len(t), cast("Any", kernels.Pose).numpy_dtype())
@@ -90,13 +93,14 @@ class WorldSight:
         self._view.prism = view.prism
 
     def inputs(self) -> list[Any]:
-        """Return the first inputs of the kernels that cast rays for pixels."""
+        """Return world and camera, the first inputs of the kernels that cast rays for pixels."""
         return [self._world.params, self._view]
 
     def look(self, view: Any, steps: Any, block: Any, n: int, faces: Any) -> Any:
         """Return the surfaces that ``n`` events saw, as a :class:`amiwarp.kernels.world_view.SeenSurfaces`.
 
-        ``faces``: face of each texel of the maps, or an empty array without maps.
+        ``view``, ``steps``: camera and instants of the chunk; ``block``: events; ``faces``: face of each texel of the
+        maps, or an empty array without maps.
         """
         out = world_view.SeenSurfaces()
         device = self._world.device

@@ -1,4 +1,4 @@
-"""Trajectories: position and orientation of a camera or a body over time."""
+"""Trajectory: position and orientation of a camera or a body over time, in a simulated world."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 LARGEST_SPEED = 1e3
-"""Largest speed of a body or camera [m/s]: more is a jump."""
+"""Largest speed of a body or camera [m/s]. A higher speed is refused as a jump."""
 LARGEST_TURN_RATE = 1e3
-"""Largest angular velocity of a body or camera [rad/s]: more is a jump."""
+"""Largest angular velocity of a body or camera [rad/s]. A higher angular velocity is refused as a jump."""
 COLUMNS = 8
-"""Columns of a table of poses: t, x, y, z, qx, qy, qz, qw."""
+"""Number of columns of a table of poses: t, x, y, z, qx, qy, qz, qw."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses over time, interpolated smoothly, and constant before the first and after the last.
+    """Pose of a camera or a body over time, interpolated smoothly between given poses.
 
     With three or more poses the position follows a cubic spline and the orientation a spline with continuous angular
-    acceleration; with two poses both are linear. Raises :class:`AmiwarpError` for tables of other shapes, times that do
-    not rise, and jumps.
+    acceleration; with two poses both change linearly. Before the first and after the last pose nothing moves. Raises
+    :class:`AmiwarpError` if arrays have the wrong shape, if times do not increase, or if the trajectory jumps.
 
     Examples
     --------
@@ -45,11 +45,14 @@ class Trajectory:
     """
 
     t: ArrayLike
-    """Times [s] from the start of the recording, rising, shape ``(n,)``."""
+    """Times from the start of the recording [s], increasing, shape ``(n,)``."""
     position: ArrayLike
     """Positions in the world [m], shape ``(n, 3)``."""
     rotation: ArrayLike
-    """Orientations as unit quaternions (x, y, z, w), from the camera's or body's frame to the world's, ``(n, 4)``."""
+    """Orientations as unit quaternions (x, y, z, w), shape ``(n, 4)``.
+
+    A quaternion rotates from the frame of the camera or body to the world's frame.
+    """
 
     def __post_init__(self) -> None:
         t = array(self.t, "trajectory's times").astype(np.float64)
@@ -61,9 +64,9 @@ class Trajectory:
                 "give shapes (n,), (n, 3) and (n, 4)"
             )
         if not all(np.isfinite(values).all() for values in (t, position, rotation)):
-            raise AmiwarpError("trajectory holds values that are not finite; drop these poses")
+            raise AmiwarpError("trajectory holds values that are not finite; remove these poses")
         if not (np.diff(t) > 0).all():
-            raise AmiwarpError("trajectory's times do not rise; sort the poses and drop doubles")
+            raise AmiwarpError("trajectory's times do not increase; sort the poses and remove duplicates")
         length = np.linalg.norm(rotation, axis=1, keepdims=True)
         if not (np.abs(length - 1.0) < 0.01).all():
             raise AmiwarpError(
@@ -74,6 +77,7 @@ class Trajectory:
         self._check_jumps()
 
     def _check_jumps(self) -> None:
+        """Raise :class:`AmiwarpError` if the camera or body moves or turns too fast between two poses."""
         from scipy.spatial.transform import Rotation
 
         t, position = self._table()
@@ -89,22 +93,23 @@ class Trajectory:
             if found.max() > limit:
                 at = float(t[int(np.argmax(found))])
                 raise AmiwarpError(
-                    f"trajectory {what} at {found.max():.3g} {unit} after {at:.6g} s, over {limit:g}: it jumps; "
-                    "split it, or check the units of its times (s) and positions (m)"
+                    f"trajectory {what} at {found.max():.3g} {unit} after {at:.6g} s, faster than {limit:g} {unit}; "
+                    "check the units of the times (s) and positions (m), or split the trajectory at the jump"
                 )
 
     def _table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return times [s] and positions [m] as arrays."""
         return np.asarray(self.t, np.float64), np.asarray(self.position, np.float64)
 
     @property
     def moves(self) -> bool:
-        """Whether any two poses differ."""
+        """Whether any two of the given poses differ."""
         position, rotation = np.asarray(self.position), np.asarray(self.rotation)
         return bool((position != position[0]).any() or (rotation != rotation[0]).any())
 
     @cached_property
     def _splines(self) -> tuple[Any, Any]:
-        """Splines of orientation and position."""
+        """Splines of the orientation and of the position over time [s]."""
         from scipy.interpolate import CubicSpline
         from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -113,7 +118,7 @@ class Trajectory:
         return RotationSpline(at, orientation), CubicSpline(at, position)
 
     def poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return orientations and positions at times.
+        """Return the orientations and positions at given times.
 
         Parameters
         ----------
@@ -123,7 +128,7 @@ class Trajectory:
         Returns
         -------
         rotation : ndarray
-            Matrices from the camera's or body's frame to the world's, shape ``(k, 3, 3)``.
+            Rotation matrices from the frame of the camera or body to the world's frame, shape ``(k, 3, 3)``.
         position : ndarray
             Positions in the world [m], shape ``(k, 3)``.
         """
@@ -153,14 +158,14 @@ class Trajectory:
         position : array_like
             Position [m], shape ``(3,)``.
         look_at : array_like, optional
-            Point [m] that the camera's axis goes through, shape ``(3,)``; then ``rotation`` is not used.
+            Point in the world that the camera looks at [m], shape ``(3,)``. With it, ``rotation`` is ignored.
         rotation : array_like
-            Unit quaternion (x, y, z, w).
+            Orientation as a unit quaternion (x, y, z, w), from the frame of the camera or body to the world's frame.
 
         Returns
         -------
         Trajectory
-            One pose, for all times.
+            Trajectory with one pose for all times.
         """
         quaternion = rotation if look_at is None else looking_at(position, look_at).as_quat()
         return cls([0.0], np.asarray(position, np.float64)[None], np.asarray(quaternion, np.float64)[None])
@@ -169,16 +174,17 @@ class Trajectory:
     def from_function(
         cls, pose: Callable[[float], tuple[Rotation, ArrayLike]], duration_s: float, *, rate_hz: float = 100.0
     ) -> Trajectory:
-        """Sample a function of time.
+        """Return a trajectory sampled from a function of time.
 
         Parameters
         ----------
         pose : callable
-            Returns orientation (``scipy.spatial.transform.Rotation``) and position [m] at a time [s].
+            Function that returns the orientation (``scipy.spatial.transform.Rotation``) and the position [m] at a time
+            [s].
         duration_s : float
             Length of the trajectory [s].
         rate_hz : float
-            Samples per second.
+            Number of samples per second.
 
         Returns
         -------
@@ -193,22 +199,23 @@ class Trajectory:
 
     @classmethod
     def from_file(cls, path: str | Path) -> Trajectory:
-        """Read poses from a text file: TUM (spaces) or CSV (commas), eight columns, ``#`` for comments.
+        """Read a trajectory from a TUM or CSV file of poses.
 
         Parameters
         ----------
         path : str or Path
-            File with the columns t [s], x, y, z [m], qx, qy, qz, qw; a CSV may begin with a header line.
+            Text file with the columns t [s], x, y, z [m], qx, qy, qz, qw, separated by spaces (TUM) or commas (CSV).
+            The file may begin with a header line, and contain comments after ``#``.
 
         Returns
         -------
         Trajectory
-            The poses, their times counted from the first.
+            The poses. Times count from the first pose.
 
         Raises
         ------
         AmiwarpError
-            If the file is no such table.
+            If the file does not exist, or is not a table of poses.
         """
         path = Path(path)
         check_regular(path)
@@ -228,7 +235,7 @@ class Trajectory:
                     f"{path}: line {number} has {len(rows[-1])} numbers; expected 8: t x y z qx qy qz qw"
                 )
         if not rows:
-            raise AmiwarpError(f"{path}: holds no poses; expected lines of t x y z qx qy qz qw")
+            raise AmiwarpError(f"{path}: holds no poses; expected lines of 8 numbers t x y z qx qy qz qw")
         table = np.array(rows)
         try:
             return cls(table[:, 0] - table[0, 0], table[:, 1:4], table[:, 4:])
@@ -236,7 +243,7 @@ class Trajectory:
             raise AmiwarpError(f"{path}: {error}") from error
 
     def save_tum(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the poses as a TUM file: lines of t x y z qx qy qz qw, separated by spaces.
+        """Write the poses to a TUM file: lines of t x y z qx qy qz qw, separated by spaces.
 
         Parameters
         ----------
@@ -251,13 +258,16 @@ class Trajectory:
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Rotation:
-    """Return the orientation of a camera at ``position`` [m] that looks at ``target`` [m], its top towards ``up``."""
+    """Return the orientation of a camera at ``position`` [m] that looks at ``target`` [m].
+
+    ``up``: direction in the world that appears upwards in the image.
+    """
     from scipy.spatial.transform import Rotation
 
     forward = np.asarray(target, np.float64) - np.asarray(position, np.float64)
     distance = float(np.linalg.norm(forward))
     if not distance > 0.0:
-        raise AmiwarpError("the camera looks at its own position; give another target")
+        raise AmiwarpError("the camera looks at its own position; give a target at another position")
     forward /= distance
     right: Any = np.cross(forward, np.asarray(up, np.float64))
     if np.linalg.norm(right) < 1e-9:

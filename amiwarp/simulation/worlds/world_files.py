@@ -1,4 +1,4 @@
-"""Worlds from files: a TOML or JSON file that names meshes, materials, trajectories, light and sky."""
+"""Reader of world files: TOML or JSON files that list meshes, materials, trajectories, lights and a sky."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
 from amiwarp.validation import one_of, real, shown
 
 FORMAT, VERSION = "amiwarp-world", 1
-"""Values of the fields ``format`` and ``version``."""
+"""Expected values of the fields ``format`` and ``version`` of a world file."""
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -26,7 +26,7 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class BodyEntry:
-    """Fields of an entry of ``bodies``, except ``material`` and ``trajectory``."""
+    """Fields of an entry of the list ``bodies`` in a world file, except ``material`` and ``trajectory``."""
 
     name: str
     mesh: str
@@ -40,7 +40,7 @@ class BodyEntry:
 
 @dataclass(frozen=True)
 class MaterialEntry:
-    """Fields of ``material``. None keeps the value of the mesh file."""
+    """Fields of ``material`` in a world file. None keeps the value of the mesh file."""
 
     reflectance: float | None = None
     texture: str | None = None
@@ -49,7 +49,7 @@ class MaterialEntry:
 
 @dataclass(frozen=True)
 class SkyEntry:
-    """Fields of ``sky``."""
+    """Fields of ``sky`` in a world file. None stands for the default."""
 
     luminance: float | None = None
     panorama: str | None = None
@@ -57,7 +57,7 @@ class SkyEntry:
 
 @dataclass(frozen=True)
 class PoseEntry:
-    """Fields of a key pose. At most one of ``rotation`` and ``look_at`` is given."""
+    """Fields of a key pose of a trajectory in a world file. At most one of ``rotation`` and ``look_at`` is given."""
 
     t: float
     position: Vector
@@ -68,7 +68,7 @@ class PoseEntry:
 def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
     """Read a world and its camera trajectory from a TOML or JSON file.
 
-    File names in it are relative to its folder. Mesh files need trimesh: ``pip install "amiwarp[worlds]"``.
+    File names in the world file are relative to its folder. Mesh files need trimesh: ``pip install "amiwarp[worlds]"``.
 
     Parameters
     ----------
@@ -78,9 +78,9 @@ def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
     Returns
     -------
     world : World
-        Bodies, light and sky.
+        The world: bodies, lights and sky.
     trajectory : Trajectory or None
-        Camera trajectory; None if the file has none.
+        Trajectory of the camera, or None if the file gives no camera trajectory.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
     """
     path = Path(path)
     data = _read(path)
-    with errors_name(path, lambda: "is no world file"):
+    with errors_name(path, lambda: "is not a world file"):
         optional = ("name", "ambient", "sun", "lamps", "sky", "joints", "camera")
         given = fields_of(data, "", "format", "version", "bodies", optional=optional)
         if given["format"] != FORMAT or given["version"] != VERSION:
@@ -117,7 +117,7 @@ def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the fields of the file."""
+    """Return the fields of a TOML or JSON file."""
     kind = path.suffix.lower()
     if kind == ".json":
         data = read_json(path, "a world")
@@ -130,12 +130,13 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 class _Reader:
-    """Builds a world from the fields of a world file. File names in it are relative to ``folder``."""
+    """Builder of a world from the fields of a world file. File names in the fields are relative to ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def world(self, given: dict[str, Any], name: str) -> tuple[World, Trajectory | None]:
+        """Return the world and the camera's trajectory. ``name``: name of a world file without the field ``name``."""
         options: dict[str, Any] = {"name": _text(given.get("name", name), "name")}
         if "ambient" in given:
             options["ambient"] = real(given["ambient"], "field ambient", 0.0)
@@ -161,17 +162,22 @@ class _Reader:
         return World(bodies=tuple(bodies), **options), camera
 
     def _sky(self, data: Any) -> Sky:
+        """Return the sky of the field ``sky``."""
         entry = build(SkyEntry, data, "sky")
         panorama = None if entry.panorama is None else self._picture(entry.panorama)
         luminance = entry.luminance if entry.luminance is not None else (0.6 if panorama is None else 1.0)
         return Sky(luminance, panorama)
 
     def _picture(self, name: str) -> Any:
+        """Return the linear luminance of a picture file."""
         note_input(self._folder / name)
         return read_picture(self._folder / name)
 
     def _bodies(self, data: Any, where: str) -> list[Body]:
-        """Return the bodies of one entry: one for each part of its mesh file."""
+        """Return the bodies of one entry of ``bodies``: one body for each part of the mesh file.
+
+        ``where``: name of the entry in messages.
+        """
         known = (*BodyEntry.__dataclass_fields__, "material", "trajectory")
         given = fields_of(data, where, "name", "mesh", optional=tuple(k for k in known if k not in ("name", "mesh")))
         plain = {key: value for key, value in given.items() if key not in ("material", "trajectory")}
@@ -199,6 +205,7 @@ class _Reader:
         ]
 
     def _body_trajectory(self, given: Mapping[str, Any], entry: BodyEntry, where: str) -> Trajectory | None:
+        """Return the trajectory of a body; None if the entry gives neither a trajectory nor a pose."""
         if "trajectory" in given:
             for name in ("position", "rotation"):
                 if name in given:
@@ -226,20 +233,21 @@ class _Reader:
 
 
 def _text(value: Any, where: str) -> str:
+    """Return a value that must be text; raise :class:`AmiwarpError` otherwise."""
     if not isinstance(value, str):
         raise AmiwarpError(f"field {where} is {shown(value)}; expected text")
     return value
 
 
 def _entries(value: Any, where: str, expected: str = "a list") -> list[tuple[str, Any]]:
-    """Return the entries of a list, each with its field name for messages."""
+    """Return the entries of a list, each with the name of its field, such as ``bodies[0]``."""
     if not isinstance(value, list):
         raise AmiwarpError(f"field {where} is {shown(value)}; expected {expected}")
     return [(f"{where}[{k}]", entry) for k, entry in enumerate(value)]
 
 
 def _rotation(pose: PoseEntry, where: str) -> Any:
-    """Return the quaternion of a key pose."""
+    """Return the orientation of a key pose as a quaternion (x, y, z, w)."""
     if pose.look_at is None:
         return pose.rotation or (0.0, 0.0, 0.0, 1.0)
     if pose.rotation is not None:
@@ -248,17 +256,22 @@ def _rotation(pose: PoseEntry, where: str) -> Any:
 
 
 def _part_names(name: str, parts: list[LoadedMesh]) -> list[str]:
-    """Return the names of the bodies of an entry: ``name``, or ``name/part`` if the mesh file has several parts."""
+    """Return the names of an entry's bodies: ``name``, or ``name/part`` if the mesh file has several parts."""
     if len(parts) == 1:
         return [name]
     return [f"{name}/{part.name}" for part in parts]
 
 
 def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) -> Material:
-    """Return the material of the mesh file, with the fields of the world file in its place."""
+    """Return the material of a part; fields of the world file replace values of the mesh file.
+
+    ``texture``: picture that the world file gives, or None.
+    """
     own = part.material
     if texture is not None and part.mesh.uv is None:
-        raise AmiwarpError(f"field {where}.material.texture needs texture coordinates, but the mesh has none; add them")
+        raise AmiwarpError(
+            f"field {where}.material.texture needs texture coordinates, but the mesh has none; remove it"
+        )
     reflectance = own.reflectance if texture is None else 1.0
     return Material(
         reflectance if entry.reflectance is None else entry.reflectance,

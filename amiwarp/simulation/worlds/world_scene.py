@@ -1,4 +1,4 @@
-"""A world and the camera's way through it, as the scene of a simulation."""
+"""World and camera trajectory, as the scene of a simulation."""
 
 from __future__ import annotations
 
@@ -10,25 +10,31 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import choice, instance, one_of, real
 
 SAMPLES = (1, 4, 9, 16)
-"""Numbers of rays a pixel, or a texel, that can be chosen."""
+"""Allowed numbers of rays per pixel or per texel."""
 
 
 @dataclass(frozen=True, eq=False)
 class WorldScene:
-    """What a camera sees on its way through a world; takes the place of :class:`amiwarp.Scene`."""
+    """Scene of a simulation in which a camera moves through a world, as an alternative to :class:`amiwarp.Scene`."""
 
     world: World
-    """The world."""
+    """World that the camera sees."""
     trajectory: Trajectory
-    """The camera's pose over time."""
+    """Pose of the camera over time."""
     blur: float = 0.5
-    """Standard deviation of the optical blur, the pixel's aperture included [px]; a single ray a pixel has none."""
+    """Standard deviation of the optical blur, including the area of the pixel [px].
+
+    The blur has no effect with ``seeing="rays"`` and ``samples=1``.
+    """
     seeing: Seeing = Seeing.MAPS
-    """How the pixels see the world."""
+    """Method by which the light that each pixel receives is computed."""
     samples: int | None = None
-    """Rays a texel (maps) or a pixel (rays): 1, 4, 9 or 16; None for 4."""
+    """Number of rays: 1, 4, 9 or 16; None stands for 4.
+
+    With maps, the rays of each texel at an edge; with rays, the rays of each pixel.
+    """
     motion_px: float = 0.5
-    """Largest motion between two maps [px]."""
+    """Largest motion of the image between two successive maps [px], 0.01 to 2. Has no effect with rays."""
 
     def __post_init__(self) -> None:
         instance(self.world, World, "world scene's world")

@@ -1,4 +1,4 @@
-"""Named worlds: scenes made by a program, which need no files."""
+"""Built-in worlds for the simulator. They are generated from a seed and need no files."""
 
 from amiwarp.simulation.worlds.named.catalogue import WORLDS, named_world
 from amiwarp.simulation.worlds.named.motion import TRAJECTORIES

@@ -1,4 +1,4 @@
-"""The world ``ball``: a ball that is thrown across the room and bounces off the floor and the ends of its path."""
+"""Built-in world ``ball``: a ball thrown across a room that bounces off the floor and at both ends of its path."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from amiwarp.simulation.worlds.scene import World
 from amiwarp.simulation.worlds.trajectory import Trajectory
 
 VIEW = room.VIEW
-"""Camera pose: that of the world ``room``."""
+"""Camera pose, the same as in the world ``room``."""
 RADIUS = 0.12
 """Radius of the ball [m]."""
 GRAVITY = 9.81
 """Acceleration of free fall [m/s²]."""
 START = (-1.25, 1.0)
-"""Start of the throw: distance along the path from its middle, and height [m]."""
+"""Position at the start of the throw: distance along the path from its middle, and height [m]."""
 THROWN = (2.6, 3.9)
-"""Initial velocity: along the path, and upwards [m/s]."""
+"""Initial velocity of the ball along the path and upwards [m/s]."""
 LENGTH = 1.55
 """Half the length of the path on the floor [m]; the ball bounces at both ends."""
 MIDDLE, DIRECTION = (-0.15, -0.15), (math.sqrt(0.5), -math.sqrt(0.5))
@@ -28,13 +28,16 @@ MIDDLE, DIRECTION = (-0.15, -0.15), (math.sqrt(0.5), -math.sqrt(0.5))
 BOUNCE = 0.8
 """Fraction of the speed that remains after a bounce."""
 STEP_S = 0.002
-"""Longest time between two poses [s]."""
+"""Longest time between two poses of the ball's trajectory [s]."""
 SPIN = 5.0
-"""Angular velocity about the path [rad/s]; about the vertical axis it is 0.6 of that."""
+"""Angular velocity of the ball about the direction of the path [rad/s].
+
+The angular velocity about the vertical axis is 0.6 times as large.
+"""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
-    """Return the room and the ball."""
+    """Return the world: the room and the ball. ``duration_s``: length of the ball's trajectory [s]."""
     ball = parts.solid(
         "ball",
         shapes.ellipsoid((RADIUS,) * 3, sides=40, rings=20),
@@ -46,7 +49,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def thrown(duration_s: float) -> Trajectory:
-    """Return the trajectory of the ball."""
+    """Return the trajectory of the ball over ``duration_s`` [s]."""
     from scipy.spatial.transform import Rotation
 
     t, along, height = flight(duration_s)
@@ -56,7 +59,10 @@ def thrown(duration_s: float) -> Trajectory:
 
 
 def flight(duration_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return times [s], distances along the path [m] and heights [m]: parabolas between bounces."""
+    """Return the ball's flight: times [s], distances along the path from its middle [m], and heights [m].
+
+    Between two bounces the flight is a parabola.
+    """
     t = np.linspace(0.0, duration_s, max(4, math.ceil(duration_s / STEP_S) + 1))
     step = float(t[1])
     s, z = START

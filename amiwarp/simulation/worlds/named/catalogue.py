@@ -1,4 +1,4 @@
-"""The named worlds, by name."""
+"""Catalogue of the built-in worlds, and the function that builds one by name."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import one_of, real, whole
 
 LONGEST_S = 3600.0
-"""Longest recording of a named world [s]."""
+"""Longest duration of a built-in world [s]."""
 
 
 @dataclass(frozen=True)
 class NamedWorld:
-    """Builder and camera position of a named world."""
+    """Builder and mean camera pose of a built-in world."""
 
     build: Callable[[np.random.Generator, float], World]
     """Function that returns the world for a random generator and a duration [s]."""
     view: Viewpoint
-    """Position and viewing direction of the camera."""
+    """Mean position and viewing direction of the camera."""
 
 
 NAMED = {
@@ -35,9 +35,9 @@ NAMED = {
     "ball": NamedWorld(ball.build, ball.VIEW),
     "person": NamedWorld(person.build, person.VIEW),
 }
-"""Named worlds by name."""
+"""Built-in worlds by name."""
 WORLDS = tuple(NAMED)
-"""Names of the worlds."""
+"""Names of the built-in worlds."""
 
 
 def named_world(
@@ -56,21 +56,21 @@ def named_world(
         Camera motion: ``still``, ``handheld`` (smooth random motion below 3 Hz, about 1.5 cm and 1.5 deg in amplitude;
         in the corridor and the street the camera also walks forward) or ``fast`` (about ten times the speed).
     seed : int
-        Seed of textures, shapes and camera motion. A seed gives the same world with every trajectory.
+        Seed of textures, shapes and camera motion. The same seed gives the same world with every trajectory.
     duration_s : float
-        Length of the trajectories [s]. After it nothing moves.
+        Length of the trajectories [s]. Nothing moves after this time.
 
     Returns
     -------
     world : World
-        Bodies, light and sky; 2,000 to 100,000 triangles.
+        The world: bodies, lights and sky, with 2,000 to 100,000 triangles.
     trajectory : Trajectory
         Camera poses. The camera never passes through a body.
 
     Raises
     ------
     AmiwarpError
-        If there is no such world or trajectory, or the seed or the duration is out of range.
+        If the name of the world or of the trajectory is unknown, or the seed or the duration is out of range.
 
     Examples
     --------

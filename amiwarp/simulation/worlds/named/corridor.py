@@ -1,4 +1,4 @@
-"""The world ``corridor``: doors, notices, pillars, pipes and lights that repeat into the distance."""
+"""Built-in world ``corridor``: doors, notices, pillars, pipes and lights that repeat into the distance."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from amiwarp.simulation.worlds.named.motion import Viewpoint
 from amiwarp.simulation.worlds.scene import Body, Lamp, World
 
 SIZE = (36.0, 2.6, 2.7)
-"""Length, width and height [m]; the corridor lies along x."""
+"""Length, width and height of the corridor [m], which lies along the x axis."""
 BAY = 4.0
-"""Length of a section [m]."""
+"""Length of one section of the corridor [m]."""
 BAYS = tuple(float(x) for x in np.arange(-14.0, 15.0, BAY))
 """Centres of the sections along x [m]."""
 VIEW = Viewpoint((-6.0, -0.1, 1.55), (4.0, 0.15, 1.3), walk_m=(7.0, 0.0, 0.0))
-"""Camera pose: in the middle of the corridor, along which the camera walks."""
+"""Camera pose: in the middle of the corridor. The camera walks along the corridor."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
-    """Return the corridor; nothing in it moves."""
+    """Return the world. No body moves, so ``duration_s`` has no effect."""
     walls = [
         textures.bricks(rng, mean=0.42, joint=0.65),
         textures.checkerboard(8),
@@ -41,7 +41,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def _bay(rng: np.random.Generator, k: int, x: float) -> list[Body]:
-    """Return the light, pillars and pictures of one section."""
+    """Return the light, pillars and pictures of section ``k``, whose centre is at ``x`` [m]."""
     y, z = SIZE[1] / 2.0, SIZE[2]
     light = shapes.box((1.2, 0.3, 0.05), (x, 0.0, z - 0.026))
     north, south = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)
@@ -58,13 +58,13 @@ def _bay(rng: np.random.Generator, k: int, x: float) -> list[Body]:
         *parts.picture(f"picture {k}", (x + 1.1, y, 1.5), north, art, 0.7, 0.8),
         *parts.picture(f"notice {k}", (x + 0.6, -y, 1.5), south, textures.text_page(rng), 0.5, 0.68),
     ]
-    if k % 2 == 0:  # other sections have a door there
+    if k % 2 == 0:  # odd sections have a door in this place
         bodies += parts.grating_strip(f"grating {k}", (x + 0.1, -y, 1.35), south, count=6, side=0.28, cycles=5.0)
     return bodies
 
 
 def _door(leaf: textures.Texture, k: int, x: float) -> list[Body]:
-    """Return a door with frame and handle. Doors alternate between the two sides."""
+    """Return the door of section ``k`` with its frame and handle. Doors alternate between the two walls."""
     side = 1.0 if k % 2 == 0 else -1.0
     at, y = x - 0.75 if side > 0 else x - 1.3, side * SIZE[1] / 2.0
     bars = [shapes.standing_box((0.09, 0.12, 2.15), (at + a * 0.52, y, 0.0), tile_m=0.7) for a in (-1, 1)]

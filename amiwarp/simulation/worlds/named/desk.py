@@ -1,4 +1,4 @@
-"""The world ``desk``, seen from the chair: a screen, a keyboard, printed pages, books, pens and a mug."""
+"""Built-in world ``desk``: a screen, a keyboard, printed pages, books, pens and a mug, seen from the chair."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from amiwarp.simulation.worlds.named.motion import Viewpoint
 from amiwarp.simulation.worlds.scene import Body, Lamp, World
 
 VIEW = Viewpoint((0.05, -0.62, 0.52), (0.0, 0.16, 0.1))
-"""Camera pose: at the head of a person who sits at the desk. The top of the desk is z = 0."""
+"""Camera pose: at the head of a person who sits at the desk. The top of the desk is at z = 0."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
-    """Return the desk; nothing on it moves."""
+    """Return the world. No body moves, so ``duration_s`` has no effect."""
     top = shapes.box((1.7, 0.9, 0.03), (0.0, 0.12, -0.015), tile_m=0.6)
     wall = shapes.panel((-2.0, 0.75, -0.8), (4.0, 0.0, 0.0), (0.0, 0.0, 2.6), tile_m=1.2)
     floor = shapes.panel((-2.0, -1.5, -0.76), (4.0, 0, 0), (0, 2.3, 0), tile_m=1.5)
@@ -28,7 +28,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def _screen(rng: np.random.Generator) -> list[Body]:
-    """Return a screen on a stand. It shows a page of text."""
+    """Return a screen on a stand, which shows a page of text."""
     frame = shapes.merged([
         shapes.box((0.56, 0.03, 0.34), (0.0, 0.5, 0.31), tile_m=0.3),
         shapes.standing_box((0.05, 0.03, 0.16), (0.0, 0.52, 0.0), tile_m=0.3),
@@ -65,6 +65,7 @@ def _keyboard(rng: np.random.Generator) -> list[Body]:
 
 
 def _papers(rng: np.random.Generator) -> list[Body]:
+    """Return three printed pages on the desk."""
     bodies = []
     for k, (x, y, turn) in enumerate(((0.36, -0.06, -12.0), (0.44, 0.1, 18.0), (-0.43, -0.08, 8.0))):
         sheet = shapes.panel((-0.105, -0.148, 0.001 + 0.001 * k), (0.21, 0, 0), (0, 0.297, 0))

@@ -1,4 +1,7 @@
-"""Gait of the walking figure: a hierarchy of joints whose angles depend on the phase of the stride."""
+"""Gait of the walking figure in the world ``person``.
+
+The figure is a hierarchy of joints whose angles depend on the phase of the stride.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +17,27 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 SPEED = 1.25
 """Walking speed [m/s]."""
 STRIDES_HZ = 0.92
-"""Strides (two steps) per second."""
+"""Number of strides, of two steps each, per second."""
 CIRCLE_M = 1.6
 """Radius of the circular path [m]. Its centre is at x = 0, y = 0.8 m."""
 RATE_HZ = 200.0
-"""Poses per second."""
+"""Number of poses per second in the trajectories of the limbs."""
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.44, 0.42, 0.29, 0.26
 """Lengths of the limbs [m]."""
 HIP, SHOULDER, SPINE = 0.1, 0.2, 0.5
-"""Half the distance between the hips and between the shoulders, and the height of the shoulders above the hips [m]."""
+"""Half the distances between the hips and between the shoulders, and height of the shoulders above the hips [m]."""
 ANKLE = 0.075
 """Height of the ankle above the sole [m]."""
 SIDES = ("left", "right")
+"""Sides of the body, as in the names of limbs and joints."""
 JOINTS = (
     "head",
     *(f"{side} {joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in SIDES),
 )
-"""Names of the joints."""
+"""Names of the joints whose positions belong to the ground truth."""
 
 Places = tuple[Any, NDArray[np.float64]]
-"""Orientations (``Rotation``) and positions [m] over time."""
+"""Pose over time: orientations as a ``Rotation``, and positions [m], shape (n, 3)."""
 
 
 def limbs() -> dict[str, Mesh]:
@@ -59,7 +63,7 @@ def limbs() -> dict[str, Mesh]:
 
 
 def walk(duration_s: float) -> dict[str, Trajectory]:
-    """Return the trajectories of all joints and limbs by name."""
+    """Return the trajectories of all joints and limbs by name, for a walk of ``duration_s`` [s]."""
     t = np.linspace(0.0, duration_s, max(4, round(duration_s * RATE_HZ) + 1))
     phase = 2.0 * np.pi * STRIDES_HZ * t
     path = SPEED * t / CIRCLE_M - np.pi / 2.0 - 0.45  # angle on the circle, from the left of the camera's view
@@ -72,13 +76,14 @@ def walk(duration_s: float) -> dict[str, Trajectory]:
 
 
 def _about(axis: tuple[int, int, int], angle: NDArray[np.float64]) -> Any:
+    """Return rotations by angles [rad] about an axis."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(np.outer(angle, axis))
 
 
 def _child(parent: Places, offset: tuple[float, float, float], turn: Any) -> Places:
-    """Return the pose of a joint at ``offset`` in its parent's frame, rotated by ``turn`` relative to it."""
+    """Return the pose of a joint at ``offset`` in its parent's frame, rotated by ``turn`` relative to the parent."""
     rotation, position = parent
     return rotation * turn, position + rotation.apply(offset)
 
@@ -86,8 +91,9 @@ def _child(parent: Places, offset: tuple[float, float, float], turn: Any) -> Pla
 def _legs(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
     """Return the poses of pelvis, hips, knees and ankles, and of the limbs below them.
 
-    The knee bends while its leg swings forward, and the foot stays nearly level. The coefficients minimise the sliding
-    of the standing foot. The angles stay within the range of human walking.
+    ``phase``: phase of the stride [rad], shape (n,). The knee bends while its leg swings forward, and the foot stays
+    nearly level. The coefficients minimise the sliding of the standing foot. The angles stay within the range of human
+    walking.
     """
     out = {"pelvis": root}
     for side, y, shift in (("left", HIP, 0.0), ("right", -HIP, np.pi)):
@@ -103,7 +109,7 @@ def _legs(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
 
 
 def _upper(root: Places, phase: NDArray[np.float64]) -> dict[str, Places]:
-    """Return the poses of trunk, neck, head and arms. Each arm swings with the leg of the other side."""
+    """Return the poses of trunk, neck, head and arms. Each arm swings with the opposite leg."""
     trunk = _child(root, (0, 0, 0.06), _about((0, 0, 1), -0.2 * np.sin(phase)) * _about((0, 1, 0), 0.05 + 0 * phase))
     neck = _child(trunk, (0, 0, SPINE + 0.08), _about((0, 0, 1), 0.12 * np.sin(phase)))
     head = _child(neck, (0.015, 0, 0.2), _about((0, 1, 0), -0.05 + 0.02 * np.sin(2.0 * phase)))

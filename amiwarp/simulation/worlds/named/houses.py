@@ -1,4 +1,4 @@
-"""Houses of the street: walls with windows, sills, cornices and roofs; and a town hall with a tower."""
+"""Buildings of the world ``street``: houses with windows, sills, cornices and roofs, and a town hall with a tower."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from amiwarp.simulation.worlds.scene import Body, Mesh
 STOREY = 3.1
 """Height of a storey [m]."""
 TEXELS = 24
-"""Texels per metre of a façade."""
+"""Resolution of the texture of a façade [texels/m]."""
 WINDOW = (1.1, 1.6)
 """Width and height of a window [m]."""
 SPACING = 2.1
-"""Least distance between the centres of two windows [m]."""
+"""Smallest distance between the centres of two windows of a storey [m]."""
 
 
 def house(
     rng: np.random.Generator, name: str, place: tuple[float, float], width: float, depth: float, storeys: int
 ) -> list[Body]:
-    """Return a house whose front faces y = 0; ``place`` is the middle of the front (x, y) [m]."""
+    """Return a house whose front faces the street, which lies along y = 0.
+
+    ``place``: middle of the front (x, y) [m]; ``width``, ``depth``: size of the house along x and y [m].
+    """
     away = 1.0 if place[1] > 0 else -1.0
     height = STOREY * storeys + 0.4
     middle = (place[0], place[1] + away * depth / 2.0, 0.1)
@@ -53,7 +56,10 @@ def window_columns(width: float) -> NDArray[np.float64]:
 
 
 def _trim(x: float, y: float, away: float, width: float, storeys: int) -> list[Mesh]:
-    """Return window sills, lintels, cornices and the doorstep."""
+    """Return the window sills, lintels, cornices and the doorstep of a house.
+
+    ``x``, ``y``: middle of the front [m]; ``away``: 1 if the house lies at larger y than its front, else -1.
+    """
     meshes = []
     for storey in range(storeys):
         base = 0.1 + STOREY * storey
@@ -75,7 +81,10 @@ def _trim(x: float, y: float, away: float, width: float, storeys: int) -> list[M
 
 
 def front(rng: np.random.Generator, width: float, storeys: int) -> textures.Texture:
-    """Return the texture of a façade: windows in each storey, and a door at the left of the ground floor."""
+    """Return the texture of a façade: windows in each storey, and a door at the left of the ground floor.
+
+    ``width``: width of the façade [m].
+    """
     rows, columns = round((STOREY * storeys + 0.4) * TEXELS), round(width * TEXELS)
     wall = float(rng.uniform(0.2, 0.7))
     if rng.uniform() < 0.5:
@@ -96,7 +105,10 @@ def front(rng: np.random.Generator, width: float, storeys: int) -> textures.Text
 
 
 def _window(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left: int) -> None:
-    """Draw a window: frame, dark panes with a reflection, and sometimes curtains or a lit room."""
+    """Draw a window into the texture ``values``: frame, panes with a reflection, and sometimes curtains or a lit room.
+
+    ``foot``, ``left``: row of the lower edge and column of the left edge [texels].
+    """
     wide, high = round(WINDOW[0] * TEXELS), round(WINDOW[1] * TEXELS)
     pane = values[foot - high : foot, left : left + wide]
     glass = float(rng.choice([0.04, 0.06, 0.1, 0.55], p=[0.35, 0.3, 0.2, 0.15]))
@@ -112,7 +124,10 @@ def _window(rng: np.random.Generator, values: NDArray[np.float64], foot: int, le
 
 
 def _door(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left: int) -> None:
-    """Draw a door with four panels."""
+    """Draw a door with four panels into the texture ``values``.
+
+    ``foot``, ``left``: row of the lower edge and column of the left edge [texels].
+    """
     wide, high = round(WINDOW[0] * TEXELS), round(2.4 * TEXELS)
     leaf = values[foot - high : foot, left : left + wide]
     shade = float(rng.uniform(0.05, 0.5))
@@ -124,7 +139,7 @@ def _door(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left
 
 
 def town_hall(rng: np.random.Generator, x: float) -> list[Body]:
-    """Return a town hall with tower, clock and spire across the end of the street at ``x`` [m]."""
+    """Return a town hall with tower, clock and spire, which stands across the end of the street at ``x`` [m]."""
     wide, high = 26.0, 13.0
     hall = shapes.standing_box((12.0, wide, high), (x + 6.0, 0.0, 0.0))
     tower = shapes.standing_box((5.0, 5.0, 24.0), (x, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Camera trajectories of the named worlds: still, handheld and fast."""
+"""Camera trajectories of the built-in worlds: still, handheld and fast."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from numpy.typing import NDArray
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
 
 TRAJECTORIES = ("still", "handheld", "fast")
-"""Kinds of camera trajectories."""
+"""Names of the kinds of camera trajectories."""
 RATE_HZ = 100.0
-"""Poses per second."""
+"""Number of poses per second."""
 SHAKE_M = 0.015
 """Approximate amplitude of the handheld translation [m]."""
 SHAKE_DEG = 1.5
 """Approximate amplitude of the handheld rotation [deg]."""
 SWAY_HZ = (0.15, 0.55)
-"""Frequency range of the slow sway [Hz]."""
+"""Range of frequencies of the slow part of handheld motion [Hz]."""
 TREMOR_HZ = (1.5, 2.8)
-"""Frequency range of the tremor [Hz]; its relative amplitude is 0.03 per sine."""
+"""Range of frequencies of the tremor in handheld motion [Hz]. Each tremor sine has a relative amplitude of 0.03."""
 FAST_RATE, FAST_REACH = 4.0, 2.5
-"""Factors of frequency and amplitude for fast trajectories; together ten times the speed."""
+"""Ratios of frequency and amplitude of fast to handheld trajectories. Their product, 10, is the ratio of speeds."""
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Mean pose of a camera, and the distance that it walks."""
+    """Mean pose of a camera, and the path that a moving camera walks."""
 
     position: tuple[float, float, float]
-    """Mean position [m]."""
+    """Mean position of the camera [m]."""
     target: tuple[float, float, float]
     """Point that the camera looks at [m]."""
     walk_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Vector from the mean position to the end of the path that a moving camera walks to and fro [m]."""
+    """Vector from the mean position to one end of the path [m]. A moving camera walks the path back and forth."""
     walk_speed: float = 1.2
-    """Largest walking speed [m/s]; fast trajectories have ten times as much."""
+    """Largest walking speed [m/s]. Fast trajectories are ten times as fast."""
 
 
 def camera_trajectory(view: Viewpoint, kind: str, duration_s: float, rng: np.random.Generator) -> Trajectory:
-    """Return the camera trajectory of a kind, one of :data:`TRAJECTORIES`."""
+    """Return a camera trajectory about a viewpoint. ``kind``: one of :data:`TRAJECTORIES`."""
     from scipy.spatial.transform import Rotation
 
     base = looking_at(view.position, view.target)
@@ -55,7 +55,10 @@ def camera_trajectory(view: Viewpoint, kind: str, duration_s: float, rng: np.ran
 
 
 def shake(t: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return smooth random motion along three axes, shape ``(n, 3)``, of amplitude about 1: a sum of six sines each."""
+    """Return smooth random motion of amplitude about 1 along three axes, shape ``(n, 3)``.
+
+    ``t``: times [s]. The motion along each axis is a sum of six sines.
+    """
     low, high = SWAY_HZ
     frequency = np.concatenate([low + (high - low) * (np.arange(4)[:, None] + rng.uniform(size=(4, 3))) / 4.0,
                                 rng.uniform(*TREMOR_HZ, (2, 3))])  # fmt: skip
@@ -66,7 +69,10 @@ def shake(t: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float6
 
 
 def walk(view: Viewpoint, factor: float, t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements [m] along ``view.walk_m``, shape ``(n, 3)``: a sine, so the speed is largest at time 0."""
+    """Return the displacements of a walking camera along ``view.walk_m`` [m], shape ``(n, 3)``.
+
+    ``factor``: factor of the speed; ``t``: times [s]. The motion is a sine, so the speed is largest at time 0.
+    """
     end = np.asarray(view.walk_m)
     length = float(np.linalg.norm(end))
     if not length > 0.0:

@@ -1,4 +1,4 @@
-"""Bodies that several named worlds share: walls, tables, chairs, pictures, vessels."""
+"""Bodies that several built-in worlds contain: walls, tables, chairs, pictures, vessels and gratings."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ def solid(
     name: str, mesh: Mesh, texture: Texture | None, category: str, *, instance: str | None = None,
     trajectory: Trajectory | None = None, emission: float = 0.0,
 ) -> Body:  # fmt: skip
-    """Return a body whose texture gives its reflectance; without a texture it is 0.5."""
+    """Return a body whose reflectance is given by a texture. Without a texture the reflectance is 0.5."""
     material = Material(1.0 if texture is not None else 0.5, texture, emission)
     return Body(name, mesh, material, trajectory, category, instance)
 
 
 def hall(size: Sequence[float], walls: Sequence[Texture], floor: Texture, ceiling: Texture) -> list[Body]:
-    """Return floor, ceiling and four walls of a hall of ``size`` (x, y, z) [m], centred on the z axis."""
+    """Return the floor, ceiling, four walls and skirting board of a hall of ``size`` (x, y, z) [m].
+
+    The hall is centred on the z axis and stands on z = 0.
+    """
     x, y, z = size[0] / 2.0, size[1] / 2.0, size[2]
     sides = {
         "north": ((-x, y, 0), (2 * x, 0, 0)),
@@ -50,7 +53,10 @@ def hall(size: Sequence[float], walls: Sequence[Texture], floor: Texture, ceilin
 def picture(
     name: str, centre: Sequence[float], right: Sequence[float], texture: Texture, width: float, height: float
 ) -> list[Body]:
-    """Return a picture of ``width`` x ``height`` [m] on a wall, and its frame; ``right`` is a unit vector along it."""
+    """Return a picture of ``width`` x ``height`` [m] on a wall, and its frame.
+
+    ``centre``: centre of the picture [m]; ``right``: unit vector along the wall, to the right as seen by a viewer.
+    """
     r = np.asarray(right, np.float64)
     out = np.cross(r, (0.0, 0.0, 1.0))
     middle = np.asarray(centre, np.float64)
@@ -67,7 +73,7 @@ def picture(
 
 
 def _bar(right: Any, out: Any, size: Sequence[float], centre: Any) -> Mesh:
-    """Return a box whose x axis lies along ``right`` and whose y axis lies along ``out``."""
+    """Return a bar of a picture frame: a box whose x axis lies along ``right`` and whose y axis lies along ``out``."""
     mesh = shapes.box(size)
     axes = np.stack([right, out, np.array((0.0, 0.0, 1.0))])
     return Mesh(np.asarray(mesh.vertices) @ axes + centre + 0.015 * out, mesh.faces, mesh.uv)
@@ -76,7 +82,7 @@ def _bar(right: Any, out: Any, size: Sequence[float], centre: Any) -> Mesh:
 def table(
     name: str, size: Sequence[float], position: Sequence[float], texture: Texture, *, turn_deg: float = 0.0
 ) -> Body:
-    """Return a table of ``size`` (x, y, height) [m]."""
+    """Return a table of ``size`` (x, y, height) [m], rotated about the vertical axis by ``turn_deg`` [deg]."""
     top = shapes.standing_box((size[0], size[1], 0.04), (0, 0, size[2] - 0.04), tile_m=0.8)
     apron = shapes.standing_box((size[0] - 0.1, size[1] - 0.1, 0.08), (0, 0, size[2] - 0.12), tile_m=0.8)
     mesh = shapes.merged([top, apron, shapes.legs(size[:2], size[2] - 0.04, 0.03)])
@@ -84,7 +90,7 @@ def table(
 
 
 def chair(name: str, position: Sequence[float], texture: Texture, *, turn_deg: float = 0.0) -> Body:
-    """Return a chair that faces its own +x."""
+    """Return a chair that faces +x before it is rotated about the vertical axis by ``turn_deg`` [deg]."""
     seat = shapes.standing_box((0.42, 0.42, 0.04), (0, 0, 0.42), tile_m=0.5)
     posts = [shapes.moved(shapes.cylinder(0.018, 0.5, sides=12, tile_m=0.3), (-0.19, y, 0.45)) for y in (-0.18, 0.18)]
     slats = [shapes.standing_box((0.02, 0.36, 0.07), (-0.19, 0, z), tile_m=0.5) for z in (0.58, 0.71, 0.84)]
@@ -100,7 +106,10 @@ def vessel(
     *,
     tile_m: float = 0.25,
 ) -> Body:
-    """Return a vessel of revolution whose profile (radius, height) [m] is smoothed by a spline."""
+    """Return a vessel: a surface of revolution whose profile (radius, height) [m] is smoothed by a spline.
+
+    ``position``: centre of the foot [m]; ``tile_m``: width and height of the texture on the surface [m].
+    """
     from scipy.interpolate import PchipInterpolator
 
     points = np.asarray(profile, np.float64)
@@ -113,7 +122,11 @@ def vessel(
 def grating_strip(
     name: str, corner: Sequence[float], right: Sequence[float], *, count: int, side: float, cycles: float
 ) -> list[Body]:
-    """Return a row of square gratings along a wall, with evenly spaced directions; ``corner`` is its lower left end."""
+    """Return a row of ``count`` square gratings along a wall, with evenly spaced directions.
+
+    ``corner``: lower left corner of the row [m]; ``right``: unit vector along the wall; ``side``: side of a square [m];
+    ``cycles``: number of stripe pairs per square.
+    """
     r = np.asarray(right, np.float64)
     out = 0.01 * np.cross(r, (0.0, 0.0, 1.0))
     bodies = []

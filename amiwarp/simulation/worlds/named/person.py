@@ -1,4 +1,4 @@
-"""The world ``person``: a figure of capsules and ellipsoids that walks in a circle in a hall."""
+"""Built-in world ``person``: a figure of capsules and ellipsoids that walks in a circle in a hall."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LAMPS = (Lamp((-1.5, -1.5, 3.0), 4.5, shadows=True), Lamp((2.5, 1.5, 2.9), 3.0))
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
-    """Return the hall and the figure, whose bodies are the instance ``person``."""
+    """Return the world: the hall and the figure. All bodies of the figure belong to the instance ``person``."""
     walls = [
         textures.bricks(rng, mean=0.4),
         textures.plaster(rng, 0.5, 0.45),
@@ -37,7 +37,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
 
 
 def _hall(rng: np.random.Generator) -> list[Body]:
-    """Return what stands in the hall, clear of the figure's path."""
+    """Return the pictures and furniture of the hall, which leave the figure's path free."""
     north, y = (1.0, 0.0, 0.0), SIZE[1] / 2.0
     columns = [
         shapes.moved(shapes.cylinder(0.18, SIZE[2], sides=32, tile_m=0.6), (x, 3.3, 0)) for x in (-3.3, -1.1, 1.1, 3.3)
@@ -66,7 +66,7 @@ def _hall(rng: np.random.Generator) -> list[Body]:
 
 
 def _figure(rng: np.random.Generator, poses: dict[str, Trajectory]) -> list[Body]:
-    """Return the limbs. Each has the trajectory of its upper joint."""
+    """Return the limbs of the figure. Each limb has the trajectory of its upper joint."""
     skin = textures.plaster(rng, 0.42, 0.25, size=256)
     trousers = textures.plaster(rng, 0.16, 0.45, size=256)
     shirt, shoe = textures.plaid(rng, stripes=12), textures.plaster(rng, 0.07, 0.4, size=128)

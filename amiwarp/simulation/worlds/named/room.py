@@ -1,4 +1,4 @@
-"""The world ``room``: textured walls, gratings in all directions, printed pages, a table, shelves and a sofa."""
+"""Built-in world ``room``: gratings in all directions, pictures, printed pages, a table, shelves and a sofa."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from amiwarp.simulation.worlds.named.motion import Viewpoint
 from amiwarp.simulation.worlds.scene import Body, Lamp, Mesh, World
 
 SIZE = (5.2, 4.4, 2.6)
-"""Length, width and height [m]."""
+"""Length (x), width (y) and height (z) of the room [m]."""
 VIEW = Viewpoint((-2.1, -1.55, 1.5), (1.0, 1.0, 0.95))
-"""Camera pose: in one corner, towards the opposite one."""
+"""Camera pose: in one corner, looking towards the opposite corner."""
 LAMPS = (Lamp((-0.3, 0.2, 2.35), 2.0, shadows=True), Lamp((-1.9, -1.7, 2.2), 0.9))
-"""A lamp near the ceiling, which casts shadows, and a weaker one behind the camera."""
+"""Two lamps: one near the ceiling, which casts shadows, and a weaker lamp behind the camera."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
-    """Return the room; nothing in it moves."""
+    """Return the world. No body moves, so ``duration_s`` has no effect."""
     return World("room", tuple(furniture(rng)), ambient=0.3, lamps=LAMPS)
 
 
 def furniture(rng: np.random.Generator) -> list[Body]:
-    """Return the bodies of the room. The ball's path, from (-1.8, 1.5) to (1.5, -1.8) [m] on the floor, is clear."""
+    """Return the bodies of the room.
+
+    A path on the floor from (-1.8, 1.5) to (1.5, -1.8) [m] is free for the ball of the world ``ball``.
+    """
     walls = [textures.plaster(rng, mean, 0.45) for mean in (0.45, 0.55, 0.4, 0.5)]
     bodies = parts.hall(SIZE, walls, textures.wood(rng, mean=0.28), textures.tiles(rng, mean=0.7, joint=0.3, count=4))
     return [*bodies, *_pictures(rng), *_shelves(rng), *_table(rng), *_sofa(rng), *_small(rng)]
@@ -57,7 +60,10 @@ def _shelves(rng: np.random.Generator) -> list[Body]:
 
 
 def _books(rng: np.random.Generator, middle: tuple[float, float, float], width: float) -> Mesh:
-    """Return a row of books along y. Each shows another part of the texture."""
+    """Return a row of books along y. Each book shows a different part of the texture.
+
+    ``middle``: middle of the row on the shelf [m]; ``width``: length of the row [m].
+    """
     books, at = [], -width / 2.0 + 0.03
     while at < width / 2.0 - 0.1:
         thick, tall, deep = rng.uniform(0.02, 0.06), rng.uniform(0.2, 0.33), rng.uniform(0.18, 0.24)

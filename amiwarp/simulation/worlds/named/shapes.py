@@ -1,4 +1,4 @@
-"""Meshes of simple shapes, made with NumPy: panels, boxes, surfaces of revolution."""
+"""Meshes of simple shapes for the built-in worlds: panels, boxes and surfaces of revolution."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ BOX_SIDES = (
     ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
     ((0, 0, -1), (1, 0, 0), (0, -1, 0)),
 )
-"""Outward normal of each side of a box, and its directions to the right and up as seen from outside."""
+"""Sides of a box: outward normal, and directions to the right and up as seen from outside."""
 
 
 def panel(corner: ArrayLike, right: ArrayLike, up: ArrayLike, *, tile_m: float | None = None) -> Mesh:
-    """Return a parallelogram from its lower left corner and two sides [m]. Its normal is ``right`` x ``up``.
+    """Return a parallelogram, given its lower left corner and two sides [m]. Its normal is ``right`` x ``up``.
 
-    ``tile_m``: width and height of the texture on it [m]; None to show the whole texture once.
+    ``tile_m``: width and height of the texture on the panel [m]; None to show the whole texture once.
     """
     c, r, u = (np.asarray(value, np.float64) for value in (corner, right, up))
     scale = (1.0, 1.0) if tile_m is None else (np.linalg.norm(r) / tile_m, np.linalg.norm(u) / tile_m)
@@ -33,7 +33,7 @@ def panel(corner: ArrayLike, right: ArrayLike, up: ArrayLike, *, tile_m: float |
 
 
 def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | None = None) -> Mesh:
-    """Return a box of ``size`` (x, y, z) [m]. Each side is a :func:`panel`."""
+    """Return a box of ``size`` (x, y, z) [m] about ``centre`` [m]. Each side is a :func:`panel`."""
     s = np.asarray(size, np.float64)
     sides = []
     for normal, right, up in BOX_SIDES:
@@ -43,14 +43,15 @@ def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float |
 
 
 def standing_box(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | None = None) -> Mesh:
-    """Return a box of ``size`` (x, y, z) [m], given the centre of its lower side."""
+    """Return a box of ``size`` (x, y, z) [m] whose lower side has the centre ``foot`` [m]."""
     return box(size, np.asarray(foot, np.float64) + np.asarray(size) * (0.0, 0.0, 0.5), tile_m=tile_m)
 
 
 def lathe(profile: ArrayLike, *, sides: int = 24, tile_m: float | None = None) -> Mesh:
     """Return the surface of revolution about z of a polyline (radius, height) [m], from bottom to top.
 
-    ``tile_m``: width and height of the texture [m]. The width is rounded so that the texture closes. None: once around.
+    ``tile_m``: width and height of the texture [m]. The width is rounded so that the texture closes around the shape.
+    None: show the texture once around.
     """
     line = np.asarray(profile, np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
@@ -66,19 +67,19 @@ def lathe(profile: ArrayLike, *, sides: int = 24, tile_m: float | None = None) -
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.int32]:
-    """Return the triangles of a grid of points, numbered row by row."""
+    """Return the triangles between the points of a grid, which are numbered row by row."""
     at = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
     return np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
 
 
 def cylinder(radius: float, height: float, *, sides: int = 20, tile_m: float | None = None) -> Mesh:
-    """Return a closed cylinder that stands on z = 0."""
+    """Return a closed cylinder about the z axis that stands on z = 0; lengths in metres."""
     return lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sides=sides, tile_m=tile_m)
 
 
 def ellipsoid(radii: ArrayLike, *, sides: int = 24, rings: int = 12, tile_m: float | None = None) -> Mesh:
-    """Return an ellipsoid about the origin."""
+    """Return an ellipsoid about the origin with radii along x, y and z [m]."""
     polar = np.linspace(-np.pi / 2.0, np.pi / 2.0, rings + 1)
     scale = np.asarray(radii, np.float64)
     line = np.column_stack([np.cos(polar).clip(0.0), np.sin(polar)]) * scale.max()
@@ -96,7 +97,10 @@ def capsule(radius: float, length: float, *, sides: int = 20, rings: int = 6, ti
 
 
 def gable_roof(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: float | None = None) -> Mesh:
-    """Return a gable roof of ``size`` (x, y, height) [m] with its ridge along x."""
+    """Return a gable roof of ``size`` (x, y, height) [m] with its ridge along x.
+
+    ``foot``: centre of its lower side [m].
+    """
     x, y, z = np.asarray(size, np.float64) / (2.0, 2.0, 1.0)
     slopes = [
         panel((-x, -y, 0), (2 * x, 0, 0), (0, y, z), tile_m=tile_m),
@@ -111,7 +115,7 @@ def gable_roof(size: ArrayLike, foot: ArrayLike = (0.0, 0.0, 0.0), *, tile_m: fl
 
 
 def merged(meshes: Iterable[Mesh]) -> Mesh:
-    """Return several meshes as one."""
+    """Return one mesh that consists of several meshes."""
     parts = list(meshes)
     starts = np.cumsum([0, *(len(np.asarray(part.vertices)) for part in parts)])
     return Mesh(
@@ -122,7 +126,7 @@ def merged(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def moved(mesh: Mesh, position: ArrayLike, *, turn_deg: float = 0.0, axis: ArrayLike = (0.0, 0.0, 1.0)) -> Mesh:
-    """Return a mesh rotated about an axis through the origin and then translated by ``position`` [m]."""
+    """Return a mesh rotated by ``turn_deg`` [deg] about an axis through the origin, then moved by ``position`` [m]."""
     from scipy.spatial.transform import Rotation
 
     rotation: Any = Rotation.from_rotvec(np.radians(turn_deg) * np.asarray(axis, np.float64))
@@ -137,7 +141,7 @@ def legs(size: Sequence[float], height: float, radius: float) -> Mesh:
 
 
 def tapered(mesh: Mesh, share: float) -> Mesh:
-    """Return a mesh whose horizontal size shrinks linearly from its foot to a fraction ``share`` at its top."""
+    """Return a mesh whose horizontal size shrinks linearly with height, to the fraction ``share`` at the top."""
     points = np.array(mesh.vertices, np.float64)
     low, high = points[:, 2].min(), points[:, 2].max()
     middle = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2.0

@@ -1,4 +1,4 @@
-"""The world ``street``, a small town: blocks of houses, pavements, parked cars, trees, and a town hall."""
+"""Built-in world ``street``, a small town: blocks of houses, pavements, parked cars, trees and a town hall."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from amiwarp.simulation.worlds.named.motion import Viewpoint
 from amiwarp.simulation.worlds.scene import Body, Sky, Sun, World
 
 ROAD, PAVEMENT = 3.6, 6.4
-"""Distances of the kerb and of the houses from the middle of the street [m]."""
+"""Distances of the kerb and of the house fronts from the middle of the street [m]."""
 BLOCKS = ((-62.0, -26.0), (-18.0, 20.0), (28.0, 62.0))
-"""Ranges of the blocks along the street [m]. Side streets lie between them."""
+"""Ranges of x that the blocks of houses occupy along the street [m]. Side streets lie between the blocks."""
 ROWS = ((PAVEMENT, 10.0, (2, 5)), (30.0, 12.0, (4, 8)))
-"""Rows of houses on each side: distance of the fronts [m], depth [m], and range of the number of storeys."""
+"""Rows of houses on each side of the street.
+
+Each row gives the distance of the fronts from the middle of the street [m], the depth of the houses [m], and the range
+of the number of storeys, upper end excluded.
+"""
 VIEW = Viewpoint((-15.0, 0.5, 1.7), (10.0, -0.2, 3.1), walk_m=(8.0, 0.0, 0.0), walk_speed=1.4)
-"""Camera pose: on the road, along which the camera walks."""
+"""Camera pose: on the road. The camera walks along the road."""
 
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
-    """Return the town; nothing in it moves."""
+    """Return the world. No body moves, so ``duration_s`` has no effect."""
     bodies = [*_ground(rng), *_blocks(rng), *houses.town_hall(rng, 76.0), *_cars(rng), *_trees(rng), *_posts(rng)]
     sky = Sky(1.0, textures.sky(rng))
     return World("street", tuple(bodies), ambient=0.38, sun=Sun((-0.8, -0.3, 0.62), 0.7), sky=sky)
@@ -47,7 +51,7 @@ def _ground(rng: np.random.Generator) -> list[Body]:
 
 
 def _blocks(rng: np.random.Generator) -> list[Body]:
-    """Return two rows of adjoining houses for each block, on both sides."""
+    """Return two rows of adjoining houses for each block, on both sides of the street."""
     bodies: list[Body] = []
     count = 0
     for start, end in BLOCKS:
@@ -63,7 +67,7 @@ def _blocks(rng: np.random.Generator) -> list[Body]:
 
 
 def _cars(rng: np.random.Generator) -> list[Body]:
-    """Return cars parked along both kerbs of the blocks."""
+    """Return cars parked along the kerbs on both sides of the street."""
     bodies: list[Body] = []
     for start, end in BLOCKS:
         for side in (-1.0, 1.0):
@@ -76,7 +80,7 @@ def _cars(rng: np.random.Generator) -> list[Body]:
 
 
 def _car(rng: np.random.Generator, name: str, place: tuple[float, float]) -> list[Body]:
-    """Return a car: body, cabin and wheels."""
+    """Return a car of body, cabin and wheels at ``place`` (x, y) [m]."""
     at = (*place, 0.0)
     van = rng.uniform() < 0.2
     cabin = (3.4, 1.62, 1.0) if van else (2.3, 1.6, 0.58)

@@ -1,4 +1,4 @@
-"""Random textures: linear reflectances from 0.03 to 0.95."""
+"""Generated textures for the built-in worlds: linear reflectances from 0.03 to 0.95."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DARKEST, BRIGHTEST = 0.03, 0.95
-"""Range of the reflectances; its log contrast is 3.5."""
+"""Range of the reflectances. The natural logarithm of their ratio is 3.5."""
 TEXT = (
     "each pixel reports changes of log intensity by itself and at once so a camera that rests sees only what moves a "
     "prism before the lens turns and moves the whole picture on a circle then every edge fires whatever its direction "
@@ -26,7 +26,7 @@ def clipped(values: NDArray[Any]) -> Texture:
 
 
 def fractal(rng: np.random.Generator, height: int, width: int, *, slope: float = 1.2) -> NDArray[np.float64]:
-    """Return periodic noise of mean 0 and standard deviation 1. Its amplitude spectrum is frequency ** -``slope``."""
+    """Return periodic noise of mean 0 and standard deviation 1, whose amplitude spectrum is frequency ** -``slope``."""
     fy, fx = np.fft.fftfreq(height)[:, None] * height, np.fft.rfftfreq(width) * width
     radius = np.hypot(fy, fx)
     radius[0, 0] = np.inf
@@ -36,17 +36,21 @@ def fractal(rng: np.random.Generator, height: int, width: int, *, slope: float =
 
 
 def plaster(rng: np.random.Generator, mean: float = 0.5, contrast: float = 0.35, size: int = 512) -> Texture:
-    """Return fractal noise about ``mean``; ``contrast`` is the standard deviation of the log reflectance."""
+    """Return fractal noise about ``mean``. ``contrast``: standard deviation of the natural log reflectance."""
     return clipped(mean * np.exp(contrast * fractal(rng, size, size)))
 
 
 def weathered(rng: np.random.Generator, values: NDArray[Any], contrast: float = 0.15) -> Texture:
-    """Return reflectances with added fractal noise, so that no area is blank."""
+    """Return reflectances multiplied by fractal noise, so that no area is blank.
+
+    ``contrast``: standard deviation of the natural log of the noise.
+    """
     return clipped(values * np.exp(contrast * fractal(rng, *values.shape, slope=1.0)))
 
 
 def checkerboard(squares: int, *, size: int = 256, dark: float = 0.05, bright: float = 0.9) -> Texture:
-    """Return a checkerboard with ``squares`` squares along each side. An even number repeats without a seam."""
+    """Return a checkerboard with ``squares`` squares along each side. With an even number the
+    texture repeats without a seam."""
     k = np.arange(size) * squares // size
     return clipped(np.where((k[:, None] + k) % 2, dark, bright))
 
@@ -54,7 +58,10 @@ def checkerboard(squares: int, *, size: int = 256, dark: float = 0.05, bright: f
 def grating(
     angle_deg: float, cycles: float = 12.0, *, size: int = 256, dark: float = 0.05, bright: float = 0.9
 ) -> Texture:
-    """Return stripes in a white frame. Light varies along ``angle_deg``, counter-clockwise from the right."""
+    """Return a grating of ``cycles`` dark and bright stripes in a white frame.
+
+    The brightness varies along the direction ``angle_deg``, counter-clockwise from the right.
+    """
     v, u = np.mgrid[size:0:-1, 0:size] / size
     phase = np.cos(np.radians(angle_deg)) * u + np.sin(np.radians(angle_deg)) * v
     stripes = np.clip(3.0 * np.sin(2.0 * np.pi * cycles * phase), -1.0, 1.0)
@@ -65,7 +72,7 @@ def grating(
 
 
 def star(spokes: int = 24, *, size: int = 384, dark: float = 0.05, bright: float = 0.9) -> Texture:
-    """Return a Siemens star: edges of all directions and scales."""
+    """Return a Siemens star, which has edges of all directions and scales."""
     v, u = (np.mgrid[0:size, 0:size] + 0.5) / size - 0.5
     radius = np.hypot(u, v)
     wave = np.clip(0.15 * size * radius * np.sin(spokes * np.arctan2(v, u)), -1.0, 1.0)
@@ -75,7 +82,7 @@ def star(spokes: int = 24, *, size: int = 384, dark: float = 0.05, bright: float
 def text_page(
     rng: np.random.Generator, *, width: int = 384, height: int = 512, letter: int = 18, ink: float = 0.05
 ) -> Texture:
-    """Return a printed page: a heading and lines of words."""
+    """Return a printed page: a heading and lines of random words. ``letter``: font size [texels]."""
     from PIL import Image, ImageDraw, ImageFont
 
     page = Image.new("F", (width, height), 0.88)
@@ -94,7 +101,7 @@ def text_page(
 
 
 def poster(rng: np.random.Generator, *, size: int = 384) -> Texture:
-    """Return overlapping discs, triangles and bars of many shades."""
+    """Return a poster of overlapping discs, triangles and bars of many shades."""
     from PIL import Image, ImageDraw
 
     page = Image.new("F", (size, size), float(rng.uniform(0.3, 0.9)))
@@ -115,7 +122,10 @@ def poster(rng: np.random.Generator, *, size: int = 384) -> Texture:
 def _cells(
     rng: np.random.Generator, rows: int, size: int, *, columns: int, joint: int, shift: bool
 ) -> NDArray[np.float64]:
-    """Return random shades of cells in rows, NaN in the joints; ``shift`` moves odd rows by half a cell."""
+    """Return random shades of a grid of cells, for bricks and tiles, and NaN in the joints between the cells.
+
+    ``joint``: width of a joint [texels]; ``shift``: whether odd rows are shifted by half a cell.
+    """
     y, x = np.mgrid[0:size, 0:size]
     row = y * rows // size
     x = (x + np.where(shift & (row % 2 == 1), size // columns // 2, 0)) % size
@@ -125,7 +135,7 @@ def _cells(
 
 
 def bricks(rng: np.random.Generator, *, mean: float = 0.25, joint: float = 0.55, size: int = 512) -> Texture:
-    """Return a brick wall, 16 rows of 8."""
+    """Return a brick wall of 16 rows with 8 bricks each. ``mean``, ``joint``: reflectance of bricks and of joints."""
     shade = _cells(rng, 16, size, columns=8, joint=3, shift=True)
     return weathered(rng, np.where(np.isnan(shade), joint, mean * np.exp(0.3 * np.nan_to_num(shade))), 0.25)
 
@@ -133,7 +143,7 @@ def bricks(rng: np.random.Generator, *, mean: float = 0.25, joint: float = 0.55,
 def tiles(
     rng: np.random.Generator, *, mean: float = 0.5, joint: float = 0.12, count: int = 8, size: int = 512
 ) -> Texture:
-    """Return ``count`` by ``count`` square tiles."""
+    """Return ``count`` by ``count`` square tiles. ``mean``, ``joint``: reflectance of tiles and of joints."""
     shade = _cells(rng, count, size, columns=count, joint=4, shift=False)
     return weathered(rng, np.where(np.isnan(shade), joint, mean * np.exp(0.25 * np.nan_to_num(shade))), 0.25)
 
@@ -155,6 +165,7 @@ def plaid(rng: np.random.Generator, *, size: int = 256, stripes: int = 10) -> Te
     """Return a fabric of crossed stripes."""
 
     def bands() -> NDArray[np.float64]:
+        """Return the shades of parallel stripes, shape (size,)."""
         return np.repeat(rng.uniform(0.25, 1.0, stripes), -(-size // stripes))[:size]
 
     return weathered(rng, 0.95 * bands()[:, None] * bands()[None, :], 0.2)
@@ -179,7 +190,7 @@ def book_spines(rng: np.random.Generator, *, books: int = 16, size: int = 512) -
 
 
 def sky(rng: np.random.Generator, *, height: int = 512) -> Texture:
-    """Return a panorama for ``Sky``: clouds, brighter towards the horizon, dark below it."""
+    """Return a panorama for ``Sky``: clouds that are brighter towards the horizon, and dark below the horizon."""
     elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
     clouds = np.clip(0.4 + 0.6 * fractal(rng, height, 2 * height, slope=1.35), 0.0, 1.0)
     light = 0.32 + 0.2 * np.exp(-np.abs(elevation) / 0.35) + 0.45 * clouds
