@@ -180,7 +180,7 @@ def test_chunks_and_room_do_not_matter_with_everything_on(
 ) -> None:
     simulation = seen_through_prism(EVERYTHING, device)
     whole, points = events_of(simulation)
-    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
+    monkeypatch.setattr("amiwarp.simulation.key_buffer.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
     parts, part_points = events_of(simulation, chunk_us)
     same_events(whole, parts)
     np.testing.assert_array_equal(points, part_points)

@@ -31,8 +31,8 @@ def open_world(name: str, trajectory: str | None, *, seed: int, duration_s: floa
         return world, poses or own
     world, stored = load_world(Path(name))
     if trajectory is not None and poses is None:
-        raise AmiwarpError(f"trajectory {trajectory} belongs to named worlds; give a file of poses for {name}")
+        raise AmiwarpError(f"trajectory {trajectory} applies only to named worlds; give a file of poses for {name}")
     chosen = poses or stored
     if chosen is None:
-        raise AmiwarpError(f"{name}: has no trajectory of the camera; give a file of poses as trajectory")
+        raise AmiwarpError(f"{name}: has no camera trajectory; give a file of poses (.txt, .csv) as trajectory")
     return world, chosen
