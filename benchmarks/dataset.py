@@ -188,7 +188,7 @@ def passed(simulation: Any, device: str, clock: Callable[[], float], to_host: bo
     engine = Engine(simulation)
     for block in engine.run():
         if to_host:
-            block.to_host()
+            block.events()
             block.truth()
     wp.synchronize_device(device)
     return clock() - began
