@@ -63,11 +63,17 @@ FOLDERS = (("metadata.yaml", Format.ROSBAG), ("dataset_events_t.npy", Format.EVI
 """Pairs of the name of a file in a folder and the format that the file identifies."""
 
 
+def _folder_format(path: Path) -> Format | None:
+    """Return the format of a folder, or None if the path is a file or an unknown folder."""
+    names = FOLDERS if path.is_dir() else ()
+    return next((found for name, found in names if (path / name).is_file()), None)
+
+
 def detect_format(path: Path) -> Format:
     """Return the format of a file from its first bytes. Raises :class:`AmiwarpError` for an unknown format."""
-    for name, found in FOLDERS:
-        if path.is_dir() and (path / name).is_file():
-            return found
+    folder = _folder_format(path)
+    if folder is not None:
+        return folder
     check_regular(path)
     with errors_name(path, lambda: "opening"), path.open("rb") as file:
         head = file.read(4096)
@@ -145,6 +151,8 @@ def open_recording(
     """
     path = Path(path)
     chosen = detect_format(path) if format is None else choice(Format, format, f"{path}: format")
+    if format is not None and _folder_format(path) is not chosen:
+        check_regular(path)
     if chosen in (Format.HDF5, Format.ROSBAG):
         return _opener(chosen)(path, topic)
     if topic is not None:

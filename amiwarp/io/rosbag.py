@@ -19,7 +19,6 @@ from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply
-from amiwarp.io.regular_file import check_regular
 from amiwarp.io.ros_messages import ARRAY_FIELDS, ARRAYS, EVENT_FIELDS, PACKET_DEFINITION, PACKETS, PacketDecoder
 from amiwarp.io.ros_messages import decode_array as _decode_array
 
@@ -36,8 +35,6 @@ OTHER = {
 
 def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     """Open the events of a topic of a bag: a file, or the folder of a ROS 2 bag."""
-    if not path.is_dir():
-        check_regular(path)
     source = os.path.abspath(path)
     with errors_name(path, lambda: "opening the bag"):
         about = run("amiwarp.io.rosbag:read_head", source, topic)
