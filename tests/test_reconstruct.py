@@ -330,7 +330,7 @@ def test_command_refuses(recording: Recording, tmp_path: Path) -> None:
         ("v.mp4", ["--mask", "m.png"], "--mask"),
         ("p.png", ["--start", "9"], "no events in"),
         ("p.png", ["--bits", "12"], "12 bits"),
-        ("p.png", ["--turns", "1", "--length", "0.1"], "a length are both given"),
+        ("p.png", ["--turns", "1", "--length", "0.1"], "length_us are both given"),
     ):
         args = ["reconstruct", str(tmp_path / "r.h5"), str(tmp_path / out), "--calibration", str(tmp_path / "c.json")]
         result = CliRunner().invoke(app, [*args, "--device", "cpu", *more])

@@ -294,7 +294,7 @@ def cut(recording: Recording, window: str) -> Recording:
 
 
 def summary(c: Calibration) -> dict[str, Any]:
-    """Return the calibration for JSON, with angles in radians and degrees; evaluated points are left out."""
+    """Return the calibration as JSON, with angles in radians and degrees, but without the points of the search."""
     data = c.to_json()
     data["stages"] = [{k: v for k, v in stage.items() if k != "points"} for stage in data["stages"]]
     return data

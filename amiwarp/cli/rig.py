@@ -53,7 +53,7 @@ class RigOptions:
     ] = None
     index: Annotated[float, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = 1.5168
     flat_side: Annotated[
-        FlatSide, typer.Option(help="Direction that the prism's flat face points to.", rich_help_panel=_PRISM)
+        FlatSide, typer.Option(help="Side that the prism's flat face is on.", rich_help_panel=_PRISM)
     ] = FlatSide.SCENE
     rpm: Annotated[
         float, typer.Option(help="Speed of the prism (turns/min); negative: backwards.", rich_help_panel=_PRISM)

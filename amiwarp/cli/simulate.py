@@ -62,7 +62,7 @@ class SceneOptions:
 
     @property
     def fov(self) -> float | None:
-        """Horizontal extent of the picture [rad], or None."""
+        """Horizontal angle that the picture spans [rad], or None for the default."""
         return None if self.scene_fov_deg is None else math.radians(self.scene_fov_deg)
 
 

@@ -61,7 +61,8 @@ class WorldOptions:
     motion_px: Annotated[
         float | None,
         typer.Option(
-            help="Largest motion of the image between two maps, 0.01 to 2 (px). A smaller value is more accurate and "
+            help="Largest motion of the image between two renderings of the world, 0.01 to 2 (px). A smaller value is "
+            "more accurate and "
             "slower. Default: 0.5.",
             rich_help_panel=_WORLD,
         ),

@@ -56,7 +56,7 @@ class StagedBatch:
     p: NDArray[np.uint8]
     arrived_us: int
     pooled_t: PooledArray | None
-    """Array for the events' times that the caller will get; None if the times stay in the buffers."""
+    """Array of the pool that receives the event times for the caller; None if the times stay in the staging buffers."""
     wait: Callable[[], ColumnCheck]
     """Function that waits until the packets are copied, and returns the properties found while copying."""
 

@@ -89,7 +89,7 @@ def _contents(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[
             kind, source, width, _, overflow, _, count, _ = PACKET_HEADER.unpack(head)
             length = width * count
             if min(width, count, overflow, source) < 0 or length > LARGEST_PACKET or kind not in range(256):
-                raise AmiwarpError(f"{path}: byte {at}: is not the header of a packet; the file is damaged")
+                raise AmiwarpError(f"{path}: byte {at} does not begin the header of a packet; the file is damaged")
             if at + PACKET_HEADER.size + length > total:
                 notes["truncated_bytes"] = total - at
                 return

@@ -46,9 +46,9 @@ class Program:
     def add_slices(
         self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any], *, smallest: int = SMALLEST_SLICE
     ) -> None:
-        """Append a kernel as :meth:`add` does, but let slice k write into ``outputs[k]`` only.
+        """Append a kernel as :meth:`add` does, but give each slice of its threads an output.
 
-        On CUDA everything goes to ``outputs[0]``, and the range is exactly ``range(n)``.
+        Slice k writes ``outputs[k]``. On CUDA there is one slice with ``n`` threads, which writes ``outputs[0]``.
         """
         if n == 0:
             return

@@ -301,7 +301,7 @@ def vote_points(
     start: int,
     cells: Cells,
 ):
-    """Vote one point per thread, with a check of every addition for overflow."""
+    """Add the votes of one point per thread to the image, and check every addition for overflow."""
     i = start + wp.tid()
     layer = int(layers[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, x[i], y[i], layer)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MISSING = "VTK found no OpenGL, so Matplotlib drew the point clouds; on Debian install libegl1 and libgl1-mesa-dri"
-"""Note for a figure whose clouds were drawn by Matplotlib."""
+"""Note in a figure whose clouds Matplotlib drew because VTK cannot draw here."""
 SECONDS = 60.0
 """Time limit of the process that draws the point clouds with VTK [s]."""
 HALF = (0.4, 0.5, 0.5)

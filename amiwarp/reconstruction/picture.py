@@ -153,7 +153,7 @@ class Reconstruction:
         first, last = self.recording.events.t_first, self.recording.events.t_last
         if turns is not None:
             if length_us is not None:
-                raise AmiwarpError("turns and a length are both given; give one of them")
+                raise AmiwarpError("turns and length_us are both given; give one of them")
             if self.turn_us is None:
                 raise AmiwarpError("turns is given, but the prism does not turn; give a length")
             length_us = round(turns * self.turn_us)

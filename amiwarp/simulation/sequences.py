@@ -25,7 +25,7 @@ MOST_TABLE_BYTES = 64 << 20
 """Largest ``times.csv`` that is read [bytes], enough for a million pictures."""
 
 TIMES = "times.csv"
-"""Table of times in a folder of pictures, with columns file and t_us."""
+"""Name of the file, in a folder of pictures, that lists their times; its columns are file and t_us."""
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 """File suffixes of pictures in a folder."""

@@ -101,7 +101,7 @@ def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
         return AmiwarpError(f"--port {port}: is in use on {host}; give another port, or 0 for a free one")
     if error.errno == errno.EADDRNOTAVAIL:
         return AmiwarpError(
-            f"--host {host!r}: is not an address of this machine; give one of its addresses, such as 127.0.0.1"
+            f"--host {host!r} is not an address of this machine; give one of its addresses, such as 127.0.0.1"
         )
     if error.errno in (errno.EACCES, errno.EPERM):
         return AmiwarpError(f"--port {port}: permission denied; give a port above 1023, or 0 for a free one")

@@ -131,7 +131,7 @@ class MessageFilter:
         return isinstance(value, str) and value == self._server.state.viewId
 
     def _is_trigger(self, args: list[Any]) -> bool:
-        """Return whether the trigger exists and takes these arguments, which must be strings, numbers or flags."""
+        """Return whether a function that the page may call exists and takes these strings, numbers or flags."""
         plain = (text(200), number(), flag)
         if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
             return False

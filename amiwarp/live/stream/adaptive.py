@@ -55,7 +55,7 @@ TEXTURE_S = 0.5
 ANGLES = 17
 """Number of points of the prism's path that are computed per window."""
 PHASES, ORBIT = 8, 1024
-"""Number of prism phases at which a predicted window may begin, and number of points of the prism's orbit."""
+"""Number of prism phases for which a window is predicted, and number of points that sample the prism's orbit."""
 SPEEDS = 32
 """Number of prism speeds between the lowest and the highest for which the coverage is predicted."""
 MEMORY_S = 0.25

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from amiwarp.calib import Calibration
 
 IMAGE, FILE = "image of events", "file to file"
-"""Names of the jobs: rows of one job do the same work and share a Pareto front."""
+"""Names of the two measured jobs, an image and a file. Rows of one job can be compared and share a Pareto front."""
 ANGLES = (TURNS, 4096, 1024, 256)
 """Numbers of distinct prism angles per turn with which images are measured."""
 SHARES = (4, 16)

@@ -227,7 +227,7 @@ def _whole_cost(item: Item, scratch: Path, device: str) -> _Cost:
 
 
 def _cost(item: Item, scratch: Path, device: str, duration_s: float | None) -> _Cost:
-    """Make a recording, and return its cost."""
+    """Make a recording, and return its computing time and its size."""
     path = scratch / f"{item.key}.h5"
     began = time.perf_counter()
     written = write_recording(item, path, device, duration_s)
