@@ -62,8 +62,7 @@ class WorldOptions:
         float | None,
         typer.Option(
             help="Largest motion of the image between two renderings of the world, 0.01 to 2 (px). A smaller value is "
-            "more accurate and "
-            "slower. Default: 0.5.",
+            "more accurate and slower. Default: 0.5.",
             rich_help_panel=_WORLD,
         ),
     ] = None

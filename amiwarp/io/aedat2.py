@@ -86,7 +86,7 @@ def _read_header(path: Path) -> tuple[Chip, int]:
     chip = next((chip for key, chip in CHIPS.items() if short.startswith(key)), None)
     if chip is None:
         given = f"camera '{name[:60]}'" if name else "no camera (AEChip)"
-        raise AmiwarpError(f"the header names the chip {given}; expected one of {', '.join(CHIPS)}")
+        raise AmiwarpError(f"the header names {given}; expected one of {', '.join(CHIPS)}")
     return chip, start
 
 

@@ -183,7 +183,7 @@ class Scene:
             renderer.reset_camera_clipping_range()
 
     def mark(self, curves: Sequence[tuple[int, NDArray[np.float32], str]]) -> None:
-        """Draw lines in the clouds. A line is the index of its cloud (0 or 1), points, shape ``(n, 3)``, and a colour."""
+        """Draw lines in the clouds, each given by its cloud (0 or 1), points, shape ``(n, 3)``, and a colour."""
         import pyvista
 
         for k, actor in self._marks:
