@@ -40,9 +40,12 @@ from .events.truth import KnownStore as KnownStore
 from .events.truth import Poses as Poses
 from .events.truth import PoseStore as PoseStore
 from .events.truth import WorldLabels as WorldLabels
+from .imaging.choices import CornerMethod as CornerMethod
 from .imaging.choices import Layers as Layers
 from .imaging.choices import Sharpness as Sharpness
 from .imaging.choices import Vote as Vote
+from .imaging.corners import CornerDetector as CornerDetector
+from .imaging.corners import detect_corners as detect_corners
 from .imaging.metrics import edge_blur as edge_blur
 from .imaging.metrics import model_error as model_error
 from .imaging.metrics import truth_model as truth_model

@@ -56,3 +56,21 @@ class Sharpness(enum.StrEnum):
     ``docs/explanation/calibration.md`` shows."""
     ENTROPY = "entropy"
     """Minus the entropy of the distribution of votes over pixels [nat]."""
+
+
+class CornerMethod(enum.StrEnum):
+    """Methods that find corners among events.
+
+    Both look at the times of the latest events on two circles of pixels around an event.
+
+    Examples
+    --------
+    >>> amiwarp.CornerMethod("arc")
+    <CornerMethod.ARC: 'arc'>
+    """
+
+    EFAST = "efast"
+    """eFAST: the newest pixels form an arc of 3 to 6 of the 16 pixels at radius 3, and of 4 to 8 of the 20 at radius 4."""
+    ARC = "arc"
+    """Arc*: as eFAST, or all pixels but such an arc are the newest. Redundant events are left out: those within 50 ms of
+    the one before at their pixel, if both have the same polarity."""

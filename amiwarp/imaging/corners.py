@@ -1,0 +1,298 @@
+"""Corners among events: eFAST and Arc*."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+import warp as wp
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import TIME_LIMIT, check_events, check_sensor
+from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
+from amiwarp.imaging.choices import CornerMethod
+from amiwarp.kernels import corners as kernels
+from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.kernels.launch import launch
+from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.validation import choice, vector, whole
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.events.events import Events
+
+REDUNDANT_US = 50_000
+"""Time after which an event of Arc* is no longer redundant [us], from the paper."""
+MOST_PIXELS = 1 << 29
+"""Largest number of pixels of a sensor: the surfaces of both polarities are indexed by int32, with room for bands."""
+PIECE = 1 << 24
+"""Largest number of events that are sorted at a time on a GPU."""
+LEAST_SHARED = 1 << 13
+"""Smallest number of events for which several CPU threads are worth their start."""
+WIDEST_BAND, NARROWEST_BAND = 5, 3
+"""Largest and smallest size of a band of rows for several CPU threads, as a power of 2."""
+
+
+@overload
+def detect_corners(
+    events: Events, size: tuple[int, int], *, detector: CornerMethod = ..., device: Any = ...
+) -> NDArray[np.bool_]: ...
+@overload
+def detect_corners(
+    events: DeviceEvents, size: tuple[int, int], *, detector: CornerMethod = ..., device: Any = ...
+) -> wp.array: ...
+def detect_corners(
+    events: Events | DeviceEvents,
+    size: tuple[int, int],
+    *,
+    detector: CornerMethod = CornerMethod.ARC,
+    device: Any = None,
+) -> NDArray[np.bool_] | wp.array:
+    """Find the events that are corners, by eFAST or Arc*.
+
+    For streams and long recordings use :class:`CornerDetector`, which keeps its state between packets.
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents
+        Events from a sensor, sorted by time.
+    size : tuple of int
+        Sensor size (width, height) [px].
+    detector : CornerMethod, optional
+        The method.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU. Events on a device are tested there, without a copy.
+
+    Returns
+    -------
+    ndarray or warp.array
+        Whether each event is a corner, bool, shape ``(n,)``. A Warp array on the same device for :class:`DeviceEvents`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the events are compensated, out of order or outside the sensor, or on another device than ``device``.
+
+    Notes
+    -----
+    eFAST: Mueggler et al., "Fast event-based corner detection", BMVC 2017. Arc*: Alzugaray and Chli, "Asynchronous
+    corner detection and tracking for event cameras in real time", IEEE RA-L 2018. An event is tested against all
+    earlier events of its polarity. Events closer than 4 px to the border are no corners. The result does not depend on
+    the device or the number of threads.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.arange(10, 15), np.arange(10, 15))  # a square of 5 x 5 pixels
+    >>> events = amiwarp.Events.from_arrays(x.ravel(), y.ravel(), np.arange(25), np.ones(25))
+    >>> corners = amiwarp.detect_corners(events, (32, 32), detector="efast")
+    >>> np.column_stack([events.x, events.y])[corners].tolist()
+    []
+    """
+    return CornerDetector(size, detector=detector, device=device_for(events, device)).detect(events)
+
+
+class CornerDetector:
+    """Finds corners among the events of a stream, packet by packet.
+
+    The result is the same as for all packets at once.
+
+    Parameters
+    ----------
+    size : tuple of int
+        Sensor size (width, height) [px].
+    detector : CornerMethod, optional
+        The method.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU.
+
+    Raises
+    ------
+    AmiwarpError
+        If the size or the method is not usable.
+
+    Examples
+    --------
+    >>> detector = amiwarp.CornerDetector((64, 48))
+    >>> for t in (0, 1000):
+    ...     packet = amiwarp.Events.from_arrays([10, 11], [20, 20], [t, t + 10], [1, 1])
+    ...     print(detector.detect(packet))
+    [False False]
+    [False False]
+    """
+
+    def __init__(
+        self, size: tuple[int, int], *, detector: CornerMethod = CornerMethod.ARC, device: Any = None
+    ) -> None:
+        check = lambda value, what: whole(value, what, 1, LARGEST_SIZE, " pixels")  # noqa: E731
+        self._width, self._height = (int(side) for side in vector(size, 2, "size of the sensor", check))
+        if self._width * self._height > MOST_PIXELS:
+            raise AmiwarpError(f"a sensor of {self._width}x{self._height} has more than {MOST_PIXELS} pixels; crop it")
+        self._method = choice(CornerMethod, detector, "detector")
+        self._device = wp.get_device("cpu" if device is None else device)
+        kind = PassInOrder if self._device.is_cpu else PassInLists
+        self._pass: PassInOrder | PassInLists = kind(self._width, self._height, self._method, self._device)
+        self._last_us: int | None = None
+
+    @overload
+    def detect(self, events: Events) -> NDArray[np.bool_]: ...
+    @overload
+    def detect(self, events: DeviceEvents) -> wp.array: ...
+    def detect(self, events: Events | DeviceEvents) -> NDArray[np.bool_] | wp.array:
+        """Find the corners among the next events of the stream.
+
+        Parameters
+        ----------
+        events : Events or DeviceEvents
+            Events from a sensor, sorted by time, none earlier than those before.
+
+        Returns
+        -------
+        ndarray or warp.array
+            Whether each event is a corner, bool, shape ``(n,)``. A Warp array on the same device for
+            :class:`DeviceEvents`.
+
+        Raises
+        ------
+        AmiwarpError
+            If the events are compensated, out of order, outside the sensor or on another device. The detector then is
+            as before.
+        """
+        device_for(events, self._device)
+        check_sensor(events)
+        corner = wp.empty(len(events), dtype=wp.bool, device=self._device)
+        if len(events):
+            moved = self._checked(events)
+            for start in range(0, len(events), PIECE):
+                stop = min(start + PIECE, len(events))
+                self._pass.detect(moved[start:stop], corner[start:stop])
+            wait(self._device)
+        return corner if isinstance(events, DeviceEvents) else corner.numpy()
+
+    def _checked(self, events: Events | DeviceEvents) -> DeviceEvents:
+        """Check events, note the time of the last, and return them on the device."""
+        if isinstance(events, DeviceEvents):
+            self._check_limits(events)
+            self._last_us = events.t_last
+            return events
+        check_events(events, self._width, self._height, where="events", after_t=self._last_us)
+        self._last_us = int(events.t[-1])
+        columns = (np.ascontiguousarray(column) for column in (events.x, events.y, events.t, events.p))
+        copy = not self._device.is_cpu
+        return DeviceEvents(*(wp.array(column, device=self._device, copy=copy) for column in columns))
+
+    def _check_limits(self, events: DeviceEvents) -> None:
+        """Check events on the device."""
+        first, last, right, bottom, polarity, decreases = limits(events)
+        if right >= self._width or bottom >= self._height:
+            raise AmiwarpError(
+                f"events reach x={right}, y={bottom}, outside the {self._width}x{self._height} frame; check the size"
+            )
+        if decreases:
+            raise AmiwarpError("events are not in the order of their times; sort by time")
+        if self._last_us is not None and first < self._last_us:
+            raise AmiwarpError(
+                f"events start at {first} us, earlier than the event before ({self._last_us} us); sort by time"
+            )
+        if not -TIME_LIMIT < first <= last < TIME_LIMIT or polarity > 1:
+            raise AmiwarpError(
+                f"events have times in {first} .. {last} us and polarities up to {polarity}; use from_arrays"
+            )
+
+
+class PassInOrder:
+    """Tests events in their order on CPU threads, each of which takes some bands of rows."""
+
+    def __init__(self, width: int, height: int, method: CornerMethod, device: Any) -> None:
+        self._threads = cpu_threads()
+        bits = WIDEST_BAND
+        while bits > NARROWEST_BAND and height >> bits < 4 * self._threads:
+            bits -= 1
+        bits = bits if self._threads > 1 else height.bit_length()
+        bands = ((height - 1) >> bits) + 1
+        reach = int(kernels.REACH)
+        self._surface = _surface(width, height, height + 2 * reach * bands, method, device)
+        self._surface.band_bits = bits
+        self._rule = _rule(method)
+        self._owner = wp.array(np.arange(bands) % self._threads, dtype=int, device=device)
+
+    def detect(self, events: DeviceEvents, corner: wp.array) -> None:
+        """Write to ``corner`` whether each event is one, and update the surfaces."""
+        smallest = 1 if len(events) >= LEAST_SHARED else self._threads
+        inputs = [_columns(events), self._surface, self._rule, self._owner]
+        launch(kernels.detect_in_order, self._threads, inputs, [corner], device=events.device, smallest=smallest)
+
+
+class PassInLists:
+    """Tests all events of a block at once. Events are sorted into lists, one for each polarity and pixel."""
+
+    def __init__(self, width: int, height: int, method: CornerMethod, device: Any) -> None:
+        self._device, self._filters = device, method is CornerMethod.ARC
+        self._surface = _surface(width, height, height, method, device)
+        self._rule = _rule(method)
+        self._lists = 2 * width * height
+
+    def detect(self, events: DeviceEvents, corner: wp.array) -> None:
+        """Write to ``corner`` whether each event is one, and update the surfaces."""
+        columns, every = _columns(events), self._sorted(events)
+        lists = self._without_redundant(columns, every, len(events)) if self._filters else every
+        corner.zero_()
+        self._run(kernels.detect_in_lists, len(events), [columns, self._surface, lists, self._rule], [corner])
+        self._run(kernels.store_lists, self._lists, [columns, lists], [self._surface])
+        if self._filters:
+            self._run(kernels.store_last, self._lists // 2, [columns, every], [self._surface])
+
+    def _sorted(self, events: DeviceEvents) -> Any:
+        """Return the lists of all events."""
+        n = len(events)
+        keys, order = self._empty(2 * n), self._empty(2 * n)
+        self._run(kernels.key_events, n, [_columns(events), self._surface], [keys, order])
+        wp.utils.radix_sort_pairs(keys, order, n)
+        lists = kernels.Lists()
+        lists.order, lists.first = order, self._empty(self._lists + 1)
+        self._run(kernels.find_lists, self._lists + 1, [keys, n], [lists.first])
+        return lists
+
+    def _without_redundant(self, columns: Any, lists: Any, n: int) -> Any:
+        """Return the lists without redundant events."""
+        fresh, place = wp.zeros(n + 1, dtype=int, device=self._device), self._empty(n + 1)
+        self._run(kernels.mark_fresh, n, [columns, self._surface, lists, self._rule], [fresh])
+        wp.utils.array_scan(fresh, place, inclusive=False)
+        kept = kernels.Lists()
+        kept.order, kept.first = self._empty(n), self._empty(self._lists + 1)
+        self._run(kernels.keep_fresh, n, [lists, fresh, place], [kept.order])
+        self._run(kernels.move_lists, self._lists + 1, [lists, place], [kept.first])
+        return kept
+
+    def _empty(self, n: int) -> wp.array:
+        return wp.empty(n, dtype=int, device=self._device)
+
+    def _run(self, kernel: Any, n: int, inputs: list[Any], outputs: list[Any]) -> None:
+        launch(kernel, n, inputs, outputs, device=self._device)
+
+
+def _surface(width: int, height: int, rows: int, method: CornerMethod, device: Any) -> Any:
+    """Return empty surfaces of ``rows`` rows, which include those that bands share."""
+    surface = kernels.Surface()
+    surface.width, surface.height, surface.pixels = width, height, width * rows
+    surface.time = wp.full(2 * surface.pixels, wp.int64(kernels.NEVER), dtype=wp.int64, device=device)
+    filtered = surface.pixels if method is CornerMethod.ARC else 0
+    surface.last = wp.zeros(filtered, dtype=wp.int64, device=device)
+    surface.polarity = wp.full(filtered, int(kernels.NO_POLARITY), dtype=wp.uint8, device=device)
+    return surface
+
+
+def _rule(method: CornerMethod) -> Any:
+    """Return the rule of a method."""
+    rule = kernels.Rule()
+    rule.complement = int(method is CornerMethod.ARC)
+    rule.redundant_us = REDUNDANT_US if method is CornerMethod.ARC else 0
+    return rule
+
+
+def _columns(events: DeviceEvents) -> Any:
+    """Return the columns of events as the struct that the kernels take."""
+    columns = kernels.Columns()
+    columns.x, columns.y, columns.t, columns.p = events.x, events.y, events.t, events.p
+    return columns
