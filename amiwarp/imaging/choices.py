@@ -70,7 +70,8 @@ class CornerMethod(enum.StrEnum):
     """
 
     EFAST = "efast"
-    """eFAST: the newest pixels form an arc of 3 to 6 of the 16 pixels at radius 3, and of 4 to 8 of the 20 at radius 4."""
+    """eFAST: the newest pixels form an arc of 3 to 6 of the 16 pixels at radius 3, and of 4 to 8 of the 20 at
+    radius 4."""
     ARC = "arc"
-    """Arc*: as eFAST, or all pixels but such an arc are the newest. Redundant events are left out: those within 50 ms of
-    the one before at their pixel, if both have the same polarity."""
+    """Arc*: as eFAST, or all pixels but such an arc are the newest. Redundant events are left out: those within 50 ms
+    of the one before at their pixel, if both have the same polarity."""

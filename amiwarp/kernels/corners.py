@@ -1,11 +1,11 @@
 """Corner tests on surfaces of active events, and the pass over events in their order.
 
-A surface of active events holds the time of the latest event of each polarity and pixel. An event is a corner if, on two
-circles around it, the newest pixels form an arc of a certain length.
+A surface of active events holds the time of the latest event of each polarity and pixel. An event is a corner if, on
+two circles around it, the newest pixels form an arc of a certain length.
 
-CPUs pass over the events in their order and keep the surfaces up to date. GPUs test all events at once: events are sorted
-into lists, one for each polarity and pixel, in which each event finds the latest events before it. Both ways give the
-same corners.
+CPUs pass over the events in their order and keep the surfaces up to date. GPUs test all events at once: events are
+sorted into lists, one for each polarity and pixel, in which each event finds the latest events before it. Both ways
+give the same corners.
 """
 
 from typing import Any
@@ -221,9 +221,7 @@ def detect_in_order(
 
 
 @wp.kernel
-def key_events(
-    events: Columns, surface: Surface, start: int, keys: wp.array(dtype=int), order: wp.array(dtype=int)
-):
+def key_events(events: Columns, surface: Surface, start: int, keys: wp.array(dtype=int), order: wp.array(dtype=int)):
     """Write the number of the list of each event, and its index."""
     i = start + wp.tid()
     keys[i] = int(events.p[i]) * surface.pixels + int(events.y[i]) * surface.width + int(events.x[i])
@@ -245,9 +243,7 @@ def find_lists(keys: wp.array(dtype=int), n: int, start: int, first: wp.array(dt
 
 
 @wp.kernel
-def mark_fresh(
-    events: Columns, surface: Surface, lists: Lists, rule: Rule, start: int, fresh: wp.array(dtype=int)
-):
+def mark_fresh(events: Columns, surface: Surface, lists: Lists, rule: Rule, start: int, fresh: wp.array(dtype=int)):
     """Write 1 for each position in the lists whose event is not redundant, else 0."""
     k = start + wp.tid()
     i = lists.order[k]
