@@ -1,0 +1,1 @@
+"""Evaluation study: the results of the AMI-EV paper, measured on simulated worlds with ground truth."""

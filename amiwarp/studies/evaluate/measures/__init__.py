@@ -1,0 +1,1 @@
+"""Measures of the evaluations, as functions of arrays."""

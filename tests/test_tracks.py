@@ -1,0 +1,158 @@
+"""Tracks of corners: association, Lucas-Kanade, truth by projection, lifetime and error with known answers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import amiwarp
+from amiwarp.studies.evaluate.measures import tracks as measures
+from amiwarp.studies.evaluate.measures.tracks import Tracks
+
+
+def two_lines(step_us: int = 1000, count: int = 50) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Two corners: one moves right by 0.5 px per step, one moves up, 20 px apart, in turns."""
+    k = np.repeat(np.arange(count), 2)
+    second = np.tile([0, 1], count)
+    x = np.where(second, 40.0, 10.0 + 0.5 * k)
+    y = np.where(second, 60.0 - 0.5 * k, 10.0)
+    return k * step_us + second * 10, np.column_stack([x, y])
+
+
+def test_corner_events_are_linked_to_their_tracks() -> None:
+    t, xy = two_lines()
+    found = measures.link_corners(t, xy)
+    np.testing.assert_array_equal(found.number, np.repeat([0, 1], 50))
+    np.testing.assert_array_equal(found.index, np.concatenate([np.arange(0, 100, 2), np.arange(1, 100, 2)]))
+    np.testing.assert_array_equal(found.xy, xy[found.index])
+    np.testing.assert_array_equal(found.t, t[found.index])
+    np.testing.assert_array_equal(found.first, [0, 50])
+
+
+def test_a_gap_or_a_jump_starts_a_new_track() -> None:
+    t, xy = two_lines()
+    late = t + np.where(t > 25_000, 20_000, 0)
+    assert len(measures.link_corners(late, xy).first) == 4
+    jumped = xy + np.where(t > 25_000, 7.0, 0.0)[:, None]
+    assert len(measures.link_corners(t, jumped).first) == 4
+    assert len(measures.link_corners(t, jumped, radius_px=12.0).first) == 2
+    lost = xy.copy()
+    lost[10:20] = np.nan
+    found = measures.link_corners(t, lost)
+    assert len(found.first) == 2
+    assert len(found.t) == 90
+
+
+def test_the_nearest_track_is_chosen() -> None:
+    xy = np.array([[10.0, 10.0], [14.0, 10.0], [12.5, 10.0], [10.5, 10.0]])
+    found = measures.link_corners(np.arange(4), xy)
+    assert found.number.tolist() == [0, 0, 1, 1]
+    assert found.index.tolist() == [0, 3, 1, 2]
+
+
+def test_no_corners_give_no_tracks() -> None:
+    found = measures.link_corners(np.zeros(0, np.int64), np.zeros((0, 2)))
+    assert len(found.first) == 0
+    quality = measures.track_quality(found, np.zeros((0, 2)), 5.0)
+    assert quality.number == 0
+    assert math.isnan(quality.lifetime_s)
+
+
+def drifting() -> tuple[Tracks, NDArray[np.float64]]:
+    """Two tracks with an update each ms for 100 ms: one drifts by 0.1 px per update, one is exact and hidden late."""
+    number, k = np.repeat([0, 1], 101), np.tile(np.arange(101), 2)
+    truth = np.column_stack([20.0 + k, np.full(202, 30.0)])
+    xy = truth + np.where(number == 0, 0.1 * k, 0.0)[:, None] * [0.6, 0.8]
+    truth[101 + 61 :] = np.nan
+    return Tracks(number, k * 1000, xy, np.arange(202)), truth
+
+
+def test_lifetime_error_and_rate_are_known() -> None:
+    tracks, truth = drifting()
+    for limit in (2.05, 5.05):
+        updates = math.floor(limit * 10)
+        np.testing.assert_allclose(measures.lifetimes(tracks, truth, limit), [updates * 1e-3, 0.060], rtol=0, atol=1e-9)
+        quality = measures.track_quality(tracks, truth, limit)
+        assert quality.number == 2
+        assert quality.lifetime_s == pytest.approx((updates * 1e-3 + 0.060) / 2)
+        assert quality.update_hz == pytest.approx(1000.0)
+        assert quality.error_px == pytest.approx(0.1 * updates * (updates + 1) / 2 / (updates + 60))
+    curve = measures.quality_curve(tracks, truth)
+    assert [quality.limit_px for quality in curve] == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]
+    assert (np.diff([quality.lifetime_s for quality in curve]) > 0).all()
+
+
+def test_a_track_does_not_return_from_its_end() -> None:
+    tracks = Tracks(
+        np.zeros(4, np.int64), np.arange(4) * 1000, np.array([[0, 0], [9, 0], [0, 0], [0, 0]], float), np.arange(4)
+    )
+    truth = np.zeros((4, 2))
+    assert measures.lives(tracks, truth, 5.0).tolist() == [True, False, False, False]
+    assert measures.lifetimes(tracks, truth, 5.0).tolist() == [0.0]
+    assert measures.track_quality(tracks, truth, 5.0).number == 0
+    assert measures.lifetimes(tracks, truth, 10.0).tolist() == [0.003]
+    with pytest.raises(amiwarp.AmiwarpError, match="expected that of the tracks"):
+        measures.lives(tracks, truth[:2], 5.0)
+
+
+def test_images_are_followed_with_subpixel_error() -> None:
+    """Blurred discs on a smooth ground move by (1.3, -0.7) px per image."""
+    rng = np.random.default_rng(3)
+    centres = np.array([[30 + 34 * i, 60 + 30 * j] for i in range(4) for j in range(3)], float) + rng.uniform(
+        -4, 4, (12, 2)
+    )
+    rows, columns = np.mgrid[:180, :240]
+    speed, count = np.array([1.3, -0.7]), 12
+    images = []
+    for k in range(count):
+        image = np.zeros((180, 240))
+        for x, y in centres + k * speed:
+            image += np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 18.0)
+        images.append(image)
+    found = measures.follow_images(images, np.arange(count) * 20_833)
+    first = found.first
+    steps = found.index - found.index[first][found.number]
+    truth = found.xy[first][found.number] + steps[:, None] * speed
+    quality = measures.track_quality(found, truth, 1.0)
+    assert quality.number >= 12
+    assert quality.error_px < 0.2
+    assert measures.lifetimes(found, truth, 1.0).max() == pytest.approx((count - 1) * 20_833e-6)
+    assert quality.update_hz == pytest.approx(1e6 / 20_833)
+
+
+def test_images_without_texture_and_wrong_times() -> None:
+    assert len(measures.follow_images([np.zeros((40, 50))] * 3, [0, 1, 2]).first) == 0
+    assert len(measures.follow_images([], []).first) == 0
+    with pytest.raises(amiwarp.AmiwarpError, match="2 images and 3 times"):
+        measures.follow_images([np.zeros((40, 50))] * 2, [0, 1, 2])
+
+
+def test_a_point_is_projected_where_the_camera_sees_it() -> None:
+    """The camera moves right along x by 1 m/s and looks along +y at a wall 2 m away."""
+    camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    square = amiwarp.Mesh([[-2, 2, -2], [2, 2, -2], [2, 2, 2], [-2, 2, 2]], [[0, 1, 2], [0, 2, 3]])
+    post = amiwarp.Mesh([[0.25, 1, -1], [0.35, 1, -1], [0.35, 1, 1], [0.25, 1, 1]], [[0, 1, 2], [0, 2, 3]])
+    world = amiwarp.World("test", (amiwarp.Body("wall", square), amiwarp.Body("post", post)))
+    still = amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0])
+    way = amiwarp.Trajectory([0.0, 0.4], [[0, 0, 0], [0.4, 0, 0]], np.repeat(np.asarray(still.rotation), 2, axis=0))
+    simulation = amiwarp.Simulation(amiwarp.WorldScene(world, way), camera, amiwarp.Prism(0.01), duration_s=0.4)
+    renderer = amiwarp.TruthRenderer(simulation)
+    focal = (camera.width / 2) / math.tan(0.5)
+    t = np.arange(0, 400_001, 20_000)
+    tracks = Tracks(np.zeros(len(t), np.int64), t, np.zeros((len(t), 2)), np.arange(len(t)))
+    place = np.array([[0.4, 2.0, 0.0]])
+    truth = measures.true_paths(tracks, place, camera, way)
+    np.testing.assert_allclose(truth[:, 0], 31.5 + focal * (0.4 - t * 1e-6) / 2.0, rtol=0, atol=1e-3)  # px
+    np.testing.assert_allclose(truth[:, 1], 23.5, rtol=0, atol=1e-3)
+    seen = measures.true_paths(tracks, place, camera, way, [renderer.at(int(k)) for k in t])
+    crossing = 0.5 * (t * 1e-6 + 0.4)  # where the line of sight crosses the post's plane, at half way [m]
+    hidden = np.isnan(seen[:, 0])
+    assert hidden[abs(crossing - 0.3) < 0.02].all()
+    assert not hidden[abs(crossing - 0.3) > 0.08].any()
+    assert hidden.sum() >= 3
+    np.testing.assert_array_equal(seen[~hidden], truth[~hidden])
+    unknown = measures.true_paths(tracks, np.full((1, 3), np.nan), camera, way)
+    assert np.isnan(unknown).all()
