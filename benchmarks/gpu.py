@@ -20,6 +20,7 @@ PICTURE = "china.jpg"
 TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
     "simulate", "translate", "benchmarks", "worlds", "sensor", "reconstruct", "auto", "arrays", "dataset",
+    "corners",
 )  # fmt: skip
 """Names of the test files that use a device and need neither the packages of the command line nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
@@ -43,6 +44,7 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
                                "--out", str(out / "worlds_calibration_cuda.json")],
         "dataset": [*module, "benchmarks.dataset", "--device", "cuda", "--limit-s", str(limit),
                     "--out", str(out / "dataset_cuda.json")],
+        "corners": [*module, "benchmarks.corners", *device, "--out", str(out / "corners_cuda.json")],
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,
                    "--limit-s", str(limit)]

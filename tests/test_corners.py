@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import math
 from pathlib import Path
 
-import eventcv
 import numpy as np
 import pytest
 import warp as wp
+from corner_reference import corners as reference_corners
+from corner_reference import corners_of_dv_processing, table
 from numpy.typing import NDArray
 
 import amiwarp
@@ -18,48 +18,6 @@ from amiwarp.imaging import corners
 from amiwarp.imaging.choices import CornerMethod
 
 METHODS = list(CornerMethod)
-QUARTERS = {3: [(0, 3), (1, 3), (2, 2), (3, 1)], 4: [(0, 4), (1, 4), (2, 3), (3, 2), (4, 1)]}
-TURNS = [np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), k) for k in range(4)]
-CIRCLES = {radius: np.concatenate([np.array(quarter) @ turn for turn in TURNS]) for radius, quarter in QUARTERS.items()}
-"""Pixels of the digital circles by radius, in the order of their angles, shape (n, 2)."""
-
-
-def shortest_arc(times: NDArray[np.float64], least: int) -> NDArray[np.int64]:
-    """Return the length of the shortest arc from ``least`` on that is newer than the rest of the circle, for each row.
-
-    It is the number of pixels if there is no such arc.
-    """
-    n = times.shape[1]
-    shortest = np.full(len(times), n)
-    for length in range(n - 1, least - 1, -1):
-        for start in range(n):
-            turned = np.roll(times, -start, axis=1)
-            shortest[turned[:, :length].min(axis=1) > turned[:, length:].max(axis=1)] = length
-    return shortest
-
-
-def oracle(events: Events, width: int, height: int, method: CornerMethod) -> NDArray[np.bool_]:
-    """Corners by the definitions in the papers: the surface before each event, then the arcs."""
-    surface = np.full((2, height, width), -np.inf)
-    last: dict[tuple[int, int], tuple[int, int]] = {}
-    seen: dict[int, list[NDArray[np.float64]]] = {}
-    for i, (x, y, t, p) in enumerate(zip(*(c.tolist() for c in (events.x, events.y, events.t, events.p)), strict=True)):
-        if method is CornerMethod.ARC:
-            t_before, p_before = last.get((x, y), (0, None))
-            last[x, y] = (t, p)
-            if p_before == p and t - t_before <= 50_000:
-                continue
-        if 4 <= x < width - 4 and 4 <= y < height - 4:
-            seen[i] = [surface[p, y + CIRCLES[r][:, 1], x + CIRCLES[r][:, 0]] for r in (3, 4)]
-        surface[p, y, x] = t
-    corner = np.ones(len(seen), bool)
-    for k, (least, most) in enumerate(((3, 6), (4, 8))):
-        times = np.array([circles[k] for circles in seen.values()])
-        n, size = times.shape[1], shortest_arc(times, least)
-        corner &= (size <= most) | ((method is CornerMethod.ARC) & (n - most <= size) & (size <= n - least))
-    found = np.zeros(len(events), bool)
-    found[np.array(list(seen))[corner]] = True
-    return found
 
 
 def random_events(n: int, width: int, height: int, seed: int) -> Events:
@@ -121,7 +79,7 @@ def test_a_straight_edge_has_no_corner(device: str, method: CornerMethod) -> Non
 @pytest.mark.parametrize("method", METHODS)
 def test_random_events_agree_with_the_definition(device: str, method: CornerMethod) -> None:
     events = random_events(12_000, 40, 30, seed=1)
-    expected = oracle(events, 40, 30, method)
+    expected = reference_corners(events, 40, 30, method)
     assert expected.sum() > 100
     np.testing.assert_array_equal(amiwarp.detect_corners(events, (40, 30), detector=method, device=device), expected)
 
@@ -226,15 +184,13 @@ def test_bad_settings_are_refused() -> None:
         amiwarp.detect_corners(np.zeros((3, 4)), (40, 30))  # type: ignore[call-overload]
 
 
-def table(events: Events) -> NDArray[np.int64]:
-    return np.column_stack([events.x, events.y, events.t, events.p]).astype(np.int64)
-
-
 RECORDINGS = ("text/shapes_rotation/events.txt", "evt/evt2_balls_640x480.raw")
 
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_eventcv_finds_the_same_corners(data_dir: Path, name: str) -> None:
+    import eventcv
+
     recording = amiwarp.open_recording(data_dir / name)
     events, size = recording.events.slice(0, 200_000), recording.events.size
     theirs = eventcv.from_numpy(table(events), sensor_size=size, time_unit="us").efast().numpy()
@@ -243,54 +199,20 @@ def test_eventcv_finds_the_same_corners(data_dir: Path, name: str) -> None:
     np.testing.assert_array_equal(table(events[ours]), theirs)
 
 
-DV_RADII = {
-    5: [(0, 5), (1, 5), (2, 5), (3, 4), (4, 3), (5, 2), (5, 1)],
-    6: [(0, 6), (1, 6), (2, 6), (3, 5), (4, 4), (5, 3), (6, 2), (6, 1)],
-}
-DV_CIRCLES = [np.concatenate([np.array(quarter) @ turn for turn in TURNS]) for quarter in DV_RADII.values()]
-
-
-def dv_accepts(times: NDArray[np.int64], range_us: int) -> bool | None:
-    """Whether dv-processing takes a circle for that of a corner; None if no pixel of it had an event."""
-    n, first = len(times), int(np.argmax(times))
-    if times[first] == 0:
-        return None
-    ends, oldest = [first, first], times[first]
-    open_ends = [True, True]
-    while any(open_ends) and (ends[1] - ends[0] + 1) < n and (ends[0] == ends[1] or (ends[1] - ends[0]) % n):
-        for side, step in enumerate((-1, 1)):
-            following = times[(ends[side] + step) % n]
-            open_ends[side] = open_ends[side] and abs(following - oldest) < range_us
-            if open_ends[side]:
-                ends[side] += step
-                oldest = min(oldest, following)
-    size = ends[1] - ends[0] + 1
-    least, most = (math.floor(n * share + 0.5) for share in (0.125, 0.4))
-    rest = [times[k % n] for k in range(ends[1] + 1, ends[0] + n)]
-    return (least <= size <= most or least <= n - size <= most) and all(t < oldest for t in rest)
-
-
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_dv_processing_differs_only_by_its_own_rule(data_dir: Path, name: str) -> None:
     """Its circles have radii of 5 and 6 px, an arc ends where times jump, and no redundant event is left out.
 
-    Its rule, written here once more, gives exactly its corners. The surfaces and circles are those of amiwarp's tests.
+    Its rule, written once more in ``corner_reference``, gives exactly its corners.
     """
-    features = pytest.importorskip("dv_processing").features
-    store = pytest.importorskip("dv_processing").EventStore()
+    dv_processing = pytest.importorskip("dv_processing")
     recording = amiwarp.open_recording(data_dir / name)
     events, (width, height) = recording.events.slice(0, 10_000), recording.events.size
-    surface = np.zeros((2, height, width), np.int64)
-    expected = []
+    store = dv_processing.EventStore()
     for x, y, t, p in table(events).tolist():
         store.push_back(t, x, y, bool(p))
-        if 6 <= x < width - 6 and 6 <= y < height - 6:
-            circles = [surface[p, y + circle[:, 1], x + circle[:, 0]] for circle in DV_CIRCLES]
-            accepted = [dv_accepts(times, 50_000) for times in circles]
-            if False not in accepted and True in accepted:
-                expected.append((x, y, t))
-        surface[p, y, x] = t
-    detector = features.ArcCornerDetector((width, height), 50_000, False)
+    detector = dv_processing.features.ArcCornerDetector((width, height), 50_000, False)
     found = detector.detect(store, (0, 0, width, height), np.full((height, width), 255, np.uint8))
+    expected = table(events[corners_of_dv_processing(events, width, height, 50_000)])[:, :3]
     assert len(expected) > 100
-    assert [(int(corner.pt[0]), int(corner.pt[1]), corner.timestamp) for corner in found] == expected
+    assert [[int(corner.pt[0]), int(corner.pt[1]), corner.timestamp] for corner in found] == expected.tolist()

@@ -34,7 +34,7 @@ def test_corner_events_are_linked_to_their_tracks() -> None:
 
 def test_a_gap_or_a_jump_starts_a_new_track() -> None:
     t, xy = two_lines()
-    late = t + np.where(t > 25_000, 20_000, 0)
+    late = t + np.where(t > 25_000, 30_000, 0)
     assert len(measures.link_corners(late, xy).first) == 4
     jumped = xy + np.where(t > 25_000, 7.0, 0.0)[:, None]
     assert len(measures.link_corners(t, jumped).first) == 4

@@ -21,8 +21,8 @@ LIMITS_PX = tuple(float(limit) for limit in range(2, 11))
 """Distances from the truth at which a track ends, for the curves [px]."""
 RADIUS_PX = 3.0
 """Largest step of a track of corner events [px]."""
-GAP_US = 10_000
-"""Largest time between two corner events of a track [us]."""
+GAP_US = 25_000
+"""Largest time between two corner events of a track [us]: a little more than a quarter turn at 720 turns/min."""
 WINDOW, LEVELS, CONSISTENT_PX = 21, 3, 1.0
 """Lucas-Kanade: side of the window [px], levels of the pyramid, largest difference between forward and back [px]."""
 MOST_CORNERS, QUALITY, SPACING_PX = 200, 0.01, 10.0
