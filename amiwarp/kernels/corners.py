@@ -31,6 +31,7 @@ LARGE_X, LARGE_Y = (wp.constant(LargeColumns(*values)) for values in zip(*LARGE_
 REACH = wp.constant(4)  # radius of the larger circle [px]; events closer to the border are no corners
 SMALL_LEAST, SMALL_MOST = wp.constant(3), wp.constant(6)  # length of the newest arc of a corner [px]
 LARGE_LEAST, LARGE_MOST = wp.constant(4), wp.constant(8)
+AHEAD = wp.constant(12)  # events between the request for memory and its use
 NEVER = wp.constant(wp.int64(-(2**63)))  # time of a pixel without events
 NO_POLARITY = wp.constant(2)  # polarity of a pixel without events
 
@@ -179,6 +180,32 @@ def has_circles(surface: Surface, x: int, y: int) -> bool:
     return inside and y >= REACH and y < surface.height - REACH
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const int64_t* at = (const int64_t*)surface.time.data + p * surface.pixels + pixel;
+    for (int dy = -4; dy <= 4; ++dy) {
+        __builtin_prefetch(at + dy * surface.width - 3);
+        __builtin_prefetch(at + dy * surface.width + 3);
+    }
+    __builtin_prefetch((const int64_t*)surface.last.data + pixel);
+    __builtin_prefetch((const uint8_t*)surface.polarity.data + pixel);
+#endif
+""")
+def prefetch(surface: Surface, pixel: int, p: int):
+    """Ask a CPU to load the surroundings of a pixel, which an event to come needs. A hint: any address is harmless."""
+
+
+@wp.func
+def prefetch_event(events: Columns, surface: Surface, owner: wp.array(dtype=int), k: int, i: int):
+    """Ask for the surroundings of event ``i`` if its band belongs to thread ``k``."""
+    if i < events.t.shape[0]:
+        y = int(events.y[i])
+        band = y >> surface.band_bits
+        if owner[band] == k:
+            pixel = (y + REACH + 2 * REACH * band) * surface.width + int(events.x[i])
+            prefetch(surface, pixel, int(events.p[i]))
+
+
 @wp.func
 def store(surface: Surface, pixel: int, t: wp.int64, p: int, rule: Rule) -> bool:
     """Store an event in the surfaces. Return whether it is not redundant."""
@@ -207,6 +234,7 @@ def detect_in_order(
     """
     k = start + wp.tid()
     for i in range(events.t.shape[0]):
+        prefetch_event(events, surface, owner, k, i + AHEAD)
         x, y, p = int(events.x[i]), int(events.y[i]), int(events.p[i])
         first = wp.max(y - REACH, 0) >> surface.band_bits
         last = wp.min(y + REACH, surface.height - 1) >> surface.band_bits
