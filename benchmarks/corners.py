@@ -134,12 +134,13 @@ def rows_of(found: Any) -> NDArray[np.int64]:
 
 def judged(program: Program, found: NDArray[np.int64], events: Events) -> float:
     """Return the share of the first events whose result differs from the reference."""
-    last = JUDGED if found.ndim == 1 else int(events.t[JUDGED - 1])  # later events may have the same time
+    judged_events = min(JUDGED, len(events))
+    last = judged_events if found.ndim == 1 else int(events.t[judged_events - 1])  # later events may have the same time
     sets = []
     for corners in (found, program.expected):
         early = corners[(corners if corners.ndim == 1 else corners[:, 2]) < last]
         sets.append({tuple(np.atleast_1d(row)) for row in early.tolist()})
-    return len(sets[0] ^ sets[1]) / JUDGED
+    return len(sets[0] ^ sets[1]) / judged_events
 
 
 def measure(programs: list[Program], events: Events) -> list[dict[str, Any]]:

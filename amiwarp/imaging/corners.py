@@ -121,8 +121,7 @@ class CornerDetector:
     """
 
     def __init__(self, size: tuple[int, int], *, detector: CornerMethod = CornerMethod.ARC, device: Any = None) -> None:
-        check = lambda value, what: whole(value, what, 1, LARGEST_SIZE, " pixels")  # noqa: E731
-        self._width, self._height = (int(side) for side in vector(size, 2, "size of the sensor", check))
+        self._width, self._height = (int(side) for side in vector(size, 2, "size of the sensor", _side))
         if self._width * self._height > MOST_PIXELS:
             raise AmiwarpError(f"a sensor of {self._width}x{self._height} has more than {MOST_PIXELS} pixels; crop it")
         self._method = choice(CornerMethod, detector, "detector")
@@ -266,6 +265,11 @@ class PassInLists:
 
     def _run(self, kernel: Any, n: int, inputs: list[Any], outputs: list[Any]) -> None:
         launch(kernel, n, inputs, outputs, device=self._device)
+
+
+def _side(value: object, what: str) -> int:
+    """Return the width or the height of a sensor [px]."""
+    return whole(value, what, 1, LARGEST_SIZE, " pixels")
 
 
 def _surface(width: int, height: int, rows: int, method: CornerMethod, device: Any) -> Any:
