@@ -156,7 +156,9 @@ def test_aedat2_tells_events_from_frames_imu_and_triggers(tmp_path):
     write_aedat2(tmp_path / "a.aedat", EVENTS, between=extra)
     recording = open_recording(tmp_path / "a.aedat")
     assert_equal(recording.events.slice(0, 999), EVENTS)
-    assert recording.metadata == {"format": "aedat2", "frames": 1, "imu_samples": 2, "triggers": 1}
+    assumed = "assumed: 8 g and 1000 deg/s, the defaults of jAER"
+    expected = {"format": "aedat2", "frames": 1, "imu_samples": 2, "triggers": 1, "imu_ranges": assumed}
+    assert recording.metadata == expected
     (tmp_path / "a.aedat").write_bytes((tmp_path / "a.aedat").read_bytes() + np.array(edges[1:], ">u4").tobytes())
     assert read_encoder_triggers(tmp_path / "a.aedat").rpm == pytest.approx(60_000)
 
