@@ -26,6 +26,7 @@ from amiwarp.io.counters import last_word, unwrapped
 from amiwarp.io.file_scan import FileEvents, Packet, head_limit
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.regular_file import check_regular
+from amiwarp.io.sensor_streams import only_counted
 
 MAGIC = b"#!AER-DAT2.0"
 HEADER_BYTES = 1 << 24
@@ -58,6 +59,7 @@ def open_aedat2(path: Path) -> Recording:
     read, last = partial(_packets, path, chip, offset), partial(_last_time, path, offset)
     events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
     imu, notes = _imu(path, chip, offset, events)
+    notes |= only_counted(events.records, "frames")
     metadata = {"format": "aedat2", **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
 

@@ -136,6 +136,15 @@ def read_sensors(
     return imu, frames, notes
 
 
+def only_counted(counts: Mapping[str, MetadataValue], *names: str) -> dict[str, MetadataValue]:
+    """Return notes that the records ``imu_samples`` or ``frames`` are not read, for those that were counted."""
+    return {
+        f"{name.partition('_')[0]}_note": "only counted: amiwarp does not read them from this format"
+        for name in names
+        if counts.get(name)
+    }
+
+
 def _if_readable(path: Path, name: str, read: Callable[[], Kept], notes: dict[str, MetadataValue]) -> Kept | None:
     """Return what a function reads; None if it raises :class:`AmiwarpError`, which is then noted."""
     try:
