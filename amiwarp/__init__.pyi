@@ -31,6 +31,9 @@ from .events.recording import MetadataValue as MetadataValue
 from .events.recording import PointStore as PointStore
 from .events.recording import Recording as Recording
 from .events.recording import Truth as Truth
+from .events.sensors import ImageStore as ImageStore
+from .events.sensors import ImuSamples as ImuSamples
+from .events.sensors import MemoryImages as MemoryImages
 from .events.truth import Cause as Cause
 from .events.truth import EventTruth as EventTruth
 from .events.truth import EventValues as EventValues

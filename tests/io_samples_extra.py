@@ -133,8 +133,10 @@ def write_mvsec(path: Path, events: Events, *, sides: tuple[str, ...] = ("left",
         for side in sides:
             rows = np.stack([events.x, events.y, events.t * 1e-6, events.p * 2.0 - 1.0], axis=1)
             file.create_dataset(f"davis/{side}/events", data=rows, chunks=(100, 2), compression="gzip")
-            file[f"davis/{side}/image_raw"] = np.zeros((3, 26, 34), np.uint8)
-            file[f"davis/{side}/imu"] = np.zeros((7, 6))
+            file[f"davis/{side}/image_raw"] = np.arange(3 * 26 * 34, dtype=np.uint16).reshape(3, 26, 34)
+            file[f"davis/{side}/image_raw_ts"] = 1.0 + np.arange(3) * 0.04
+            file[f"davis/{side}/imu"] = np.arange(42.0).reshape(7, 6)
+            file[f"davis/{side}/imu_ts"] = 1.0 + np.arange(7) * 0.001
 
 
 def write_prophesee_hdf5(path: Path, events: Events, **filters: Any) -> None:

@@ -34,6 +34,7 @@ from amiwarp.cli.info import describe
 from amiwarp.cli.inputs import read_camera
 from amiwarp.events.checks import check_events
 from amiwarp.events.events import Events
+from amiwarp.events.sensors import ImuSamples
 from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
 from amiwarp.io.text import read_calib
@@ -91,14 +92,25 @@ def write_truth(path: Path) -> None:
         writer.append_poses(Poses(np.arange(3) * 1000, poses, {"ball": poses}, {"a": poses[:, :3]}))
 
 
-def write_plain_truth(path: Path) -> None:
-    """Write the same without checksums, so that damage reaches the values and the file's structure."""
-    write_truth(path)
+def write_sensors(path: Path) -> None:
+    """Write a native file with IMU samples and frames."""
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path, width=SIZE[0], height=SIZE[1]) as writer:
+        writer.append(EVENTS)
+        writer.append_imu(ImuSamples(np.arange(5), rng.random((5, 3)), rng.random((5, 3))))
+        for t in (0, 1000):
+            writer.append_image(t, rng.integers(0, 2**16, (6, 8)).astype(np.uint16))
+
+
+def write_plain(write: Callable[[Path], None], path: Path) -> None:
+    """Write a native file without checksums, so that damage reaches the values and the file's structure."""
+    write(path)
     with h5py.File(path) as file:
         found: dict[str, Any] = {}
+        about = dict(file.attrs)
         file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
     with h5py.File(path, "w", libver="earliest") as file:
-        file.attrs["width"], file.attrs["height"] = 8, 6
+        file.attrs.update(about)
         for name, values in found.items():
             file[name] = values
 
@@ -168,6 +180,9 @@ def read_recording(path: Path) -> None:
             assert recording.truth.known[index].shape == recording.events.size[::-1]
         if recording.truth.poses is not None:
             assert len(recording.truth.poses[:]) == len(recording.truth.poses)
+    if recording.frames is not None:
+        for index in range(len(recording.frames.t)):
+            assert recording.frames[index].shape == recording.frames.size[::-1]
     json.dumps(describe(recording, str(path)), ensure_ascii=False).encode()
 
 
@@ -218,7 +233,9 @@ KINDS: dict[str, Kind] = {
     },
     "hdf5_v110": (".h5", partial(write_hdf5, PLUGINS["gzip"], "v110"), read_recording),
     "truth": (".h5", write_truth, read_recording),
-    "truth_plain": (".h5", write_plain_truth, read_recording),
+    "truth_plain": (".h5", partial(write_plain, write_truth), read_recording),
+    "sensors": (".h5", write_sensors, read_recording),
+    "sensors_plain": (".h5", partial(write_plain, write_sensors), read_recording),
     "encoder_csv": (".csv", write_csv, read_log),
     "calib_txt": (".txt", lambda path: path.write_text(CALIB), lambda path: read_calib(path, *SIZE)),
     "camera_json": (".json", write_camera, lambda path: read_camera(path, *SIZE)),

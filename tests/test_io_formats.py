@@ -137,6 +137,9 @@ def test_evt21_in_both_byte_orders(tmp_path, legacy, header):
     assert_equal(recording.events.slice(0, 999), EVENTS)
 
 
+ONLY_COUNTED = "only counted: amiwarp does not read them from this format"
+
+
 def test_evt21_vectors(tmp_path):
     words = np.array([0x8 << 60 | 5 << 32, 1 << 60 | 3 << 54 | 64 << 43 | 9 << 32 | 0x80000005], np.uint64)
     (tmp_path / "a.raw").write_bytes(
@@ -156,7 +159,11 @@ def test_aedat2_tells_events_from_frames_imu_and_triggers(tmp_path):
     write_aedat2(tmp_path / "a.aedat", EVENTS, between=extra)
     recording = open_recording(tmp_path / "a.aedat")
     assert_equal(recording.events.slice(0, 999), EVENTS)
-    assert recording.metadata == {"format": "aedat2", "frames": 1, "imu_samples": 2, "triggers": 1}
+    assumed = "assumed: 8 g and 1000 deg/s, the defaults of jAER"
+    assert recording.metadata == {
+        "format": "aedat2", "frames": 1, "imu_samples": 2, "triggers": 1, "imu_ranges": assumed,
+        "frames_note": ONLY_COUNTED,
+    }  # fmt: skip
     (tmp_path / "a.aedat").write_bytes((tmp_path / "a.aedat").read_bytes() + np.array(edges[1:], ">u4").tobytes())
     assert read_encoder_triggers(tmp_path / "a.aedat").rpm == pytest.approx(60_000)
 
@@ -182,7 +189,7 @@ def test_aedat3_triggers_sources_and_overflow(tmp_path):
     recording = open_recording(tmp_path / "a.aedat")
     assert_equal(recording.events.slice(0, 999), EVENTS)
     assert recording.metadata == {
-        "format": "aedat3", "imu_samples": 5, "triggers": 3, "events_of_other_sources": 1,
+        "format": "aedat3", "imu_samples": 5, "triggers": 3, "events_of_other_sources": 1, "imu_note": ONLY_COUNTED,
     }  # fmt: skip
     assert np.diff(read_encoder_triggers(tmp_path / "a.aedat").t).tolist() == [500]
     later = Events(EVENTS.x, EVENTS.y, EVENTS.t + 2**31, EVENTS.p)

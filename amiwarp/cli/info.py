@@ -14,6 +14,7 @@ from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.inputs import Topic
 from amiwarp.cli.options import Common
 from amiwarp.events.events import DEFAULT_BLOCK
+from amiwarp.events.sensors import mean_rate
 from amiwarp.events.truth import Cause
 from amiwarp.io import open_recording
 from amiwarp.io.conversion import GAP_INTERVALS
@@ -21,9 +22,12 @@ from amiwarp.io.file_scan import head_only
 from amiwarp.optics.prism import Prism
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import EventSource
     from amiwarp.events.recording import Recording, Truth
+    from amiwarp.events.sensors import ImageStore, ImuSamples
 
 EXAMPLE = "amiwarp info recording.h5"
 MOST_NAMES = 16
@@ -46,7 +50,7 @@ def run(
     topic: Topic = None,
     common: Common,
 ) -> None:
-    """Show a recording's format, events, encoder, camera, prism, ground truth and repairs.
+    """Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth and repairs.
 
     Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
     read, unless --count is given. Figures that are then estimates are marked as such.
@@ -79,6 +83,8 @@ def describe(recording: Recording, file: str, *, head: bool = False) -> dict[str
         "encoder": None if recording.encoder is None else _encoder(recording.encoder, source),
         "camera": None if recording.camera is None else _camera(recording),
         "prism": None,
+        "imu": None if recording.imu is None else _imu(recording.imu),
+        "frames": None if recording.frames is None else _frames(recording.frames),
         "truth": None if recording.truth is None else _degrees(recording.truth.parameters),
         "truth_points": recording.truth is not None and recording.truth.points(0, 1) is not None,
         "world": None if recording.truth is None else _world(recording.truth, None if head else len(source)),
@@ -147,6 +153,41 @@ def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
         "index_pulses": len(slip),
         "slip_deg": math.degrees(float(np.abs(slip).max())) if len(slip) else None,
     }
+
+
+def _imu(imu: ImuSamples) -> dict[str, Any]:
+    """Return the number, the rate and the times of the IMU samples."""
+    return {"samples": len(imu), "rate_hz": imu.rate_hz, **_ends(imu.t)}
+
+
+def _frames(frames: ImageStore) -> dict[str, Any]:
+    """Return the number, the rate, the size and the times of the frames."""
+    width, height = frames.size
+    return {
+        "count": len(frames.t),
+        "rate_hz": mean_rate(frames.t),
+        "width": width,
+        "height": height,
+        **_ends(frames.t),
+    }
+
+
+def _ends(t: NDArray[np.int64]) -> dict[str, int | None]:
+    """Return the first and the last time [us], or None for both without times."""
+    return {"first_us": int(t[0]) if len(t) else None, "last_us": int(t[-1]) if len(t) else None}
+
+
+def _sensor_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows of the table about IMU samples and frames."""
+    rows = []
+    for label, name, text in (
+        ("IMU", "imu", "{samples:,} samples"),
+        ("frames", "frames", "{count:,} of {width} x {height} px"),
+    ):
+        if d[name] is not None:
+            rate = "" if d[name]["rate_hz"] is None else f", {d[name]['rate_hz']:.4g} Hz"
+            rows.append((label, text.format(**d[name]) + rate))
+    return rows
 
 
 def _camera(recording: Recording) -> dict[str, Any]:
@@ -247,6 +288,7 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("camera", "unknown" if c is None else f"fx {c['fx']:.6g}, fy {c['fy']:.6g}, cx {c['cx']:.6g}, "
                  f"cy {c['cy']:.6g} px, FOV {c['fov_deg']:.4g} deg, {lens}"))  # fmt: skip
     rows.append(("prism", _prism_text(p)))
+    rows += _sensor_rows(d)
     if d["truth"] is not None:
         points = "with the true position of each event" if d["truth_points"] else "without positions"
         shown = [f"{n} {v:.5g}" for n, v in d["truth"].items() if n in ("apex_deg", "phase_deg", "index")]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.events import EventSource
+from amiwarp.events.sensors import ImageStore, ImuSamples
 from amiwarp.events.truth import EventTruth, EventValues, FrameStore, KnownStore, PoseStore, WorldLabels
 
 if TYPE_CHECKING:
@@ -152,3 +153,7 @@ class Recording:
     """Other information by name, such as the file format, repairs made while reading, and the simulator's seed."""
     name: str = "recording"
     """Short name of the recording in messages and titles: the file name without its extension."""
+    imu: ImuSamples | None = None
+    """Samples of the camera's inertial measurement unit, or None."""
+    frames: ImageStore | None = None
+    """Frames that the camera recorded with the events, read on demand, or None."""

@@ -1,4 +1,4 @@
-"""Reader of iniVation's AEDAT 4.0 files, with faery: the first stream of events. Frames and IMU samples are counted.
+"""Reader of iniVation's AEDAT 4.0 files, with faery: the first streams of events, frames and IMU samples.
 
 The decoder does not check the file's structure: text that is not UTF-8 ends the process. Therefore the header and the
 packet sizes are checked first.
@@ -23,6 +23,7 @@ from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply, noting_progress
 from amiwarp.io.regular_file import check_regular
+from amiwarp.io.sensor_streams import read_sensors
 
 COUNTED = {"frame": "frames", "imus": "imu_samples"}
 """Types of other streams, and the names of their counts."""
@@ -44,7 +45,9 @@ def open_aedat4(path: Path) -> Recording:
         width, height, number = run("amiwarp.io.aedat:read_head", os.path.abspath(path))
     source = partial(packets, "amiwarp.io.aedat:read_packets", os.path.abspath(path), number, False)
     events = FileEvents(path, source, size=(width, height))
-    return Recording(events=events, metadata={"format": "aedat4", **events.metadata}, name=path.stem)
+    imu, frames, notes = read_sensors(path, events.records, "aedat_sensors")
+    metadata = {"format": "aedat4", **events.metadata, **notes}
+    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
 
 
 def _check_frame(path: Path, file: BinaryIO) -> None:

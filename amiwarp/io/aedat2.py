@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import MetadataValue, Recording
+from amiwarp.events.sensors import ImuSamples
+from amiwarp.io.aedat2_imu import RANGES, read_imu, read_ranges
 from amiwarp.io.counters import last_word, unwrapped
-from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.file_scan import FileEvents, Packet, head_limit
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.regular_file import check_regular
+from amiwarp.io.sensor_streams import only_counted
 
 MAGIC = b"#!AER-DAT2.0"
 HEADER_BYTES = 1 << 24
@@ -55,7 +58,21 @@ def open_aedat2(path: Path) -> Recording:
         chip, offset = _read_header(path)
     read, last = partial(_packets, path, chip, offset), partial(_last_time, path, offset)
     events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
-    return Recording(events=events, metadata={"format": "aedat2", **events.metadata}, name=path.stem)
+    imu, notes = _imu(path, chip, offset, events)
+    notes |= only_counted(events.records, "frames")
+    metadata = {"format": "aedat2", **events.metadata, **notes}
+    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
+
+
+def _imu(path: Path, chip: Chip, offset: int, events: FileEvents) -> tuple[ImuSamples | None, dict[str, MetadataValue]]:
+    """Return the IMU samples, unless only the head of the file was read, and notes about them."""
+    if not events.records.get("imu_samples") or head_limit() is not None:
+        return None, {}
+    ranges = read_ranges(path, offset)
+    notes: dict[str, MetadataValue] = {}
+    if ranges is None:
+        notes["imu_ranges"] = f"assumed: {RANGES[0]} g and {RANGES[1]} deg/s, the defaults of jAER"
+    return read_imu(path, _records(path, offset, {}), ranges or RANGES), notes
 
 
 def _last_time(path: Path, offset: int, estimate: int) -> int | None:

@@ -20,6 +20,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.regular_file import check_regular
+from amiwarp.io.sensor_streams import only_counted
 
 MAGIC = b"#!AER-DAT3.1"
 HEADER_END = b"#!END-HEADER\r\n"
@@ -54,7 +55,8 @@ def open_aedat3(path: Path) -> Recording:
     with errors_name(path, lambda: "reading the header"):
         size, offset = _read_header(path)
     events = FileEvents(path, partial(_packets, path, offset), size=size)
-    return Recording(events=events, metadata={"format": "aedat3", **events.metadata}, name=path.stem)
+    metadata = {"format": "aedat3", **events.metadata, **only_counted(events.records, "imu_samples", "frames")}
+    return Recording(events=events, metadata=metadata, name=path.stem)
 
 
 def _read_header(path: Path) -> tuple[tuple[int, int] | None, int]:

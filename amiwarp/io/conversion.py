@@ -85,8 +85,8 @@ def convert(
 ) -> ConversionSummary:
     """Convert a recording to the native format or to another one, in constant memory.
 
-    Only the native format holds the encoder, the camera, the prism, the ground truth and the metadata. All formats
-    keep x, y, t and p of every event exactly.
+    Only the native format holds the encoder, the camera, the prism, the ground truth, the IMU samples, the frames and
+    the metadata. All formats keep x, y, t and p of every event exactly.
 
     Parameters
     ----------
@@ -205,6 +205,8 @@ def _left_out(recording: Recording, holds_size: bool) -> tuple[str, ...]:
         "camera": recording.camera is not None,
         "prism": recording.prism is not None,
         "ground truth": recording.truth is not None,
+        "IMU samples": recording.imu is not None,
+        "frames": recording.frames is not None,
         "metadata": not set(recording.metadata) <= known,
     }
     return tuple(name for name, left in found.items() if left)

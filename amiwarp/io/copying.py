@@ -16,7 +16,7 @@ POSE_BLOCK = 1 << 16
 
 
 def copy_events(recording: Recording, writer: RecordingWriter, progress: Progress | None = None) -> None:
-    """Append all events of a recording to a writer, with their ground truth and flags."""
+    """Append all events of a recording to a writer, with their ground truth and flags, IMU samples and frames."""
     source, truth = recording.events, recording.truth
     flags = {name: getattr(source, name, None) for name in ("inside", "extrapolated")}
     start = 0
@@ -30,6 +30,11 @@ def copy_events(recording: Recording, writer: RecordingWriter, progress: Progres
             progress("writing events", start / len(source))
     if truth is not None:
         _copy_world_truth(truth, writer)
+    if recording.imu is not None:
+        writer.append_imu(recording.imu)
+    if recording.frames is not None:
+        for index, t in enumerate(recording.frames.t.tolist()):
+            writer.append_image(t, recording.frames[index])
 
 
 def _copy_world_truth(truth: Truth, writer: RecordingWriter) -> None:

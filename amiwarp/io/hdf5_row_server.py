@@ -35,12 +35,12 @@ def read_head(path: str, group: str) -> Reply:
     with h5py.File(path, "r") as file:
         if group != "CD":
             others = {"frames": member(file, f"{group}/image_raw"), "imu_samples": member(file, f"{group}/imu")}
-            counts = {name: int(found.shape[0]) for name, found in others.items() if _is_dataset(found)}
+            counts = {name: int(found.shape[0]) for name, found in others.items() if is_dataset(found)}
             return {"size": MVSEC_SIZE, "counts": counts}, []
         texts = [str(file.attrs[name])[:100] for name in ("geometry", "format") if name in file.attrs]
         match = re.search(r"(\d+)x(\d+)", " ".join(texts)) or re.search(r"width=(\d+);.*height=(\d+)", " ".join(texts))
         triggers = member(file, "EXT_TRIGGER/events")
-        counts = {"triggers": int(triggers.shape[0])} if _is_dataset(triggers) and triggers.shape[0] else {}
+        counts = {"triggers": int(triggers.shape[0])} if is_dataset(triggers) and triggers.shape[0] else {}
         return {"size": [int(match[1]), int(match[2])] if match else None, "counts": counts}, []
 
 
@@ -62,13 +62,14 @@ def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
                 yield rows["x"], rows["y"], rows["t"], rows["p"]
 
 
-def _is_dataset(found: Any) -> bool:
+def is_dataset(found: Any) -> bool:
+    """Return whether a member of a file is a dataset with rows."""
     return isinstance(found, h5py.Dataset) and found.ndim > 0
 
 
 def _check_rows(dataset: Any, name: str, path: str) -> None:
     """Check that a dataset holds rows of events, and that all of it is in the file."""
-    if not _is_dataset(dataset):
+    if not is_dataset(dataset):
         raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
     wanted = ("p", "t", "id") if name.startswith("EXT_TRIGGER") else ("x", "y", "p", "t")
     fields = dataset.dtype.fields
@@ -85,6 +86,11 @@ def _check_rows(dataset: Any, name: str, path: str) -> None:
             "is compressed with Prophesee's ECF codec, which is not installed; install the plugin hdf5_ecf, set "
             "HDF5_PLUGIN_PATH to its folder, or convert the file to RAW with Metavision"
         )
+    check_stored(dataset, name, path)
+
+
+def check_stored(dataset: Any, name: str, path: str) -> None:
+    """Check that the file holds all of a dataset, in chunks that fit into memory."""
     if dataset.chunks is None:
         plain_length(dataset, name, path)
         return

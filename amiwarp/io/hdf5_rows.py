@@ -10,6 +10,7 @@ from pathlib import Path
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.reading_process import packets, run
+from amiwarp.io.sensor_streams import read_sensors
 
 READ = "amiwarp.io.hdf5_row_server:read_rows"
 """Function of the reading process."""
@@ -20,8 +21,9 @@ def open_rows(path: Path, layout: str, group: str) -> Recording:
     source = os.path.abspath(path)
     about = run("amiwarp.io.hdf5_row_server:read_head", source, group)
     events = FileEvents(path, partial(packets, READ, source, f"{group}/events"), size=_size(about["size"]))
-    metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata}
-    return Recording(events=events, metadata=metadata, name=path.stem)
+    imu, frames, notes = read_sensors(path, about["counts"], "hdf5_sensors", group)
+    metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata, **notes}
+    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
 
 
 def _size(given: list[int] | None) -> tuple[int, int] | None:

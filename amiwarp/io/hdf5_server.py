@@ -20,6 +20,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.hdf5_layouts import M3ED_COLUMNS, find_layout, m3ed_attributes
+from amiwarp.io.native_layout import FORMAT
 from amiwarp.io.reading_server import Reply, keep, kept
 
 ATTRIBUTES = {
@@ -53,6 +54,9 @@ COLUMNS = {
     "truth/poses/camera": "f",
     "truth/poses/bodies": "f",
     "truth/joints/position": "f",
+    **{f"{group}/t": "iu" for group in ("imu", "frames")},
+    **{f"imu/{name}": "f" for name in ("angular_velocity", "acceleration")},
+    "frames/image": "u",
     **{f"truth/{name}": "S" for name in ("world/instances", "world/categories", "poses/body_names", "joints/names")},
 }
 """Datasets that are read, with the kinds of data types allowed for each, as in NumPy's ``dtype.kind``."""
@@ -63,6 +67,8 @@ DIMENSIONS = {
     **{f"truth/{name}": 3 for name in ("frames/joints", "poses/bodies", "joints/position")},
     **{f"truth/frames/{name}": 3 for name in ("depth", "instance", "intensity", "intensity_with_prism")},
     "truth/known/mask": 3,
+    **{f"imu/{name}": 2 for name in ("angular_velocity", "acceleration")},
+    "frames/image": 3,
     **{f"truth/frames/{name}": 4 for name in ("normal", "flow", "flow_with_prism")},
 }
 """Numbers of dimensions of the datasets that do not have exactly one dimension."""
@@ -70,6 +76,7 @@ DIMENSIONS = {
 READ_AT_ONCE = (
     "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "truth/frames/t", "truth/known/t",
     "truth/world/instances", "truth/world/categories", "truth/poses/body_names", "truth/joints/names",
+    "imu/t", "imu/angular_velocity", "imu/acceleration", "frames/t",
 )  # fmt: skip
 """Datasets that are read into memory at once, and therefore have stricter size limits."""
 
@@ -104,7 +111,8 @@ def open_file(path: str, topic: str | None) -> Reply:
     layout, group = find_layout(file, topic, member)
     groups = {name: found for name in ATTRIBUTES if (found := _group(file, name)) is not None}
     attributes = {name: dict(_attributes(found, name)) for name, found in groups.items()}
-    names = {name: name for name in COLUMNS}
+    ours = attributes.get("/", {}).get("format") == FORMAT
+    names = {name: name for name in COLUMNS if ours or not name.startswith(("imu/", "frames/"))}
     if layout == "m3ed":
         names = {name: f"{group}/{theirs}" for name, theirs in M3ED_COLUMNS.items()}
         attributes = m3ed_attributes(file, group, member)

@@ -27,6 +27,7 @@ from amiwarp.io.hdf5_rows import open_rows
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.io.native_layout import FORMAT, FORMAT_VERSION
 from amiwarp.io.regular_file import check_regular
+from amiwarp.io.sensor_reader import read_frames, read_imu
 from amiwarp.io.truth_reader import read_truth
 from amiwarp.optics.camera import check_size
 
@@ -218,6 +219,8 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         truth=None if file.attributes("truth") is None else read_truth(path, file, len(events), events.size),
         metadata=metadata,
         name=path.stem,
+        imu=read_imu(path, file),
+        frames=read_frames(path, file),
     )
     file.settle()
     return recording

@@ -21,7 +21,7 @@ from amiwarp.events.checks import check_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
-from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
+from amiwarp.events.truth import EventTruth, WorldLabels
 from amiwarp.io.atomic_output import NewFile, spare_space
 from amiwarp.io.chunks import CHUNK, Codec, append_chunk, encode, in_order
 from amiwarp.io.input_files import errors_name
@@ -35,7 +35,8 @@ from amiwarp.io.native_layout import (
     ms_entries,
     write_header,
 )
-from amiwarp.io.truth_writer import TruthWriter, event_columns
+from amiwarp.io.record_appender import RecordAppender
+from amiwarp.io.truth_writer import event_columns
 from amiwarp.optics.camera import Camera
 from amiwarp.validation import choice
 
@@ -46,7 +47,7 @@ FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8]]
 """Compensated events with flags of shape ``(n,)``: 1 if the event lies inside the image."""
 
 
-class RecordingWriter:
+class RecordingWriter(RecordAppender):
     """Writer that streams a recording into a native HDF5 file.
 
     Use it in a ``with`` block. The file appears under its name when the block ends without an exception. After an
@@ -113,7 +114,6 @@ class RecordingWriter:
         self._truth_parameters, self._truth_labels = truth_parameters, truth_labels
         self._metadata = dict(metadata or {})
         self._file: Any = None
-        self._truth: TruthWriter | None = None
         self._datasets: dict[str, Any] = {}
         self._new: NewFile | None = None
         self._spare = contextlib.ExitStack()
@@ -136,7 +136,7 @@ class RecordingWriter:
                 self._spare.enter_context(spare_space(self._new.part.parent))
                 # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
                 self._file = h5py.File(self._new.part, "x", libver=("v110", "v110"))
-                self._truth = TruthWriter(self._file, self.path, self._size, self._codec)
+                self._open_records(self._file, self._size, self._codec)
                 self._write_header()
         except BaseException:
             self._discard()
@@ -266,46 +266,6 @@ class RecordingWriter:
         """
         self._encoder = encoder
 
-    def append_frame(self, frame: FrameTruth) -> None:
-        """Append the ground truth of an instant.
-
-        Parameters
-        ----------
-        frame : FrameTruth
-            Ground truth of all pixels, at a later time than the frame before.
-        """
-        with errors_name(self.path, lambda: f"truth of the instant {frame.t_us} us"):
-            self._open_truth().append_frame(frame)
-
-    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
-        """Append a mask of the pixels whose scene is known.
-
-        Parameters
-        ----------
-        t_us : int
-            Time from which the mask holds [us], later than that of the mask before.
-        mask : numpy.ndarray
-            Whether the scene at each pixel without the prism is known, shape ``(height, width)``.
-        """
-        with errors_name(self.path, lambda: f"mask at {t_us} us"):
-            self._open_truth().append_known(t_us, mask)
-
-    def append_poses(self, poses: Poses) -> None:
-        """Append true poses of camera, bodies and joints.
-
-        Parameters
-        ----------
-        poses : Poses
-            Poses at later times than those before.
-        """
-        with errors_name(self.path, lambda: "true poses"):
-            self._open_truth().append_poses(poses)
-
-    def _open_truth(self) -> TruthWriter:
-        if self._truth is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
-        return self._truth
-
     def _as_columns(self, events: Events, truth: EventTruth, flags: Mapping[str, ArrayLike | None]) -> Columns:
         columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
         for name, flag in flags.items():
@@ -372,8 +332,7 @@ class RecordingWriter:
 
     def _write_header(self) -> None:
         write_header(self._file, self._size, self._camera, self._prism, self._metadata)
-        if self._truth is not None:
-            self._truth.write_header(self._truth_parameters, self._truth_labels)
+        self._open_truth().write_header(self._truth_parameters, self._truth_labels)
 
     def _finish(self) -> None:
         self._flush(whole=self._pending_count)

@@ -21,6 +21,7 @@ from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply
 from amiwarp.io.ros_messages import ARRAY_FIELDS, ARRAYS, EVENT_FIELDS, PACKET_DEFINITION, PACKETS, PacketDecoder
 from amiwarp.io.ros_messages import decode_array as _decode_array
+from amiwarp.io.sensor_streams import read_sensors
 
 ROS1, SQLITE, MCAP = b"#ROSBAG V2.0\n", b"SQLite format 3\0", b"\x89MCAP0\r\n"
 """First bytes of the files of bags."""
@@ -41,8 +42,9 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     read = partial(packets, "amiwarp.io.rosbag:read_packets", source, about["topic"], False)
     size = tuple(about["size"]) if min(about["size"]) else None
     events = FileEvents(path, read, size=size)
-    metadata = {"format": about["format"], "topic": about["topic"], **about["counts"], **events.metadata}
-    return Recording(events=events, metadata=metadata, name=path.stem)
+    imu, frames, notes = read_sensors(path, about["counts"], "ros_sensors", about["topic"])
+    metadata = {"format": about["format"], "topic": about["topic"], **about["counts"], **events.metadata, **notes}
+    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
 
 
 def trigger_packets(path: Path, topic: str | None = None) -> Iterator[Packet]:
@@ -54,7 +56,7 @@ def trigger_packets(path: Path, topic: str | None = None) -> Iterator[Packet]:
 
 def read_head(path: str, topic: str | None) -> Reply:
     """Return the format, topic, sensor size and counts of other messages of a bag. Runs in the reading process."""
-    with _opened(path) as (bag, ros1):
+    with opened_bag(path) as (bag, ros1):
         connection = _choose(bag, topic, 1 if ros1 else 2)
         counts: dict[str, int] = {}
         for other in bag.connections:
@@ -75,7 +77,7 @@ def read_head(path: str, topic: str | None) -> Reply:
 
 def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -> Iterator[Columns]:
     """Yield the events, or the triggers, of each message of a topic. Runs in the reading process."""
-    with _opened(path) as (bag, ros1):
+    with opened_bag(path) as (bag, ros1):
         connections = [found for found in bag.connections if found.topic == topic]
         decode = _decoder(connections[0], ros1=ros1)
         notes["total"] = max(sum(found.msgcount for found in connections), 1)
@@ -87,7 +89,7 @@ def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -
 
 
 @contextlib.contextmanager
-def _opened(path: str) -> Iterator[tuple[Any, bool]]:
+def opened_bag(path: str) -> Iterator[tuple[Any, bool]]:
     """Open a bag by its content, not its ending. Return the library's reader, and whether the bag is of ROS 1."""
     try:
         from rosbags.rosbag1 import Reader as Reader1
@@ -142,14 +144,14 @@ def _decoder(connection: Any, *, ros1: bool) -> Any:
 
         return decode
     packet = PacketDecoder()
-    return lambda raw: packet.decode(_deserialised(connection, raw, ros1=ros1))
+    return lambda raw: packet.decode(deserialised(connection, raw, ros1=ros1))
 
 
 def _size(connection: Any, raw: bytes, *, ros1: bool) -> tuple[int, int]:
     """Return the sensor size in a message [px]; 0 if it is not set."""
     if connection.msgtype in ARRAYS:
         return _decode_array(raw, ros1=ros1)[:2]
-    message = _deserialised(connection, raw, ros1=ros1)
+    message = deserialised(connection, raw, ros1=ros1)
     return int(message.width), int(message.height)
 
 
@@ -157,7 +159,7 @@ _stores: dict[tuple[Any, ...], Any] = {}
 """Type stores by message type and definition. Making one takes 10 ms."""
 
 
-def _deserialised(connection: Any, raw: bytes, *, ros1: bool) -> Any:
+def deserialised(connection: Any, raw: bytes, *, ros1: bool) -> Any:
     """Return a message as an object with its fields."""
     store = _typestore(connection, ros1=ros1)
     return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, connection.msgtype)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses
 from amiwarp.io.chunks import Codec
-from amiwarp.io.native_layout import Columns, make_dataset
+from amiwarp.io.native_layout import Columns
+from amiwarp.io.row_writer import ROWS, RowWriter
 
 EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
     "cause": (np.uint8, ()),
@@ -24,9 +25,6 @@ EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
     "place": (np.float32, (3,)),
 }
 """Names of the datasets in ``truth/events``, with the data type and the shape of a row."""
-
-POSE_ROWS = 1024
-"""Number of rows per HDF5 chunk in the datasets of poses."""
 
 
 def event_columns(truth: EventTruth, count: int) -> Columns:
@@ -50,7 +48,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
     return columns
 
 
-class TruthWriter:
+class TruthWriter(RowWriter):
     """Writer of labels, instants and poses into an open HDF5 file.
 
     All instants must have the same joints. All tables of poses must have the same bodies and joints.
@@ -58,8 +56,8 @@ class TruthWriter:
 
     def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
         """Set up the writer; ``size`` is the width and height of the sensor [px]."""
-        self._file, self._path, self._size, self._codec = file, path, size, codec
-        self._datasets: dict[str, Any] = {}
+        super().__init__(file, path, codec)
+        self._size = size
         self._names: dict[str, tuple[str, ...]] = {}
 
     def write_header(self, parameters: Mapping[str, float] | None, labels: WorldLabels | None) -> None:
@@ -86,8 +84,8 @@ class TruthWriter:
                     f"expected {(height, width, *tail)}"
                 )
         self._check_later("truth/frames/t", frame.t_us)
-        self._append("truth/frames/t", np.array([frame.t_us], np.int64), POSE_ROWS)
-        self._append("truth/frames/pose", as_poses(frame.rotation, frame.position)[None], POSE_ROWS)
+        self._append("truth/frames/t", np.array([frame.t_us], np.int64), ROWS)
+        self._append("truth/frames/pose", as_poses(frame.rotation, frame.position)[None], ROWS)
         self._append_joints("truth/frames/joints", {name: at[None] for name, at in frame.joints.items()})
         for name, values in rows.items():
             self._append(f"truth/frames/{name}", values[None], 1)
@@ -97,12 +95,12 @@ class TruthWriter:
         if not len(poses):
             return
         self._check_later("truth/poses/t", int(poses.t[0]))
-        self._append("truth/poses/t", np.asarray(poses.t, np.int64), POSE_ROWS)
-        self._append("truth/poses/camera", np.asarray(poses.camera, np.float64), POSE_ROWS)
+        self._append("truth/poses/t", np.asarray(poses.t, np.int64), ROWS)
+        self._append("truth/poses/camera", np.asarray(poses.camera, np.float64), ROWS)
         self._append_joints("truth/joints/position", poses.joints)
         if poses.bodies:
             self._keep_names("truth/poses/body_names", poses.bodies)
-            self._append("truth/poses/bodies", np.stack(list(poses.bodies.values()), axis=1), POSE_ROWS)
+            self._append("truth/poses/bodies", np.stack(list(poses.bodies.values()), axis=1), ROWS)
 
     def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
         """Append a mask of known pixels, which holds from a time later than those before."""
@@ -110,14 +108,14 @@ class TruthWriter:
         if mask.shape != (height, width):
             raise AmiwarpError(f"{self._path}: mask at {t_us} us has shape {mask.shape}; expected {(height, width)}")
         self._check_later("truth/known/t", t_us)
-        self._append("truth/known/t", np.array([t_us], np.int64), POSE_ROWS)
+        self._append("truth/known/t", np.array([t_us], np.int64), ROWS)
         self._append("truth/known/mask", np.asarray(mask, np.uint8)[None], 1)
 
     def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
         """Append the positions of joints [m], shape (k, 3) each, to the dataset ``name``."""
         if joints:
             self._keep_names("truth/joints/names", joints)
-            self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), POSE_ROWS)
+            self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), ROWS)
 
     def _keep_names(self, name: str, given: Iterable[str]) -> None:
         """Write the names at the first call, and check that later calls give the same names."""
@@ -135,26 +133,3 @@ class TruthWriter:
         encoded = [text.encode("utf-8", "replace") for text in names]
         kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
         self._file.create_dataset(name, data=np.array(encoded, kind))
-
-    def _check_later(self, name: str, t: int) -> None:
-        """Raise :class:`AmiwarpError` if the time ``t`` [us] does not follow the last time in a dataset."""
-        stored = self._datasets.get(name)
-        if stored is not None and t <= int(stored[-1]):
-            raise AmiwarpError(
-                f"{self._path}: {name} {t} us does not follow {int(stored[-1])} us; append in order of time"
-            )
-
-    def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
-        """Append rows to a dataset, which is created at the first call with ``chunk_rows`` rows per chunk."""
-        if name not in self._datasets:
-            self._datasets[name] = make_dataset(
-                self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec
-            )
-        dataset = self._datasets[name]
-        if dataset.shape[1:] != values.shape[1:]:
-            raise AmiwarpError(
-                f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {dataset.shape[1:]}"
-            )
-        start = dataset.shape[0]
-        dataset.resize(start + len(values), axis=0)
-        dataset[start:] = values
