@@ -28,7 +28,10 @@ def run(
     ] = Path("amiwarp-evaluation"),
     only: Annotated[
         str | None,
-        typer.Option(help="Evaluations to run, such as texture,edges. Default: all.", metavar="NAME,..."),
+        typer.Option(
+            help="Evaluations to run, such as texture,flow. Default: with --full all, with --quick the short ones.",
+            metavar="NAME,...",
+        ),
     ] = None,
     full: Annotated[
         bool,

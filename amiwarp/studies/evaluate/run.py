@@ -14,7 +14,7 @@ from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import Workers, run_jobs, single_worker, start_workers
 from amiwarp.studies.dataset.run import worker_count
 from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
-from amiwarp.studies.evaluate.registry import EVALUATIONS
+from amiwarp.studies.evaluate.registry import EVALUATIONS, SHORT
 from amiwarp.studies.evaluate.report import REPORT_FILES, section, write
 from amiwarp.studies.evaluate.results import FULL, QUICK, CellResult
 from amiwarp.validation import whole
@@ -70,7 +70,8 @@ def evaluate(
     out : str or Path
         Folder for the report, its tables and figures, and the cells.
     only : sequence of str, optional
-        Names of the evaluations, by default all.
+        Names of the evaluations. By default a full run has all of them, and a quick run the short ones: texture,
+        edges, apex_speed and fading.
     full : bool, optional
         Run the full study: 640×480, at least ten seeds, all values. By default the run is quick: 240×180, two seeds.
     seeds : int, optional
@@ -113,7 +114,8 @@ def evaluate(
     earlier = any((folder / "cells").iterdir())  # an existing report was made from these cells and may be replaced
     for name in () if earlier else REPORT_FILES:
         check_output(folder / name)
-    jobs = plan(only or EVALUATIONS, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
+    chosen = only or (EVALUATIONS if full else SHORT)
+    jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
     with _workers(scheduler, workers, device) as there:
         results, new, processor_s = _run(jobs, Store(folder / "cells"), there, progress or silent)
     names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
