@@ -118,6 +118,8 @@ from .studies.dataset.plan import DatasetPlan as DatasetPlan
 from .studies.dataset.plan import plan_dataset as plan_dataset
 from .studies.dataset.run import DatasetSummary as DatasetSummary
 from .studies.dataset.run import make_dataset as make_dataset
+from .studies.evaluate.run import EvaluationSummary as EvaluationSummary
+from .studies.evaluate.run import evaluate as evaluate
 from .translation.datasets import DataSet as DataSet
 from .translation.interpolation import Interpolation as Interpolation
 from .translation.translator import translate as translate

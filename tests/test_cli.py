@@ -27,6 +27,7 @@ from amiwarp.cli import (
     demo,
     design,
     emulate,
+    evaluate,
     info,
     live,
     motor,
@@ -64,6 +65,7 @@ COMMANDS = {
         chart,
         design,
         stability,
+        evaluate,
     )
 }  # fmt: skip
 

@@ -22,6 +22,7 @@ from amiwarp.cli import (
     demo,
     design,
     emulate,
+    evaluate,
     fail,
     info,
     live,
@@ -88,7 +89,7 @@ def _version(
 
 for module in (
     demo, info, view, convert, simulate, translate, dataset, calibrate, compensate, reconstruct, chart, design,
-    stability, truth, motor, record, live, emulate,
+    stability, evaluate, truth, motor, record, live, emulate,
 ):  # fmt: skip
     command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 

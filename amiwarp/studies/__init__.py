@@ -1,1 +1,1 @@
-"""Studies that run the library many times and report: chart, stability, design and demo."""
+"""Studies that run the library many times and report: chart, stability, evaluation, design, data sets and demo."""

@@ -1,0 +1,120 @@
+"""Cells of the study: one evaluation under one condition. Each is a file, so that a stopped run can be continued."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from amiwarp._version import __version__
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.atomic_output import write_text
+from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, RecordedStreams, Streams
+from amiwarp.studies.evaluate.registry import load
+from amiwarp.studies.evaluate.results import CellResult, Settings
+
+FORMAT = 1
+"""Version of the files of cells."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Evaluations of one condition, which share its simulation."""
+
+    condition: Condition | RecordedCondition
+    """Condition."""
+    evaluations: tuple[str, ...]
+    """Names of the evaluations."""
+    settings: Settings
+    """Size of the run."""
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """Results of a job."""
+
+    cells: list[CellResult]
+    """Result of each evaluation."""
+    processor_s: float
+    """Processor time of the whole job [s]."""
+
+
+def run_job(job: Job) -> JobResult:
+    """Simulate the condition of a job once, or open its recording, and run its evaluations."""
+    began = time.process_time()
+    try:
+        if isinstance(job.condition, Condition):
+            streams: RecordedStreams = Streams(job.condition, job.settings.device)
+        else:
+            streams = RecordedStreams.of(job.condition, job.settings.device)
+        cells = [_run(name, streams, job) for name in job.evaluations]
+    except AmiwarpError as error:
+        cells = [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
+    return JobResult(cells, time.process_time() - began)
+
+
+def _run(name: str, streams: RecordedStreams, job: Job) -> CellResult:
+    """Run one evaluation. An error becomes part of the result, as a refused calibration does."""
+    began = time.process_time()
+    try:
+        values, error = load(name).measure(streams, job.settings), ""
+    except AmiwarpError as refusal:
+        values, error = {}, str(refusal)
+    return CellResult(name, job.condition, values, error, time.process_time() - began)
+
+
+class Store:
+    """Folder of cells, one file each."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def _path(self, name: str, condition: Condition | RecordedCondition, settings: Settings) -> Path:
+        size = "quick" if settings.quick else "full"
+        return self.folder / f"{name}_{size}_{condition.key}.json"
+
+    def load(self, name: str, condition: Condition | RecordedCondition, settings: Settings) -> CellResult | None:
+        """Return a stored cell, or None if it is missing or of another version.
+
+        Raises :class:`AmiwarpError` for a damaged file.
+        """
+        path = self._path(name, condition, settings)
+        if not path.exists():
+            return None
+        try:
+            data = json.loads(path.read_text())
+            if data["version"] != [FORMAT, __version__]:
+                return None
+            return CellResult(name, condition, data["values"], data["error"], float(data["processor_s"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
+
+    def save(self, cell: CellResult, settings: Settings) -> None:
+        """Write a cell."""
+        data: dict[str, Any] = {
+            "version": [FORMAT, __version__],
+            "condition": asdict(cell.condition),
+            "values": cell.values,
+            "error": cell.error,
+            "processor_s": cell.processor_s,
+        }
+        path = self._path(cell.evaluation, cell.condition, settings)
+        write_text(path, json.dumps(data, indent=1, default=str) + "\n", overwrite=True)
+
+
+def plan(names: Sequence[str], settings: Settings, recordings: Iterable[Path], *, worlds: bool = True) -> list[Job]:
+    """Return one job for each condition and each recording, with all evaluations that need it.
+
+    Without ``worlds`` there are only the recordings.
+    """
+    by: dict[Condition | RecordedCondition, list[str]] = {}
+    for name in names:
+        evaluation = load(name)
+        for condition in evaluation.conditions(settings) if worlds else ():
+            by.setdefault(condition, []).append(name)
+        for path in () if evaluation.NEEDS_TRUTH else recordings:
+            by.setdefault(RecordedCondition(path), []).append(name)
+    return [Job(condition, tuple(evaluations), settings) for condition, evaluations in by.items()]

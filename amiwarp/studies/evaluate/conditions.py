@@ -1,0 +1,333 @@
+"""Conditions of the evaluations, and the streams of events that are compared under each of them."""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.calib import calibrate
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events
+from amiwarp.events.truth import EventTruth
+from amiwarp.io import open_recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.prism import Prism
+from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.worlds.frame_truth import TruthRenderer
+from amiwarp.simulation.worlds.named.catalogue import named_world
+from amiwarp.simulation.worlds.world_scene import WorldScene
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib import Calibration
+    from amiwarp.events.recording import Recording
+    from amiwarp.events.truth import FrameTruth
+    from amiwarp.optics.models import Model
+
+INDEX = 1.55
+"""Refractive index of the paper's prism."""
+FOCAL_PX = 554.0
+"""Focal length [px]: that of 640 px over a field of view of 60 deg. A smaller image is the middle of the sensor: its
+displacements in pixels are the same."""
+NOMINAL = 1.15
+"""Nominal apex angle that calibration starts from, relative to the true one."""
+
+ENOUGH = 0.95
+"""Smallest number of events of the stream with the same count, relative to those of the AMI-EV."""
+
+
+class Stream(enum.StrEnum):
+    """Streams of events that are compared."""
+
+    PLAIN = "S-EV"
+    """Plain event camera: same world, sensor and seed without the prism."""
+    TRUE = "AMI-EV, true"
+    """Events behind the prism, compensated by the true model."""
+    CALIBRATED = "AMI-EV, calibrated"
+    """Events behind the prism, compensated as calibrated from the recording itself."""
+    RAW = "AMI-EV, raw"
+    """Events behind the prism, as recorded."""
+    SAME_COUNT = "S-EV, same count"
+    """Plain events, thinned, or from a longer window, to the number of events of the AMI-EV."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Description of a simulated recording."""
+
+    world: str = "room"
+    """Name of the world, see :func:`amiwarp.named_world`."""
+    trajectory: str = "handheld"
+    """Motion of the camera: still, handheld or fast."""
+    apex: float = math.radians(0.5)
+    """Apex angle of the prism [rad]."""
+    rpm: float = 720.0
+    """Speed of the prism [turns/min]."""
+    seed: int = 0
+    """Seed of the world, of the camera's motion and of the sensor."""
+    duration_s: float = 0.25
+    """Duration [s]."""
+    width: int = 240
+    """Width of the image [px]."""
+    height: int = 180
+    """Height of the image [px]."""
+    focal_px: float = FOCAL_PX
+    """Focal length [px]."""
+    sensor: str = "dvxplorer"
+    """Name of the sensor, see :meth:`amiwarp.SensorModel.preset`."""
+    cutoff_hz: float | None = None
+    """Bandwidth of the photoreceptors at white [Hz], 0 for unlimited; None for that of the sensor."""
+
+    @property
+    def key(self) -> str:
+        """Short text that identifies the condition."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:12]
+
+    def simulation(self, device: str) -> Simulation:
+        """Return the simulation of the AMI-EV under this condition."""
+        world, trajectory = named_world(self.world, self.trajectory, seed=self.seed, duration_s=self.duration_s)
+        sensor = SensorModel.preset(self.sensor)
+        if self.cutoff_hz is not None:
+            sensor = replace(sensor, cutoff_hz=self.cutoff_hz)
+        phase = float(np.random.default_rng(self.seed).uniform(0.0, 2.0 * math.pi))
+        return Simulation(
+            WorldScene(world, trajectory),
+            Camera.from_fov(self.width, self.height, 2.0 * math.atan(self.width / (2.0 * self.focal_px))),
+            Prism(self.apex, INDEX),
+            self.duration_s,
+            motion=PrismMotion(self.rpm, phase),
+            sensor=sensor,
+            nominal_prism=Prism(NOMINAL * self.apex, INDEX),
+            seed=self.seed,
+            device=device,
+        )
+
+
+@dataclass(frozen=True)
+class RecordedCondition:
+    """Recording of a real camera, given as a file."""
+
+    path: Path
+    """File of the recording."""
+    seed: int = 0
+    """Seed of the calibration."""
+
+    @property
+    def key(self) -> str:
+        """Short text that identifies the recording."""
+        stat = self.path.stat()
+        text = json.dumps([str(self.path.resolve()), stat.st_size, stat.st_mtime_ns, self.seed])
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+class RecordedStreams:
+    """Streams of a recording without ground truth: its events as recorded, and compensated as calibrated."""
+
+    def __init__(self, recording: Recording, device: str = "cpu") -> None:
+        self.recording, self.device = recording, device
+
+    @classmethod
+    def of(cls, condition: RecordedCondition, device: str) -> RecordedStreams:
+        """Return the streams of a file."""
+        return cls(open_recording(condition.path), device)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image [px]."""
+        return self.recording.events.size
+
+    @property
+    def start_us(self) -> int:
+        """Time of the first event [us]."""
+        return self.recording.events.t_first
+
+    @property
+    def end_us(self) -> int:
+        """Time after the last event [us]."""
+        return self.recording.events.t_last + 1
+
+    @property
+    def names(self) -> tuple[Stream, ...]:
+        """Streams that exist: a recording without encoder is one of a plain event camera."""
+        if self.recording.encoder is None:
+            return (Stream.PLAIN,)
+        return (Stream.RAW,) if self.calibration is None else (Stream.CALIBRATED, Stream.RAW)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Calibration from the recording, or None if that fails; then :attr:`refusal` says why."""
+        self.refusal = ""
+        try:
+            return calibrate(self.recording, device=self.device)
+        except AmiwarpError as error:
+            self.refusal = str(error)
+            return None
+
+    def window(self, stream: Stream, start_us: int, end_us: int) -> Events:
+        """Return the events of a stream with ``start_us <= t < end_us``. Compensated coordinates are float32.
+
+        Events that have no position without the prism are left out.
+        """
+        events, _ = self._window(stream, start_us, end_us)
+        return events
+
+    def count(self, stream: Stream, start_us: int, end_us: int) -> int:
+        """Return the number of events that the stream's camera recorded with ``start_us <= t < end_us``."""
+        source = self._source(stream).events
+        return source.find(end_us) - source.find(start_us)
+
+    def _source(self, stream: Stream) -> Recording:
+        """Return the recording that the events of a stream are from."""
+        return self.recording
+
+    def _window(self, stream: Stream, start_us: int, end_us: int) -> tuple[Events, NDArray[np.int64]]:
+        """Return the events of a window, and their indices in their recording."""
+        source = self._source(stream).events
+        first = source.find(start_us)
+        raw = source.slice(first, source.find(end_us))
+        rows = np.arange(first, first + len(raw))
+        xy = self._compensated(stream, raw, first)
+        if xy is None:
+            return raw, rows
+        kept = np.isfinite(xy).all(axis=1)
+        return Events(xy[kept, 0], xy[kept, 1], raw.t[kept], raw.p[kept]), rows[kept]
+
+    def _compensated(self, stream: Stream, raw: Events, first: int) -> NDArray[np.float32] | None:
+        """Return the places of the events from index ``first`` without the prism; None if they are not compensated."""
+        model, encoder = self._optics(stream)
+        return None if model is None else compensate_events(raw, model, encoder, device=self.device)
+
+    def _optics(self, stream: Stream) -> tuple[Model | None, Any]:
+        """Return the model and the encoder that compensate a stream, or None for one that is not compensated."""
+        if stream is not Stream.CALIBRATED or self.calibration is None:
+            return None, None
+        recording = self.recording
+        assert recording.encoder is not None
+        events = recording.events
+        return self.calibration.model, self.calibration.encoder_for(recording.encoder, events.t_first, events.t_last)
+
+
+class Streams(RecordedStreams):
+    """Streams of a simulated recording with ground truth."""
+
+    def __init__(self, condition: Condition, device: str = "cpu") -> None:
+        self.condition = condition
+        self.simulation = condition.simulation(device)
+        super().__init__(self.simulation.run(), device)
+        self._places: dict[Stream, NDArray[np.float32] | None] = {}
+        self.frame = lru_cache(maxsize=8)(self._frame)
+
+    @property
+    def start_us(self) -> int:
+        """Start of the simulation [us]."""
+        return 0
+
+    @property
+    def end_us(self) -> int:
+        """End of the simulation [us]."""
+        return self.simulation.duration_us
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of all streams."""
+        return self.simulation.camera
+
+    @cached_property
+    def plain(self) -> Recording:
+        """Recording of the plain event camera."""
+        return self.simulation.without_prism().run()
+
+    @property
+    def names(self) -> tuple[Stream, ...]:
+        """Streams that exist: all, but not the calibrated one if the calibration refuses the recording."""
+        return tuple(s for s in Stream if s is not Stream.CALIBRATED or self.calibration is not None)
+
+    @cached_property
+    def true_model(self) -> ExactModel:
+        """True model of the prism."""
+        motion = self.simulation.motion
+        return ExactModel(self.camera, self.simulation.prism, motion.phase, motion.tilt)
+
+    def compensated_late(self, delay_us: int, most: int) -> NDArray[np.float32]:
+        """Return the places of events that the true model gives if the events are late by ``delay_us``, shape (n, 2).
+
+        At most ``most`` events are used, spread evenly over the recording. Those without a position are left out.
+        """
+        count = len(self.recording.events)
+        raw = self.recording.events.slice(0, count)[:: max(1, -(-count // most))]
+        encoder = self.recording.encoder
+        assert encoder is not None
+        covered = raw.t >= encoder.coverage[0] + delay_us
+        early = Events(raw.x[covered], raw.y[covered], raw.t[covered] - delay_us, raw.p[covered])
+        xy = compensate_events(early, self.true_model, encoder, device=self.device)
+        return xy[np.isfinite(xy).all(axis=1)]
+
+    def event_truth(self, stream: Stream, start_us: int, end_us: int) -> EventTruth:
+        """Return the ground truth of the events that :meth:`window` returns, in the same order."""
+        _, rows = self._window(stream, start_us, end_us)
+        source = self._source(stream)
+        assert source.truth is not None
+        if not len(rows):
+            return source.truth.of_events(0, 0)
+        truth = source.truth.of_events(int(rows[0]), int(rows[-1]) + 1)
+        at = rows - rows[0]
+        values = {name: getattr(truth, name) for name in ("points", "cause", "instance", "depth", "place")}
+        return EventTruth(**{name: None if value is None else value[at] for name, value in values.items()})
+
+    def _source(self, stream: Stream) -> Recording:
+        return self.plain if stream in (Stream.PLAIN, Stream.SAME_COUNT) else self.recording
+
+    def _compensated(self, stream: Stream, raw: Events, first: int) -> NDArray[np.float32] | None:
+        """Return the places as usual; all events of a stream are compensated once, and kept."""
+        if stream not in self._places:
+            source = self.recording.events
+            self._places[stream] = super()._compensated(stream, source.slice(0, len(source)), 0)
+        places = self._places[stream]
+        return None if places is None else places[first : first + len(raw)]
+
+    @cached_property
+    def _truth(self) -> TruthRenderer:
+        return TruthRenderer(self.simulation)
+
+    def _frame(self, t_us: int) -> FrameTruth:
+        """Return the ground truth of all pixels at a time; :attr:`frame` keeps the last eight."""
+        return self._truth.at(t_us)
+
+    def _window(self, stream: Stream, start_us: int, end_us: int) -> tuple[Events, NDArray[np.int64]]:
+        if stream is not Stream.SAME_COUNT:
+            return super()._window(stream, start_us, end_us)
+        source = self.plain.events
+        rows = np.arange(source.find(start_us), source.find(end_us))
+        rows = self._with_count(rows, self.count(Stream.RAW, start_us, end_us))
+        if not len(rows):
+            return Events.empty(), rows
+        return source.slice(int(rows[0]), int(rows[-1]) + 1)[rows - rows[0]], rows
+
+    def _with_count(self, rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+        """Return ``count`` indices of plain events: drawn from ``rows``, or of a longer window around them.
+
+        There are fewer if the whole recording has fewer events.
+        """
+        if len(rows) >= count:
+            chosen = np.random.default_rng(self.condition.seed).choice(len(rows), count, replace=False)
+            return rows[np.sort(chosen)]
+        total = len(self.plain.events)
+        middle = int(rows[0] + len(rows) // 2) if len(rows) else total // 2
+        first = max(0, min(middle - count // 2, total - count))
+        return np.arange(first, min(first + count, total))
+
+    def _optics(self, stream: Stream) -> tuple[Model | None, Any]:
+        return (self.true_model, self.recording.encoder) if stream is Stream.TRUE else super()._optics(stream)

@@ -1,0 +1,156 @@
+"""Evaluation of fading: event rate of parts of the image over time, where the camera's motion cancels the prism's."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.optics.prism import Prism
+from amiwarp.studies.evaluate.conditions import INDEX, Condition, Stream, Streams
+from amiwarp.studies.evaluate.results import (
+    CellResult,
+    Chart,
+    Claim,
+    Picture,
+    Settings,
+    Table,
+    decode_picture,
+    encode_picture,
+    grouped,
+    rows_of,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+TITLE = "Perceptual fading"
+PROTOCOL = (
+    "The image moves behind the prism at the speed δ·2πf, where δ is the radius of the orbit in pixels and f the "
+    "turns per second, in a direction that turns with the prism. Where the camera moves the image at the same speed "
+    "in the opposite direction, both cancel. The image is divided into tiles, and time into 12 parts of a turn. The "
+    "event rate of a tile, relative to its mean, is set against the speed of the image through the prism, which the "
+    "ground truth states, relative to δ·2πf."
+)
+DIFFERENCES = "The paper shows single moments of a film. Here the rate is measured over all tiles and moments."
+NEEDS_TRUTH = True
+
+PARTS = 12
+"""Parts of a turn."""
+TILE = 30
+"""Size of a tile [px]."""
+EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0)
+"""Limits of the classes of the relative speed."""
+LEAST_RATE = 20.0
+"""Smallest mean number of events of a tile in a part of a turn. Tiles with less texture say nothing."""
+DIP, USUAL = (0.0, 0.5), (0.75, 1.25)
+"""Classes of the relative speed that are compared: cancelling motion, and the prism alone."""
+
+
+def conditions(settings: Settings) -> list[Condition]:
+    """Return fast motion through the room, whose speed comes near that of the prism; and rest."""
+    speeds = (720.0,) if settings.quick else (360.0, 720.0, 1440.0)
+    return [
+        c
+        for rpm in speeds
+        for motion in ("still", "fast")
+        for c in settings.conditions(world="room", trajectory=motion, rpm=rpm)
+    ]
+
+
+def orbit_speed(condition: Condition) -> float:
+    """Return the speed of the image behind the prism, δ·2πf [px/s]."""
+    radius = math.tan(Prism(condition.apex, INDEX).deflection) * condition.focal_px
+    return radius * 2.0 * math.pi * condition.rpm / 60.0
+
+
+def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
+    """Return the relative event rate by class of relative speed, and the film of the first seed."""
+    condition = streams.condition
+    length = round(60e6 / condition.rpm / PARTS)
+    starts = range(0, streams.end_us - length + 1, length)
+    counts, speeds, frames = [], [], []
+    film = (condition.seed, condition.trajectory, condition.rpm) == (settings.first_seed, "fast", 720.0)
+    for start in starts:
+        events = streams.window(Stream.RAW, start, start + length)
+        counts.append(_tiles(events.x, events.y, np.ones(len(events)), streams.size))
+        flow = streams.frame(start + length // 2).flow_with_prism
+        y, x = np.mgrid[: flow.shape[0], : flow.shape[1]]
+        speed = np.nan_to_num(np.hypot(flow[..., 0], flow[..., 1]))
+        speeds.append(_tiles(x.ravel(), y.ravel(), speed.ravel(), streams.size) / TILE**2)
+        if film:
+            frames.append(_frame(events.x, events.y, streams.size))
+    rows = _classes(np.array(counts), np.array(speeds) / orbit_speed(condition))
+    return {"rows": rows, "film": frames}
+
+
+def _tiles(x: NDArray[Any], y: NDArray[Any], weight: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the sums of the weights in each whole tile."""
+    columns, rows = size[0] // TILE, size[1] // TILE
+    column, row = x.astype(np.int64) // TILE, y.astype(np.int64) // TILE
+    whole = (column < columns) & (row < rows)
+    return np.asarray(np.bincount((row * columns + column)[whole], weight[whole], rows * columns), np.float64)
+
+
+def _classes(counts: NDArray[np.float64], speeds: NDArray[np.float64]) -> list[dict[str, Any]]:
+    """Return the mean relative event rate of each class of relative speed. Arrays of shape (parts, tiles)."""
+    mean = counts.mean(axis=0)
+    good = mean >= LEAST_RATE
+    relative, speed = counts[:, good] / mean[good], speeds[:, good]
+    rows = []
+    for low, high in itertools.pairwise(EDGES):
+        chosen = (speed >= low) & (speed < high)
+        if chosen.any():
+            rate = float(relative[chosen].mean())
+            rows.append({"speed": (low + high) / 2.0, "rate": rate, "tiles": int(chosen.sum())})
+    return rows
+
+
+def _frame(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int]) -> str:
+    """Return the events of a part of a turn as a frame of the film: white, with black where there are many."""
+    width, height = size
+    counts = np.bincount(y.astype(np.int64) * width + x, minlength=width * height).reshape(height, width)
+    return encode_picture(np.asarray(255 - np.minimum(255, 85 * counts), np.uint8))
+
+
+def tables(results: Sequence[CellResult]) -> list[Table]:
+    """Return the relative event rate over the relative speed."""
+    rows = [{**r, "prism": f"{r['rpm']:g} rpm"} for r in rows_of(results, "rows")]
+    x = "speed through the prism / δ·2πf"
+    return [
+        Table("fading", "Event rate where camera and prism cancel",
+              ("camera", "prism", x, "seeds", "relative rate", "std"),
+              grouped(rows, ("camera", "prism", "speed"), ["rate"]),
+              "Rate of a tile relative to its mean over the recording. Near 0 the motions cancel; 1 is the prism's own "
+              "speed.",
+              Chart(x, "relative rate", "camera", "std", panels=("prism",))),
+    ]  # fmt: skip
+
+
+def pictures(results: Sequence[CellResult]) -> list[Picture]:
+    """Return the film of the first seed, ten times slower or more."""
+    films = [r for r in results if r.values.get("film")]
+    if not films:
+        return []
+    frames = [decode_picture(text) for text in films[0].values["film"]]
+    caption = ("Raw events of the AMI-EV moving fast, one frame for each twelfth of a turn (6.9 ms), slowed "
+               "down. Parts of the image fade once a turn, where the camera's motion cancels the prism's.")  # fmt: skip
+    return [Picture("fading_film", caption, frames, 0.12)]
+
+
+def claims(results: Sequence[CellResult]) -> list[Claim]:
+    """Return the verdict on the dip of the event rate."""
+    rows = [r for r in rows_of(results, "rows") if r["camera"] == "fast"]
+    dip, usual = ([r["rate"] for r in rows if low <= r["speed"] <= high] for low, high in (DIP, USUAL))
+    known = bool(dip and usual)
+    ours = "the camera never came near the prism's speed"
+    if known:
+        ours = f"relative rate {np.mean(dip):.2f} where they cancel, {np.mean(usual):.2f} at the prism's speed"
+    return [Claim.judge(
+        "Texture fades for a moment where the camera's motion cancels the prism's.", "film", ours,
+        bool(np.mean(dip) < 0.75 * np.mean(usual)) if known else None,
+        "the mean relative rate below half of the speed δ·2πf is less than 0.75 of that between 0.75 and 1.25 of it",
+    )]  # fmt: skip

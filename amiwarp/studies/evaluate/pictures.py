@@ -1,0 +1,137 @@
+"""Evaluation of pictures that are reconstructed from events."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
+from amiwarp.studies.evaluate.measures.niqe import BLOCK, niqe
+from amiwarp.studies.evaluate.measures.pictures import displayed, fitted, similarity
+from amiwarp.studies.evaluate.results import CellResult, Chart, Claim, Settings, Table, grouped, mean_of, rows_of
+from amiwarp.studies.evaluate.stream_pictures import PictureMaker, Reconstructor, Window, reconstructed_streams
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+TITLE = "Pictures"
+PROTOCOL = (
+    "Our own reconstruction, which needs no training, makes a picture of each time window; windows follow each other "
+    "every millisecond (1,000 pictures/s). PSNR and SSIM (scikit-image) compare it with the true luminance without the "
+    "prism in the middle of the window, in log intensity, after a fit of gain and offset, which events do not "
+    "determine. NIQE needs no truth; its natural pictures are eight of scikit-image's own (astronaut, brick, camera, "
+    "chelsea, coffee, grass, gravel, rocket; public domain or CC0), each in three sizes. Without usable events "
+    "a picture is uniform and has no NIQE. No other implementation of NIQE was compared."
+)
+DIFFERENCES = (
+    "The paper uses the network E2VID, which is not part of amiwarp, and reports NIQE only, as curves, by statistics "
+    "that its authors fitted to other pictures. Values of NIQE are therefore comparable between our streams only."
+)
+NEEDS_TRUTH = True
+
+STEP_US = 1000
+"""Time between the pictures [us]: 1,000 pictures/s."""
+STANDARD_TURNS = 0.25
+"""Length of the windows of the pictures over time [turns]."""
+TURNS = (0.25, 0.5, 1.0)
+"""Lengths in the sensitivity curve [turns]."""
+QUICK_PICTURES, FULL_PICTURES = 6, 60
+"""Number of pictures over time."""
+DARK = 0.02
+"""Luminance that is added before the logarithm, as in the simulated sensor."""
+
+
+def conditions(settings: Settings) -> list[Condition]:
+    """Return the room at rest and moving; in full also the desk."""
+    worlds = ("room",) if settings.quick else ("room", "desk")
+    return [c for world in worlds for motion in ("still", "handheld")
+            for c in settings.conditions(world=world, trajectory=motion)]  # fmt: skip
+
+
+def measure(
+    streams: Streams, settings: Settings, reconstructors: Mapping[str, Reconstructor] | None = None
+) -> dict[str, Any]:
+    """Return PSNR, SSIM and NIQE over time, and over the length of the window.
+
+    ``reconstructors``: learned or other reconstructions by name, which are judged next to our own.
+    """
+    methods: dict[str, Reconstructor | None] = {"own": None, **(reconstructors or {})}
+    over_time, over_length = [], []
+    for method, reconstructor in methods.items():
+        for stream in reconstructed_streams(streams):
+            maker = PictureMaker(streams, stream, reconstructor)
+            known = {"stream": stream.value, "method": method}
+            count = QUICK_PICTURES if settings.quick else FULL_PICTURES
+            over_time += [{**known, **row} for row in _scores(maker, windows(streams, STANDARD_TURNS, count))]
+            for turns in TURNS:
+                chosen = windows(streams, turns, 1)
+                over_length += [{**known, "turns": turns, **row} for row in _scores(maker, chosen)]
+    return {"time": over_time, "length": over_length}
+
+
+def windows(streams: Streams, turns: float, count: int) -> list[Window]:
+    """Return up to ``count`` windows, one every millisecond, about the middle of the recording."""
+    length = round(turns * 60e6 / streams.condition.rpm)
+    spare = streams.end_us - streams.start_us - length
+    count = min(count, spare // STEP_US + 1)
+    first = streams.start_us + (spare - (count - 1) * STEP_US) // 2
+    return [Window(first + k * STEP_US, first + k * STEP_US + length) for k in range(max(count, 0))]
+
+
+def _scores(maker: PictureMaker, chosen: Sequence[Window]) -> list[dict[str, Any]]:
+    """Return time and scores of the picture of each window."""
+    rows = []
+    for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
+        truth = np.log(maker.streams.frame(window.middle_us).intensity.astype(np.float64) + DARK)
+        found = similarity(*fitted(picture, truth))
+        rows.append({"time_ms": (window.middle_us - chosen[0].middle_us) * 1e-3, "psnr": found.psnr_db,
+                     "ssim": found.ssim, "niqe": naturalness(picture), "niqe_truth": naturalness(truth)})  # fmt: skip
+    return rows
+
+
+def naturalness(picture: NDArray[Any]) -> float | None:
+    """Return the NIQE of a picture, or None if it is uniform or smaller than two blocks."""
+    rows, columns = (side // BLOCK for side in picture.shape)
+    return niqe(displayed(picture)) if rows * columns >= 2 and np.ptp(picture) > 0.0 else None
+
+
+def tables(results: Sequence[CellResult]) -> list[Table]:
+    """Return the mean scores, the scores over time, and those over the length of the window."""
+    over_time, over_length = rows_of(results, "time"), rows_of(results, "length")
+    names = ("scene", "camera", "method", "stream")
+    columns = ("seeds x pictures", "PSNR [dB]", "std of PSNR", "SSIM", "std of SSIM", "NIQE", "std of NIQE")
+    scores = ["psnr", "ssim", "niqe"]
+    return [
+        Table("pictures", "Quality of the pictures, windows of a quarter turn", (*names, *columns, "NIQE of the truth",
+              "std of the truth"), grouped(over_time, names, [*scores, "niqe_truth"]),
+              "PSNR and SSIM: higher is better. NIQE: lower is better."),
+        Table("pictures_time", "Quality over time, 1,000 pictures/s", (*names, "time [ms]", *columns),
+              grouped(over_time, (*names, "time_ms"), scores), "The first picture is solved from scratch.",
+              Chart("time [ms]", "NIQE", "stream", "std of NIQE", panels=("scene", "camera"))),
+        Table("pictures_window", "Quality over the length of the window", (*names, "window [turns]", *columns),
+              grouped(over_length, (*names, "turns"), scores), "A long window has more events and more motion.",
+              Chart("window [turns]", "SSIM", "stream", "std of SSIM", panels=("scene", "camera"), log_x=True)),
+    ]  # fmt: skip
+
+
+def claims(results: Sequence[CellResult]) -> list[Claim]:
+    """Return the verdicts on the ranking by NIQE, and by SSIM, for each motion of the camera."""
+    rows = [r for r in rows_of(results, "time") if r["method"] == "own"]
+    return [_claim([r for r in rows if r["camera"] == camera], camera, score, sign)
+            for camera in ("still", "handheld") for score, sign in (("niqe", -1.0), ("ssim", 1.0))]  # fmt: skip
+
+
+def _claim(rows: Sequence[dict[str, Any]], camera: str, score: str, sign: float) -> Claim:
+    ours, plain = (
+        mean_of([r for r in rows if r["stream"] == stream], score, lambda _: True)
+        for stream in (Stream.CALIBRATED, Stream.PLAIN)
+    )
+    text = f"Pictures from the AMI-EV are better ({score.upper()}, camera {camera})."
+    direction = "higher" if sign > 0.0 else "lower"
+    rule = f"the mean {score.upper()} of '{Stream.CALIBRATED}' is {direction} than that of '{Stream.PLAIN}'"
+    paper = "curves of NIQE" if score == "niqe" else "not in the paper"
+    if ours is None or plain is None:
+        return Claim.judge(text, paper, "no result for a stream", None, rule)
+    return Claim.judge(text, paper, f"AMI-EV {ours:.3g}, S-EV {plain:.3g}", sign * (ours - plain) > 0.0, rule)

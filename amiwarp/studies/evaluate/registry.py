@@ -1,0 +1,54 @@
+"""Evaluations by name. A new one needs its module in this folder and its name in :data:`EVALUATIONS`."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import Any, Protocol, cast
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.studies.evaluate.conditions import Condition
+from amiwarp.studies.evaluate.results import CellResult, Claim, Picture, Settings, Table
+
+EVALUATIONS = ("texture", "edges", "pictures", "segmentation", "flow", "pose", "apex_speed", "fading")
+"""Names of the evaluations, in the order of the report: each is a module of this folder, see :class:`Evaluation`."""
+SHORT = ("texture", "edges", "apex_speed", "fading")
+"""Names of the evaluations that together take under ten minutes on two cores in their quick form."""
+
+
+class Evaluation(Protocol):
+    """What the module of an evaluation contains."""
+
+    TITLE: str
+    """Title in the report."""
+    PROTOCOL: str
+    """What is computed, and how."""
+    DIFFERENCES: str
+    """How that differs from the paper."""
+    NEEDS_TRUTH: bool
+    """Whether it needs ground truth. If not, it also runs on recordings."""
+
+    def conditions(self, settings: Settings) -> list[Condition]:
+        """Return the conditions under which the evaluation runs."""
+
+    def measure(self, streams: Any, settings: Settings) -> dict[str, Any]:
+        """Return the result of one condition, as JSON data. ``streams``: :class:`Streams`."""
+
+    def tables(self, results: Sequence[CellResult]) -> list[Table]:
+        """Return the tables of all results, each with its chart. Results of failed cells have no values."""
+
+    def claims(self, results: Sequence[CellResult]) -> list[Claim]:
+        """Return the paper's claims with the verdicts that follow from the results."""
+
+
+def load(name: str) -> Evaluation:
+    """Return an evaluation. Raises :class:`AmiwarpError` if there is none of that name."""
+    if name not in EVALUATIONS:
+        raise AmiwarpError(f"unknown evaluation {name!r}; choose among {', '.join(EVALUATIONS)}")
+    return cast("Evaluation", importlib.import_module(f"amiwarp.studies.evaluate.{name}"))
+
+
+def pictures(evaluation: Evaluation, results: Sequence[CellResult]) -> list[Picture]:
+    """Return the pictures of an evaluation; its function ``pictures(results)`` is optional."""
+    draw = getattr(evaluation, "pictures", None)
+    return [] if draw is None else draw(results)

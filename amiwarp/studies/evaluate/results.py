@@ -1,0 +1,223 @@
+"""What evaluations return: results of cells, tables with their charts, pictures, and verdicts on the paper's claims."""
+
+from __future__ import annotations
+
+import base64
+import enum
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Value = str | int | float | bool | None
+"""Type of a value in a table."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Size of a run."""
+
+    quick: bool = True
+    """Whether the run is short: a small image and few values."""
+    seeds: int = 2
+    """Number of seeds of each condition."""
+    first_seed: int = 0
+    """First seed."""
+    width: int = 240
+    """Width of the images [px]."""
+    height: int = 180
+    """Height of the images [px]."""
+    duration_s: float = 0.25
+    """Duration of a recording [s]."""
+    device: str = "cpu"
+    """Device that computes."""
+
+    def conditions(self, **values: Any) -> list[Condition]:
+        """Return a condition of this size for each seed, with the given ``values`` of its other fields."""
+        size = {"width": self.width, "height": self.height, "duration_s": self.duration_s}
+        seeds = range(self.first_seed, self.first_seed + self.seeds)
+        return [Condition(**{**size, **values}, seed=seed) for seed in seeds]
+
+    def scenes(self) -> list[Condition]:
+        """Return the room at rest and moving; in full also the desk and the street, and fast motion."""
+        worlds: tuple[str, ...] = ("room",) if self.quick else ("room", "desk", "street")
+        motions: tuple[str, ...] = ("still", "handheld") if self.quick else ("still", "handheld", "fast")
+        return [c for world in worlds for motion in motions for c in self.conditions(world=world, trajectory=motion)]
+
+
+QUICK = Settings()
+FULL = Settings(quick=False, seeds=10, width=640, height=480, duration_s=0.5)
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """Result of one evaluation under one condition."""
+
+    evaluation: str
+    """Name of the evaluation."""
+    condition: Condition | RecordedCondition
+    """Condition under which it ran."""
+    values: dict[str, Any] = field(default_factory=dict)
+    """Values that the evaluation's function ``measure`` returned; empty if it failed."""
+    error: str = ""
+    """Message of an error that ended it, or empty."""
+    processor_s: float = 0.0
+    """Processor time of the measure [s], without the simulation."""
+
+
+class ChartKind(enum.StrEnum):
+    """Kinds of charts."""
+
+    LINES = "lines"
+    BARS = "bars"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Chart of a table. All texts but the labels are names of columns."""
+
+    x: str
+    """Column of the horizontal axis."""
+    y: str
+    """Column of the vertical axis."""
+    series: str
+    """Column whose values are drawn as separate lines or bars."""
+    spread: str | None = None
+    """Column of the standard deviation over seeds, drawn as a band or as error bars."""
+    panels: tuple[str, ...] = ()
+    """Columns whose combinations are drawn in separate panels."""
+    kind: ChartKind = ChartKind.LINES
+    """Kind of the chart."""
+    log_x: bool = False
+    """Whether the horizontal axis is logarithmic."""
+    log_y: bool = False
+    """Whether the vertical axis is logarithmic."""
+    marks: dict[str, float] = field(default_factory=dict)
+    """Values of the vertical axis that are marked by a horizontal line, by their labels, such as the paper's."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Table of results."""
+
+    name: str
+    """Name of its files."""
+    title: str
+    """Title: what is measured."""
+    columns: tuple[str, ...]
+    """Names of the columns, with their units."""
+    rows: list[tuple[Value, ...]]
+    """Rows."""
+    caption: str = ""
+    """What can be seen, and how to read it."""
+    chart: Chart | None = None
+    """Chart of the table, or None."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Picture or film in the report."""
+
+    name: str
+    """Name of its file."""
+    caption: str
+    """What can be seen."""
+    frames: list[NDArray[np.uint8]]
+    """Picture, or frames of the film, shape ``(height, width)`` or ``(height, width, 3)``."""
+    frame_s: float = 0.1
+    """Time that a frame of a film is shown [s]."""
+
+
+class Verdict(enum.StrEnum):
+    """Verdict on a claim of the paper."""
+
+    REPRODUCED = "reproduced"
+    NOT_REPRODUCED = "not reproduced"
+    NOT_TESTABLE = "not testable"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Claim of the paper with the verdict on it, which follows from the results by a stated rule."""
+
+    text: str
+    """What the paper says."""
+    paper: str
+    """Value in the paper, or the place of a curve without published numbers."""
+    ours: str
+    """Our value."""
+    verdict: Verdict
+    """Verdict."""
+    rule: str
+    """Rule by which the verdict follows from our results."""
+
+    @classmethod
+    def judge(cls, text: str, paper: str, ours: str, holds: bool | None, rule: str) -> Claim:
+        """Return a claim that is reproduced if it ``holds``; None if there are no results to judge it by."""
+        verdict = {True: Verdict.REPRODUCED, False: Verdict.NOT_REPRODUCED, None: Verdict.NOT_TESTABLE}[holds]
+        return cls(text, paper, ours, verdict, rule)
+
+
+def rows_of(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:
+    """Return the rows that the cells' values hold under ``name``, with the fields of their conditions.
+
+    Each row also has ``scene`` (the world, or the name of a recording) and ``camera`` (the camera's motion).
+    """
+    rows = []
+    for result in results:
+        condition = result.condition
+        if isinstance(condition, Condition):
+            known = {**asdict(condition), "scene": condition.world, "camera": condition.trajectory}
+        else:
+            known = {"scene": condition.path.name, "camera": "recording", "seed": condition.seed}
+        rows += [{**known, **row} for row in result.values.get(name, ())]
+    return rows
+
+
+def grouped(rows: Sequence[dict[str, Any]], by: Sequence[str], values: Sequence[str]) -> list[tuple[Value, ...]]:
+    """Return one row for each combination of the columns ``by``, in order of appearance.
+
+    A row holds the combination, the number of rows, and for each of ``values`` the mean and the standard deviation.
+    Values that are None or NaN are left out.
+    """
+    groups: dict[tuple[Value, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in by), []).append(row)
+    out: list[tuple[Value, ...]] = []
+    for key, members in groups.items():
+        cells: list[Value] = [*key, len(members)]
+        for name in values:
+            given = np.array([m[name] for m in members if m.get(name) is not None], np.float64)
+            given = given[np.isfinite(given)]
+            cells += [float(given.mean()), float(given.std())] if given.size else [None, None]
+        out.append(tuple(cells))
+    return out
+
+
+def mean_of(rows: Sequence[dict[str, Any]], name: str, where: Callable[[dict[str, Any]], bool]) -> float | None:
+    """Return the mean of a column over the rows that fulfil ``where``, or None if there are none."""
+    given = [row[name] for row in rows if where(row) and row[name] is not None and np.isfinite(row[name])]
+    return float(np.mean(given)) if given else None
+
+
+def encode_picture(picture: NDArray[np.uint8]) -> str:
+    """Return a picture as text, for the values of a cell."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG", optimize=True)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def decode_picture(text: str) -> NDArray[np.uint8]:
+    """Return a picture of :func:`encode_picture`."""
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))))

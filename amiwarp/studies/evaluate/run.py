@@ -1,0 +1,163 @@
+"""Run of the evaluations on local processes or a cluster. Finished cells are kept."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from amiwarp.io.atomic_output import check_output, make_folder, own_folder
+from amiwarp.progress import Progress, silent
+from amiwarp.studies.cluster import Workers, run_jobs, single_worker, start_workers
+from amiwarp.studies.dataset.run import worker_count
+from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
+from amiwarp.studies.evaluate.registry import EVALUATIONS, SHORT
+from amiwarp.studies.evaluate.report import REPORT_FILES, section, write
+from amiwarp.studies.evaluate.results import FULL, QUICK, CellResult
+from amiwarp.validation import whole
+
+
+@dataclass(frozen=True)
+class EvaluationSummary:
+    """What :func:`evaluate` did.
+
+    Examples
+    --------
+    >>> summary = amiwarp.EvaluationSummary(
+    ...     cells=4, new_cells=1, failed=0, verdicts={"reproduced": 3}, files={}, seconds=2.0, processor_seconds=3.0)
+    >>> summary.verdicts["reproduced"]
+    3
+    """
+
+    cells: int
+    """Number of cells: evaluations under a condition, with a seed."""
+    new_cells: int
+    """Number of cells that were run; the others were there already."""
+    failed: int
+    """Number of cells that ended with an error, which the report states."""
+    verdicts: dict[str, int]
+    """Number of claims of the paper by the verdict on them."""
+    files: dict[str, Path]
+    """Files of the report, ``report`` and ``data``."""
+    seconds: float
+    """Elapsed time [s]."""
+    processor_seconds: float
+    """Processor time of all workers [s]."""
+
+
+def evaluate(
+    out: str | Path,
+    *,
+    only: Sequence[str] = (),
+    full: bool = False,
+    seeds: int | None = None,
+    recordings: Sequence[str | Path] = (),
+    scheduler: str | None = None,
+    workers: int | None = None,
+    device: str = "cpu",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> EvaluationSummary:
+    """Evaluate the AMI-EV against a plain event camera as its paper does, and write a report.
+
+    Finished cells in ``out`` are kept: the same call continues a stopped run.
+
+    Parameters
+    ----------
+    out : str or Path
+        Folder for the report, its tables and figures, and the cells.
+    only : sequence of str, optional
+        Names of the evaluations. By default a full run has all of them, and a quick run the short ones: texture,
+        edges, apex_speed and fading.
+    full : bool, optional
+        Run the full study: 640×480, at least ten seeds, all values. By default the run is quick: 240×180, two seeds.
+    seeds : int, optional
+        Number of seeds instead.
+    recordings : sequence of str or Path, optional
+        Recordings on which to run the evaluations that need no ground truth. Without names in ``only``, nothing else is
+        run then.
+    scheduler : str, optional
+        Address of a Dask scheduler. By default the work is done on this machine.
+    workers : int, optional
+        Number of local processes, by default one for each GPU, or for each core without a GPU. With 1 everything runs
+        in this process.
+    device : str, optional
+        Device of the workers; ``cuda`` for all GPUs.
+    seed : int, optional
+        First seed.
+    progress : Progress, optional
+        Called with the finished share.
+
+    Returns
+    -------
+    EvaluationSummary
+        Numbers of cells and verdicts, the files, and the time.
+
+    Raises
+    ------
+    AmiwarpError
+        If there is no evaluation of a name, a file in the folder is damaged, or a package is missing.
+
+    Examples
+    --------
+    >>> amiwarp.evaluate("report", only=["texture"])  # doctest: +SKIP
+    """
+    began = time.perf_counter()
+    settings = replace(FULL if full else QUICK, first_seed=seed, device=device)
+    if seeds is not None:
+        settings = replace(settings, seeds=whole(seeds, "seeds", 1, 10_000))
+    folder = Path(out)
+    make_folder(folder / "cells")
+    earlier = any((folder / "cells").iterdir())  # an existing report was made from these cells and may be replaced
+    for name in () if earlier else REPORT_FILES:
+        check_output(folder / name)
+    chosen = only or (EVALUATIONS if full else SHORT)
+    jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
+    with _workers(scheduler, workers, device) as there:
+        results, new, processor_s = _run(jobs, Store(folder / "cells"), there, progress or silent)
+    names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
+    sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
+    with contextlib.ExitStack() as stack:
+        for own in (folder, folder / "tables", folder / "figures") if earlier else ():
+            stack.enter_context(own_folder(own))
+        files = write(folder, sections, settings, processor_s)
+    verdicts = [claim.verdict.value for s in sections for claim in s.claims]
+    return EvaluationSummary(
+        len(results), new, sum(bool(r.error) for r in results), {v: verdicts.count(v) for v in dict.fromkeys(verdicts)},
+        files, time.perf_counter() - began, processor_s,
+    )  # fmt: skip
+
+
+def _workers(scheduler: str | None, count: int | None, device: str) -> AbstractContextManager[Workers]:
+    """Return the workers: those of the scheduler, this process, or local processes."""
+    count = worker_count(count, device)
+    if scheduler is None and count == 1:
+        return single_worker()
+    return start_workers("amiwarp evaluate", "cluster", scheduler, count, device)
+
+
+def _run(
+    jobs: Sequence[Job], store: Store, workers: Workers, progress: Progress
+) -> tuple[list[CellResult], int, float]:
+    """Run the missing cells of the jobs. Return all cells, the number of new ones, and the processor time [s]."""
+    results: list[CellResult] = []
+    todo: list[Job] = []
+    for job in jobs:
+        known = {name: store.load(name, job.condition, job.settings) for name in job.evaluations}
+        results += [cell for cell in known.values() if cell is not None]
+        if missing := tuple(name for name, cell in known.items() if cell is None):
+            todo.append(replace(job, evaluations=missing))
+    processor_s, done, new = 0.0, 0, 0
+    with contextlib.closing(run_jobs(workers, run_job, todo)) as running:
+        for job, future in running:
+            result = future.result()
+            for cell in result.cells:
+                store.save(cell, job.settings)
+            results += result.cells
+            processor_s, done, new = processor_s + result.processor_s, done + 1, new + len(result.cells)
+            progress(f"{done:,} of {len(todo):,} recordings", done / len(todo))
+    order = {(job.condition, name): k for k, job in enumerate(jobs) for name in job.evaluations}
+    return sorted(results, key=lambda r: order[r.condition, r.evaluation]), new, processor_s

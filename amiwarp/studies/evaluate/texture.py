@@ -1,0 +1,134 @@
+"""Evaluation of texture stability: how evenly events cover the image, and how many there are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, RecordedStreams, Stream
+from amiwarp.studies.evaluate.measures.density import density_variance
+from amiwarp.studies.evaluate.results import CellResult, Chart, ChartKind, Claim, Settings, Table, grouped, rows_of
+
+if TYPE_CHECKING:
+    from amiwarp.events.events import Events
+
+TITLE = "Texture stability"
+PROTOCOL = (
+    "The events of a window are a sample of points in the image. A Gaussian kernel of standard deviation h estimates "
+    "their density ρ at the place of each event. The measure is the variance of ρ / mean ρ over the events, averaged "
+    "over up to four windows of a recording. Lower is more even. The paper's values are marked at h = 3 px and "
+    "windows of 33 ms, our choice."
+)
+DIFFERENCES = (
+    "The paper's main text gives neither kernel width nor window nor normalisation, and its scenes are real. Absolute"
+    " values therefore cannot be compared; the ranking can."
+)
+NEEDS_TRUTH = False
+
+H_PX, WINDOW_MS = 3.0, 33.0
+"""Standard deviation of the kernel [px], and length of the window [ms], of the comparison with the paper."""
+WIDTHS, WINDOWS = (1.0, 2.0, 3.0, 5.0, 8.0), (10.0, 20.0, 33.0, 66.0, 132.0)
+"""Values of both in the sensitivity curves."""
+REPEATS = 4
+"""Largest number of windows of a recording."""
+PAPER = {"paper, AMI-EV": 0.196, "paper, S-EV": 0.425}
+"""Variances in the paper."""
+
+
+def conditions(settings: Settings) -> list[Condition]:
+    """Return the standard scenes, at rest and moving."""
+    return settings.scenes()
+
+
+def measure(streams: RecordedStreams, settings: Settings) -> dict[str, Any]:
+    """Return the variance for each stream, kernel and window, and each stream's event rate [1/s]."""
+    cases = sorted({(H_PX, w) for w in WINDOWS} | {(h, WINDOW_MS) for h in WIDTHS})
+    rows, rates = [], []
+    for stream in streams.names:
+        for h_px, window_ms in cases:
+            values = [_variance(e, streams.size, h_px) for e in _windows(streams, stream, window_ms)]
+            seen = [v for v in values if np.isfinite(v)]
+            variance = float(np.mean(seen)) if seen else None
+            rows.append({"stream": stream.value, "h": h_px, "window": window_ms, "variance": variance})
+    for stream in (s for s in (Stream.PLAIN, Stream.RAW) if s in streams.names):
+        count = streams.count(stream, streams.start_us, streams.end_us)
+        rates.append({"stream": stream.value, "rate": count / (streams.end_us - streams.start_us)})
+    return {"rows": rows, "rates": rates}
+
+
+def _windows(streams: RecordedStreams, stream: Stream, window_ms: float) -> list[Events]:
+    """Return the events of up to :data:`REPEATS` windows, spread over the recording.
+
+    Windows of the stream with the same count are left out if the plain event camera recorded too few events.
+    """
+    length = min(round(window_ms * 1e3), streams.end_us - streams.start_us)
+    number = min(REPEATS, (streams.end_us - streams.start_us) // length)
+    starts = np.linspace(streams.start_us, streams.end_us - length, number).astype(np.int64)
+    found = [(int(t), streams.window(stream, int(t), int(t) + length)) for t in starts]
+    if stream is not Stream.SAME_COUNT:
+        return [events for _, events in found]
+    return [e for t, e in found if len(e) >= ENOUGH * streams.count(Stream.RAW, t, t + length)]
+
+
+def _variance(events: Events, size: tuple[int, int], h_px: float) -> float:
+    return density_variance(np.stack([events.x, events.y], axis=1).astype(np.float64), size, h_px)
+
+
+def tables(results: Sequence[CellResult]) -> list[Table]:
+    """Return the variances of the paper's protocol, both sensitivity curves, and the event rates."""
+    rows, rates = rows_of(results, "rows"), rows_of(results, "rates")
+    by = ("scene", "camera", "stream")
+    names = ("scene", "camera", "stream")
+    variance = ("seeds", "variance of ρ / mean ρ", "std")
+
+    def chart(x: str, **extra: Any) -> Chart:
+        return Chart(x, variance[1], "stream", "std", panels=("scene", "camera"), marks=PAPER, **extra)
+
+    standard = [r for r in rows if (r["h"], r["window"]) == (H_PX, WINDOW_MS)]
+    kernel, window = ([r for r in rows if r[o] == v] for o, v in (("window", WINDOW_MS), ("h", H_PX)))
+    return [
+        Table("texture", "Variance of the event density, h = 3 px, 33 ms", (*names, *variance),
+              grouped(standard, by, ["variance"]), "Lower is more even. At rest the S-EV records noise only, which is "
+              "even, and never as many events as the AMI-EV.",
+              Chart("camera", variance[1], "stream", "std", panels=("scene",), marks=PAPER, kind=ChartKind.BARS)),
+        Table("texture_kernel", "Variance over the kernel's width, windows of 33 ms", (*names, "h [px]", *variance),
+              grouped(kernel, (*by, "h"), ["variance"]), "A wide kernel hides blur; a narrow one counts noise.",
+              chart("h [px]")),
+        Table("texture_window", "Variance over the length of the window, h = 3 px",
+              (*names, "window [ms]", *variance), grouped(window, (*by, "window"), ["variance"]),
+              "A quarter turn at 720 rpm takes 21 ms.", chart("window [ms]", log_x=True)),
+        Table("event_rate", "Event rate", (*names, "seeds", "rate [Mev/s]", "std"), grouped(rates, by, ["rate"]),
+              "Events of the whole recording over its duration."),
+    ]  # fmt: skip
+
+
+def claims(results: Sequence[CellResult]) -> list[Claim]:
+    """Return the verdicts on the paper's ranking, on its robustness, and on the ranking at equal numbers of events."""
+    rows = rows_of(results, "rows")
+    moving = [r for r in rows if r["camera"] not in ("still", "recording")]
+    standard = [r for r in moving if (r["h"], r["window"]) == (H_PX, WINDOW_MS)]
+    return [
+        _ranking(standard, Stream.PLAIN, "The AMI-EV's texture is more even than the S-EV's (moving camera).",
+                 "AMI-EV 0.196, S-EV 0.425"),
+        _ranking(moving, Stream.PLAIN, "The same for every kernel width and window.", "not in the paper"),
+        _ranking(standard, Stream.SAME_COUNT, "The same when the S-EV has as many events.", "not in the paper"),
+    ]  # fmt: skip
+
+
+def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: str) -> Claim:
+    """Judge whether the calibrated AMI-EV is more even than ``other`` in each case."""
+    means: dict[tuple[Any, ...], dict[str, tuple[float, float]]] = {}
+    for scene, camera, h, window, stream, _, mean, std in grouped(
+        rows, ("scene", "camera", "h", "window", "stream"), ["variance"]
+    ):
+        if mean is not None:
+            means.setdefault((scene, camera, h, window), {})[str(stream)] = (float(mean), float(std or 0.0))
+    pairs = [(*m[Stream.CALIBRATED], *m[other]) for m in means.values() if {Stream.CALIBRATED, other} <= m.keys()]
+    better = sum(theirs - ours > max(std, their_std) for ours, std, theirs, their_std in pairs)
+    ours = f"lower in {better} of {len(pairs)} cases" if pairs else "no result"
+    if len(pairs) == 1:
+        ours = f"AMI-EV {pairs[0][0]:.3f} ± {pairs[0][1]:.3f}, {other} {pairs[0][2]:.3f} ± {pairs[0][3]:.3f}"
+    rule = f"the mean variance of '{Stream.CALIBRATED}' is below that of '{other}' by more than either spread"
+    return Claim.judge(text, paper, ours, better == len(pairs) if pairs else None, rule)

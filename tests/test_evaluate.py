@@ -1,0 +1,250 @@
+"""Evaluations of the AMI-EV paper: measures on cases with a known answer, cells, and the report."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import amiwarp
+from amiwarp.studies.evaluate import fading, texture
+from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
+from amiwarp.studies.evaluate.conditions import Condition, RecordedStreams, Stream, Streams
+from amiwarp.studies.evaluate.measures.density import density_variance
+from amiwarp.studies.evaluate.measures.edge_match import Counts, best_f, binary_entropy, match
+from amiwarp.studies.evaluate.measures.true_edges import geometric_edges
+from amiwarp.studies.evaluate.registry import EVALUATIONS, load
+from amiwarp.studies.evaluate.report import section, write
+from amiwarp.studies.evaluate.results import QUICK, Claim, Table, Verdict, grouped
+
+SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
+
+
+def poisson(rate: float, size: tuple[int, int], seed: int) -> np.ndarray:
+    """Return the places of a Poisson process of ``rate`` events/px² in an image."""
+    rng = np.random.default_rng(seed)
+    width, height = size
+    n = rng.poisson(rate * width * height)
+    return rng.uniform(-0.5, [width - 0.5, height - 0.5], (n, 2))
+
+
+@pytest.mark.parametrize(("rate", "h"), [(0.1, 3.0), (1.0, 3.0), (0.5, 5.0)])
+def test_density_of_a_poisson_process(rate: float, h: float) -> None:
+    size = (320, 240)
+    found = np.mean([density_variance(poisson(rate, size, seed), size, h) for seed in range(4)])
+    own = 1.0 / (2.0 * math.pi * h**2)
+    expected = rate / (4.0 * math.pi * h**2) / (rate + own) ** 2
+    assert found == pytest.approx(expected, rel=0.12)
+
+
+def test_density_of_a_regular_grid_is_even() -> None:
+    x, y = np.meshgrid(np.arange(64.0), np.arange(48.0))
+    assert density_variance(np.stack([x.ravel(), y.ravel()], axis=1), (64, 48), 3.0) < 1e-12
+
+
+def test_density_of_half_an_image() -> None:
+    """Events in two halves of rates 1 : 3 have two densities: 0.4 and 1.2 times their mean."""
+    rng = np.random.default_rng(0)
+    size, n = (4000, 40), 300_000
+    left = rng.random(n) < 0.25
+    x = np.where(left, rng.uniform(-0.5, 1999.5, n), rng.uniform(1999.5, 3999.5, n))
+    places = np.stack([x, rng.uniform(-0.5, 39.5, n)], axis=1)
+    assert density_variance(places, size, 3.0) == pytest.approx(0.25 * 0.6**2 + 0.75 * 0.2**2, abs=0.01)
+
+
+def line(column: int, shape: tuple[int, int] = (40, 60)) -> np.ndarray:
+    """Return an image with a vertical line."""
+    mask = np.zeros(shape, np.bool_)
+    mask[:, column] = True
+    return mask
+
+
+@pytest.mark.parametrize("shift", [0, 1, 2, 5])
+def test_f_score_of_a_shifted_line(shift: int) -> None:
+    tolerances = (1.0, 2.0, 4.0, 6.0)
+    for tolerance, matched in zip(tolerances, match(line(20 + shift), line(20), tolerances), strict=True):
+        assert matched.sum() == (40 if shift <= tolerance else 0)
+
+
+def test_pixels_match_one_to_one() -> None:
+    thick = line(19) | line(20) | line(21)
+    (matched,) = match(thick, line(20), [3.0])
+    counts = Counts(*(np.array([n]) for n in (matched.sum(), thick.sum(), 40)))
+    assert best_f(counts) == (0, pytest.approx(2 * 40 / (120 + 40)))
+    assert counts.precision[0] == pytest.approx(1 / 3)
+    assert counts.recall[0] == 1.0
+
+
+def test_a_largest_matching_leaves_no_augmenting_path() -> None:
+    """Targets at 0 and 2, points at 1 and 3: the greedy nearest choice may match one pair only; two are possible."""
+    true, found = (np.zeros((1, 5), np.bool_) for _ in range(2))
+    true[0, [0, 2]], found[0, [1, 3]] = True, True
+    assert match(found, true, [1.0])[0].tolist() == [True, True]
+    assert match(np.zeros_like(found), true, [1.0])[0].tolist() == [False, False]
+
+
+def test_entropy_of_binary_images() -> None:
+    assert binary_entropy(np.zeros((4, 4), np.bool_)) == 0.0
+    assert binary_entropy(np.eye(2, dtype=np.bool_)) == 1.0
+
+
+@pytest.fixture(scope="module")
+def streams() -> Streams:
+    return Streams(Condition(width=64, height=48, duration_s=0.1, trajectory="handheld"))
+
+
+def test_streams_belong_together(streams: Streams) -> None:
+    raw, true = (streams.window(s, 0, streams.end_us) for s in (Stream.RAW, Stream.TRUE))
+    assert raw.whole_pixels
+    assert not true.whole_pixels
+    assert len(raw) == streams.count(Stream.RAW, 0, streams.end_us) >= len(true) > 0
+    points = streams.event_truth(Stream.TRUE, 0, streams.end_us).points
+    assert points is not None
+    apart = np.hypot(true.x - points[:, 0], true.y - points[:, 1])
+    assert np.nanmedian(apart) < 0.3  # px: half a pixel of quantisation and the sensor's delay
+
+
+def test_windows_hold_the_events_of_their_time(streams: Streams) -> None:
+    for stream in (Stream.PLAIN, Stream.TRUE, Stream.RAW):
+        events = streams.window(stream, 20_000, 50_000)
+        assert len(events)
+        assert 20_000 <= events.t[0] <= events.t[-1] < 50_000
+
+
+def test_the_same_count(streams: Streams) -> None:
+    wanted = streams.count(Stream.RAW, 40_000, 42_000)
+    found = streams.window(Stream.SAME_COUNT, 40_000, 42_000)
+    assert len(found) == min(wanted, len(streams.plain.events))
+    assert (np.diff(found.t) >= 0).all()
+    cause = streams.event_truth(Stream.SAME_COUNT, 40_000, 42_000).cause
+    assert cause is not None
+    assert len(cause) == len(found)
+
+
+def test_geometric_edges_lie_between_instances(streams: Streams) -> None:
+    frame = streams.frame(50_000)
+    edges = geometric_edges(frame)
+    assert 0 < edges.mean() < 0.4
+    flat = replace(frame, instance=np.ones_like(frame.instance), depth=np.ones_like(frame.depth),
+                   normal=np.broadcast_to(np.float32([0, 0, 1]), frame.normal.shape))  # fmt: skip
+    assert not geometric_edges(flat).any()
+
+
+def test_a_recording_without_truth() -> None:
+    rng = np.random.default_rng(0)
+    n = 20_000
+    events = amiwarp.Events.from_arrays(
+        rng.integers(0, 64, n), rng.integers(0, 48, n), np.sort(rng.integers(0, 100_000, n)), rng.integers(0, 2, n)
+    )
+    recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 64, 48))
+    found = texture.measure(RecordedStreams(recording), SMALL)
+    assert found["rates"][0] == {"stream": "S-EV", "rate": pytest.approx(n / 100_000, rel=1e-3)}
+    (row,) = [r for r in found["rows"] if (r["h"], r["window"]) == (3.0, 33.0)]
+    rate = n * 0.33 / (64 * 48)
+    assert row["variance"] == pytest.approx(rate / (36 * math.pi) / (rate + 1 / (18 * math.pi)) ** 2, rel=0.25)
+
+
+def test_fading_classes() -> None:
+    counts, speeds = np.array([[10.0, 100.0], [30.0, 100.0]]), np.array([[0.1, 1.1], [1.1, 1.1]])
+    rows = {r["speed"]: r["rate"] for r in fading._classes(10 * counts, speeds)}
+    assert rows[0.125] == 0.5
+    assert rows[1.125] == pytest.approx((1.5 + 1.0 + 1.0) / 3)
+
+
+def test_grouped_rows() -> None:
+    rows = [{"a": 1, "v": 1.0}, {"a": 1, "v": 3.0}, {"a": 2, "v": None}]
+    assert grouped(rows, ["a"], ["v"]) == [(1, 2, 2.0, 1.0), (2, 1, None, None)]
+
+
+def test_verdicts() -> None:
+    verdicts = [Claim.judge("", "", "", holds, "").verdict for holds in (True, False, None)]
+    assert verdicts == [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.NOT_TESTABLE]
+
+
+@pytest.mark.parametrize("name", EVALUATIONS)
+def test_every_evaluation_keeps_the_contract(name: str) -> None:
+    evaluation = load(name)
+    assert evaluation.TITLE
+    assert evaluation.PROTOCOL
+    assert evaluation.DIFFERENCES
+    assert {c.seed for c in evaluation.conditions(QUICK)} == {0, 1}
+    assert {c.verdict for c in evaluation.claims([])} <= {Verdict.NOT_TESTABLE}
+
+
+def test_jobs_share_conditions() -> None:
+    jobs = plan(EVALUATIONS, QUICK, [])
+    assert any({"texture", "edges"} <= set(job.evaluations) for job in jobs)
+    assert len({job.condition for job in jobs}) == len(jobs)
+
+
+def test_unknown_evaluation() -> None:
+    with pytest.raises(amiwarp.AmiwarpError, match="unknown evaluation 'nothing'; choose among texture"):
+        load("nothing")
+
+
+def test_cells_are_kept_and_the_report_is_one_file(tmp_path: Path) -> None:
+    condition = Condition(width=64, height=48, duration_s=60 / 1440, trajectory="still", rpm=1440.0, cutoff_hz=0.0)
+    cells = run_job(Job(condition, ("apex_speed",), SMALL)).cells
+    assert not cells[0].error
+    store = Store(tmp_path)
+    store.save(cells[0], SMALL)
+    known = store.load("apex_speed", condition, SMALL)
+    assert known is not None
+    assert known.values == cells[0].values
+    files = write(tmp_path, [section("apex_speed", [known])], SMALL, 1.0)
+    page = files["report"].read_text()
+    assert page.count("data:image/svg+xml;base64,") == 3
+    assert "not testable" in page
+    assert 'src="http' not in page
+    assert 'href="http' not in page
+    data = json.loads(files["data"].read_text())
+    assert data["evaluations"][0]["tables"][0]["rows"][0][2] == 1440.0
+    assert (tmp_path / "figures" / "apex_speed_blur.pdf").stat().st_size > 1000
+    assert (tmp_path / "tables" / "apex_speed_rate.csv").read_text().startswith("apex,bandwidth,speed [rpm]")
+
+
+def test_a_damaged_cell_is_named(tmp_path: Path) -> None:
+    condition = Condition()
+    path = tmp_path / f"texture_quick_{condition.key}.json"
+    path.write_text("{}")
+    with pytest.raises(amiwarp.AmiwarpError, match="damaged cell"):
+        Store(tmp_path).load("texture", condition, SMALL)
+
+
+def test_a_table_without_values_has_no_chart() -> None:
+    from amiwarp.studies.evaluate.drawing import draw
+    from amiwarp.studies.evaluate.results import Chart
+
+    empty = Table("t", "t", ("x", "y", "s"), [(1, None, "a")], chart=Chart("x", "y", "s"))
+    assert draw(empty) is None
+
+
+def test_a_recording_from_the_command_line(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from amiwarp.cli.app import app
+
+    rng = np.random.default_rng(0)
+    n = 5_000
+    events = amiwarp.Events.from_arrays(
+        rng.integers(0, 64, n), rng.integers(0, 48, n), np.sort(rng.integers(0, 100_000, n)), rng.integers(0, 2, n)
+    )
+    path = tmp_path / "plain.h5"
+    amiwarp.save_recording(path, amiwarp.Recording(amiwarp.MemoryEvents(events, 64, 48)))
+    words = ["evaluate", "--out", str(tmp_path / "out"), "--recording", str(path), "--workers", "1", "--device", "cpu",
+             "--json"]  # fmt: skip
+    done = [CliRunner().invoke(app, words) for _ in range(2)]
+    assert [d.exit_code for d in done] == [0, 0], [d.stderr for d in done]
+    first, second = (json.loads(d.stdout) for d in done)
+    assert (first["cells"], first["new_cells"], first["failed"]) == (1, 1, 0)
+    assert (second["cells"], second["new_cells"]) == (1, 0)
+    assert "plain.h5" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_report_that_is_not_ours_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(amiwarp.AmiwarpError, match=r"report\.html"):
+        amiwarp.evaluate(tmp_path, only=["texture"], seeds=1, workers=1)
+    assert (tmp_path / "report.html").read_text() == "mine"
