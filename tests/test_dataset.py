@@ -86,6 +86,29 @@ def checksums(place: Path) -> dict[str, str]:
     return {p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in out.rglob("*.h5")}
 
 
+def test_recordings_are_translated_for_every_prism(place: Path) -> None:
+    """A recording of a rotating plain camera becomes one recording for each prism of the specification."""
+    camera = amiwarp.Camera.from_fov(32, 24, 1.0)
+    turning = amiwarp.CameraMotion([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 1.0, 0.0]])
+    scene = amiwarp.Scene.from_picture(place / "pictures" / "disc" / "0.png")
+    plain = amiwarp.Simulation(
+        scene, camera, amiwarp.Prism(0.0), 0.2, camera_motion=turning, encoder_model=None, seed=1
+    )
+    plain.write(place / "plain.h5")
+    source = '[[sources]]\ntranslated = "plain.h5"\nduration_s = 0.05\n'
+    (place / "spec.toml").write_text(BASE + source)
+    done = make(place)
+    assert done.failed == {}
+    items = manifest(place)["items"]
+    assert {item["source_kind"] for item in items} == {"translated"}
+    assert {item["apex_deg"] for item in items} == {1.0, 2.0}
+    for item in items:
+        recording = amiwarp.open_recording(place / "out" / item["file"])
+        assert len(recording.events) == item["events"] > 0
+        assert recording.truth is not None
+        assert recording.truth.known is not None
+
+
 def run(*args: str | Path) -> Result:
     return CliRunner().invoke(app, ["dataset", *(str(arg) for arg in args)])
 

@@ -86,7 +86,7 @@ def _recipes(specification: Specification, source: Source) -> Iterator[dict[str,
         yield base
         return
     base |= {"camera": asdict(specification.camera)}
-    if entry.kind == "videos":
+    if entry.kind in ("videos", "translated"):
         base |= {"fps": entry.fps, "duration_s": entry.duration_s}
     else:
         base |= {"duration_s": entry.duration_s or specification.duration_s}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
-from amiwarp.io import convert
+from amiwarp.io import convert, open_recording
 from amiwarp.io.atomic_output import HOST, make_folder, put_in_place
 from amiwarp.kernels.cpu_threads import limited_cpu_threads
 from amiwarp.simulation.motion import PrismMotion
@@ -159,6 +159,9 @@ def simulation_of(item: Item, device: str, duration_s: float | None = None) -> S
     length = recipe["duration_s"] if duration_s is None else duration_s
     prism, motion = PrismEntry(**recipe["prism"]).build(), PrismMotion(recipe["rpm"])
     sensor = SensorModel(**{name: value for name, value in recipe["sensor"].items() if name != "name"})
+    if item.kind == "translated":
+        return translation(open_recording(source), prism, duration_s=length, motion=motion, sensor=sensor,
+                           seed=item.seed, device=device)  # fmt: skip
     if item.kind == "videos":
         return _of_video(item, source, camera, duration_s=length, prism=prism, motion=motion, sensor=sensor,
                          seed=item.seed, device=device)  # fmt: skip

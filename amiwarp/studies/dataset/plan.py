@@ -216,7 +216,7 @@ def _variance_of_mean(values: Sequence[float], of: int) -> float:
 def _whole_cost(item: Item, scratch: Path, device: str) -> _Cost:
     """Return the cost of a recording, extrapolated from two short ones if it is long."""
     whole = item.recipe.get("duration_s")
-    if whole is None and item.kind == "videos":
+    if whole is None and item.kind in ("videos", "translated"):
         whole = simulation_of(item, device).duration_s
     if whole is None or whole <= LONGEST_SAMPLE_S:
         return _cost(item, scratch, device, None)

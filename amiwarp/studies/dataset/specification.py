@@ -22,7 +22,7 @@ FORMAT, VERSION = "amiwarp-dataset-specification", 1
 """Values of the fields ``format`` and ``version``."""
 SPLITS = {"train": 0.8, "val": 0.1, "test": 0.1}
 """Default shares of the splits."""
-KINDS = ("pictures", "videos", "recordings", "world_files", "worlds")
+KINDS = ("pictures", "videos", "recordings", "translated", "world_files", "worlds")
 """Fields of a source that name its files or worlds; each source has exactly one of them."""
 LARGEST_SEED = 2**31 - 1
 """Largest seed of a recording."""
@@ -66,6 +66,7 @@ class SourceEntry:
     pictures: str | None = None
     videos: str | None = None
     recordings: str | None = None
+    translated: str | None = None
     world_files: str | None = None
     worlds: tuple[str, ...] | None = None
     fps: float | None = None
@@ -268,7 +269,7 @@ def _check_source(entry: SourceEntry, where: str) -> None:
     if len(kinds) != 1:
         raise AmiwarpError(f"field {where} has {' and '.join(kinds) or 'no source'}; give one of {', '.join(KINDS)}")
     uses = {"fps": ("videos",), "trajectories": ("worlds", "world_files"),
-            "duration_s": ("pictures", "videos", "worlds", "world_files")}  # fmt: skip
+            "duration_s": ("pictures", "videos", "translated", "worlds", "world_files")}  # fmt: skip
     for name, allowed in uses.items():
         if getattr(entry, name) is not None and kinds[0] not in allowed:
             raise AmiwarpError(f"field {where}.{name} does not apply to {kinds[0]}; remove it")
