@@ -95,7 +95,7 @@ def _plan_lines(plan: DatasetPlan) -> list[str]:
         lines += [
             f"about {plan.events:.3g} events and {plan.size_bytes / 1e9:.3g} GB to write",
             f"about {duration_text(plan.seconds)} (± {100 * plan.uncertainty:.0f} %) with {plan.workers} workers on "
-            f"{plan.device}, estimated from {plan.samples} samples",
+            f"{plan.device} once the workers have started, estimated from {plan.samples} samples",
         ]
     return lines
 
