@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import amiwarp
-from amiwarp.studies.evaluate import fading, texture
+from amiwarp.studies.evaluate import corners, fading, texture
 from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
 from amiwarp.studies.evaluate.conditions import Condition, RecordedStreams, Stream, Streams
 from amiwarp.studies.evaluate.measures.density import density_variance
@@ -17,7 +17,7 @@ from amiwarp.studies.evaluate.measures.edge_match import Counts, best_f, binary_
 from amiwarp.studies.evaluate.measures.true_edges import geometric_edges
 from amiwarp.studies.evaluate.registry import EVALUATIONS, load
 from amiwarp.studies.evaluate.report import section, write
-from amiwarp.studies.evaluate.results import QUICK, Claim, Table, Verdict, grouped
+from amiwarp.studies.evaluate.results import QUICK, CellResult, Claim, Table, Verdict, grouped
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
 
@@ -161,6 +161,26 @@ def test_grouped_rows() -> None:
 def test_verdicts() -> None:
     verdicts = [Claim.judge("", "", "", holds, "").verdict for holds in (True, False, None)]
     assert verdicts == [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.NOT_TESTABLE]
+
+
+def test_corners_of_uncompensated_events_leave_the_truth() -> None:
+    condition = Condition(width=64, height=48, duration_s=0.08, apex=math.radians(1.0))
+    streams = Streams(condition)
+    streams.calibration = None  # not needed here
+    result = corners.measure(streams, QUICK)
+    lives = {
+        (row["detector"], row["stream"]): row["lifetime_ms"]
+        for row in result["rows"]
+        if row["limit"] == corners.LIMIT_PX
+    }
+    for detector in ("efast", "arc"):
+        assert lives[detector, Stream.TRUE.value] > 5.0
+        assert lives[detector, Stream.TRUE.value] > 5.0 * lives[detector, Stream.RAW.value]
+    assert {row["gap"] for row in result["gaps"]} == {10.0, 25.0, 50.0}
+    cell = CellResult("corners", condition, result)
+    table = corners.tables([cell])[0]
+    assert {row[2] for row in table.rows} == {"efast", "arc"}
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
 @pytest.mark.parametrize("name", EVALUATIONS)

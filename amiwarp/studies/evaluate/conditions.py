@@ -181,7 +181,7 @@ class RecordedStreams:
 
         Events that have no position without the prism are left out.
         """
-        events, _ = self._window(stream, start_us, end_us)
+        events, _ = self.indexed_window(stream, start_us, end_us)
         return events
 
     def count(self, stream: Stream, start_us: int, end_us: int) -> int:
@@ -193,7 +193,7 @@ class RecordedStreams:
         """Return the recording that the events of a stream are from."""
         return self.recording
 
-    def _window(self, stream: Stream, start_us: int, end_us: int) -> tuple[Events, NDArray[np.int64]]:
+    def indexed_window(self, stream: Stream, start_us: int, end_us: int) -> tuple[Events, NDArray[np.int64]]:
         """Return the events of a window, and their indices in their recording."""
         source = self._source(stream).events
         first = source.find(start_us)
@@ -277,7 +277,7 @@ class Streams(RecordedStreams):
 
     def event_truth(self, stream: Stream, start_us: int, end_us: int) -> EventTruth:
         """Return the ground truth of the events that :meth:`window` returns, in the same order."""
-        _, rows = self._window(stream, start_us, end_us)
+        _, rows = self.indexed_window(stream, start_us, end_us)
         source = self._source(stream)
         assert source.truth is not None
         if not len(rows):
@@ -306,9 +306,10 @@ class Streams(RecordedStreams):
         """Return the ground truth of all pixels at a time; :attr:`frame` keeps the last eight."""
         return self._truth.at(t_us)
 
-    def _window(self, stream: Stream, start_us: int, end_us: int) -> tuple[Events, NDArray[np.int64]]:
+    def indexed_window(self, stream: Stream, start_us: int, end_us: int) -> tuple[Events, NDArray[np.int64]]:
+        """Return the events of a window, and their indices in their recording."""
         if stream is not Stream.SAME_COUNT:
-            return super()._window(stream, start_us, end_us)
+            return super().indexed_window(stream, start_us, end_us)
         source = self.plain.events
         rows = np.arange(source.find(start_us), source.find(end_us))
         rows = self._with_count(rows, self.count(Stream.RAW, start_us, end_us))

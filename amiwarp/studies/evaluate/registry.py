@@ -10,7 +10,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.studies.evaluate.conditions import Condition
 from amiwarp.studies.evaluate.results import CellResult, Claim, Picture, Settings, Table
 
-EVALUATIONS = ("texture", "edges", "pictures", "segmentation", "flow", "pose", "apex_speed", "fading")
+EVALUATIONS = ("texture", "edges", "pictures", "corners", "segmentation", "flow", "pose", "apex_speed", "fading")
 """Names of the evaluations, in the order of the report: each is a module of this folder, see :class:`Evaluation`."""
 SHORT = ("texture", "edges", "apex_speed", "fading")
 """Names of the evaluations that together take under ten minutes on two cores in their quick form."""

@@ -1,0 +1,157 @@
+"""Evaluation of corners: how long corner tracks live, and how far they are from the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.imaging.choices import CornerMethod
+from amiwarp.imaging.corners import detect_corners
+from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
+from amiwarp.studies.evaluate.measures.tracks import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
+from amiwarp.studies.evaluate.results import CellResult, Chart, ChartKind, Claim, Settings, Table, grouped, rows_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+TITLE = "Corners"
+PROTOCOL = (
+    "eFAST and Arc* detect corners in the events as recorded. The events are then compensated, and corner events up to "
+    f"3 px and {GAP_US / 1000:.0f} ms apart are joined to tracks. The truth of a track is the point of the world that "
+    "its first event saw, projected to the image without the prism. A track ends where it is further from the truth "
+    "than a limit (5 px in the comparison), or where the point is hidden. Apex 1°."
+)
+DIFFERENCES = (
+    "The paper's main text gives neither the tracker nor the limit at which a track ends. The ranking depends on the "
+    "limit: see the curves. Scenes are simulated."
+)
+NEEDS_TRUTH = True
+
+APEX = math.radians(1.0)
+"""Apex angle of the paper's evaluation of features [rad]."""
+LIMIT_PX = 5.0
+"""Distance from the truth at which a track ends in the comparison [px]."""
+GAPS_US = (10_000, 25_000, 50_000)
+"""Largest times between two corner events of a track, for the sensitivity curve [us]."""
+INSTANTS = 5
+"""Number of instants whose depth tells which points are hidden."""
+SOURCES = {
+    Stream.PLAIN: (Stream.PLAIN,),
+    Stream.RAW: (Stream.TRUE, Stream.CALIBRATED, Stream.RAW),
+}
+"""Streams whose positions are those of the events of another stream, by that stream."""
+VALUES = ("number", "lifetime_ms", "error_px", "update_hz")
+"""Names of the values of each row."""
+
+
+def conditions(settings: Settings) -> list[Condition]:
+    """Return the standard scenes with the apex angle of the paper's features."""
+    return [replace(condition, apex=APEX) for condition in settings.scenes()]
+
+
+def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
+    """Return number, lifetime, error and update rate of the tracks, for each detector, stream, limit and gap."""
+    instants = np.linspace(streams.start_us, streams.end_us - 1, INSTANTS).astype(int)
+    frames = [streams.frame(int(t)) for t in instants]
+    rows: list[dict[str, Any]] = []
+    gaps: list[dict[str, Any]] = []
+    for source, members in SOURCES.items():
+        raw, indices = streams.indexed_window(source, streams.start_us, streams.end_us)
+        for detector in CornerMethod:
+            found = detect_corners(raw, streams.size, detector=detector)
+            for stream in (s for s in members if s in streams.names):
+                kept = _chosen(streams, stream, found, indices)
+                known = {"detector": detector.value, "stream": stream.value}
+                rows += [known | row for row in _quality(streams, stream, kept, frames, GAP_US, LIMITS_PX)]
+                for gap_us in GAPS_US:
+                    gaps += [known | row for row in _quality(streams, stream, kept, frames, gap_us, (LIMIT_PX,))]
+    return {"rows": rows, "gaps": gaps}
+
+
+def _chosen(
+    streams: Streams, stream: Stream, found: NDArray[np.bool_], indices: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return which events of a stream are corners, given those of the recording that it belongs to."""
+    _, rows = streams.indexed_window(stream, streams.start_us, streams.end_us)
+    return found[rows - indices[0]] if len(rows) else np.zeros(0, bool)
+
+
+def _quality(
+    streams: Streams, stream: Stream, corners: NDArray[np.bool_], frames: Sequence[Any], gap_us: int,
+    limits_px: Sequence[float],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return the quality of a stream's tracks for each limit; None where there are no tracks."""
+    events = streams.window(stream, streams.start_us, streams.end_us)
+    place = streams.event_truth(stream, streams.start_us, streams.end_us).place
+    scene = streams.simulation.scene
+    assert place is not None
+    assert isinstance(scene, WorldScene)
+    xy = np.stack([events.x[corners], events.y[corners]], axis=1).astype(np.float64)
+    tracks = link_corners(events.t[corners], xy, gap_us=gap_us)
+    starts = place[corners][tracks.index[tracks.first]]
+    truth = true_paths(tracks, starts, streams.camera, scene.trajectory, frames)
+    found = []
+    for q in quality_curve(tracks, truth, limits_px):
+        values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
+        known = (value if math.isfinite(value) else None for value in values)
+        found.append({"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, known, strict=True))})
+    return found
+
+
+def tables(results: Sequence[CellResult]) -> list[Table]:
+    """Return the quality at the limit of the comparison, and the curves of lifetime and error over the limit."""
+    rows = rows_of(results, "rows")
+    by = ("scene", "camera", "detector", "stream")
+    names = ("seeds", "tracks", "std of tracks", "lifetime [ms]", "std", "error [px]", "std of error",
+             "updates [1/s]", "std of updates")  # fmt: skip
+    standard = [r for r in rows if r["limit"] == LIMIT_PX]
+    curve = ("seeds", "value", "std")
+
+    def over_limit(name: str, value: str, title: str) -> Table:
+        return Table(name, title, (*by, "limit [px]", *curve), grouped(rows, (*by, "limit"), [value]),
+                     "A lenient limit hides errors; a strict one ends tracks early.",
+                     Chart("limit [px]", "value", "stream", "std", panels=("camera", "detector")))  # fmt: skip
+
+    return [
+        Table("corners", f"Tracks of corners that end {LIMIT_PX:g} px from the truth", (*by, *names),
+              grouped(standard, by, VALUES), "Longer lifetimes and smaller errors are better.",
+              Chart("camera", "lifetime [ms]", "stream", "std", panels=("detector",), kind=ChartKind.BARS)),
+        over_limit("corners_lifetime", "lifetime_ms", "Lifetime [ms] over the limit"),
+        over_limit("corners_error", "error_px", "Error [px] over the limit"),
+        Table("corners_gap", "Lifetime [ms] over the largest time between two corner events of a track",
+              (*by, "gap [ms]", *curve), grouped(rows_of(results, "gaps"), (*by, "gap"), ["lifetime_ms"]),
+              "A quarter turn at 720 rpm takes 21 ms.",
+              Chart("gap [ms]", "value", "stream", "std", panels=("camera", "detector"))),
+    ]  # fmt: skip
+
+
+def claims(results: Sequence[CellResult]) -> list[Claim]:
+    """Return the verdicts on the lifetime of tracks at the limit of the comparison, and for every limit."""
+    moving = [r for r in rows_of(results, "rows") if r["camera"] != "still"]
+    standard = [r for r in moving if r["limit"] == LIMIT_PX]
+    text = "Corners of the AMI-EV live substantially longer than those of the S-EV (moving camera)."
+    return [
+        _longer(standard, text, "curves"),
+        _longer(moving, f"The same for every limit from {LIMITS_PX[0]:g} to {LIMITS_PX[-1]:g} px.", "not in the paper"),
+    ]
+
+
+def _longer(rows: Sequence[dict[str, Any]], text: str, paper: str) -> Claim:
+    """Judge whether the tracks of the calibrated AMI-EV live longer than those of the S-EV in each case."""
+    means: dict[tuple[Any, ...], dict[str, tuple[float, float]]] = {}
+    for scene, camera, detector, limit, stream, _, mean, std in grouped(
+        rows, ("scene", "camera", "detector", "limit", "stream"), ["lifetime_ms"]
+    ):
+        if mean is not None:
+            means.setdefault((scene, camera, detector, limit), {})[str(stream)] = (float(mean), float(std or 0.0))
+    both = {Stream.CALIBRATED, Stream.PLAIN}
+    pairs = [(*m[Stream.CALIBRATED], *m[Stream.PLAIN]) for m in means.values() if both <= m.keys()]
+    better = sum(ours - theirs > max(std, their_std) for ours, std, theirs, their_std in pairs)
+    rule = f"the mean lifetime of '{Stream.CALIBRATED}' exceeds that of '{Stream.PLAIN}' by more than either spread"
+    ours = f"longer in {better} of {len(pairs)} cases" if pairs else "no result"
+    return Claim.judge(text, paper, ours, better == len(pairs) if pairs else None, rule)
