@@ -175,7 +175,7 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
 
 
 def _link(part: Path, target: Path) -> None:
-    """Rename a file without replacing one that another program has just created, which os.replace would replace."""
+    """Rename a file, but do not replace a file that another program has just created, as os.replace would."""
     try:
         os.link(part, target)
     except FileExistsError:

@@ -18,24 +18,13 @@ from amiwarp.events.events import Events, regroup
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.io.evt3_writer import Evt3Encoder, origin_of
 from amiwarp.io.output_formats import Outline
+from amiwarp.io.ros_messages import PACKET_DEFINITION
 
 TOPIC = "/event_camera/events"
 """Topic of the events, as the drivers call it."""
 
 MESSAGE = "event_camera_msgs/msg/EventPacket"
 """Type of the messages."""
-
-DEFINITION = """\
-std_msgs/Header header
-uint32 height
-uint32 width
-uint64 seq
-uint64 time_base
-string encoding
-bool is_bigendian
-uint8[] events
-"""
-"""Fields of the messages."""
 
 PACKET_US = 10_000
 """Longest packet [us]."""
@@ -52,7 +41,7 @@ def write_ros2(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     except ImportError as error:
         raise AmiwarpError(f"{about.path}: ROS bags need rosbags; install it by: pip install 'amiwarp[ros]'") from error
     store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(DEFINITION, MESSAGE))
+    store.register(get_types_from_msg(PACKET_DEFINITION, MESSAGE))
     storage = StoragePlugin.MCAP if kind == ".mcap" else StoragePlugin.SQLITE3
     with scratch_folder(part.parent) as folder:
         bag = folder / "bag"

@@ -22,7 +22,7 @@ from amiwarp.kernels.vector_code import add_word, load_float, load_uint8, load_u
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BLOCK = wp.constant(64)  # number of events per CPU thread, which displaces eight at a time and then votes
-TRASH = wp.constant(4096)  # number of words for votes outside the image; so many that none overflows
+TRASH = wp.constant(4096)  # number of words for votes outside the image, large enough that no word overflows
 CAPACITY = wp.constant(1024)  # number of events at which a word overflows
 FIELD_CARRY = wp.constant(wp.int64(1 << 18))  # value of a carry out of the fields fx, fy, b
 MIX_1 = wp.constant(wp.uint32(0x85EBCA6B))  # multipliers of MurmurHash3's finaliser

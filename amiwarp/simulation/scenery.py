@@ -36,7 +36,7 @@ TEXELS_PER_PIXEL = 1.75
 SMALLEST_COSINE = 0.25
 """Cosine of the largest angle between a line of sight and the axis of the picture.
 
-The picture lies on a plane, which does not reach to directions beside or behind the camera.
+The picture lies on a plane in front of the camera, so no picture exists beside or behind the camera.
 """
 
 

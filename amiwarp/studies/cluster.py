@@ -22,7 +22,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 WAITING = 2
-"""Jobs given out for each worker: the one that it runs, and the next."""
+"""Number of jobs that each worker holds at a time: a running job and the next one."""
 ANY_GPU = "cuda"
 """Name of the device for all CUDA GPUs: each local worker uses one of them."""
 

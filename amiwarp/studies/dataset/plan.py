@@ -173,7 +173,7 @@ def _sample_all(
     Each group holds the recordings of one kind of source.
     """
     total, samples, variance = _Cost(), 0, 0.0
-    # the folder of the data set may not exist yet, and its disk is the one that matters
+    # The samples are written to the disk of the data set, whose folder may not exist yet.
     near = next(folder for folder in (out.resolve(), *out.resolve().parents) if folder.is_dir())
     with scratch_folder(near) as scratch:
         for group in groups:

@@ -97,7 +97,7 @@ def make_dataset(
     specification : str or Path
         TOML file that describes the data set.
     out : str or Path
-        Folder of the data set: a new folder, or one that an earlier call made.
+        Folder of the data set: a new folder, or the folder of an earlier call.
     scheduler : str, optional
         Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``. By default, processes of this machine do the
         work. All workers need access to ``out`` and to the sources under the same paths.

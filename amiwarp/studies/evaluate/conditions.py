@@ -211,7 +211,7 @@ class RecordedStreams:
         return None if model is None else compensate_events(raw, model, encoder, device=self.device)
 
     def _optics(self, stream: Stream) -> tuple[Model | None, Any]:
-        """Return the model and the encoder that compensate a stream, or None for one that is not compensated."""
+        """Return the model and the encoder that compensate a stream; both are None without compensation."""
         if stream is not Stream.CALIBRATED or self.calibration is None:
             return None, None
         recording = self.recording

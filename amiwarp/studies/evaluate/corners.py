@@ -14,7 +14,17 @@ from amiwarp.imaging.corners import detect_corners
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.measures.tracks import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
-from amiwarp.studies.evaluate.results import CellResult, Chart, ChartKind, Claim, Settings, Table, grouped, rows_of
+from amiwarp.studies.evaluate.results import (
+    CellResult,
+    Chart,
+    ChartKind,
+    Claim,
+    Settings,
+    Table,
+    compared,
+    grouped,
+    rows_of,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,38 +75,42 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
         for detector in CornerMethod:
             found = detect_corners(raw, streams.size, detector=detector)
             for stream in (s for s in members if s in streams.names):
-                kept = _chosen(streams, stream, found, indices)
                 known = {"detector": detector.value, "stream": stream.value}
-                rows += [known | row for row in _quality(streams, stream, kept, frames, GAP_US, LIMITS_PX)]
+                t, xy, place = _corners(streams, stream, found, indices)
                 for gap_us in GAPS_US:
-                    gaps += [known | row for row in _quality(streams, stream, kept, frames, gap_us, (LIMIT_PX,))]
+                    curve = [known | row for row in _quality(streams, t, xy, place, frames, gap_us)]
+                    rows += curve if gap_us == GAP_US else []
+                    gaps += [row for row in curve if row["limit"] == LIMIT_PX]
     return {"rows": rows, "gaps": gaps}
 
 
-def _chosen(
+def _corners(
     streams: Streams, stream: Stream, found: NDArray[np.bool_], indices: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Return which events of a stream are corners, given those of the recording that it belongs to."""
-    _, rows = streams.indexed_window(stream, streams.start_us, streams.end_us)
-    return found[rows - indices[0]] if len(rows) else np.zeros(0, bool)
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+    """Return times, places [px] and points of the world [m] of a stream's corners.
+
+    ``found``: which events of the recording that the stream belongs to are corners; ``indices``: those events' indices.
+    """
+    span = streams.start_us, streams.end_us
+    events, rows = streams.indexed_window(stream, *span)
+    place = streams.event_truth(stream, *span).place
+    assert place is not None
+    corners = found[rows - indices[0]] if len(rows) else np.zeros(0, bool)
+    xy = np.stack([events.x[corners], events.y[corners]], axis=1).astype(np.float64)
+    return events.t[corners], xy, place[corners]
 
 
 def _quality(
-    streams: Streams, stream: Stream, corners: NDArray[np.bool_], frames: Sequence[Any], gap_us: int,
-    limits_px: Sequence[float],
+    streams: Streams, t: NDArray[np.int64], xy: NDArray[np.float64], place: NDArray[np.float32],
+    frames: Sequence[Any], gap_us: int,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Return the quality of a stream's tracks for each limit; None where there are no tracks."""
-    events = streams.window(stream, streams.start_us, streams.end_us)
-    place = streams.event_truth(stream, streams.start_us, streams.end_us).place
+    """Return the quality of the tracks of corners for each limit; a value is None if there are no tracks."""
     scene = streams.simulation.scene
-    assert place is not None
     assert isinstance(scene, WorldScene)
-    xy = np.stack([events.x[corners], events.y[corners]], axis=1).astype(np.float64)
-    tracks = link_corners(events.t[corners], xy, gap_us=gap_us)
-    starts = place[corners][tracks.index[tracks.first]]
-    truth = true_paths(tracks, starts, streams.camera, scene.trajectory, frames)
+    tracks = link_corners(t, xy, gap_us=gap_us)
+    truth = true_paths(tracks, place[tracks.index[tracks.first]], streams.camera, scene.trajectory, frames)
     found = []
-    for q in quality_curve(tracks, truth, limits_px):
+    for q in quality_curve(tracks, truth, LIMITS_PX):
         values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
         known = (value if math.isfinite(value) else None for value in values)
         found.append({"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, known, strict=True))})
@@ -149,9 +163,6 @@ def _longer(rows: Sequence[dict[str, Any]], text: str, paper: str) -> Claim:
     ):
         if mean is not None:
             means.setdefault((scene, camera, detector, limit), {})[str(stream)] = (float(mean), float(std or 0.0))
-    both = {Stream.CALIBRATED, Stream.PLAIN}
-    pairs = [(*m[Stream.CALIBRATED], *m[Stream.PLAIN]) for m in means.values() if both <= m.keys()]
-    better = sum(ours - theirs > max(std, their_std) for ours, std, theirs, their_std in pairs)
+    holds, ours = compared(means, Stream.PLAIN, "longer", larger=True)
     rule = f"the mean lifetime of '{Stream.CALIBRATED}' exceeds that of '{Stream.PLAIN}' by more than either spread"
-    ours = f"longer in {better} of {len(pairs)} cases" if pairs else "no result"
-    return Claim.judge(text, paper, ours, better == len(pairs) if pairs else None, rule)
+    return Claim.judge(text, paper, ours, holds, rule)

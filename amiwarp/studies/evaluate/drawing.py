@@ -37,7 +37,7 @@ STREAM_COLOURS = {
 OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK)
 """Colours of other series, in their order."""
 MARKERS = "osD^vPX"
-"""Markers of the series, so that they can be told apart without colour."""
+"""Markers that distinguish the series without colour."""
 
 
 def draw(table: Table) -> Figure | None:

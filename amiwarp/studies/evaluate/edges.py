@@ -27,6 +27,7 @@ from amiwarp.studies.evaluate.results import (
     Picture,
     Settings,
     Table,
+    compared,
     decode_picture,
     encode_picture,
     grouped,
@@ -290,13 +291,9 @@ def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: st
     by: dict[tuple[Any, ...], dict[str, tuple[float, float]]] = {}
     for r in rows:
         by.setdefault((r["scene"], r["camera"], r["tolerance"]), {})[r["stream"]] = (r["f"], r["std"])
-    pairs = [(*m[Stream.CALIBRATED], *m[other]) for m in by.values() if {Stream.CALIBRATED, other} <= m.keys()]
-    better = sum(ours - theirs > max(std, their_std) for ours, std, theirs, their_std in pairs)
-    ours = f"higher in {better} of {len(pairs)} cases" if pairs else "no result"
-    if len(pairs) == 1:
-        ours = f"AMI-EV {pairs[0][0]:.3f} ± {pairs[0][1]:.3f}, {other} {pairs[0][2]:.3f} ± {pairs[0][3]:.3f}"
+    holds, ours = compared(by, other, "higher", larger=True)
     rule = f"the ODS-F of '{Stream.CALIBRATED}' is above that of '{other}' by more than either spread in every case"
-    return Claim.judge(text, paper, ours, better == len(pairs) if pairs else None, rule)
+    return Claim.judge(text, paper, ours, holds, rule)
 
 
 def _fading(rows: Sequence[dict[str, Any]]) -> Claim:

@@ -110,7 +110,7 @@ def _classes(counts: NDArray[np.float64], speeds: NDArray[np.float64]) -> list[d
 
 
 def _frame(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int]) -> str:
-    """Return the events of a part of a turn as a frame of the film: white, with black where there are many."""
+    """Return the events of a part of a turn as a frame of the film: white without events, black with many events."""
     width, height = size
     counts = np.bincount(y.astype(np.int64) * width + x, minlength=width * height).reshape(height, width)
     return encode_picture(np.asarray(255 - np.minimum(255, 85 * counts), np.uint8))

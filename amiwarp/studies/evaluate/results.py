@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 import enum
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition
+from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, Stream
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -163,6 +163,25 @@ class Claim:
         """Return a claim that is reproduced if it ``holds``; None if there are no results to judge it by."""
         verdict = {True: Verdict.REPRODUCED, False: Verdict.NOT_REPRODUCED, None: Verdict.NOT_TESTABLE}[holds]
         return cls(text, paper, ours, verdict, rule)
+
+
+def compared(
+    cases: Mapping[Any, Mapping[str, tuple[float, float]]], other: Stream, word: str, *, larger: bool
+) -> tuple[bool | None, str]:
+    """Compare the calibrated AMI-EV with another stream, and return whether it is better in each case, and a text.
+
+    ``cases``: mean and standard deviation of the streams in each case. Better means ``larger`` or smaller by more than
+    either standard deviation. ``word``: comparative for the text. Without cases that have both streams, the first
+    value is None.
+    """
+    both = {Stream.CALIBRATED, other}
+    pairs = [(*case[Stream.CALIBRATED], *case[other]) for case in cases.values() if both <= case.keys()]
+    sign = 1.0 if larger else -1.0
+    better = sum(sign * (ours - theirs) > max(std, their_std) for ours, std, theirs, their_std in pairs)
+    text = f"{word} in {better} of {len(pairs)} cases" if pairs else "no result"
+    if len(pairs) == 1:
+        text = f"AMI-EV {pairs[0][0]:.3f} ± {pairs[0][1]:.3f}, {other} {pairs[0][2]:.3f} ± {pairs[0][3]:.3f}"
+    return better == len(pairs) if pairs else None, text
 
 
 def rows_of(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:

@@ -9,7 +9,17 @@ import numpy as np
 
 from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, RecordedStreams, Stream
 from amiwarp.studies.evaluate.measures.density import density_variance
-from amiwarp.studies.evaluate.results import CellResult, Chart, ChartKind, Claim, Settings, Table, grouped, rows_of
+from amiwarp.studies.evaluate.results import (
+    CellResult,
+    Chart,
+    ChartKind,
+    Claim,
+    Settings,
+    Table,
+    compared,
+    grouped,
+    rows_of,
+)
 
 if TYPE_CHECKING:
     from amiwarp.events.events import Events
@@ -125,10 +135,6 @@ def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: st
     ):
         if mean is not None:
             means.setdefault((scene, camera, h, window), {})[str(stream)] = (float(mean), float(std or 0.0))
-    pairs = [(*m[Stream.CALIBRATED], *m[other]) for m in means.values() if {Stream.CALIBRATED, other} <= m.keys()]
-    better = sum(theirs - ours > max(std, their_std) for ours, std, theirs, their_std in pairs)
-    ours = f"lower in {better} of {len(pairs)} cases" if pairs else "no result"
-    if len(pairs) == 1:
-        ours = f"AMI-EV {pairs[0][0]:.3f} ± {pairs[0][1]:.3f}, {other} {pairs[0][2]:.3f} ± {pairs[0][3]:.3f}"
+    holds, ours = compared(means, other, "lower", larger=False)
     rule = f"the mean variance of '{Stream.CALIBRATED}' is below that of '{other}' by more than either spread"
-    return Claim.judge(text, paper, ours, better == len(pairs) if pairs else None, rule)
+    return Claim.judge(text, paper, ours, holds, rule)
