@@ -42,12 +42,13 @@ class DeviceWorld:
         if world.sky.panorama is not None:
             p.panorama = texels.add(world.sky.panorama, 1)
             p.panorama_height, p.panorama_width = world.sky.panorama.shape
-        self._upload_faces(bodies, surfaces)
+        resting = [_resting(body) for body in still]
+        self._upload_faces(bodies, [*resting, *(np.asarray(body.mesh.vertices) for body in self.movers)], surfaces)
         p.surfaces = wp.array(surfaces, dtype=kernels.Surface, device=self.device)
         p.texels = wp.array(texels.joined(), dtype=float, device=self.device)
         self._upload_light()
         self._meshes: list[Any] = []
-        p.still = self._mesh([_resting(body) for body in still], still).id if still else wp.uint64(0)
+        p.still = self._mesh(resting, still).id if still else wp.uint64(0)
         self._upload_movers(sum(len(np.asarray(body.mesh.faces)) for body in still))
         self.set_instants(np.zeros(1))
 
@@ -61,13 +62,17 @@ class DeviceWorld:
         self._meshes.append(mesh)
         return mesh
 
-    def _upload_faces(self, bodies: Sequence[Body], surfaces: Sequence[Any]) -> None:
-        """Upload the body number, corners, texture coordinates and reflectance factors of each face."""
+    def _upload_faces(
+        self, bodies: Sequence[Body], vertices: Sequence[NDArray[np.float64]], surfaces: Sequence[Any]
+    ) -> None:
+        """Upload the body number, corners, texture coordinates and reflectance factors of each face.
+
+        ``vertices``: those of each body in the frame of its mesh on the device [m].
+        """
         number, corners, uv, shade, density = [], [], [], [], []
         for k, body in enumerate(bodies):
             mesh, faces = body.mesh, np.asarray(body.mesh.faces)
-            vertices = np.asarray(mesh.vertices) if body in self.movers else _resting(body)
-            corners.append(vertices[faces.ravel()])
+            corners.append(vertices[k][faces.ravel()])
             number.append(np.full(len(faces), k, np.int32))
             place = np.zeros((len(np.asarray(mesh.vertices)), 2)) if mesh.uv is None else np.asarray(mesh.uv)
             light = np.ones(len(place)) if mesh.light is None else np.asarray(mesh.light)
