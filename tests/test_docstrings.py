@@ -28,13 +28,20 @@ CHECKS = {
 """The checks of numpydoc that are applied here."""
 
 
+def _inherits(public: type, key: str) -> bool:
+    """Whether a member has no docstring but that of a public base class, where it is checked."""
+    bases = [base for base in public.__mro__[1:] if base.__name__ in amiwarp.__all__ and key in vars(base)]
+    return vars(public)[key].__doc__ is None and bool(bases)
+
+
 def _members(name: str) -> Iterator[str]:
-    """A public name, and the public methods and properties that its class defines itself."""
+    """A public name, and the public methods and properties that its class documents itself."""
     yield name
     public = getattr(amiwarp, name)
     if isinstance(public, type) and public.__module__.startswith("amiwarp"):
         for key, value in vars(public).items():
-            if key[0] != "_" and isinstance(value, FunctionType | property | classmethod | staticmethod):
+            kinds = FunctionType | property | classmethod | staticmethod
+            if key[0] != "_" and isinstance(value, kinds) and not _inherits(public, key):
                 yield f"{name}.{key}"
 
 

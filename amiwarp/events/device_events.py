@@ -129,16 +129,9 @@ class DeviceEvents:
             raise AmiwarpError("there are no blocks of events to join; give at least one")
         if len(blocks) == 1:
             return blocks[0]
-        device = blocks[0].device
-        types, n = [getattr(blocks[0], name).dtype for name in NAMES], sum(map(len, blocks))
-        joined = [wp.empty(n, dtype=dtype, device=device) for dtype in types]
-        at = 0
-        for block in blocks:
-            for name, out in zip(NAMES, joined, strict=True) if len(block) else ():
-                wp.copy(out, getattr(block, name), dest_offset=at)
-            at += len(block)
-        wait(device)
-        return cls(*joined)
+        events = cls(*(join([getattr(block, name) for block in blocks]) for name in NAMES))
+        wait(events.device)
+        return events
 
     @property
     def device(self) -> Any:
@@ -178,9 +171,24 @@ class DeviceEvents:
         start, stop, step = instance(which, slice, "index of events on a device").indices(len(self))
         if step != 1:
             raise AmiwarpError(f"events are sliced in steps of {step}; on a device, slice without steps")
-        if start >= stop:
-            return DeviceEvents(*(wp.empty(0, dtype=getattr(self, n).dtype, device=self.device) for n in NAMES))
-        return DeviceEvents(*(getattr(self, name)[start:stop] for name in NAMES))
+        return DeviceEvents(*(part(getattr(self, name), start, stop) for name in NAMES))
+
+
+def part(values: wp.array, start: int, stop: int) -> wp.array:
+    """Return the values with ``0 <= start <= index < stop``: a view, unless it is empty, which Warp does not allow."""
+    return values[start:stop] if start < stop else wp.empty(0, dtype=values.dtype, device=values.device)
+
+
+def join(arrays: Sequence[wp.array]) -> wp.array:
+    """Return one array of the values of several arrays on one device, of which there is at least one."""
+    if len(arrays) == 1:
+        return arrays[0]
+    out = wp.empty(sum(map(len, arrays)), dtype=arrays[0].dtype, device=arrays[0].device)
+    at = 0
+    for values in filter(len, arrays):
+        wp.copy(out, values, dest_offset=at)
+        at += len(values)
+    return out
 
 
 def limits(events: DeviceEvents) -> list[int]:

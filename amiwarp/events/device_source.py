@@ -6,18 +6,22 @@ import bisect
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
 from amiwarp.events.checks import check_events
-from amiwarp.events.device_events import DeviceEvents, limits
+from amiwarp.events.device_events import DeviceEvents, device_for, limits, part
 from amiwarp.events.events import DEFAULT_BLOCK, Events, EventSource, regroup
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import instance, whole
 
 
-class DeviceMemoryEvents:
+class DeviceMemoryEvents(EventSource):
     """Source of events that are held on a device, for recordings.
 
     Every function that takes a recording takes one with this source. :func:`reconstruct` reads the events on the
-    device. All others read copies in NumPy arrays.
+    device. All others read copies in NumPy arrays, which the methods of :class:`EventSource` return here.
 
     Parameters
     ----------
@@ -54,17 +58,14 @@ class DeviceMemoryEvents:
 
     @property
     def t_first(self) -> int:
-        """Time of the first event [us]."""
         return self._events.t_first
 
     @property
     def t_last(self) -> int:
-        """Time of the last event [us]."""
         return self._events.t_last
 
     @property
     def size(self) -> tuple[int, int]:
-        """Sensor size (width, height) [px]."""
         return self._size
 
     @property
@@ -73,7 +74,10 @@ class DeviceMemoryEvents:
         return self._events.device
 
     def slice(self, start: int, stop: int) -> Events:
-        """Return the events with ``start <= index < stop`` in NumPy arrays.
+        return self.slice_on_device(start, stop).to_host()
+
+    def slice_on_device(self, start: int, stop: int) -> DeviceEvents:
+        """Return the events with ``start <= index < stop``, as views on the device.
 
         Parameters
         ----------
@@ -82,40 +86,16 @@ class DeviceMemoryEvents:
 
         Returns
         -------
-        Events
+        DeviceEvents
             The events.
         """
-        return self._events[max(start, 0) : max(stop, 0)].to_host()
+        return self._events[max(start, 0) : max(stop, 0)]
 
     def find(self, t: int) -> int:
-        """Return the index of the first event at or after a time.
-
-        Parameters
-        ----------
-        t : int
-            Time [us].
-
-        Returns
-        -------
-        int
-            The index, or the number of events if none is that late.
-        """
         times = self._events.t
         return bisect.bisect_left(range(len(self)), t, key=lambda index: int(times[index : index + 1].numpy()[0]))
 
     def between(self, t_start: int, t_end: int) -> Events:
-        """Return the events with ``t_start <= t < t_end`` in NumPy arrays.
-
-        Parameters
-        ----------
-        t_start, t_end : int
-            Start and end of the window [us].
-
-        Returns
-        -------
-        Events
-            The events.
-        """
         return self.between_on_device(t_start, t_end).to_host()
 
     def between_on_device(self, t_start: int, t_end: int) -> DeviceEvents:
@@ -134,22 +114,26 @@ class DeviceMemoryEvents:
         return self._events[self.find(t_start) : self.find(t_end)]
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """Return all events in order, in NumPy arrays, in blocks of equal count or equal duration.
-
-        Parameters
-        ----------
-        count : int, optional
-            Events per block; ``1 << 20`` by default.
-        duration_us : int, optional
-            Length of a block's window [us]. Windows start at ``t_first + k * duration_us``. Empty windows are left out.
-
-        Returns
-        -------
-        iterator of Events
-            The blocks.
-        """
         chunks = (self.slice(start, start + DEFAULT_BLOCK) for start in range(0, len(self), DEFAULT_BLOCK))
         return regroup(chunks, count=count, duration_us=duration_us)
+
+
+class DeviceValues:
+    """Array on a device with one row per event, which slices copy to NumPy arrays (:class:`EventValues`)."""
+
+    def __init__(self, values: wp.array) -> None:
+        self._values = values
+
+    def __getitem__(self, which: slice, /) -> NDArray[Any]:
+        start, stop, _ = which.indices(len(self._values))
+        return np.asarray(part(self._values, start, stop).numpy())
+
+
+def device_of(source: EventSource, device: Any) -> Any:
+    """Return the device to compute on, as :func:`device_for` does for events."""
+    if isinstance(source, DeviceMemoryEvents):
+        return device_for(source.slice_on_device(0, len(source)), device)
+    return wp.get_device("cpu" if device is None else device)
 
 
 def read_between(source: EventSource, t_start: int, t_end: int) -> Events | DeviceEvents:

@@ -214,8 +214,8 @@ class EventSource(Protocol):
         """
 
 
-class MemoryEvents:
-    """Source of events that are held in memory.
+class MemoryEvents(EventSource):
+    """Source of events that are held in memory. Its methods return views where they can.
 
     Parameters
     ----------
@@ -251,80 +251,27 @@ class MemoryEvents:
 
     @property
     def t_first(self) -> int:
-        """Time of the first event [us]."""
         return int(self._nonempty().t[0])
 
     @property
     def t_last(self) -> int:
-        """Time of the last event [us]."""
         return int(self._nonempty().t[-1])
 
     @property
     def size(self) -> tuple[int, int]:
-        """Size of the sensor (width, height) [px]."""
         return self._size
 
     def slice(self, start: int, stop: int) -> Events:
-        """Return the events with ``start <= index < stop``, as views.
-
-        Parameters
-        ----------
-        start, stop : int
-            First index, and index after the last. Both are clipped to the existing events.
-
-        Returns
-        -------
-        Events
-            The events.
-        """
         return self._events[max(start, 0) : max(stop, 0)]
 
     def find(self, t: int) -> int:
-        """Return the index of the first event at or after a time.
-
-        Parameters
-        ----------
-        t : int
-            Time [us].
-
-        Returns
-        -------
-        int
-            The index, or the number of events if none is that late.
-        """
         return int(np.searchsorted(self._events.t, t))
 
     def between(self, t_start: int, t_end: int) -> Events:
-        """Return the events with ``t_start <= t < t_end``, as views.
-
-        Parameters
-        ----------
-        t_start, t_end : int
-            Start and end of the window [us].
-
-        Returns
-        -------
-        Events
-            The events.
-        """
         start, stop = np.searchsorted(self._events.t, [t_start, t_end])
         return self._events[start:stop]
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """Return all events in order, in blocks of equal count or equal duration.
-
-        Parameters
-        ----------
-        count : int, optional
-            Events per block; ``1 << 20`` by default.
-        duration_us : int, optional
-            Length of a block's window [us]. Windows start at ``t_first + k * duration_us``. Empty windows are left out.
-
-        Returns
-        -------
-        iterator of Events
-            The blocks.
-        """
         return regroup([self._events], count=count, duration_us=duration_us)
 
     def _nonempty(self) -> Events:
