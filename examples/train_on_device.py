@@ -23,12 +23,12 @@ def sample(label: int, seed: int) -> torch.Tensor:
     angle = (label + rng.uniform(-0.2, 0.2)) * math.pi / ORIENTATIONS
     y, x = np.mgrid[:64, :64]
     wave = np.sin((x * math.cos(angle) + y * math.sin(angle)) * rng.uniform(0.3, 0.5) + rng.uniform(0, 2 * math.pi))
-    simulation = amiwarp.Simulation(
-        scene=amiwarp.Scene.from_picture((0.5 + rng.uniform(0.2, 0.45) * wave).astype(np.float32)),
-        camera=CAMERA, prism=PRISM, duration_s=0.02, motion=amiwarp.PrismMotion(3000.0), seed=seed, device=DEVICE,
-    )  # fmt: skip
-    events = amiwarp.DeviceEvents.concatenate([events for events, _ in simulation.device_blocks()])
-    image = amiwarp.iwe(events, SIDE, SIDE, model=MODEL, encoder=simulation.encoder(), per_polarity=True)
+    picture = (0.5 + rng.uniform(0.2, 0.45) * wave).astype(np.float32)
+    recording = amiwarp.simulate(
+        picture, CAMERA, PRISM, duration_s=0.02, motion=3000.0, seed=seed, device=DEVICE, on_device=True
+    )
+    events = recording.events.slice_on_device(0, len(recording.events))
+    image = amiwarp.iwe(events, SIDE, SIDE, model=MODEL, encoder=recording.encoder, per_polarity=True)
     return torch.from_dlpack(image)
 
 

@@ -392,20 +392,29 @@ def test_no_events_on_a_device(device: str) -> None:
     assert len(DeviceEvents.concatenate([none, none])) == 0
 
 
+def reader(library: str) -> Any:
+    """Return the function with which a library reads arrays through DLPack."""
+    return pytest.importorskip({"jax": "jax.dlpack"}.get(library, library)).from_dlpack
+
+
+def assert_shared(library: str, result: wp.array) -> None:
+    """Check that a library reads a result through DLPack without a copy, with the same values."""
+    shared = reader(library)(result)
+    assert pointer(shared) == result.ptr
+    assert tuple(shared.shape) == result.shape
+    on_host = shared.cpu().numpy() if library == "torch" else shared.get() if library == "cupy" else shared
+    np.testing.assert_array_equal(np.asarray(on_host), result.numpy())
+
+
 @pytest.mark.parametrize(("library", "device"), [case for case in SHARED if case[0] not in ("numpy", "warp")])
 def test_other_libraries_share_the_memory_of_results(library: str, device: str) -> None:
     host = random_events()
     events = DeviceEvents.from_arrays(**as_columns(library, device, host))
     image = amiwarp.iwe(events, WIDTH, HEIGHT, model=MODEL, encoder=ENCODER)
     xy = amiwarp.compensate_events(events, MODEL, ENCODER)
-    module = {"torch": "torch", "cupy": "cupy", "jax": "jax.dlpack"}[library]
-    read = pytest.importorskip(module).from_dlpack
+    read = reader(library)
     for result in (image, xy, events.x):
-        shared = read(result)
-        assert pointer(shared) == result.ptr
-        assert tuple(shared.shape) == result.shape
-        on_host = shared.cpu().numpy() if library == "torch" else shared.get() if library == "cupy" else shared
-        np.testing.assert_array_equal(np.asarray(on_host), result.numpy())
+        assert_shared(library, result)
     expected = amiwarp.sharpness(image.numpy(), smoothing=1.0, device=device)
     assert amiwarp.sharpness(read(image), smoothing=1.0) == expected
     assert amiwarp.sharpness(read(image).T.T, smoothing=1.0) == expected
@@ -458,15 +467,101 @@ def test_simulated_events_stay_on_the_device(simulation: Simulation, device: str
     assert sum(len(events) for events, _ in blocks) > 5000
 
 
-def test_reconstruction_reads_events_on_the_device(simulation: Simulation, device: str) -> None:
+def test_a_simulated_recording_stays_on_the_device(simulation: Simulation, device: str) -> None:
+    """Over more than one chunk of simulated time."""
+    simulation = replace(simulation, duration_s=0.6, device=device)
+    expected, found = simulation.run(), simulation.run(on_device=True)
+    n = len(expected.events)
+    assert isinstance(found.events, DeviceMemoryEvents)
+    assert (len(found.events), str(found.events.device)) == (n, device)
+    assert_equal(found.events.slice(0, n), expected.events.slice(0, n))
+    for start, stop in ((0, n), (5, 70), (n, n + 5)):
+        for values, others in zip(truth_of(found, start, stop), truth_of(expected, start, stop), strict=True):
+            np.testing.assert_array_equal(values, others, strict=True)
+    assert found.truth is not None
+    assert expected.truth is not None
+    assert found.truth.parameters == expected.truth.parameters
+    np.testing.assert_array_equal(found.encoder.angle, expected.encoder.angle)  # type: ignore[union-attr]
+
+
+def truth_of(recording: Recording, start: int, stop: int) -> tuple[Any, Any]:
+    assert recording.truth is not None
+    truth = recording.truth.of_events(start, stop)
+    return truth.points, truth.cause
+
+
+@pytest.mark.parametrize(("library", "device"), [case for case in SHARED if case[0] != "warp"])
+def test_libraries_share_the_memory_of_simulated_events_and_pictures(
+    simulation: Simulation, library: str, device: str
+) -> None:
+    foreign(library, device, np.zeros(1))  # skips without the library or the device
+    recording = replace(simulation, device=device).run(on_device=True)
+    assert isinstance(recording.events, DeviceMemoryEvents)
+    events = recording.events.slice_on_device(0, len(recording.events))
+    picture = amiwarp.reconstruct(recording, model=MODEL)
+    for result in (events.x, events.y, events.t, events.p, picture.log, picture.known, picture.intensity()):
+        assert str(result.device) == device
+        assert_shared(library, result)
+    views = recording.events.slice_on_device(0, 10), recording.events.between_on_device(-1, 2**40)
+    assert {view.t.ptr for view in views} == {events.t.ptr}
+
+
+def test_no_simulated_event_leaves_a_cuda_device(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    sizes, to_host = [0], wp.array.numpy
+    monkeypatch.setattr(wp.array, "numpy", lambda array: (sizes.append(array.size), to_host(array))[1])
+    recording = replace(simulation, device="cuda:0").run(on_device=True)
+    assert max(sizes) < 10_000 < len(recording.events)  # tables of the scene are smaller
+
+
+def test_functions_take_recordings_on_a_device(simulation: Simulation, device: str) -> None:
+    simulation = replace(simulation, device=device)
+    expected, found = simulation.run(), simulation.run(on_device=True)
+    assert isinstance(found.events, DeviceMemoryEvents)
+    n = len(found.events)
+    host, events = expected.events.slice(0, n), found.events.slice_on_device(0, n)
+    given = {"model": MODEL, "encoder": found.encoder}
+    image = amiwarp.iwe(events, WIDTH, HEIGHT, **given)
+    np.testing.assert_array_equal(image.numpy(), amiwarp.iwe(host, WIDTH, HEIGHT, device=device, **given))
+    assert found.encoder is not None
+    compensator = Compensator(MODEL, streamed(found.encoder), device=device)
+    compensator.put(events, 0)
+    [packet] = compensator.take_on_device(2**62)
+    xy = amiwarp.compensate_events(host, MODEL, found.encoder, device=device)
+    np.testing.assert_array_equal(np.stack([packet.events.x.numpy(), packet.events.y.numpy()], axis=1), xy)
+
+
+def test_calibration_takes_a_recording_on_a_device(recording: Recording, device: str) -> None:
+    host = recording.events.slice(0, len(recording.events))
+    moved = replace(recording, events=DeviceMemoryEvents(on_device(host, device), *recording.events.size))
+    found, expected = (amiwarp.calibrate(r, model="circle", stages=("sharpness",)) for r in (moved, recording))
+    assert found.parameters == expected.parameters
+
+
+@pytest.mark.parametrize("fill", ["smooth", "none"])
+def test_pictures_are_on_the_device_of_the_events(simulation: Simulation, fill: Any, device: str) -> None:
     recording = simulation.run()
     host = recording.events.slice(0, len(recording.events))
-    source = DeviceMemoryEvents(on_device(host, device), WIDTH, HEIGHT)
-    found = amiwarp.reconstruct(replace(recording, events=source), model=MODEL)
-    expected = amiwarp.reconstruct(recording, model=MODEL, device=device)
-    np.testing.assert_array_equal(found.known, expected.known)
-    # additions on a GPU have no fixed order
-    np.testing.assert_array_equal(found.log, expected.log)
+    moved = replace(recording, events=DeviceMemoryEvents(on_device(host, device), WIDTH, HEIGHT))
+    work = amiwarp.Reconstruction(moved, model=MODEL, fill=fill)
+    reference = amiwarp.Reconstruction(recording, model=MODEL, fill=fill, device=device)
+    windows = work.windows(0, 60_000, step_us=20_000), reference.windows(0, 60_000, step_us=20_000)
+    for found, expected in zip(*windows, strict=True):  # each starts from the one before
+        assert {str(found.log.device), str(found.known.device)} == {device}
+        np.testing.assert_array_equal(found.to_host().log, expected.log, strict=True)
+        np.testing.assert_array_equal(found.to_host().known, expected.known, strict=True)
+        np.testing.assert_allclose(found.intensity(0.2).numpy(), expected.intensity(0.2), rtol=1e-5)
+        assert expected.to_host() is expected
+    assert isinstance(expected.log, np.ndarray)
+
+
+def test_reconstruction_on_another_device_than_the_events_is_refused_on_cuda(simulation: Simulation) -> None:
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    recording = replace(simulation, device="cuda:0").run(on_device=True)
+    with pytest.raises(AmiwarpError, match="events are on cuda:0, device is cpu; leave device out"):
+        amiwarp.reconstruct(recording, model=MODEL, device="cpu")
 
 
 def test_a_source_on_a_device_equals_a_source_in_memory(device: str) -> None:

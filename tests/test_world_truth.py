@@ -1,5 +1,6 @@
 """Ground truth of simulated worlds: in memory, in the native file, in other data sets' files, on the command line."""
 
+import dataclasses
 import itertools
 import json
 import re
@@ -515,6 +516,14 @@ def test_no_prism_and_the_same_seed(named: Path) -> None:
     camera, prism = amiwarp.Camera.from_fov(*SIZE, np.radians(60.0)), amiwarp.Prism(np.radians(1.0))
     same = amiwarp.Simulation(scene, camera, prism, DURATION_S, seed=5).without_prism().run()
     np.testing.assert_array_equal(back.events.slice(0, 10**6).t, same.events.slice(0, 10**6).t)
+
+
+def test_truth_of_events_that_stay_on_the_device(device: str) -> None:
+    at = dataclasses.replace(simulation(), device=device)
+    expected, found = at.run(truth_hz=100.0), at.run(truth_hz=100.0, on_device=True)
+    assert isinstance(found.events, amiwarp.DeviceMemoryEvents)
+    assert len(found.events) == len(expected.events)
+    same_truth(found, expected)
 
 
 def test_how_pixels_see_the_world(named: Path) -> None:

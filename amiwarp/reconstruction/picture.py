@@ -18,11 +18,11 @@ from amiwarp.brightness.event_pairs import EventTable, PairSet
 from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_source import DeviceMemoryEvents, read_between
+from amiwarp.events.device_source import DeviceMemoryEvents, device_of, read_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.known import dilated, known_nodes
-from amiwarp.reconstruction.result import Picture
+from amiwarp.reconstruction.result import Picture, upload_picture
 from amiwarp.reconstruction.window import busiest_square, map_tile, off_excess_by_counts
 from amiwarp.validation import choice
 
@@ -82,7 +82,8 @@ class Reconstruction:
     Raises
     ------
     AmiwarpError
-        If the recording has no events, the sensor sizes differ, or there is no model or no encoder.
+        If the recording has no events, the sensor sizes differ, there is no model or no encoder, or the events are on
+        another device than ``device``.
 
     Examples
     --------
@@ -119,9 +120,7 @@ class Reconstruction:
         self.recording, self.model, self.encoder = recording, model, encoder
         if camera_rotation is None and calibration is not None:
             camera_rotation = calibration.camera_rotation
-        if device is None:
-            device = recording.events.device if isinstance(recording.events, DeviceMemoryEvents) else "cpu"
-        self.camera_rotation, self.device = camera_rotation or CameraRotation(), device
+        self.camera_rotation, self.device = camera_rotation or CameraRotation(), device_of(recording.events, device)
         self.fill = choice(Fill, fill, "fill")
         self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
         self._smoothness: float | None = None
@@ -181,7 +180,7 @@ class Reconstruction:
         Returns
         -------
         Picture
-            The picture.
+            The picture. It is on the device if the events are.
 
         Raises
         ------
@@ -210,11 +209,12 @@ class Reconstruction:
         if self.fill is Fill.NONE:
             log = np.where(known, log, np.float32(np.nan))
         hot = int((table.tile_of.numpy() < 0).sum())
-        return Picture(
+        found = Picture(
             log=log.astype(np.float32), known=known, start_us=start_us, length_us=length_us, pairs=pair_count,
             off_excess=off, smoothness=self._smoothness, residual=residual, hot=hot,
             seconds=time.perf_counter() - began, unknowns=unknowns,
         )  # fmt: skip
+        return upload_picture(found, self.device) if isinstance(recording.events, DeviceMemoryEvents) else found
 
     def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
         """Yield pictures of sliding windows, each started from the one before, up to the last complete window.
@@ -320,7 +320,7 @@ def _solve(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tupl
     """
     nodes = solver.tiles.nodes
     if last is not None:
-        unknowns = last.unknowns.copy()
+        unknowns = last.to_host().unknowns.copy()
         unknowns[nodes:] = solver.unknowns[nodes:]
         solver.unknowns = unknowns
     for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
@@ -376,12 +376,13 @@ def reconstruct(
     Returns
     -------
     Picture
-        The picture.
+        The picture. It is on the device if the events are, in :class:`DeviceMemoryEvents`.
 
     Raises
     ------
     AmiwarpError
-        If the recording has no events in the window, the sensor sizes differ, or there is no model or no encoder.
+        If the recording has no events in the window, the sensor sizes differ, there is no model or no encoder, or the
+        events are on another device than ``device``.
 
     Examples
     --------

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+import warp as wp
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from amiwarp.events.device_events import wait
+from amiwarp.kernels.picture import exponentiate
+
+ARRAYS = ("log", "known", "unknowns")
+"""Names of the arrays of a picture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """Picture of the scene over a time window, without the prism.
+
+    Its arrays are NumPy arrays, or Warp arrays on a device if the events are there (:class:`DeviceMemoryEvents`).
+    PyTorch, CuPy and JAX read Warp arrays through DLPack without a copy.
 
     Examples
     --------
@@ -25,13 +32,13 @@ class Picture:
     array([[1.  , 2.72]], dtype=float32)
     """
 
-    log: NDArray[np.float32]
-    """Log intensity in units of the ON threshold, median 0, shape (height, width); NaN where it is not filled.
+    log: Any
+    """Log intensity in units of the ON threshold, median 0, float32, shape (height, width); NaN where it is not filled.
 
     Events determine it up to one constant per connected region of :attr:`known`; the fill joins the regions.
     """
-    known: NDArray[np.bool_]
-    """Whether events determine the pixel, shape (height, width)."""
+    known: Any
+    """Whether events determine the pixel, bool, shape (height, width)."""
     start_us: int
     """Start of the time window [us]."""
     length_us: int
@@ -48,11 +55,23 @@ class Picture:
     """Number of hot pixels that were excluded."""
     seconds: float
     """Computing time of the picture [s]."""
-    unknowns: NDArray[np.float32] = field(repr=False)
-    """Solution of the whole map with its margin, flattened, followed by the sensor's unknowns, shape (n,). The next
-    window can start from it."""
+    unknowns: Any = field(repr=False)
+    """Solution of the whole map with its margin, flattened, followed by the sensor's unknowns, float32, shape (n,). The
+    next window can start from it."""
 
-    def intensity(self, contrast: float = 0.25) -> NDArray[np.float32]:
+    def to_host(self) -> Picture:
+        """Return the picture in NumPy arrays: copies from a GPU, views on a CPU.
+
+        Returns
+        -------
+        Picture
+            The picture; this one if its arrays are NumPy arrays.
+        """
+        if not isinstance(self.log, wp.array):
+            return self
+        return replace(self, **{name: getattr(self, name).numpy() for name in ARRAYS})
+
+    def intensity(self, contrast: float = 0.25) -> Any:
         """Return relative linear intensity, 1 at the median.
 
         Parameters
@@ -62,7 +81,20 @@ class Picture:
 
         Returns
         -------
-        ndarray
-            Intensity, float32, shape ``(height, width)``; NaN where the picture is not filled.
+        ndarray or warp.array
+            Intensity, float32, shape ``(height, width)``; NaN where the picture is not filled. It is where the picture
+            is.
         """
+        if isinstance(self.log, wp.array):
+            out = wp.empty_like(self.log)
+            wp.launch(exponentiate, out.shape, inputs=[self.log, contrast], outputs=[out], device=out.device)
+            wait(out.device)
+            return out
         return np.exp(np.float32(contrast) * self.log)
+
+
+def upload_picture(picture: Picture, device: Any) -> Picture:
+    """Return the picture in Warp arrays on a device."""
+    found = replace(picture, **{name: wp.array(getattr(picture, name), device=device) for name in ARRAYS})
+    wait(found.log.device)
+    return found

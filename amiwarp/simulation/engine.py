@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.events.device_events import DeviceEvents, wait
+from amiwarp.events.device_events import NAMES, DeviceEvents, wait
 from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
 from amiwarp.kernels import event_generation as kernels
@@ -56,21 +56,17 @@ class DeviceBlock:
 
     arrays: Any
     """Columns of the events: the kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
-    count: int
-    """Number of events."""
     look: Callable[[], Any] | None = None
     """Function that finds the surfaces that the events saw, valid until the next chunk; None for a picture scene."""
 
     def events(self) -> Events:
         """Return the events in host memory."""
-        if not self.count:
-            return Events.empty()
         b = self.arrays
         return Events(b.x.numpy(), b.y.numpy(), b.t.numpy(), b.p.numpy())
 
     def points(self) -> NDArray[np.float32]:
         """Return the scene point of each event: its pixel without the prism [px], shape (n, 2)."""
-        return self.arrays.points.numpy() if self.count else np.empty((0, 2), np.float32)
+        return np.asarray(self.arrays.points.numpy())
 
     def on_device(self) -> tuple[DeviceEvents, wp.array]:
         """Return the finished events, and their scene points without the prism, without a copy."""
@@ -83,14 +79,18 @@ class DeviceBlock:
 
         In a world, call this method before the engine simulates the next chunk.
         """
-        cause = self.arrays.cause.numpy() if self.count else np.empty(0, np.uint8)
-        if self.look is None:
-            return EventTruth(self.points(), cause)
-        if not self.count:
-            surfaces = (np.empty(0, np.uint16), np.empty(0, np.float32), np.empty((0, 3), np.float32))
-            return EventTruth(self.points(), cause, *surfaces)
-        seen = self.look()
-        return EventTruth(self.points(), cause, seen.instance.numpy(), seen.depth.numpy(), seen.place.numpy())
+        return EventTruth(**{name: a.numpy() for name, a in self.columns().items() if name not in NAMES})
+
+    def columns(self) -> dict[str, wp.array]:
+        """Return events and ground truth on the device, by the names of :class:`Events` and :class:`EventTruth`.
+
+        In a world, call this method before the engine simulates the next chunk.
+        """
+        found = {name: getattr(self.arrays, name) for name in (*NAMES, "points", "cause")}
+        if self.look is not None:
+            seen = self.look()
+            found |= {name: getattr(seen, name) for name in ("instance", "depth", "place")}
+        return found
 
 
 class Engine:
@@ -286,11 +286,11 @@ class Engine:
         if stamps is not None:
             block.t = stamps
         if self._sight is None:
-            return DeviceBlock(block, n)
+            return DeviceBlock(block)
         faces = (
             self._maps.faces if isinstance(self._maps, WorldMapRing) else wp.empty(0, dtype=int, device=self._device)
         )
-        return DeviceBlock(block, n, partial(self._sight.look, self._view, steps, block, n, faces))
+        return DeviceBlock(block, partial(self._sight.look, self._view, steps, block, n, faces))
 
 
 def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:

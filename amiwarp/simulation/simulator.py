@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.events.truth import EventTruth
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
+from amiwarp.simulation.collected_events import CollectedEvents
 from amiwarp.simulation.engine import DeviceBlock, Engine
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.parameters import check_values, true_parameters
@@ -212,6 +213,7 @@ class Simulation:
         *,
         truth_hz: float | None = None,
         truth_times_us: ArrayLike | None = None,
+        on_device: bool = False,
         progress: Progress | None = None,
     ) -> Recording:
         """Simulate the whole recording in memory.
@@ -223,6 +225,8 @@ class Simulation:
             have them. By default there are none.
         truth_times_us : array_like, optional
             The instants themselves instead of a rate [us], shape (k,), rising.
+        on_device : bool, optional
+            Keep the events and their ground truth on :attr:`device`, as :func:`simulate` does.
         progress : Progress, optional
             Called with the finished share.
 
@@ -232,19 +236,14 @@ class Simulation:
             The recording, with ground truth.
         """
         recorded = RecordedTruth(self, chosen_instants(self.duration_us, truth_hz, truth_times_us))
-        blocks: list[Events] = []
+        collected = CollectedEvents(on_device=on_device)
         for block, now_us in self._run_engine(None, progress):
-            blocks.append(block.events())
-            recorded.keep(block.truth(), now_us)
-        return Recording(
-            MemoryEvents(Events.concatenate(blocks), self.camera.width, self.camera.height),
-            self.camera,
-            self.encoder(),
-            self._stored_prism,
-            recorded.kept(self.truth_parameters()),
-            self.metadata(),
-            "simulation",
-        )
+            collected.add(block)
+            recorded.keep(now_us)
+        events, of_events = collected.take(self.camera.width, self.camera.height)
+        truth = recorded.kept(self.truth_parameters(), of_events)
+        camera, encoder, prism = self.camera, self.encoder(), self._stored_prism
+        return Recording(events, camera, encoder, prism, truth, self.metadata(), "simulation")
 
     @property
     def _stored_prism(self) -> Prism | None:
@@ -319,13 +318,14 @@ def simulate(
     nominal_prism: Prism | None = None,
     seed: int = 0,
     device: str = "cpu",
+    on_device: bool = False,
     truth_hz: float | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Simulate a recording.
 
-    The events are in the host's memory. For recordings larger than memory, use :meth:`Simulation.write` or
-    :meth:`Simulation.blocks`; for events that stay on ``device``, use :meth:`Simulation.device_blocks`.
+    For recordings larger than memory, use :meth:`Simulation.write`, :meth:`Simulation.blocks` or
+    :meth:`Simulation.device_blocks`.
 
     Parameters
     ----------
@@ -351,6 +351,9 @@ def simulate(
         Seed of all random numbers.
     device : str, optional
         Device to compute on.
+    on_device : bool, optional
+        Keep the events and their ground truth on ``device``: the recording has :class:`DeviceMemoryEvents`. By default,
+        they are copied to the host's memory.
     truth_hz : float, optional
         Rate of the instants whose depth, normals, instances, flow and luminance are recorded [1/s], in a world.
     progress : Progress, optional
@@ -387,4 +390,4 @@ def simulate(
         nominal_prism=nominal_prism,
         seed=seed,
         device=device,
-    ).run(truth_hz=truth_hz, progress=progress)
+    ).run(truth_hz=truth_hz, on_device=on_device, progress=progress)

@@ -109,7 +109,7 @@ class ReconstructedPictures:
             return nothing
         self._work.camera_rotation = window.rotation
         try:
-            picture = self._work.window(window.start_us, window.length_us)
+            picture = self._work.window(window.start_us, window.length_us).to_host()
         except AmiwarpError:  # no pixel fires twice
             return nothing
         log = np.float32(CONTRAST) * picture.log + np.float32(np.log(MEDIAN_LIGHT))

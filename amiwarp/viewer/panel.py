@@ -383,7 +383,7 @@ class Panel:
             s.update({"picture": "", "picture_note": str(error)})
             return
         left, top, right, bottom = shown.region
-        s.picture = jpeg(tones(picture, Tone.MAPPED)[top:bottom, left:right])
+        s.picture = jpeg(tones(picture.to_host(), Tone.MAPPED)[top:bottom, left:right])
         s.picture_note = f"{picture.pairs:,} pairs, residual {picture.residual:.2f}"
 
     def _pick(self, x: float, y: float) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,7 @@ from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.validation import array, real
 
 if TYPE_CHECKING:
+    from amiwarp.events.truth import EventValues
     from amiwarp.simulation.simulator import Simulation
 
 POSE_INTERVAL_US = 1000
@@ -64,7 +66,6 @@ class RecordedTruth:
         self._instants = instants
         self._next_instant = self._next_pose = 0
         self._duration_us = simulation.duration_us
-        self._events: list[EventTruth] = []
         self._frames: list[FrameTruth] = []
         self._poses: list[Poses] = []
         self._masks: list[tuple[int, NDArray[np.bool_]]] = []
@@ -103,23 +104,26 @@ class RecordedTruth:
         self._next_pose += len(t) * POSE_INTERVAL_US
         return poses_at(self._scene, t)
 
-    def keep(self, truth: EventTruth, t_us: int) -> None:
-        """Keep in memory the ground truth of a block of events, and the instants and poses before ``t_us`` [us]."""
-        self._events.append(truth)
+    def keep(self, t_us: int) -> None:
+        """Keep in memory the instants and poses before ``t_us`` [us]."""
         self._frames.extend(self.frames_before(t_us))
         self._masks.extend(self.known.take())
         poses = self.poses_before(t_us)
         if poses is not None:
             self._poses.append(poses)
 
-    def kept(self, parameters: dict[str, float]) -> Truth:
-        """Return the ground truth that :meth:`keep` stored, together with the true parameters of the prism."""
-        known = EventTruth.concatenate(self._events)
+    def kept(self, parameters: dict[str, float], of_events: Mapping[str, EventValues]) -> Truth:
+        """Return the ground truth that :meth:`keep` stored, with the true parameters, and the truth of the events.
+
+        ``of_events``: ground truth of all events by the names of :class:`EventTruth`.
+        """
         frames = MemoryFrames(self._frames) if self._frames else None
         poses = Poses.concatenate(self._poses) if self._poses else None
         masks = MemoryMasks(*zip(*self._masks, strict=True)) if self._masks else None
-        columns = known.points, known.cause, known.instance, known.depth, known.place
-        return Truth(parameters, *columns, self.labels, frames, poses, masks)
+        points, causes, instances, depths, places = (of_events.get(part.name) for part in fields(EventTruth))
+        return Truth(
+            parameters, points, causes, instances, depths, places, self.labels, frames, poses, masks
+        )  # fmt: skip
 
 
 def poses_at(scene: WorldScene, t_us: NDArray[np.int64]) -> Poses:
