@@ -52,7 +52,7 @@ def time_run(simulation: Simulation, to_host: bool) -> tuple[float, int, float]:
     ready = time.perf_counter()
     events = 0
     for block in engine.run():
-        events += len(block.events()) if to_host else block.count
+        events += len(block.events()) if to_host else len(block.arrays.t)
     wp.synchronize_device(simulation.device)
     return time.perf_counter() - ready, events, ready - start
 

@@ -69,7 +69,7 @@ def timed(scene: Any, seconds: float, device: str, errors: list[np.ndarray] | No
     wall, processor, count = 0.0, 0.0, 0
     began, began_processor = time.perf_counter(), time.process_time()
     for block in engine.run():
-        count += block.count
+        count += len(block.arrays.t)
         truth = None if errors is None else block.truth()
         wp.synchronize_device(device)
         wall, processor = wall + time.perf_counter() - began, processor + time.process_time() - began_processor

@@ -8,6 +8,7 @@ FAR = wp.constant(1.0e6)  # distance of the sky [m]
 LIFT = wp.constant(1.0e-4)  # height above a surface at which shadow rays start, per (distance to the camera + 0.1 m)
 EDGE = wp.constant(1.0e-5)  # barycentric distance outside of a face at which a ray still counts as a hit
 PI = wp.constant(3.14159265358979)
+NAN = wp.constant(float("nan"))
 
 
 @wp.struct
@@ -312,27 +313,29 @@ def radiance(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, co
 
 
 @wp.func
-def meet_triangle(o: wp.vec3, d: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
-    """Return the distance from ``o`` along ``d`` to the triangle with the corners 0, ``u`` and ``v``.
+def meet_triangle(o: wp.vec3, d: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec3:
+    """Return where a ray from ``o`` along ``d`` hits the triangle with the corners 0, ``u`` and ``v``.
 
-    If the ray does not hit the triangle, return FAR. Uses Cramer's rule.
+    The result is the distance and the barycentric weights of the first two corners. If the ray does not hit the
+    triangle, the distance is FAR. Uses Cramer's rule.
     """
+    missed = wp.vec3(FAR, 0.0, 0.0)
     p = wp.cross(d, v)
     q = wp.cross(o, u)
     det = wp.dot(u, p)
     if det == 0.0:
-        return FAR
+        return missed
     a = wp.dot(o, p) / det
     b = wp.dot(d, q) / det
     distance = wp.dot(v, q) / det
     if a < -EDGE or b < -EDGE or a + b > 1.0 + EDGE or distance <= 0.0:
-        return FAR
-    return distance
+        return missed
+    return wp.vec3(distance, 1.0 - a - b, a)
 
 
 @wp.func
-def meet_face(world: World, instant: int, face: int, origin: wp.vec3, direction: wp.vec3) -> float:
-    """Return the distance [m] at which a ray along a unit vector hits a face; FAR if the ray misses the face."""
+def meet_face(world: World, instant: int, face: int, origin: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """Return where a ray along a unit vector hits a face; see :func:`meet_triangle`."""
     o = origin
     d = direction
     m = world.body[face] - world.first_mover

@@ -1,8 +1,7 @@
-"""Event simulation in a world by ray casting: each pixel casts rays through the prism at every time step."""
+"""Event simulation from a table of the luminance that each pixel sees at every time step."""
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, pixel_to_ray
 from amiwarp.kernels.event_generation import (
     Pixel,
     SensorParams,
@@ -15,70 +14,46 @@ from amiwarp.kernels.event_generation import (
 )
 from amiwarp.kernels.photoreceptor import advance_filtered, last_input, next_input
 from amiwarp.kernels.prism_view import Steps
-from amiwarp.kernels.refraction import ExactParams, trace
-from amiwarp.kernels.world import Pose, World, radiance
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
-class RayView:
-    """Camera and prism, and the camera's pose at every instant of a chunk of simulated time."""
-
-    camera: CameraParams  # camera model
-    prism: ExactParams  # prism model
-    poses: wp.array(dtype=Pose)  # pose of the camera at each instant
-    aperture: wp.array(dtype=wp.vec3)  # rays of a pixel: x and y relative to the pixel's centre [px], and weight
-    cone: float  # angular width of a ray [rad]
-    dark: float  # luminance that is added before the logarithm
-
-
 @wp.func
-def see_world(world: World, view: RayView, steps: Steps, k: int, i: int) -> float:
-    """Return the log intensity that pixel ``i`` sees through the prism at instant ``k``."""
-    row = i / view.camera.width
-    col = i - row * view.camera.width
-    w = steps.at[k].azimuth
-    pose = view.poses[k]
-    total = float(0.0)
-    for j in range(view.aperture.shape[0]):
-        a = view.aperture[j]
-        xy = wp.vec2(float(col) + a[0], float(row) + a[1])
-        ray = trace(view.prism, pixel_to_ray(view.camera, xy), w, view.prism.flat_to_scene)
-        total += a[2] * radiance(world, k, pose.position, pose.rotation * wp.normalize(ray), view.cone)
-    return wp.log(total + view.dark)
+def table_level(light: wp.array2d(dtype=float), sensor: SensorParams, k: int, i: int) -> float:
+    """Return the log intensity of pixel ``i`` in row ``k`` of a table of luminance."""
+    return wp.log(light[k, i] + sensor.dark)
 
 
 @wp.kernel
 def start_world_pixels(
-    world: World, view: RayView, steps: Steps, sensor: SensorParams, seed: int, start: int,
+    light: wp.array2d(dtype=float), steps: Steps, sensor: SensorParams, seed: int, start: int,
     pixels: wp.array(dtype=Pixel),
 ):  # fmt: skip
-    """Set the state of every pixel at the start of the recording."""
+    """Set the state of every pixel at the start of the recording, whose luminance is the first row of ``light``."""
     i = start + wp.tid()
-    pixels[i] = new_pixel(sensor, seed, i, see_world(world, view, steps, steps.margin, i))
+    pixels[i] = new_pixel(sensor, seed, i, table_level(light, sensor, 0, i))
 
 
 @wp.kernel
 def run_world_pixels(
-    world: World,
-    view: RayView,
+    light: wp.array2d(dtype=float),
     steps: Steps,
     sensor: SensorParams,
     pixels: wp.array(dtype=Pixel),
     start: int,
     sink: Sink,
 ):
-    """Simulate pixels that cast rays over the steps of a chunk, and write the keys of their events to ``sink``.
+    """Simulate pixels over the steps of a chunk, and write the keys of their events to ``sink``.
 
-    Counterpart of :func:`amiwarp.kernels.event_generation.run_pixels`, which uses maps.
+    Counterpart of :func:`amiwarp.kernels.event_generation.run_pixels`, which uses maps. ``light``: luminance of each
+    pixel at the end of each step; axes: step, pixel.
     """
     i = start + wp.tid()
     p = pixels[i]
     span = whole_step(steps, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
-        p = advance_pixel(p, sensor, sink, i, t0, span, see_world(world, view, steps, steps.margin + k + 1, i))
+        p = advance_pixel(p, sensor, sink, i, t0, span, table_level(light, sensor, k, i))
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
@@ -86,8 +61,7 @@ def run_world_pixels(
 
 @wp.kernel
 def run_filtered_world_pixels(
-    world: World,
-    view: RayView,
+    light: wp.array2d(dtype=float),
     steps: Steps,
     sensor: SensorParams,
     pixels: wp.array(dtype=Pixel),
@@ -95,7 +69,7 @@ def run_filtered_world_pixels(
     start: int,
     sink: Sink,
 ):
-    """Simulate pixels that cast rays and whose photoreceptors have limited bandwidth, over the steps of a chunk.
+    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_world_pixels`.
 
     ``seen``: last log intensity that entered each photoreceptor.
     """
@@ -105,17 +79,10 @@ def run_filtered_world_pixels(
     span = whole_step(steps, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
-        after = next_input(see_world(world, view, steps, steps.margin + k + 1, i), before)
+        after = next_input(table_level(light, sensor, k, i), before)
         p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
     seen[i] = before.level
-
-
-@wp.kernel
-def see_pixels(world: World, view: RayView, steps: Steps, k: int, start: int, out: wp.array(dtype=float)):
-    """Compute the luminance that each pixel sees through the prism at instant ``k``."""
-    i = start + wp.tid()
-    out[i] = wp.exp(see_world(world, view, steps, k, i)) - view.dark

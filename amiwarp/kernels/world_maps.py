@@ -37,22 +37,32 @@ class MapFrame:
 
 @wp.struct
 class FirstHits:
-    """Result of the ray through the centre of each texel."""
+    """Result of the ray through the centre of each texel or pixel."""
 
+    face: wp.array(dtype=int)  # number of the face that the ray hits; -1 for the sky
     light: wp.array(dtype=float)  # luminance that the ray sees
     white: wp.array(dtype=float)  # illumination: luminance of a white surface in the same place
     normal: wp.array(dtype=wp.vec3)  # unit normal of the surface in the world's frame; zero for the sky
 
 
 @wp.func
-def texel_of_tile(f: MapFrame, k: int) -> int:
-    """Return the index of the texel that thread ``k`` computes; -1 if the texel lies outside of the map."""
-    across = (f.width + TILE - 1) / TILE
-    tile = f.tiles[k / (TILE * TILE)]
+def place_in_tile(width: int, height: int, k: int) -> int:
+    """Return the index of the element of an image that is number ``k`` in the order of tiles; -1 outside of the image.
+
+    Tiles and the elements of a tile are counted row by row.
+    """
+    across = (width + TILE - 1) / TILE
+    tile = k / (TILE * TILE)
     inner = k % (TILE * TILE)
     row = tile / across * TILE + inner / TILE
     col = tile % across * TILE + inner % TILE
-    return wp.where(row < f.height and col < f.width, row * f.width + col, -1)
+    return wp.where(row < height and col < width, row * width + col, -1)
+
+
+@wp.func
+def texel_of_tile(f: MapFrame, k: int) -> int:
+    """Return the index of the texel that thread ``k`` computes; -1 if the texel lies outside of the map."""
+    return place_in_tile(f.width, f.height, f.tiles[k / (TILE * TILE)] * TILE * TILE + k % (TILE * TILE))
 
 
 @wp.func
@@ -75,39 +85,40 @@ def render_map(world: World, f: MapFrame, start: int, faces: wp.array(dtype=int)
     out.white[i] = white
     out.light[i] = luminance(world, direction, hit, f.cone, white)
     out.normal[i] = hit.normal
+    out.face[i] = hit.face
     faces[f.first + i] = hit.face
 
 
 @wp.func
-def differs(world: World, f: MapFrame, faces: wp.array(dtype=int), hits: FirstHits, i: int, j: int) -> bool:
-    """Return whether texels ``i`` and ``j`` see different bodies, differently inclined surfaces, or different light."""
+def differs(world: World, hits: FirstHits, i: int, j: int) -> bool:
+    """Return whether rays ``i`` and ``j`` see different bodies, differently inclined surfaces, or different light."""
     apart = wp.abs(hits.white[i] - hits.white[j])
     if apart > CONTRAST * (hits.white[i] + hits.white[j] + LEAST_LIGHT):
         return True
-    a = faces[f.first + i]
-    b = faces[f.first + j]
+    a = hits.face[i]
+    b = hits.face[j]
     if a == b:
         return False
     return body_of(world, a) != body_of(world, b) or wp.dot(hits.normal[i], hits.normal[j]) < SAME_PLANE
 
 
 @wp.func
-def on_edge(world: World, f: MapFrame, faces: wp.array(dtype=int), hits: FirstHits, i: int) -> bool:
-    """Return whether a texel differs from any of its eight neighbours."""
-    row = i / f.width
-    col = i - row * f.width
-    found = bool(False)
-    for k in range(9):
-        c = wp.clamp(col + k % 3 - 1, 0, f.width - 1)
-        r = wp.clamp(row + k / 3 - 1, 0, f.height - 1)
-        found = found or differs(world, f, faces, hits, i, r * f.width + c)
-    return found
+def on_edge(world: World, hits: FirstHits, base: int, width: int, height: int, reach: int, i: int) -> bool:
+    """Return whether element ``i`` of an image differs from any element at most ``reach`` rows and columns away.
+
+    ``base``: index of the image's first element in the arrays of ``hits``.
+    """
+    row = i / width
+    col = i - row * width
+    for r in range(wp.max(row - reach, 0), wp.min(row + reach, height - 1) + 1):
+        for c in range(wp.max(col - reach, 0), wp.min(col + reach, width - 1) + 1):
+            if differs(world, hits, base + i, base + r * width + c):
+                return True
+    return False
 
 
 @wp.kernel
-def smooth_edges(
-    world: World, f: MapFrame, faces: wp.array(dtype=int), hits: FirstHits, start: int, out: wp.array(dtype=float)
-):
+def smooth_edges(world: World, f: MapFrame, hits: FirstHits, start: int, out: wp.array(dtype=float)):
     """Replace the luminance of texels on edges by the mean of several rays.
 
     Textures need no further rays, because each ray averages the texture over the ray's angular width.
@@ -116,7 +127,7 @@ def smooth_edges(
     if i < 0:
         return
     value = float(hits.light[i])
-    if on_edge(world, f, faces, hits, i):
+    if on_edge(world, hits, 0, f.width, f.height, 1, i):
         row = i / f.width
         col = i - row * f.width
         value = float(0.0)
@@ -263,7 +274,7 @@ def mover_changes(world: World, f: MapFrame, instants: int, face: int, direction
         return True
     if face < 0:
         return False
-    distance = meet_face(world, 0, face, origin, direction)
+    distance = meet_face(world, 0, face, origin, direction)[0]
     if distance == FAR:
         return False
     a = world.corners[3 * face]

@@ -4,11 +4,9 @@ import warp as wp
 
 from amiwarp.kernels.camera import pixel_to_ray
 from amiwarp.kernels.prism_view import Steps, View
-from amiwarp.kernels.world import FAR, Pose, World, body_of, cast, meet_face
+from amiwarp.kernels.world import FAR, NAN, Pose, World, body_of, cast, meet_face
 
 wp.set_module_options({"enable_backward": False})
-
-NAN = wp.constant(float("nan"))
 
 
 @wp.struct
@@ -118,7 +116,7 @@ def meet_near(
                 met.distance = FAR
                 return met
             last = face
-            distance = meet_face(world, instant, face, origin, direction)
+            distance = meet_face(world, instant, face, origin, direction)[0]
             if distance < met.distance:
                 met.face = face
                 met.distance = distance

@@ -46,6 +46,9 @@ CHUNK_US = {True: 100_000, False: 500_000}
 """Length of a chunk of simulated time [us] on a CPU (True) and on CUDA (False), for up to 640x480 pixels; shorter for
 more pixels."""
 
+RAYS_CHUNK_US = 100_000
+"""Longest chunk of simulated time [us] if pixels cast rays: the chunk's luminance is held in memory."""
+
 LATEST_US = 1 << 16
 """Largest time by which an event's time stamp can exceed the end of its chunk of simulated time [us]."""
 
@@ -114,7 +117,9 @@ class Engine:
             self._step = step_us(simulation, world_speed=speed.total, longest=1e6 * flicker)
             longest_chunk = 1e6 * MAPS_PER_CHUNK * min(flicker, scene.motion_px / max(speed.in_maps, 1e-9))
             self._sight = WorldSight(simulation, scene, world)
-            if scene.seeing is not Seeing.RAYS:
+            if scene.seeing is Seeing.RAYS:
+                longest_chunk = RAYS_CHUNK_US
+            else:
                 self._maps = WorldMapRing(simulation, scene, world, seen_bearings(simulation))
         else:
             self._step = step_us(simulation)
@@ -223,9 +228,14 @@ class Engine:
             return photoreceptor.run_filtered_pixels_ahead if ahead else photoreceptor.run_filtered_pixels
         return kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
 
-    def _views(self) -> list[Any]:
-        """Return the kernel inputs that describe what the pixels see."""
-        return [self._view] if self._maps is not None or self._sight is None else self._sight.inputs()
+    def _seen(self, steps: Any, ahead: int, count: int) -> Any:
+        """Return the kernels' input that describes what pixels see: the maps, or the luminance at each instant.
+
+        ``ahead``: index of the first instant, counted from the start of the chunk; ``count``: number of instants.
+        """
+        if self._maps is not None or self._sight is None:
+            return self._view
+        return self._sight.light(steps, steps.margin + ahead, count)
 
     def _upload(self, values: NDArray[np.float64]) -> wp.array:
         """Copy values to the device as float32."""
@@ -233,7 +243,7 @@ class Engine:
 
     def _start_pixels(self, steps: Any) -> None:
         """Set the initial state of every pixel."""
-        inputs = [*self._views(), steps, self._sensor, self._simulation.seed, 0, *self._state]
+        inputs = [self._seen(steps, 0, 1), steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
         if self._filters:  # at the start, the photoreceptors have settled to the light of the scene
@@ -245,7 +255,8 @@ class Engine:
 
         Later events are kept for the next chunk.
         """
-        keys = self._buffer.run(self._kernel(), [*self._views(), steps, self._sensor], self._state, self._carry)
+        inputs = [self._seen(steps, 1, count), steps, self._sensor]
+        keys = self._buffer.run(self._kernel(), inputs, self._state, self._carry)
         limit = min(count * self._step, self._simulation.duration_us - self.now_us)
         total = len(keys) // 2
         if not total:  # Warp cannot slice an empty array

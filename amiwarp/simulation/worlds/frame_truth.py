@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import FrameTruth
-from amiwarp.kernels import prism_view, world_events
-from amiwarp.kernels.launch import launch
+from amiwarp.kernels import prism_view
 from amiwarp.optics.displacement import wrap_angle
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.renderer import SMALLEST_LAUNCH, SurfaceView, pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.renderer import SurfaceView, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.sight import WorldSight
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
@@ -168,10 +167,7 @@ class TruthRenderer:
         table["azimuth"] = (math.cos(angle), math.sin(angle))
         steps = prism_view.Steps()
         steps.at = wp.array(table, dtype=prism_view.Step, device=device)
-        out = wp.empty(len(self._rays), dtype=float, device=device)
-        inputs = [*self._sight.inputs(), steps, 0]
-        launch(world_events.see_pixels, len(out), inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
-        return np.asarray(out.numpy())
+        return np.array(self._sight.light(steps, 0, 1).numpy()[0])
 
 
 def moved_points(move: Callable[..., Any], xy: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -88,6 +88,15 @@ def sample_grid(samples: int, device: Any) -> wp.array:
     return wp.array(np.array(places, np.float32), dtype=wp.vec2, device=device)
 
 
+def first_hits(n: int, device: Any) -> Any:
+    """Return the :class:`amiwarp.kernels.world_maps.FirstHits` of ``n`` rays, without an array for the luminance."""
+    hits = world_maps.FirstHits()
+    hits.face = wp.empty(n, dtype=int, device=device)
+    hits.white = wp.empty(n, dtype=float, device=device)
+    hits.normal = wp.empty(n, dtype=wp.vec3, device=device)
+    return hits
+
+
 class MapRenderer:
     """Renderer of maps: pictures of a world on a plane at distance 1 from the camera, without the prism.
 
@@ -105,9 +114,8 @@ class MapRenderer:
         frame.offsets = sample_grid(samples, world.device)
         n = frame.width * frame.height
         self._smooth, self._half = (wp.empty(n, dtype=float, device=world.device) for _ in range(2))
-        self._hits = world_maps.FirstHits()
-        self._hits.light, self._hits.white = (wp.empty(n, dtype=float, device=world.device) for _ in range(2))
-        self._hits.normal = wp.empty(n, dtype=wp.vec3, device=world.device)
+        self._hits = first_hits(n, world.device)
+        self._hits.light = wp.empty(n, dtype=float, device=world.device)
         half = gaussian(blur)
         self._weights = wp.array(np.concatenate([half[:0:-1], half]), dtype=float, device=world.device)
         self._grid = (-(-frame.height // TILE), -(-frame.width // TILE))
@@ -158,7 +166,7 @@ class MapRenderer:
         if len(f.offsets) == 1:
             wp.copy(self._smooth, self._hits.light)
             return
-        inputs += [faces, self._hits]
+        inputs += [self._hits]
         launch(world_maps.smooth_edges, n, inputs, [self._smooth], device=device, smallest=SMALLEST_LAUNCH)
 
     def _blur(self, tiles: wp.array, written: wp.array, maps: wp.array) -> None:

@@ -11,13 +11,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.kernels import world as kernels
-from amiwarp.kernels import world_events, world_view
+from amiwarp.kernels import world_rays, world_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.device_camera import camera_params
-from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.motion import movers_speed, parallax_speed, rotation_speed
-from amiwarp.simulation.worlds.renderer import SMALLEST_LAUNCH
+from amiwarp.simulation.worlds.renderer import SMALLEST_LAUNCH, TILE, first_hits
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
@@ -29,16 +28,17 @@ LEAST_CONE_PX = 0.25
 """Smallest width of the cone of a ray [px]. Textures are averaged over the cone."""
 MOMENTS = 64
 """Number of times in a simulation at which the speed of the world's image is computed."""
+INSTANTS_TOGETHER = 16
+"""Number of instants at which all pixels cast their rays together."""
 
 
-def aperture(scene: WorldScene) -> NDArray[np.float32]:
+def aperture(samples: int, blur: float) -> NDArray[np.float32]:
     """Return the rays of a pixel, shape (n, 3): x and y relative to the centre [px], and weights that sum to 1.
 
-    The rays are the nodes of a Gauss-Hermite quadrature with the variance of the optical blur.
+    The rays are the nodes of a Gauss-Hermite quadrature with the standard deviation ``blur`` of the optical blur [px].
     """
-    side = math.isqrt(scene.samples or RAYS_PER_PIXEL)
-    nodes, weights = np.polynomial.hermite_e.hermegauss(side)
-    x, y = np.meshgrid(nodes * scene.blur, nodes * scene.blur)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(math.isqrt(samples))
+    x, y = np.meshgrid(nodes * blur, nodes * blur)
     return np.stack([x.ravel(), y.ravel(), np.outer(weights, weights).ravel() / weights.sum() ** 2], 1).astype(
         np.float32
     )
@@ -67,18 +67,26 @@ def image_speed(world: DeviceWorld, simulation: Simulation, scene: WorldScene) -
 
 
 class WorldSight:
-    """Inputs of the kernels that cast rays: camera and world at the instants of a chunk of simulated time."""
+    """Light that pixels receive from a world through the prism, at the instants of a chunk of simulated time."""
 
     def __init__(self, simulation: Simulation, scene: WorldScene, world: DeviceWorld) -> None:
         self._scene, self._world, device = scene, world, world.device
-        camera = simulation.camera
-        self._view = world_events.RayView()
-        self._view.camera = camera_params(camera, str(device))
-        self._view.aperture = wp.array(aperture(scene), dtype=wp.vec3, device=device)
-        side = math.isqrt(scene.samples or RAYS_PER_PIXEL)
+        camera, samples = simulation.camera, scene.samples or RAYS_PER_PIXEL
+        rays = aperture(samples, scene.blur)
+        view = self._view = world_rays.RayView()
+        view.camera = camera_params(camera, str(device))
+        view.aperture = wp.array(rays, dtype=wp.vec3, device=device)
+        view.reach = max(1, math.ceil(float(np.abs(rays[:, :2]).max())))
+        side = math.isqrt(samples)
         width = 1.0 if side == 1 else max(2.0 * scene.blur * math.sqrt(2.0 / side), LEAST_CONE_PX)
-        self._view.cone = width / max(camera.fx, camera.fy)
-        self._view.dark = DARK
+        view.cone = width / max(camera.fx, camera.fy)
+        self._pixels = camera.width * camera.height
+        self._tiled = math.prod(-(-size // TILE) * TILE for size in (camera.width, camera.height))
+        self._light: wp.array = wp.empty(0, dtype=float, device=device)
+        self._cast: wp.array = wp.empty(0, dtype=float, device=device)
+        self._batch = world_rays.Batch()
+        self._marks: wp.array = wp.empty(0, dtype=int, device=device)
+        self._listed: wp.array = wp.empty(0, dtype=int, device=device)
 
     def set_instants(self, t_us: NDArray[np.float64], view: Any) -> None:
         """Set the poses of the camera and the bodies at the instants of a chunk.
@@ -92,9 +100,46 @@ class WorldSight:
         self._view.poses = wp.array(poses, dtype=kernels.Pose, device=self._world.device)
         self._view.prism = view.prism
 
-    def inputs(self) -> list[Any]:
-        """Return world and camera, the first inputs of the kernels that cast rays for pixels."""
-        return [self._world.params, self._view]
+    def light(self, steps: Any, first: int, count: int) -> wp.array:
+        """Return the luminance that each pixel sees at ``count`` instants, the first of which has the index ``first``.
+
+        The shape of the array is (count, pixels). The array is valid until the next call.
+        """
+        n = self._pixels
+        if len(self._light) < count * n:
+            self._light = wp.empty(count * n, dtype=float, device=self._world.device)
+        self._reserve(min(count, INSTANTS_TOGETHER))
+        for k in range(0, count, INSTANTS_TOGETHER):
+            self._batch.first, self._batch.count = first + k, min(INSTANTS_TOGETHER, count - k)
+            self._batch.hits.light = self._light[k * n : (k + self._batch.count) * n]
+            self._cast_batch(steps)
+        return self._light[: count * n].reshape((count, n))
+
+    def _reserve(self, count: int) -> None:
+        """Allocate the arrays of a batch of ``count`` instants."""
+        if len(self._listed) < count * self._tiled:
+            device = self._world.device
+            self._batch.hits = first_hits(count * self._pixels, device)
+            self._marks, self._listed = (wp.empty(count * self._tiled, dtype=int, device=device) for _ in range(2))
+
+    def _cast_batch(self, steps: Any) -> None:
+        """Write the luminance of all pixels at the instants of the batch to ``light`` of its hits."""
+        device, batch, view, rays = self._world.device, self._batch, self._view, len(self._view.aperture)
+        seen = [self._world.params, view, steps]
+        launch(world_rays.cast_centres, self._tiled, seen, [batch], device=device, smallest=SMALLEST_LAUNCH)
+        if rays == 1:
+            return
+        n = self._tiled * batch.count
+        marks = self._marks[:n]
+        launch(world_rays.smooth_insides, n, [*seen, batch], [marks], device=device)
+        wp.utils.array_scan(marks, marks, inclusive=True)
+        launch(world_rays.list_marked, n, [marks], [self._listed], device=device)
+        listed = int(marks[n - 1 :].numpy()[0])
+        if len(self._cast) < listed * rays:
+            self._cast = wp.empty(listed * rays * 5 // 4, dtype=float, device=device)
+        launch(world_rays.cast_edges, listed * rays, [*seen, batch, self._listed], [self._cast], device=device,
+               smallest=SMALLEST_LAUNCH)  # fmt: skip
+        launch(world_rays.add_edges, listed, [view, batch, self._listed, self._cast], [], device=device)
 
     def look(self, view: Any, steps: Any, block: Any, n: int, faces: Any) -> Any:
         """Return the surfaces that ``n`` events saw, as a :class:`amiwarp.kernels.world_view.SeenSurfaces`.

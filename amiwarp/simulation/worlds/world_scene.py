@@ -31,7 +31,8 @@ class WorldScene:
     samples: int | None = None
     """Number of rays: 1, 4, 9 or 16; None stands for 4.
 
-    With maps, the rays of each texel at an edge; with rays, the rays of each pixel.
+    With maps, the rays of each texel at an edge; with rays, the rays of each pixel, which search the whole world only
+    at edges.
     """
     motion_px: float = 0.5
     """Largest motion of the image between two successive maps [px], 0.01 to 2. Has no effect with rays."""
