@@ -40,6 +40,7 @@ DIFFERENCES = (
     "The paper's main text gives neither the tracker nor the limit at which a track ends. The ranking depends on the "
     "limit: see the curves. Scenes are simulated."
 )
+VERSION = 1
 NEEDS_TRUTH = True
 
 APEX = math.radians(1.0)

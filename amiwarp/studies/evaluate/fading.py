@@ -36,6 +36,7 @@ PROTOCOL = (
     "ground truth states, relative to δ·2πf."
 )
 DIFFERENCES = "The paper shows single moments of a film. Here the rate is measured over all tiles and moments."
+VERSION = 1
 NEEDS_TRUTH = True
 
 PARTS = 12

@@ -31,6 +31,7 @@ DIFFERENCES = (
     "The paper's main text names neither the algorithm nor the interval, which determines an error in pixels. Its "
     "difference of +0.19 px is marked for a comparison of its sign and order only."
 )
+VERSION = 1
 NEEDS_TRUTH = True
 
 TURNS = (0.25, 0.5, 1.0)

@@ -29,6 +29,7 @@ DIFFERENCES = (
     "The paper uses the network E2VID, which is not part of amiwarp, and reports NIQE only, as curves, by statistics "
     "that its authors fitted to other pictures. Values of NIQE are therefore comparable between our streams only."
 )
+VERSION = 1
 NEEDS_TRUTH = True
 
 STEP_US = 1000

@@ -38,6 +38,7 @@ DIFFERENCES = (
     "The paper uses a pose network on pictures of people. No weights are part of amiwarp: give a detector to "
     "`amiwarp.studies.evaluate.pose.measure`."
 )
+VERSION = 1
 NEEDS_TRUTH = True
 
 RATES_HZ = (10.0, 30.0, 100.0, 300.0, 1000.0)

@@ -35,6 +35,7 @@ DIFFERENCES = (
     "The paper's main text gives neither kernel width nor window nor normalisation, and its scenes are real. Absolute"
     " values therefore cannot be compared; the ranking can."
 )
+VERSION = 1
 NEEDS_TRUTH = False
 
 H_PX, WINDOW_MS = 3.0, 33.0
