@@ -203,7 +203,7 @@ def test_every_evaluation_keeps_the_contract(name: str) -> None:
     assert evaluation.TITLE
     assert evaluation.PROTOCOL
     assert evaluation.DIFFERENCES
-    assert {c.seed for c in evaluation.conditions(QUICK)} == {0, 1}
+    assert {c.seed for c in evaluation.conditions(QUICK)} == {1, 2}
     assert {c.verdict for c in evaluation.claims([])} <= {Verdict.NOT_TESTABLE}
 
 
@@ -259,7 +259,7 @@ def test_cells_are_kept_and_the_report_is_one_file(tmp_path: Path) -> None:
     known = store.load("apex_speed", condition, SMALL)
     assert known is not None
     assert known.values == cells[0].values
-    for other in (replace(SMALL, first_seed=1), replace(SMALL, device="cuda:0"), replace(SMALL, duration_s=0.2)):
+    for other in (replace(SMALL, first_seed=2), replace(SMALL, device="cuda:0"), replace(SMALL, duration_s=0.2)):
         assert store.load("apex_speed", condition, other) is None
     assert store.load("apex_speed", condition, replace(SMALL, seeds=5)) is not None
     with mock.patch.object(apex_speed, "VERSION", -1):

@@ -84,11 +84,15 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     best = {name: min(blur, key=lambda d: blur[d][name]) for name in ("all", "bright", "dark")}
     known = {"degrees": round(float(np.degrees(streams.condition.apex)), 3)}
     count = streams.count(Stream.RAW, 0, streams.end_us)
-    row = {"blur": blur[best["all"]]["all"], "delay": best["all"], "uncorrected": blur[0]["all"],
+    row = {"blur": _finite(blur[best["all"]]["all"]), "delay": best["all"],
            "edge_blur": _edge_blur(streams, best["all"]), "mev_per_s": count / streams.end_us}  # fmt: skip
-    light = [known | {"light": name, "blur": blur[best["all"]][name], "own_delay": best[name],
-                      "own_blur": blur[best[name]][name]} for name in ("bright", "dark")]  # fmt: skip
+    light = [known | {"light": name, "blur": _finite(blur[best["all"]][name]), "own_delay": best[name],
+                      "own_blur": _finite(blur[best[name]][name])} for name in ("bright", "dark")]  # fmt: skip
     return {"rows": [known | row], "light": light}
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def _blur(streams: Streams, discs: DiscTarget, delay_us: int) -> dict[str, float]:
@@ -156,7 +160,7 @@ def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[Value, ...]]:
 
 def _rows(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:
     """Return rows with the names of apex and bandwidth; those without events are left out."""
-    rows = [r for r in rows_of(results, name) if np.isfinite(r["blur"])]
+    rows = [r for r in rows_of(results, name) if r["blur"] is not None]
     return [{**r, "bandwidth": _name(r["cutoff_hz"]), "apex_name": f"apex {r['degrees']:g}°"} for r in rows]
 
 
