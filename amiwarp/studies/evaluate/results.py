@@ -124,6 +124,8 @@ class Table:
     """What can be seen, and how to read it."""
     chart: Chart | None = None
     """Chart of the table, or None."""
+    long: bool = False
+    """Whether the table is too long for the page and for ``report.json``, and is only written as CSV."""
 
 
 @dataclass(frozen=True)
