@@ -4,14 +4,20 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 import amiwarp
-from amiwarp.studies.evaluate import corners, fading, texture
+from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
 from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
-from amiwarp.studies.evaluate.conditions import Condition, RecordedStreams, Stream, Streams
+from amiwarp.studies.evaluate.conditions import DISCS, IDEAL, Condition, RecordedStreams, Stream, Streams
+from amiwarp.studies.evaluate.disc_target import DiscTarget, robust_spread
 from amiwarp.studies.evaluate.measures.density import density_variance
 from amiwarp.studies.evaluate.measures.edge_match import Counts, best_f, binary_entropy, match
 from amiwarp.studies.evaluate.measures.true_edges import geometric_edges
@@ -66,6 +72,7 @@ def test_f_score_of_a_shifted_line(shift: int) -> None:
     tolerances = (1.0, 2.0, 4.0, 6.0)
     for tolerance, matched in zip(tolerances, match(line(20 + shift), line(20), tolerances), strict=True):
         assert matched.sum() == (40 if shift <= tolerance else 0)
+        assert not matched[:, :20].any()
 
 
 def test_pixels_match_one_to_one() -> None:
@@ -75,14 +82,21 @@ def test_pixels_match_one_to_one() -> None:
     assert best_f(counts) == (0, pytest.approx(2 * 40 / (120 + 40)))
     assert counts.precision[0] == pytest.approx(1 / 3)
     assert counts.recall[0] == 1.0
+    (matched,) = match(line(20), thick, [3.0])
+    assert matched.sum() == 40
+    assert matched[:, 20].all()  # the nearest
 
 
-def test_a_largest_matching_leaves_no_augmenting_path() -> None:
-    """Targets at 0 and 2, points at 1 and 3: the greedy nearest choice may match one pair only; two are possible."""
-    true, found = (np.zeros((1, 5), np.bool_) for _ in range(2))
-    true[0, [0, 2]], found[0, [1, 3]] = True, True
-    assert match(found, true, [1.0])[0].tolist() == [True, True]
-    assert match(np.zeros_like(found), true, [1.0])[0].tolist() == [False, False]
+def test_nearest_first_finds_nearly_as_many_pairs_as_possible() -> None:
+    rng = np.random.default_rng(0)
+    found, true = (rng.random((60, 80)) < 0.1 for _ in range(2))
+    tolerances = (3.0, 1.0)
+    for tolerance, matched in zip(tolerances, match(found, true, tolerances), strict=True):
+        near = cdist(np.argwhere(true), np.argwhere(found)) <= tolerance
+        largest = (maximum_bipartite_matching(csr_array(near)) >= 0).sum()
+        apart = KDTree(np.argwhere(found)).query(np.argwhere(matched))[0]
+        assert apart.max() <= tolerance
+        assert 0.85 * largest <= matched.sum() <= largest
 
 
 def test_entropy_of_binary_images() -> None:
@@ -189,7 +203,7 @@ def test_every_evaluation_keeps_the_contract(name: str) -> None:
     assert evaluation.TITLE
     assert evaluation.PROTOCOL
     assert evaluation.DIFFERENCES
-    assert {c.seed for c in evaluation.conditions(QUICK)} == {0, 1}
+    assert {c.seed for c in evaluation.conditions(QUICK)} == {1, 2}
     assert {c.verdict for c in evaluation.claims([])} <= {Verdict.NOT_TESTABLE}
 
 
@@ -204,8 +218,40 @@ def test_unknown_evaluation() -> None:
         load("nothing")
 
 
+def test_distances_from_known_edges() -> None:
+    discs = DiscTarget.of_seed((240, 180), 3)
+    assert discs.centres.shape == (4, 2)
+    angle = np.linspace(0.0, 2.0 * math.pi, 50)
+    ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places = np.concatenate([discs.centres[1] + r * ray for r in (17.0, 20.0, 26.0, 39.0)])
+    distance, luminance = discs.distances(places)
+    np.testing.assert_allclose(distance, np.repeat([-3.0, 0.0, 6.0], 50), rtol=0, atol=1e-9)  # px
+    assert set(luminance) == {discs.luminance[1]}
+
+
+def test_robust_spread_of_normal_distances() -> None:
+    rng = np.random.default_rng(0)
+    group = rng.integers(0, 2, 100_000)
+    distance = rng.normal(3.0 * group, 2.5)
+    distance[:3000] = 18.0  # noise far away
+    assert robust_spread(distance, group) == pytest.approx(2.5, rel=0.05)
+    assert robust_spread(np.zeros(0), np.zeros(0)) == math.inf
+
+
+def test_the_blur_grows_with_the_lag_of_the_photoreceptors() -> None:
+    blur = {}
+    for cutoff in (0.0, 100.0):
+        condition = Condition(
+            DISCS, "still", width=120, height=100, duration_s=60 / 1440, rpm=1440.0, cutoff_hz=cutoff, only=IDEAL
+        )
+        (row,) = apex_speed.measure(Streams(condition), SMALL)["rows"]
+        blur[cutoff] = row["blur"]
+    assert 0.3 < blur[0.0] < 0.6  # px: quantisation and the width of the edge
+    assert blur[100.0] > 1.5 * blur[0.0]
+
+
 def test_cells_are_kept_and_the_report_is_one_file(tmp_path: Path) -> None:
-    condition = Condition(width=64, height=48, duration_s=60 / 1440, trajectory="still", rpm=1440.0, cutoff_hz=0.0)
+    condition = Condition(DISCS, "still", width=120, height=100, duration_s=60 / 1440, rpm=1440.0, cutoff_hz=0.0)
     cells = run_job(Job(condition, ("apex_speed",), SMALL)).cells
     assert not cells[0].error
     store = Store(tmp_path)
@@ -213,9 +259,14 @@ def test_cells_are_kept_and_the_report_is_one_file(tmp_path: Path) -> None:
     known = store.load("apex_speed", condition, SMALL)
     assert known is not None
     assert known.values == cells[0].values
+    for other in (replace(SMALL, first_seed=2), replace(SMALL, device="cuda:0"), replace(SMALL, duration_s=0.2)):
+        assert store.load("apex_speed", condition, other) is None
+    assert store.load("apex_speed", condition, replace(SMALL, seeds=5)) is not None
+    with mock.patch.object(apex_speed, "VERSION", -1):
+        assert store.load("apex_speed", condition, SMALL) is None
     files = write(tmp_path, [section("apex_speed", [known])], SMALL, 1.0)
     page = files["report"].read_text()
-    assert page.count("data:image/svg+xml;base64,") == 3
+    assert page.count("data:image/svg+xml;base64,") == 5
     assert "not testable" in page
     assert 'src="http' not in page
     assert 'href="http' not in page

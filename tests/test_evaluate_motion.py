@@ -27,7 +27,7 @@ from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation, rotated_back
 from amiwarp.studies.evaluate.flow_estimation import flow_by_contrast, flow_by_dis, rotation_flow
 from amiwarp.studies.evaluate.measures.flow_error import flow_error
-from amiwarp.studies.evaluate.motion_segmentation import moving_events
+from amiwarp.studies.evaluate.motion_segmentation import SegmentationSettings, moving_events
 from amiwarp.studies.evaluate.results import QUICK, CellResult, Table, Verdict
 
 CAMERA = Camera.from_fov(160, 120, math.radians(40.0))
@@ -108,7 +108,7 @@ def test_rotation_flow_is_the_motion_of_rotated_events() -> None:
 def test_no_events_give_no_motion() -> None:
     assert not estimate_rotation(Events.empty(), CAMERA).moves
     assert not flow_by_contrast(Events.empty(), CAMERA).any()
-    assert moving_events(Events.empty(), CAMERA).shape == (0,)
+    assert [m.shape for m in moving_events(Events.empty(), CAMERA, [SegmentationSettings()])] == [(0,)]
 
 
 @pytest.mark.parametrize("velocity", [(60.0, 0.0), (-30.0, 45.0)])
@@ -152,8 +152,7 @@ def check_tables(evaluation: Any, values: dict[str, Any]) -> None:
 
 
 def test_the_board_is_segmented_in_each_stream(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(segmentation, "QUICK_WINDOWS", 1)
-    monkeypatch.setattr(segmentation, "GAINS", (segmentation.STANDARD_GAIN,))
+    monkeypatch.setattr(segmentation, "VARIED", {"gain": ()})
     values = segmentation.measure(streams, QUICK)
     check_tables(segmentation, values)
     iou = {row["stream"]: row["iou"] for row in values["rows"]}

@@ -37,7 +37,7 @@ def run(
         bool,
         typer.Option(
             "--full/--quick",
-            help="Full study: 640x480, ten seeds, all values; or quick: 240x180, two seeds, within ten minutes on two "
+            help="Full study: 320x240, ten seeds, all values; or quick: 240x180, two seeds, within ten minutes on two "
             "cores.",
         ),
     ] = False,

@@ -16,8 +16,8 @@ from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, Re
 from amiwarp.studies.evaluate.registry import load
 from amiwarp.studies.evaluate.results import CellResult, Settings
 
-FORMAT = 1
-"""Version of the files of cells."""
+FORMAT = 2
+"""Version of the files of cells, and of the streams and measures that all evaluations share."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,18 @@ class Store:
         size = "quick" if settings.quick else "full"
         return self.folder / f"{name}_{size}_{condition.key}.json"
 
+    @staticmethod
+    def _version(name: str, settings: Settings) -> list[Any]:
+        """Return all that a cell depends on next to its condition: versions, settings and the kind of device.
+
+        Seeds are left out, so that a run with more of them keeps its cells; the first one is shown in pictures.
+        """
+        size = asdict(settings) | {"device": settings.device.partition(":")[0]}
+        del size["seeds"]
+        return [FORMAT, __version__, load(name).VERSION, size]
+
     def load(self, name: str, condition: Condition | RecordedCondition, settings: Settings) -> CellResult | None:
-        """Return a stored cell, or None if it is missing or of another version.
+        """Return a stored cell, or None if it is missing, or of another version, other settings or another device.
 
         Raises :class:`AmiwarpError` for a damaged file.
         """
@@ -86,7 +96,7 @@ class Store:
             return None
         try:
             data = json.loads(path.read_text())
-            if data["version"] != [FORMAT, __version__]:
+            if data["version"] != self._version(name, settings):
                 return None
             return CellResult(name, condition, data["values"], data["error"], float(data["processor_s"]))
         except (ValueError, KeyError, TypeError) as error:
@@ -95,7 +105,7 @@ class Store:
     def save(self, cell: CellResult, settings: Settings) -> None:
         """Write a cell."""
         data: dict[str, Any] = {
-            "version": [FORMAT, __version__],
+            "version": self._version(cell.evaluation, settings),
             "condition": asdict(cell.condition),
             "values": cell.values,
             "error": cell.error,

@@ -23,11 +23,13 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.studies.evaluate.disc_target import DiscTarget
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,6 +47,18 @@ displacements in pixels are the same."""
 NOMINAL = 1.15
 """Nominal apex angle that calibration starts from, relative to the true one."""
 
+DISCS = "discs"
+"""Name of the picture of :class:`DiscTarget` among the worlds."""
+IDEAL, BANDWIDTH = "none", "bandwidth"
+"""Names of the sensor without any of :data:`LIMITS`, and of the limit of its photoreceptors."""
+LIMITS = {
+    BANDWIDTH: ("cutoff_hz",),
+    "refractory period": ("refractory_us",),
+    "readout": ("row_us", "bus_rate_mev_s", "bus_queue"),
+    "latency jitter": ("latency_us", "latency_jitter_us"),
+    "mismatch and noise": ("mismatch", "leak_hz", "shot_noise_hz", "shot_noise_dark"),
+}
+"""Limits of a sensor, by the fields of :class:`amiwarp.SensorModel` that describe them."""
 ENOUGH = 0.95
 """Smallest number of events of the stream with the same count, relative to those of the AMI-EV."""
 
@@ -69,7 +83,7 @@ class Condition:
     """Description of a simulated recording."""
 
     world: str = "room"
-    """Name of the world, see :func:`amiwarp.named_world`."""
+    """Name of the world, see :func:`amiwarp.named_world`; or :data:`DISCS` for a picture of discs at infinity."""
     trajectory: str = "handheld"
     """Motion of the camera: still, handheld or fast."""
     apex: float = math.radians(0.5)
@@ -90,6 +104,8 @@ class Condition:
     """Name of the sensor, see :meth:`amiwarp.SensorModel.preset`."""
     cutoff_hz: float | None = None
     """Bandwidth of the photoreceptors at white [Hz], 0 for unlimited; None for that of the sensor."""
+    only: str | None = None
+    """The only one of :data:`LIMITS` that the sensor has, or :data:`IDEAL` for none of them; None for all."""
 
     @property
     def key(self) -> str:
@@ -98,22 +114,31 @@ class Condition:
 
     def simulation(self, device: str) -> Simulation:
         """Return the simulation of the AMI-EV under this condition."""
-        world, trajectory = named_world(self.world, self.trajectory, seed=self.seed, duration_s=self.duration_s)
-        sensor = SensorModel.preset(self.sensor)
-        if self.cutoff_hz is not None:
-            sensor = replace(sensor, cutoff_hz=self.cutoff_hz)
         phase = float(np.random.default_rng(self.seed).uniform(0.0, 2.0 * math.pi))
         return Simulation(
-            WorldScene(world, trajectory),
+            self._scene(),
             Camera.from_fov(self.width, self.height, 2.0 * math.atan(self.width / (2.0 * self.focal_px))),
             Prism(self.apex, INDEX),
             self.duration_s,
             motion=PrismMotion(self.rpm, phase),
-            sensor=sensor,
+            sensor=self._sensor(),
             nominal_prism=Prism(NOMINAL * self.apex, INDEX),
             seed=self.seed,
             device=device,
         )
+
+    def _scene(self) -> Scene | WorldScene:
+        if self.world == DISCS:
+            return DiscTarget.of_seed((self.width, self.height), self.seed).scene(self.focal_px)
+        return WorldScene(*named_world(self.world, self.trajectory, seed=self.seed, duration_s=self.duration_s))
+
+    def _sensor(self) -> SensorModel:
+        """Return the sensor with this condition's bandwidth, and without the limits that it leaves out."""
+        sensor = SensorModel.preset(self.sensor)
+        if self.only is not None:
+            ideal = SensorModel.ideal(sensor.contrast_on)
+            sensor = replace(ideal, **{name: getattr(sensor, name) for name in LIMITS.get(self.only, ())})
+        return sensor if self.cutoff_hz is None else replace(sensor, cutoff_hz=self.cutoff_hz)
 
 
 @dataclass(frozen=True)

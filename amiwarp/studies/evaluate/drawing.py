@@ -36,6 +36,8 @@ STREAM_COLOURS = {
 """Colours of the streams, the same in all charts."""
 OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK)
 """Colours of other series, in their order."""
+CHANCE, GREY = "chance", "0.55"
+"""Name and colour of the level of chance."""
 MARKERS = "osD^vPX"
 """Markers that distinguish the series without colour."""
 
@@ -127,6 +129,8 @@ def _bars(ax: Axes, chart: Chart, by: dict[Value, list[dict[str, Value]]]) -> No
 
 def _colour(name: Value, k: int) -> str:
     """Return the colour of a stream, or of the k-th other series."""
+    if name == CHANCE:
+        return GREY
     return STREAM_COLOURS[Stream(name)] if name in set(Stream) else OTHERS[k % len(OTHERS)]
 
 

@@ -33,9 +33,11 @@ PROTOCOL = (
     "turns per second, in a direction that turns with the prism. Where the camera moves the image at the same speed "
     "in the opposite direction, both cancel. The image is divided into tiles, and time into 12 parts of a turn. The "
     "event rate of a tile, relative to its mean, is set against the speed of the image through the prism, which the "
-    "ground truth states, relative to δ·2πf."
+    "ground truth states, relative to δ·2πf. A table of the first seed holds the rate of every tile over time, and "
+    "marks the tiles where the camera alone moves the image at 0.75 to 1.25 of δ·2πf; the film marks them in red."
 )
 DIFFERENCES = "The paper shows single moments of a film. Here the rate is measured over all tiles and moments."
+VERSION = 2
 NEEDS_TRUTH = True
 
 PARTS = 12
@@ -48,17 +50,16 @@ LEAST_RATE = 20.0
 """Smallest mean number of events of a tile in a part of a turn. Tiles with less texture say nothing."""
 DIP, USUAL = (0.0, 0.5), (0.75, 1.25)
 """Classes of the relative speed that are compared: cancelling motion, and the prism alone."""
+TILE_COLUMNS = ("camera", "rpm", "time_ms", "column", "row", "rate", "speed", "camera_speed", "marked")
+"""Values of the table of tiles."""
+RED = (213, 94, 0)
+"""Colour of the borders of marked tiles in the film."""
 
 
 def conditions(settings: Settings) -> list[Condition]:
     """Return fast motion through the room, whose speed comes near that of the prism; and rest."""
-    speeds = (720.0,) if settings.quick else (360.0, 720.0, 1440.0)
-    return [
-        c
-        for rpm in speeds
-        for motion in ("still", "fast")
-        for c in settings.conditions(world="room", trajectory=motion, rpm=rpm)
-    ]
+    cases = [("still", 720.0), ("fast", 720.0)] + ([] if settings.quick else [("fast", 360.0), ("fast", 1440.0)])
+    return [c for motion, rpm in cases for c in settings.conditions(world="room", trajectory=motion, rpm=rpm)]
 
 
 def orbit_speed(condition: Condition) -> float:
@@ -68,23 +69,51 @@ def orbit_speed(condition: Condition) -> float:
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
-    """Return the relative event rate by class of relative speed, and the film of the first seed."""
+    """Return the relative event rate by class of relative speed, and tiles and film of the first seed."""
     condition = streams.condition
     length = round(60e6 / condition.rpm / PARTS)
     starts = range(0, streams.end_us - length + 1, length)
-    counts, speeds, frames = [], [], []
+    orbit = orbit_speed(condition)
+    counts, speeds, cameras, frames = [], [], [], []
     film = (condition.seed, condition.trajectory, condition.rpm) == (settings.first_seed, "fast", 720.0)
     for start in starts:
         events = streams.window(Stream.RAW, start, start + length)
         counts.append(_tiles(events.x, events.y, np.ones(len(events)), streams.size))
-        flow = streams.frame(start + length // 2).flow_with_prism
-        y, x = np.mgrid[: flow.shape[0], : flow.shape[1]]
-        speed = np.nan_to_num(np.hypot(flow[..., 0], flow[..., 1]))
-        speeds.append(_tiles(x.ravel(), y.ravel(), speed.ravel(), streams.size) / TILE**2)
+        frame = streams.frame(start + length // 2)
+        speeds.append(_mean_speed(frame.flow_with_prism, streams.size) / orbit)
+        cameras.append(_mean_speed(frame.flow, streams.size) / orbit)
         if film:
-            frames.append(_frame(events.x, events.y, streams.size))
-    rows = _classes(np.array(counts), np.array(speeds) / orbit_speed(condition))
-    return {"rows": rows, "film": frames}
+            frames.append(_frame(events.x, events.y, streams.size, _marked(cameras[-1])))
+    rows = _classes(np.array(counts), np.array(speeds))
+    tiles = _tile_rows(np.array(counts) / length, np.array(speeds), np.array(cameras), length, streams.size)
+    first = condition.seed == settings.first_seed
+    return {"rows": rows, "film": frames, "tiles": tiles if first else []}
+
+
+def _mean_speed(flow: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the mean speed of the image in each tile [px/s], shape (tiles,); 0 where the flow is unknown."""
+    y, x = np.mgrid[: flow.shape[0], : flow.shape[1]]
+    speed = np.nan_to_num(np.hypot(flow[..., 0], flow[..., 1]))
+    return _tiles(x.ravel(), y.ravel(), speed.ravel(), size) / TILE**2
+
+
+def _marked(camera: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the tiles that the camera alone moves about as fast as the prism does, by their relative speed."""
+    return np.asarray((camera >= USUAL[0]) & (camera < USUAL[1]))
+
+
+def _tile_rows(
+    rate: NDArray[np.float64], speed: NDArray[np.float64], camera: NDArray[np.float64], length: int,
+    size: tuple[int, int],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return a row for each part of a turn and tile. Arrays of shape (parts, tiles); ``rate`` in Mev/s."""
+    columns = size[0] // TILE
+    return [
+        {"time_ms": (part + 0.5) * length * 1e-3, "column": tile % columns, "row": tile // columns,
+         "rate": round(1e3 * float(rate[part, tile]), 3), "speed": round(float(speed[part, tile]), 3),
+         "camera_speed": round(float(camera[part, tile]), 3), "marked": bool(_marked(camera[part, tile]))}
+        for part in range(len(rate)) for tile in range(rate.shape[1])
+    ]  # fmt: skip
 
 
 def _tiles(x: NDArray[Any], y: NDArray[Any], weight: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float64]:
@@ -109,15 +138,24 @@ def _classes(counts: NDArray[np.float64], speeds: NDArray[np.float64]) -> list[d
     return rows
 
 
-def _frame(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int]) -> str:
-    """Return the events of a part of a turn as a frame of the film: white without events, black with many events."""
+def _frame(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int], marked: NDArray[np.bool_]) -> str:
+    """Return the events of a part of a turn as a frame of the film: white without events, black with many events.
+
+    The borders of marked tiles are red.
+    """
     width, height = size
     counts = np.bincount(y.astype(np.int64) * width + x, minlength=width * height).reshape(height, width)
-    return encode_picture(np.asarray(255 - np.minimum(255, 85 * counts), np.uint8))
+    picture = np.repeat((255 - np.minimum(255, 85 * counts)).astype(np.uint8)[..., None], 3, axis=2)
+    for tile in np.flatnonzero(marked).tolist():
+        row, column = divmod(tile, width // TILE)
+        part = picture[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
+        part[[0, -1]] = RED
+        part[:, [0, -1]] = RED
+    return encode_picture(picture)
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
-    """Return the relative event rate over the relative speed."""
+    """Return the relative event rate over the relative speed, and the rate of every tile over time."""
     rows = [{**r, "prism": f"{r['rpm']:g} rpm"} for r in rows_of(results, "rows")]
     x = "speed through the prism / δ·2πf"
     return [
@@ -127,6 +165,11 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
               "Rate of a tile relative to its mean over the recording. Near 0 the motions cancel; 1 is the prism's own "
               "speed.",
               Chart(x, "relative rate", "camera", "std", panels=("prism",))),
+        Table("fading_tiles", "Event rate of every tile over time",
+              ("camera", "rpm", "time [ms]", "tile column", "tile row", "rate [kev/s]", x, "camera's speed / δ·2πf",
+               "camera as fast as the prism"),
+              [tuple(r[k] for k in TILE_COLUMNS) for r in rows_of(results, "tiles")],
+              f"Tiles of {TILE} px, raw events, first seed.", long=True),
     ]  # fmt: skip
 
 
@@ -137,7 +180,8 @@ def pictures(results: Sequence[CellResult]) -> list[Picture]:
         return []
     frames = [decode_picture(text) for text in films[0].values["film"]]
     caption = ("Raw events of the AMI-EV moving fast, one frame for each twelfth of a turn (6.9 ms), slowed "
-               "down. Parts of the image fade once a turn, where the camera's motion cancels the prism's.")  # fmt: skip
+               "down. Red: tiles that the camera alone moves at 0.75 to 1.25 times the speed of the prism; they fade "
+               "once a turn, where the motions cancel.")  # fmt: skip
     return [Picture("fading_film", caption, frames, 0.12)]
 
 

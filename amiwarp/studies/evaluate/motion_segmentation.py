@@ -6,6 +6,7 @@ a further velocity in the image. The events of blurred regions are clustered in 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -56,24 +57,28 @@ WINDOW_RADII = 5.0
 """Length of a window on the time axis of the clustering [radii]."""
 
 
-def moving_events(events: Events, camera: Camera, settings: SegmentationSettings | None = None) -> NDArray[np.bool_]:
-    """Return which events of a short window belong to bodies that move, shape (n,).
+def moving_events(events: Events, camera: Camera, settings: Sequence[SegmentationSettings]) -> list[NDArray[np.bool_]]:
+    """Return which events of a short window belong to bodies that move, shape (n,), for each of several settings.
 
-    ``events``: events of a plain camera, or compensated, in order of time.
+    ``events``: events of a plain camera, or compensated, in order of time. ``settings``: they may differ in the least
+    gain and in the clustering only.
     """
-    s = settings or SegmentationSettings()
     if len(events) < 2 or events.t[-1] == events.t[0]:
-        return np.zeros(len(events), np.bool_)
-    scale = camera.width / 640.0
+        return [np.zeros(len(events), np.bool_) for _ in settings]
+    size, scale = (camera.width, camera.height), camera.width / 640.0
     back = rotated_back(dithered(events), camera, estimate_rotation(events, camera))
-    which = blurred(back, (camera.width, camera.height), s, scale)
-    out = np.zeros(len(events), np.bool_)
-    out[np.flatnonzero(which)] = in_large_clusters(back[which], (camera.width, camera.height), s, scale)
+    gain = agreement_gain(back, size, settings[0], scale)
+    out = []
+    for s in settings:
+        which = gain > s.gain
+        mask = np.zeros(len(events), np.bool_)
+        mask[np.flatnonzero(which)] = in_large_clusters(back[which], size, s, scale)
+        out.append(mask)
     return out
 
 
-def blurred(events: Events, size: tuple[int, int], s: SegmentationSettings, scale: float) -> NDArray[np.bool_]:
-    """Return which events lie where they agree better under a velocity in the image, shape (n,)."""
+def agreement_gain(events: Events, size: tuple[int, int], s: SegmentationSettings, scale: float) -> NDArray[np.float64]:
+    """Return how much better events agree under a further velocity where each event lies, shape (n,): a ratio."""
     seconds = (int(events.t[-1]) - int(events.t[0])) * 1e-6
     grid = velocity_grid(s.reach_px * scale, max(s.step_px * scale, 1.0)).reshape(-1, 2)
     fast = np.hypot(*grid.T) >= s.least_px * scale
@@ -82,7 +87,8 @@ def blurred(events: Events, size: tuple[int, int], s: SegmentationSettings, scal
     for is_fast, agreement in zip(fast, found, strict=True):
         best = fast_best if is_fast else slow_best
         np.maximum(best, agreement, out=best)
-    return np.asarray((fast_best > s.gain * slow_best).ravel()[pixel_index(events, size)])
+    ratio = np.divide(fast_best, slow_best, out=np.where(fast_best > 0.0, np.inf, 0.0), where=slow_best > 0.0)
+    return np.asarray(ratio.ravel()[pixel_index(events, size)])
 
 
 def in_large_clusters(

@@ -10,11 +10,21 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.studies.evaluate.blob_detector import blob_keypoints
-from amiwarp.studies.evaluate.conditions import FOCAL_PX, Condition, Streams
+from amiwarp.studies.evaluate.conditions import Condition, Streams
 from amiwarp.studies.evaluate.measures.keypoints import detected_joints
 from amiwarp.studies.evaluate.measures.masks import box_overlap
 from amiwarp.studies.evaluate.measures.pictures import displayed
-from amiwarp.studies.evaluate.results import CellResult, Chart, Claim, Settings, Table, Verdict, grouped, rows_of
+from amiwarp.studies.evaluate.results import (
+    CellResult,
+    Chart,
+    Claim,
+    Settings,
+    Table,
+    Verdict,
+    grouped,
+    rows_of,
+    wide_focal,
+)
 from amiwarp.studies.evaluate.stream_pictures import PictureMaker, Window, reconstructed_streams
 
 if TYPE_CHECKING:
@@ -38,6 +48,7 @@ DIFFERENCES = (
     "The paper uses a pose network on pictures of people. No weights are part of amiwarp: give a detector to "
     "`amiwarp.studies.evaluate.pose.measure`."
 )
+VERSION = 1
 NEEDS_TRUTH = True
 
 RATES_HZ = (10.0, 30.0, 100.0, 300.0, 1000.0)
@@ -53,11 +64,8 @@ TORSO = ("left shoulder", "right hip")
 
 
 def conditions(settings: Settings) -> list[Condition]:
-    """Return the walking figure before a moving camera; in full also one at rest. The lens sees the whole figure."""
-    focal = FOCAL_PX * settings.width / 640.0
-    motions = ("handheld",) if settings.quick else ("still", "handheld")
-    return [c for motion in motions
-            for c in settings.conditions(world="person", trajectory=motion, focal_px=focal)]  # fmt: skip
+    """Return the walking figure before a moving camera. The lens sees the whole figure."""
+    return settings.conditions(world="person", trajectory="handheld", focal_px=wide_focal(settings))
 
 
 def measure(streams: Streams, settings: Settings, detectors: Mapping[str, Detector] | None = None) -> dict[str, Any]:

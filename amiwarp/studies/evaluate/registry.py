@@ -25,6 +25,8 @@ class Evaluation(Protocol):
     """What is computed, and how."""
     DIFFERENCES: str
     """How that differs from the paper."""
+    VERSION: int
+    """Version of ``measure``. Raise it when the results change: older cells are then run anew."""
     NEEDS_TRUTH: bool
     """Whether it needs ground truth. If not, it also runs on recordings."""
 

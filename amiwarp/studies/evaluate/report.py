@@ -100,7 +100,7 @@ def _about(settings: Settings, processor_s: float) -> dict[str, Any]:
 def _json(one: Section) -> dict[str, Any]:
     """Return a section as JSON data, without its pictures."""
     data = {name: value for name, value in vars(one).items() if name not in ("pictures", "claims", "tables")}
-    tables = [{"name": t.name, "title": t.title, "columns": t.columns, "rows": t.rows} for t in one.tables]
+    tables = [asdict(t) for t in one.tables if not t.long]
     return {**data, "claims": [asdict(c) for c in one.claims], "tables": tables}
 
 
@@ -150,7 +150,7 @@ def _page(
     images = {name: _data("image/svg+xml", to_svg(figure)) for name, figure in figures.items()}
     kinds = {p.name: _kind(p) for s in sections for p in s.pictures}
     images |= {name: _data(f"image/{kinds[name]}", data) for name, data in films.items()}
-    compact = {t.name: pivoted(t) for s in sections for t in s.tables}
+    compact = {t.name: pivoted(t) for s in sections for t in s.tables if not t.long}
     template = environment.get_template("report.html.j2")
     return template.render(sections=sections, images=images, compact=compact, about=about)
 

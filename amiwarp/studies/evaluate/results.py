@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, Stream
+from amiwarp.studies.evaluate.conditions import FOCAL_PX, Condition, RecordedCondition, Stream
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,8 +28,8 @@ class Settings:
     """Whether the run is short: a small image and few values."""
     seeds: int = 2
     """Number of seeds of each condition."""
-    first_seed: int = 0
-    """First seed."""
+    first_seed: int = 1
+    """First seed. The settings of the algorithms were chosen with seed 0, which is therefore not scored."""
     width: int = 240
     """Width of the images [px]."""
     height: int = 180
@@ -46,14 +46,19 @@ class Settings:
         return [Condition(**{**size, **values}, seed=seed) for seed in seeds]
 
     def scenes(self) -> list[Condition]:
-        """Return the room at rest and moving; in full also the desk and the street, and fast motion."""
-        worlds: tuple[str, ...] = ("room",) if self.quick else ("room", "desk", "street")
-        motions: tuple[str, ...] = ("still", "handheld") if self.quick else ("still", "handheld", "fast")
-        return [c for world in worlds for motion in motions for c in self.conditions(world=world, trajectory=motion)]
+        """Return the room at rest and moving; in full also in fast motion, and the desk and the street."""
+        scenes = [("room", "still"), ("room", "handheld")]
+        scenes += [] if self.quick else [("room", "fast"), ("desk", "handheld"), ("street", "handheld")]
+        return [c for world, motion in scenes for c in self.conditions(world=world, trajectory=motion)]
 
 
 QUICK = Settings()
-FULL = Settings(quick=False, seeds=10, width=640, height=480, duration_s=0.5)
+FULL = Settings(quick=False, seeds=10, width=320, height=240, duration_s=0.3)
+
+
+def wide_focal(settings: Settings) -> float:
+    """Return the focal length with which an image of any size sees what the whole sensor does [px]."""
+    return FOCAL_PX * settings.width / 640.0
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,8 @@ class Table:
     """What can be seen, and how to read it."""
     chart: Chart | None = None
     """Chart of the table, or None."""
+    long: bool = False
+    """Whether the table is too long for the page and for ``report.json``, and is only written as CSV."""
 
 
 @dataclass(frozen=True)
@@ -218,6 +225,17 @@ def grouped(rows: Sequence[dict[str, Any]], by: Sequence[str], values: Sequence[
             cells += [float(given.mean()), float(given.std())] if given.size else [None, None]
         out.append(tuple(cells))
     return out
+
+
+def by_case(
+    rows: Sequence[dict[str, Any]], by: Sequence[str], value: str
+) -> dict[tuple[Value, ...], dict[str, tuple[float, float]]]:
+    """Return mean and standard deviation of a column by case, the columns ``by``, and stream, for :func:`compared`."""
+    cases: dict[tuple[Value, ...], dict[str, tuple[float, float]]] = {}
+    for *case, stream, _, mean, std in grouped(rows, (*by, "stream"), [value]):
+        if isinstance(mean, float) and isinstance(std, float):
+            cases.setdefault(tuple(case), {})[str(stream)] = (mean, std)
+    return cases
 
 
 def mean_of(rows: Sequence[dict[str, Any]], name: str, where: Callable[[dict[str, Any]], bool]) -> float | None:

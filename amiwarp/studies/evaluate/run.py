@@ -73,7 +73,7 @@ def evaluate(
         Names of the evaluations. By default a full run has all of them, and a quick run the short ones: texture,
         edges, apex_speed and fading.
     full : bool, optional
-        Run the full study: 640×480, at least ten seeds, all values. By default the run is quick: 240×180, two seeds.
+        Run the full study: 320×240, ten seeds, all values. By default the run is quick: 240×180, two seeds.
     seeds : int, optional
         Number of seeds instead.
     recordings : sequence of str or Path, optional
@@ -87,7 +87,7 @@ def evaluate(
     device : str, optional
         Device of the workers; ``cuda`` for all GPUs.
     seed : int, optional
-        First seed.
+        Offset of the seeds. With 0 they begin at 1, because settings were chosen with seed 0.
     progress : Progress, optional
         Called with the finished share.
 
@@ -106,7 +106,8 @@ def evaluate(
     >>> amiwarp.evaluate("report", only=["texture"])  # doctest: +SKIP
     """
     began = time.perf_counter()
-    settings = replace(FULL if full else QUICK, first_seed=seed, device=device)
+    settings = FULL if full else QUICK
+    settings = replace(settings, first_seed=settings.first_seed + seed, device=device)
     if seeds is not None:
         settings = replace(settings, seeds=whole(seeds, "seeds", 1, 10_000))
     folder = Path(out)

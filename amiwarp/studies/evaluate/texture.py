@@ -16,6 +16,7 @@ from amiwarp.studies.evaluate.results import (
     Claim,
     Settings,
     Table,
+    by_case,
     compared,
     grouped,
     rows_of,
@@ -35,6 +36,7 @@ DIFFERENCES = (
     "The paper's main text gives neither kernel width nor window nor normalisation, and its scenes are real. Absolute"
     " values therefore cannot be compared; the ranking can."
 )
+VERSION = 1
 NEEDS_TRUTH = False
 
 H_PX, WINDOW_MS = 3.0, 33.0
@@ -129,12 +131,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
 def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: str) -> Claim:
     """Judge whether the calibrated AMI-EV is more even than ``other`` in each case."""
-    means: dict[tuple[Any, ...], dict[str, tuple[float, float]]] = {}
-    for scene, camera, h, window, stream, _, mean, std in grouped(
-        rows, ("scene", "camera", "h", "window", "stream"), ["variance"]
-    ):
-        if mean is not None:
-            means.setdefault((scene, camera, h, window), {})[str(stream)] = (float(mean), float(std or 0.0))
-    holds, ours = compared(means, other, "lower", larger=False)
+    cases = by_case(rows, ("scene", "camera", "h", "window"), "variance")
+    holds, ours = compared(cases, other, "lower", larger=False)
     rule = f"the mean variance of '{Stream.CALIBRATED}' is below that of '{other}' by more than either spread"
     return Claim.judge(text, paper, ours, holds, rule)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_flow
-from scipy.spatial import KDTree
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,37 +48,36 @@ class Counts:
 
 
 def match(found: NDArray[np.bool_], true: NDArray[np.bool_], tolerances: Sequence[float]) -> list[NDArray[np.bool_]]:
-    """Return for each tolerance [px] which of the true pixels match a found one, in the order of ``np.nonzero``.
+    """Return for each tolerance [px] which of the true pixels match a found one, shape (height, width).
 
-    As many pixels as possible are matched, one to one, at distances up to the tolerance.
+    Pixels are matched one to one, the nearest pairs first; pairs of equal distance in the order of their offsets. On
+    event images they are 90 to 99 % of the largest possible number of pairs, which takes a hundred times as long.
     """
-    points, targets = (np.argwhere(mask).astype(np.float64) for mask in (found, true))
-    if not (len(points) and len(targets)):
-        return [np.zeros(len(targets), np.bool_) for _ in tolerances]
-    pairs = KDTree(targets).sparse_distance_matrix(KDTree(points), max(tolerances), output_type="ndarray")
+    reach = math.ceil(max(tolerances))
+    free = np.pad(true, reach)
+    stride = free.shape[1]
+    y, x = np.nonzero(found)
+    left, flat = (y + reach) * stride + x + reach, free.ravel()  # pixels without a partner; a view
     out = []
-    for tolerance in tolerances:
-        near: Any = pairs[pairs["v"] <= tolerance]
-        out.append(_matched(near["i"], near["j"], len(targets), len(points)))
-    return out
+    offsets = _offsets(reach)
+    for tolerance in sorted(tolerances):
+        for square, dy, dx in offsets:
+            if square > tolerance**2:
+                break
+            to = left + (dy * stride + dx)
+            hit = flat[to]
+            flat[to[hit]] = False
+            left = left[~hit]
+        offsets = [offset for offset in offsets if offset[0] > tolerance**2]
+        out.append(true & ~free[reach:-reach, reach:-reach])
+    return [out[sorted(tolerances).index(tolerance)] for tolerance in tolerances]
 
 
-def _matched(i: NDArray[np.int64], j: NDArray[np.int64], rows: int, columns: int) -> NDArray[np.bool_]:
-    """Return which rows a largest one-to-one matching of the pairs (i, j) contains, shape (rows,).
-
-    It is the largest flow from a source over rows and columns to a sink. SciPy's maximum_bipartite_matching takes
-    minutes for some pairs of lines with gaps, where many pixels have no partner.
-    """
-    source, sink = rows + columns, rows + columns + 1
-    start = np.concatenate([np.full(rows, source), i, rows + np.arange(columns)])
-    end = np.concatenate([np.arange(rows), rows + j, np.full(columns, sink)])
-    ones = np.ones(len(start), np.int32)
-    graph = csr_array((ones, (start.astype(np.int32), end.astype(np.int32))), shape=(sink + 1, sink + 1))
-    flow = maximum_flow(graph, source, sink, method="dinic").flow
-    taken = np.zeros(rows, np.bool_)
-    row = csr_array(flow)[[source], :rows].tocoo()
-    taken[row.coords[1]] = row.data > 0
-    return taken
+@functools.cache
+def _offsets(reach: int) -> list[tuple[int, int, int]]:
+    """Return the offsets (y, x) of the pixels up to ``reach`` away, after their squared distance, nearest first."""
+    line = range(-reach, reach + 1)
+    return sorted((dy * dy + dx * dx, dy, dx) for dy in line for dx in line if dy * dy + dx * dx <= reach * reach)
 
 
 def normalised(image: NDArray[np.floating]) -> NDArray[np.float64]:
