@@ -24,10 +24,11 @@ extensions = [
     "api_pages",
     "command_pages",
     "offline",
+    "paper_results",
     "repository_pages",
     "results_table",
 ]
-exclude_patterns = ["_build", "tutorials", "gallery/backreferences", "**/*.ipynb"]
+exclude_patterns = ["_build", "tutorials", "gallery/backreferences", "explanation/paper-results/*", "**/*.ipynb"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4

@@ -1,5 +1,6 @@
 """The extensions that make pages of the site: references, tables of measurements, links, check for remote files."""
 
+import json
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -128,3 +129,26 @@ def test_rows_are_selected_and_summarised(extension: Any) -> None:
         results.select(rows, "key = slow")
     with pytest.raises(results.ResultsError, match="no 'none' in the file"):
         list(results.rows_at(data, "none"))
+
+
+def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) -> None:
+    from amiwarp.studies.evaluate.report import write
+    from amiwarp.studies.evaluate.results import QUICK, Chart, Claim, Table
+
+    report, page = extension("amiwarp.studies.evaluate.report"), extension("paper_results")
+    chart = Chart("x", "y", "s", panels=("p",))
+    tables = [Table("curve", "Curve", ("p", "s", "x", "y"), [("a", "b", k, 2.0 * k) for k in range(3)], "Up.", chart),
+              Table("few", "Few", ("name", "y"), [("one | two", 0.5)]),
+              Table("all", "All", ("y",), [(1.0,)], long=True)]  # fmt: skip
+    claims = [Claim.judge("More is more.", "2", "3", True, "larger")]
+    section = report.Section("n", "Name", "How.", "Else.", claims, tables, [], 1, [], 0.0)
+    data = json.loads(write(tmp_path, [section], QUICK, 1.0)["data"].read_text())
+    other = json.loads(json.dumps(data).replace("More is more.", "Less."))
+    text = page.content({"cpu": data, "gpu": other}, tmp_path)
+    assert "| More is more. | 2 | 3 | **reproduced** | not run | – |" in text
+    assert "![Curve](paper-results/curve.png)" in text
+    assert "| one \\| two | 0.5 |" in text
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+    assert (tmp_path / "tables" / "all.csv").read_text() == "y\n1.0\n"
+    assert "All" not in text
+    assert page.content({}, tmp_path).startswith("No report")

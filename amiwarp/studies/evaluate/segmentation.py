@@ -58,7 +58,7 @@ def conditions(settings: Settings) -> list[Condition]:
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     """Return IoU, precision and recall for each stream, window and choice of settings."""
-    choices = [STANDARD, *(replace(STANDARD, **{n: v}) for n, values in VARIED.items() for v in values)]  # type: ignore[arg-type]
+    choices = [STANDARD, *(replace(STANDARD, **{n: v}) for n, values in VARIED.items() for v in values)]
     length = round(WINDOW_TURNS * 60e6 / streams.condition.rpm)
     count = QUICK_WINDOWS if settings.quick else FULL_WINDOWS
     starts = np.linspace(streams.start_us, streams.end_us - length, count + 2).astype(np.int64)[1:-1]

@@ -1,0 +1,117 @@
+"""Make the tables and figures of the page on the paper's results from the reports of ``amiwarp evaluate``.
+
+The reports are ``benchmarks/results/evaluate/*.json``, each a ``report.json``. What is made from them is not under
+version control: ``docs/explanation/paper-results/``, with the text ``content.md`` that the page includes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from generated_files import write_page
+from sphinx.application import Sphinx
+
+from amiwarp.studies.evaluate.drawing import draw, save
+from amiwarp.studies.evaluate.report import pivoted
+from amiwarp.studies.evaluate.results import Chart, ChartKind, Table
+
+FOLDER = "paper-results"
+"""Name of the folder of the figures and of the text."""
+LONGEST = 60
+"""Largest number of rows of a table without a chart on the page."""
+
+
+def table_of(data: dict[str, Any]) -> Table:
+    """Return a table from its JSON form."""
+    chart = data["chart"]
+    if chart is not None:
+        chart = Chart(**{**chart, "panels": tuple(chart["panels"]), "kind": ChartKind(chart["kind"])})
+    rows = [tuple(row) for row in data["rows"]]
+    return Table(data["name"], data["title"], tuple(data["columns"]), rows, data["caption"], chart)
+
+
+def markdown_table(headings: list[str], rows: list[list[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n\n"
+
+
+def verdicts(reports: dict[str, Any]) -> str:
+    """Return the claims with the results and the verdicts of each report, by evaluation."""
+    first = next(iter(reports.values()))
+    text = ""
+    for section in first["evaluations"]:
+        rows = [
+            [claim["text"], claim["paper"], *(cell for report in reports.values() for cell in judged(report, claim))]
+            for claim in section["claims"]
+        ]
+        names = [cell for name in reports for cell in (f"here ({name})", "verdict")]
+        text += f"### {section['title']}\n\n" + markdown_table(["claim", "paper", *names], rows)
+    return text
+
+
+def judged(report: dict[str, Any], claim: dict[str, Any]) -> tuple[str, str]:
+    """Return the result and the verdict on a claim in a report."""
+    for other in (c for section in report["evaluations"] for c in section["claims"]):
+        if other["text"] == claim["text"]:
+            return other["ours"], f"**{other['verdict']}**"
+    return "not run", "–"
+
+
+def run_of(name: str, report: dict[str, Any]) -> str:
+    """Return how a report was made, as an item of a list."""
+    about, settings = report["about"], report["about"]["settings"]
+    cells = sum(section["cells"] for section in report["evaluations"])
+    failed = sum(len(section["errors"]) for section in report["evaluations"])
+    return (
+        f"- **{name}**: {about['date']}, {settings['seeds']} seeds, images of {settings['width']} × "
+        f"{settings['height']} px, {settings['duration_s']} s; {cells:,} cells, {failed} of them failed; "
+        f"{about['machine']}; amiwarp {about['versions']['amiwarp']}\n"
+    )
+
+
+def sections(report: dict[str, Any], folder: Path) -> Iterator[str]:
+    """Yield the text of each evaluation, and draw its charts into a folder."""
+    for section in report["evaluations"]:
+        yield f"## {section['title']}\n\n{section['protocol']}\n\n"
+        yield f"*Different from the paper.* {section['differences']}\n\n"
+        for table in map(table_of, section["tables"]):
+            figure = draw(table)
+            if figure is not None:
+                save(figure, folder / f"{table.name}.png")
+                yield f"![{table.title}]({FOLDER}/{table.name}.png)\n\n*{table.title}. {table.caption}*\n\n"
+            elif len(table.rows) <= LONGEST:
+                yield f"*{table.title}. {table.caption}*\n\n" + markdown_table(*pivoted(table))
+
+
+def content(reports: dict[str, Any], folder: Path) -> str:
+    """Return the text that the page includes, and draw its figures into a folder."""
+    if not reports:
+        return "No report lies in `benchmarks/results/evaluate`.\n"
+    runs = "".join(run_of(name, report) for name, report in reports.items())
+    first = next(iter(reports))
+    return (
+        f"## Verdicts\n\n{runs}\n{verdicts(reports)}Figures and tables below are those of the run {first}.\n\n"
+        + "".join(sections(reports[first], folder))
+    )
+
+
+def make(app: Sphinx) -> None:
+    """Write the text and the figures."""
+    source = Path(app.srcdir)
+    folder = source / "explanation" / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob("*.png"):
+        old.unlink()
+    files = sorted((source.parent / "benchmarks" / "results" / "evaluate").glob("*.json"))
+    reports = {path.stem: json.loads(path.read_text()) for path in files}
+    write_page(folder / "content.md", content(reports, folder))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Make the content before Sphinx reads its sources."""
+    app.connect("builder-inited", make)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
