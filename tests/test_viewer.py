@@ -25,11 +25,12 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import inspector as viewer
+from amiwarp.viewer import window_loading
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.colouring import colours_of, residual
-from amiwarp.viewer.inspector import Inspector, Knobs, Selection
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.parameters import Knobs, Selection
 from amiwarp.viewer.timeline import event_rate, read_span
 
 TRUE = Prism(math.radians(1.0))
@@ -152,7 +153,7 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
 
 
 def test_points_are_thinned_evenly(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "MOST_POINTS", 1000)
+    monkeypatch.setattr(window_loading, "MOST_POINTS", 1000)
     shown = inspector.show()
     assert len(shown.events) == len(shown.after) == 1000
     parts = np.histogram(shown.events.t, 4, (shown.span.start_us, shown.span.start_us + shown.span.length_us))[0]

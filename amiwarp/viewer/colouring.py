@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.viewer.cloud_scene import Look
-    from amiwarp.viewer.inspector import DisplayedWindow
+    from amiwarp.viewer.window import DisplayedWindow
 
 NEAR_PX = 3.0
 """Diameter of the neighbourhood whose centre an event is compared with: two standard deviations [px]."""

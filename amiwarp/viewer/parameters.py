@@ -1,0 +1,84 @@
+"""Parameters of the prism and selection of events under which the inspector shows a recording."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from amiwarp.viewer.imager import Region
+
+if TYPE_CHECKING:
+    from amiwarp.events.recording import Recording
+
+
+class Source(enum.StrEnum):
+    """Where the value of a parameter comes from. The value of a member is the text that the page shows."""
+
+    ASSUMED = "assumed"
+    FILE = "from the file"
+    CALIBRATED = "calibrated"
+    HAND = "set by hand"
+    TRUTH = "known truth"
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """Parameters of the prism that the page's sliders set."""
+
+    model: str = "exact"
+    """Name of the optical model."""
+    apex: float = 0.0
+    """Apex angle of the prism [rad]."""
+    phase: float = 0.0
+    """Phase θ_b of the prism [rad]."""
+    clock_offset: float = 0.0
+    """Offset between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
+    tilt_x: float = 0.0
+    """Tilt of the axis of rotation, x component [rad]."""
+    tilt_y: float = 0.0
+    """Tilt of the axis of rotation, y component [rad]."""
+    rpm: float = 0.0
+    """Speed of the prism if the recording has no encoder [1/min]."""
+    index: float | None = None
+    """Refractive index, if a calibration or the known truth gave it; None: that of the nominal prism."""
+    focal_length: float | None = None
+    """Calibrated focal length [px]; None: that of the camera."""
+
+    @property
+    def calibrated_only(self) -> dict[str, float]:
+        """Parameters by name that the page cannot change, and that a calibration or the known truth gave."""
+        found = {"index": self.index, "focal_length": self.focal_length}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+CURVE_HALF_WIDTH = {
+    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "tilt_x": math.radians(5.0),
+    "tilt_y": math.radians(5.0), "rpm": 6.0,
+}  # fmt: skip
+"""Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Conditions for the events that are shown."""
+
+    polarity: int | None = None
+    """Polarity of the shown events: 1 for only ON, 0 for only OFF, None for both."""
+    region: Region | None = None
+    """Region of the image: left, top, right and bottom [px], right and bottom exclusive. None: the whole image."""
+    hide_hot: bool = False
+    """Whether the events of hot pixels are left out."""
+    noise_us: int | None = None
+    """Time within which an earlier event at a neighbouring pixel must support an event [us]; None: no noise filter."""
+
+
+def first_sources(recording: Recording) -> dict[str, Source]:
+    """Return the sources of a recording's camera and of the parameters that the page shows, without a calibration."""
+    encoder, apex = recording.encoder is not None, getattr(recording.prism, "apex", None)
+    return {
+        "camera": Source.FILE, "model": Source.ASSUMED, "apex": Source.ASSUMED if apex is None else Source.FILE,
+        **dict.fromkeys(("phase", "tilt_x", "tilt_y"), Source.ASSUMED),
+        **({"clock_offset": Source.FILE} if encoder else {"rpm": Source.ASSUMED}),
+    }  # fmt: skip

@@ -1,0 +1,252 @@
+"""The inspector's values for its page: suggested region, sharpness, residuals, event rates and state."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.background_activity import find_background_activity
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import random_variance, relative_variance, sharpness
+from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import Prism
+from amiwarp.simulation.simulator import simulate
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.parameters import Knobs, Selection, Source
+from amiwarp.viewer.suggestion import suggest_region
+
+TRUE = Prism(math.radians(1.0))
+
+
+@pytest.fixture(scope="module")
+def recording(texture: np.ndarray) -> Recording:
+    camera, nominal = Camera.from_fov(160, 120, math.radians(60)), Prism(math.radians(1.2))
+    return simulate(texture, camera, TRUE, duration_s=0.25, seed=1, nominal_prism=nominal)
+
+
+@pytest.fixture
+def inspector(recording: Recording) -> Inspector:
+    made = Inspector(recording)
+    made.take_truth()
+    return made
+
+
+def random_events(n: int, width: int, height: int, seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, 100_000, n))
+    x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (width, height))
+    return Events(x, y, t, rng.integers(0, 2, n).astype(np.uint8))
+
+
+def every_other(recording: Recording) -> Recording:
+    """Return a recording with half of the events, chosen at random."""
+    events = recording.events.slice(0, len(recording.events))
+    kept = events[np.random.default_rng(3).random(len(events)) < 0.5]
+    return replace(recording, events=MemoryEvents(kept, *recording.events.size), truth=None)
+
+
+# sharpness
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("n", [20_000, 200_000])
+def test_random_events_have_no_sharpness(n: int, smoothing: float) -> None:
+    rng = np.random.default_rng(1)
+    width, height = 200, 150
+    votes = Votes(CanvasShape(width, height), "cpu")
+    x, y = (rng.uniform(-0.5, side - 0.5, n).astype(np.float32) for side in (width, height))
+    votes.add_unmoved(Events(x, y, np.zeros(n, np.int64), np.zeros(n, np.uint8)))
+    image = votes.take()[0][8:-8, 8:-8]
+    found = sharpness(image, Sharpness.VARIANCE, smoothing=smoothing)
+    pixels = image.size
+    noise = random_variance(smoothing) * math.sqrt(2.0 * 4.0 * math.pi * max(smoothing, 0.4) ** 2 / pixels)
+    border = 0.1 * smoothing * float(image.mean())  # smoothing darkens the border
+    assert found == pytest.approx(random_variance(smoothing), abs=4.0 * noise + border)
+    assert relative_variance(found, float(image.mean()), smoothing) == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("region", [None, (30, 20, 110, 80)])
+def test_half_of_the_events_have_the_same_sharpness(
+    recording: Recording, inspector: Inspector, region: tuple[int, int, int, int] | None
+) -> None:
+    window = inspector.first_window()
+    inspector.open(*window, Selection(region=region))
+    half = Inspector(every_other(recording))
+    half.open(*window, Selection(region=region))
+    all_of_them, some = inspector.show(), half.show(inspector.knobs)
+    assert some.selected == pytest.approx(0.5 * all_of_them.selected, rel=0.05)
+    for name in ("sharpness_before", "sharpness_after"):
+        assert getattr(some, name) == pytest.approx(getattr(all_of_them, name), rel=0.03)
+    assert all_of_them.sharpness_after > 1.2 * all_of_them.sharpness_before
+
+
+def test_the_curve_and_the_images_have_one_sharpness(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
+    values, scores = inspector.curve("apex")
+    at_apex = np.interp(inspector.knobs.apex, values, scores)
+    assert at_apex == pytest.approx(inspector.show().sharpness_after, rel=0.03)
+    assert inspector.sharpness_of(inspector.knobs) == inspector.show().sharpness_after
+
+
+def test_events_that_move_into_a_region_are_in_its_image(inspector: Inspector) -> None:
+    window, region = inspector.first_window(), (40, 30, 90, 70)
+    inspector.open(*window)
+    whole = inspector.show()
+    inspector.open(*window, Selection(region=region))
+    part = inspector.show()
+    left, top, right, bottom = region
+    for name in ("image_before", "image_after"):
+        cut, expected = (getattr(shown, name)[top:bottom, left:right] for shown in (part, whole))
+        assert cut.sum() == pytest.approx(expected.sum(), rel=2e-3)
+    assert ((part.before >= (left, top)) & (part.before < (right, bottom))).all()
+
+
+# suggested region
+
+
+def test_the_region_with_the_largest_gain_is_suggested() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.poisson(4.0, (300, 400)).astype(np.float32)
+    before[40, 50] = before[41, 300] = 5000.0  # hot pixels
+    after = before.copy()
+    after[150:240, 230:340] = np.where(np.arange(110) % 10 < 2, 20.0, 0.0)
+    found = suggest_region(before, after)
+    assert found.gains
+    left, top, right, bottom = found.region
+    assert right - left == 120
+    assert bottom - top == 90
+    assert left == pytest.approx(225, abs=12)
+    assert top == pytest.approx(150, abs=12)
+    fallback = suggest_region(after, after)
+    assert not fallback.gains
+    assert fallback.region == pytest.approx(found.region, abs=12)
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (60, 80), (10, 1000), (1000, 10), (720, 1280)])
+def test_a_suggested_region_lies_in_the_image(shape: tuple[int, int]) -> None:
+    for image in (np.zeros(shape, np.float32), np.eye(*shape, dtype=np.float32)):
+        left, top, right, bottom = suggest_region(image, image).region
+        assert 0 <= left < right <= shape[1]
+        assert 0 <= top < bottom <= shape[0]
+        assert right - left <= 120
+
+
+def test_compensation_sharpens_the_suggested_region(inspector: Inspector, recording: Recording) -> None:
+    whole, found = inspector.show(), inspector.suggest_region()
+    assert found.gains
+    inspector.open(*inspector.first_window(), Selection(region=found.region))
+    shown = inspector.show()
+    assert shown.sharpness_after > 1.3 * shown.sharpness_before
+    assert shown.sharpness_after - shown.sharpness_before > whole.sharpness_after - whole.sharpness_before
+    assert inspector.suggest_region() == found  # a region that is shown does not matter
+    plain = Inspector(replace(recording, encoder=None, prism=None, camera=None, truth=None))
+    assert not plain.suggest_region().gains
+
+
+# background activity
+
+
+def reference_background(events: Events, window_us: int) -> np.ndarray:
+    out = np.ones(len(events), np.bool_)
+    for k in range(len(events)):
+        dx = np.abs(events.x[:k].astype(int) - int(events.x[k]))
+        dy = np.abs(events.y[:k].astype(int) - int(events.y[k]))
+        near = (np.maximum(dx, dy) == 1) & (events.t[k] - events.t[:k] <= window_us)
+        out[k] = not near.any()
+    return out
+
+
+def test_background_activity_is_what_no_neighbour_supports() -> None:
+    events = random_events(1500, 24, 17)
+    for window_us in (1, 500, 5000):
+        found = find_background_activity(events, (24, 17), window_us=window_us)
+        np.testing.assert_array_equal(found, reference_background(events, window_us))
+    assert not find_background_activity(Events.empty(), (4, 4)).size
+
+
+def test_background_activity_needs_events_of_a_sensor() -> None:
+    events = random_events(10, 24, 17)
+    with pytest.raises(AmiwarpError, match="window_us = 0"):
+        find_background_activity(events, (24, 17), window_us=0)
+    with pytest.raises(AmiwarpError, match="outside"):
+        find_background_activity(events, (5, 5))
+    moved = Events(events.x.astype(np.float32), events.y.astype(np.float32), events.t, events.p)
+    with pytest.raises(AmiwarpError, match="compensated"):
+        find_background_activity(moved, (24, 17))
+
+
+def test_the_noise_filter_leaves_events_out(inspector: Inspector) -> None:
+    window = inspector.first_window()
+    inspector.open(*window)
+    everything = inspector.show().selected
+    inspector.open(*window, Selection(noise_us=2000))
+    assert 0.3 * everything < inspector.show().selected < everything
+
+
+# parameters
+
+
+def test_every_parameter_has_a_source(recording: Recording, inspector: Inspector) -> None:
+    truth = inspector.truth
+    assert truth is not None
+    assert truth.apex == TRUE.apex
+    assert inspector.knobs == truth
+    assert set(inspector.sources.values()) == {Source.TRUTH, Source.FILE}
+    fresh = Inspector(recording)
+    assert fresh.sources["apex"] is Source.FILE
+    assert fresh.sources["phase"] is Source.ASSUMED
+    fresh.set(replace(fresh.knobs, phase=0.3))
+    assert fresh.sources["phase"] is Source.HAND
+    assert fresh.sources["tilt_x"] is Source.ASSUMED
+    made = fresh.as_calibration()
+    fresh.accept(replace(made, free=("apex", "phase")))
+    assert fresh.sources["apex"] is fresh.sources["model"] is Source.CALIBRATED
+    assert fresh.sources["tilt_x"] is Source.FILE
+    bare = Inspector(replace(recording, truth=None, prism=None, encoder=None, camera=None))
+    assert bare.truth is None
+    assert set(bare.sources.values()) == {Source.ASSUMED}
+    with pytest.raises(AmiwarpError, match="no true parameters"):
+        bare.take_truth()
+
+
+def test_two_sets_of_parameters_are_compared(inspector: Inspector) -> None:
+    wrong = replace(inspector.knobs, phase=inspector.knobs.phase + math.pi)
+    both = inspector.show(against=wrong)
+    alone = inspector.show(wrong)
+    np.testing.assert_array_equal(both.before, alone.after)
+    np.testing.assert_array_equal(both.image_before, alone.image_after)
+    assert both.sharpness_before == alone.sharpness_after < both.sharpness_after
+    np.testing.assert_array_equal(both.after, inspector.show().after)
+
+
+def test_a_calibration_without_encoder_keeps_its_phase(recording: Recording) -> None:
+    """The time at which the angle is 0 differs between inspector and calibration."""
+    encoder = recording.encoder
+    assert encoder is not None
+    inspector = Inspector(replace(recording, encoder=None))
+    inspector.set(replace(Knobs(), apex=TRUE.apex, phase=0.4, rpm=720.0))
+    made = inspector.as_calibration()
+    assert made.zero_us == inspector.zero_us
+    later = 10_000
+    shift = 720.0 * math.tau / 60e6 * later
+    moved = replace(made, zero_us=inspector.zero_us + later, parameters={**made.parameters, "phase": 0.4 + shift})
+    other = Inspector(replace(recording, encoder=None), moved)
+    np.testing.assert_allclose(other.show().after, inspector.show().after, atol=2e-3)
+    assert other.as_calibration() is moved
+
+
+def test_a_constant_speed_equals_its_encoder(recording: Recording, inspector: Inspector) -> None:
+    steady = Encoder.constant_speed(720.0, 0, recording.events.t_last)
+    with_encoder = Inspector(replace(recording, encoder=steady))
+    with_encoder.set(inspector.knobs)
+    without = Inspector(replace(recording, encoder=None))
+    zero = float(steady.angle_at([without.zero_us])[0])
+    without.set(replace(inspector.knobs, rpm=720.0, phase=inspector.knobs.phase + zero))
+    without.open(*with_encoder.first_window())
+    np.testing.assert_allclose(without.show().after, with_encoder.show().after, atol=5e-3)
