@@ -13,7 +13,7 @@ import typer
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
-from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import parse_size
 from amiwarp.cli.streams import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
@@ -139,20 +139,11 @@ class PageOptions:
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port to serve on; 0 for any free port.", rich_help_panel=_SERVER)
     ] = 0
-    out_dir: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for the files that the page exports. Default: the recording's folder; for a stream the "
-            "current folder.",
-            rich_help_panel=_SERVER,
-        ),
-        OUTPUT_FOLDER,
-    ] = None
 
-    def show(self, new_inspector: Callable[[], Inspector], *, name: str, folder: Path, common: Common) -> None:
+    def show(self, new_inspector: Callable[[], Inspector], *, name: str, common: Common) -> None:
         """Show the inspector's page in a window, or serve the page for a browser, until closed or interrupted.
 
-        ``name``: name of the recording; ``folder``: folder for exported files.
+        ``name``: name of the recording.
         """
         from amiwarp.viewer.app import has_display, open_window, serve_panel
 
@@ -164,9 +155,9 @@ class PageOptions:
             report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
 
         if in_browser:
-            serve_panel(new_inspector, folder, host=self.host, port=self.port, ready=ready)
+            serve_panel(new_inspector, host=self.host, port=self.port, ready=ready)
         else:
-            open_window(new_inspector, folder, ready)
+            open_window(new_inspector, ready)
 
 
 @dataclass(frozen=True)
@@ -228,7 +219,6 @@ def run(
     common: Common,
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
-    from amiwarp.viewer.app import export_folder
     from amiwarp.viewer.cloud_scene import check_display
 
     device = choose_device(common.device)
@@ -245,12 +235,11 @@ def run(
             data = {**picture.write(waiting[0], picture.screenshot), "device": device}
             report(common, data, _lines(data))
             return
-        folder = export_folder(None if stream.live else recording, page.out_dir)
 
         def inspector_of_tab() -> Inspector:
             return waiting.pop() if waiting else new_inspector()
 
-        page.show(inspector_of_tab, name=recording.name, folder=folder, common=common)
+        page.show(inspector_of_tab, name=recording.name, common=common)
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

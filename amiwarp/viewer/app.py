@@ -20,7 +20,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import check_output
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.cloud_scene import Look, Scene
@@ -45,7 +44,6 @@ def has_display() -> bool:
 
 def serve_panel(
     make_inspector: Callable[[], Inspector],
-    folder: Path,
     *,
     host: str = LOCALHOST,
     port: int = 0,
@@ -53,37 +51,26 @@ def serve_panel(
 ) -> None:
     """Serve the inspector's page until interrupted; each browser tab gets its own inspector.
 
-    Exports are written to ``folder``. ``ready`` is called with the page's address as soon as it can be opened.
+    ``ready`` is called with the page's address as soon as it can be opened.
     Raises :class:`AmiwarpError` if the host or the port cannot be used.
     """
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make_inspector, folder, host, port, ready))
+        asyncio.run(_serve(make_inspector, host, port, ready))
 
 
 async def _serve(
-    make_inspector: Callable[[], Inspector], folder: Path, host: str, port: int, ready: Callable[[str], None]
+    make_inspector: Callable[[], Inspector], host: str, port: int, ready: Callable[[str], None]
 ) -> None:
     token = secrets.token_urlsafe(16)
-    build = partial(_build_tab, make_inspector, folder)
+    build = partial(_build_tab, make_inspector)
     await serve(build, settable=SETTABLE, host=host, port=port, token=token, ready=ready)
 
 
-def _build_tab(make_inspector: Callable[[], Inspector], folder: Path, server: Any) -> Callable[[], None]:
-    return Panel(server, make_inspector(), folder).close
+def _build_tab(make_inspector: Callable[[], Inspector], server: Any) -> Callable[[], None]:
+    return Panel(server, make_inspector()).close
 
 
-def export_folder(recording: Path | None, given: Path | None) -> Path:
-    """Return the folder for exports: ``given``, else the recording's folder, else the current folder.
-
-    Raises :class:`AmiwarpError` if this folder does not exist.
-    """
-    folder = given or (recording.parent if recording is not None else Path())
-    if not folder.is_dir():
-        raise AmiwarpError(f"{folder}: is not a folder; create it first, or give another --out-dir")
-    return folder.resolve()
-
-
-def open_window(make_inspector: Callable[[], Inspector], folder: Path, ready: Callable[[str], None]) -> None:
+def open_window(make_inspector: Callable[[], Inspector], ready: Callable[[str], None]) -> None:
     """Open the page in a window and serve it until the window is closed.
 
     If none of :data:`BROWSERS` is installed, open a tab of the default browser and serve until interrupted.
@@ -92,7 +79,7 @@ def open_window(make_inspector: Callable[[], Inspector], folder: Path, ready: Ca
     async def serve_and_show() -> None:
         address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         serving: asyncio.Future[Any] = asyncio.create_task(
-            _serve(make_inspector, folder, LOCALHOST, 0, address.set_result)
+            _serve(make_inspector, LOCALHOST, 0, address.set_result)
         )
         await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
         if serving.done():
@@ -124,7 +111,6 @@ def view(
     *,
     device: Any = "cpu",
     height: int = 700,
-    out_dir: str | os.PathLike[str] | None = None,
 ) -> Any:
     """Show the inspector below a notebook cell.
 
@@ -138,9 +124,6 @@ def view(
         Device that compensates the events.
     height : int
         Height of the page in the notebook [px].
-    out_dir : str or path-like or None
-        Folder for the files that the page exports. Without it, the folder of the recording's file is used, or the
-        current folder for a recording in memory.
 
     Returns
     -------
@@ -150,8 +133,7 @@ def view(
     Raises
     ------
     AmiwarpError
-        If the recording holds no events, the calibration belongs to a camera of another size, or the folder does not
-        exist.
+        If the recording holds no events, or the calibration belongs to a camera of another size.
 
     Examples
     --------
@@ -159,11 +141,9 @@ def view(
     """
     from IPython.display import IFrame, display
 
-    folder = export_folder(getattr(recording.events, "path", None), None if out_dir is None else Path(out_dir))
-
     Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
     make_inspector = partial(Inspector, recording, calibration, device=device)
-    serving = _serve(make_inspector, folder, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
+    serving = _serve(make_inspector, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
     return asyncio.get_running_loop().create_task(serving)
 
 

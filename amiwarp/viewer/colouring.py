@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 NEAR_PX = 3.0
 """Diameter of the neighbourhood whose centre an event is compared with: two standard deviations [px]."""
+COLOUR_MAPS = {Colour.ANGLE: "twilight", Colour.TIME: "viridis", Colour.DENSITY: "cividis", Colour.RESIDUAL: "cividis"}
+"""Matplotlib colour map of each quantity that a scale shows."""
 
 
 def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
@@ -31,7 +33,6 @@ def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
 
 def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np.uint8]:
     """Return red, green and blue of each point (0 to 255), shape ``(n, 3)``."""
-    from matplotlib import colormaps
     from matplotlib.colors import to_rgb
 
     if look.overlaid and not after:
@@ -41,28 +42,51 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
     if look.colour in STORES:
         return truth_colours(shown.truth, look.colour)
-    value, name = _measure(shown, look.colour, after=after)
-    table = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
-    if name == "twilight":  # its ends are white and its middle is black: keep both apart from the background
-        table = 1.0 - 0.8 * (1.0 - table) if look.dark else 0.8 * table
-    table = (255.0 * table).astype(np.uint8)
+    value, table = _measure(shown, look.colour, after=after), colour_table(look.colour, dark=look.dark)
     return np.asarray(table[np.clip(np.nan_to_num(value) * 255.0, 0, 255).astype(np.uint8)])
 
 
-def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> tuple[NDArray[np.float64], str]:
-    """Return the displayed quantity of each point, scaled to 0 … 1, and the name of its colour map.
+def colour_table(colour: Colour, *, dark: bool) -> NDArray[np.uint8]:
+    """Return the 256 colours of a scale, shape ``(256, 3)``.
 
     The colour maps are perceptually uniform; the colour map of the angle is cyclic.
     """
+    from matplotlib import colormaps
+
+    name = COLOUR_MAPS[colour]
+    table = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
+    if colour is Colour.ANGLE:  # its ends are white and its middle is black: keep both apart from the background
+        table = 1.0 - 0.8 * (1.0 - table) if dark else 0.8 * table
+    return np.asarray(255.0 * table, np.uint8)
+
+
+def scale_of(shown: DisplayedWindow, colour: Colour, *, start_ms: float) -> tuple[str, str, str]:
+    """Return the texts at both ends of a colour scale, and its title. ``start_ms``: start of the window [ms]."""
     if colour is Colour.ANGLE:
-        return shown.theta / math.tau, "twilight"
+        return "0°", "360°", "prism angle θ"
     if colour is Colour.TIME:
-        return (shown.events.t - shown.span.start_us) / shown.span.length_us, "viridis"
+        return f"{start_ms:.6g}", f"{start_ms + shown.span.length_us * 1e-3:.6g} ms", "time"
+    if colour is Colour.DENSITY:
+        return "0", f"{density_top(shown):.3g}", "events per pixel (square root)"
+    return "0", "2 px", "residual"
+
+
+def density_top(shown: DisplayedWindow) -> float:
+    """Return the number of events per pixel at which the colour scale of the density ends, for both clouds."""
+    image = shown.image_after
+    return max(float(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0, 1.0)
+
+
+def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[np.float64]:
+    """Return the displayed quantity of each point, scaled to 0 … 1."""
+    if colour is Colour.ANGLE:
+        return shown.theta / math.tau
+    if colour is Colour.TIME:
+        return (shown.events.t - shown.span.start_us) / shown.span.length_us
     image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
     if colour is Colour.DENSITY:
-        top = max(float(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0, 1.0)
-        return np.sqrt(at_pixels(image, xy) / top), "cividis"
-    return residual(image, xy) / 2.0, "cividis"
+        return np.sqrt(at_pixels(image, xy) / density_top(shown))
+    return residual(image, xy) / 2.0
 
 
 def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -53,8 +53,8 @@ def reachable(host: str) -> str:
 
 
 def address(host: str, port: int, token: str) -> str:
-    """Return the URL to open in a browser, with the token."""
-    return str(URL.build(scheme="http", host=reachable(host), port=port, path="/") % {"token": token})
+    """Return the URL to open in a browser. Its path is the token."""
+    return str(URL.build(scheme="http", host=reachable(host), port=port) / token / "")
 
 
 def warning(host: str) -> str | None:

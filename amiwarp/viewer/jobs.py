@@ -1,4 +1,4 @@
-"""Long-running jobs of a page: calibration, playback of the recording, and writing of films."""
+"""Long-running jobs of a page: calibration, and playback of the recording."""
 
 from __future__ import annotations
 
@@ -6,22 +6,15 @@ import asyncio
 import math
 import traceback
 import weakref
-from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.errors import AmiwarpError
 from amiwarp.progress import Progress
-from amiwarp.reconstruction.export import save_film
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from amiwarp.viewer.panel import Panel
 
-FRAMES, FPS = 90, 25.0
-"""Number of pictures of a film, and pictures per second."""
 PLAY_S, FOLLOW_S = 0.05, 0.25
 """Shortest interval between two pictures while a recording is played, and while a live stream is followed [s]."""
 PROGRESS_S = 0.1
@@ -47,12 +40,12 @@ class CalibrationJob:
         """Start a calibration, or cancel the running one."""
         state = self._panel.state
         if state.busy:
-            if state.busy.startswith("calibrating"):
+            if state.calibrating:
                 self.cancelled = True
                 state.busy = "calibrating: cancelling"
             return
         self.cancelled, self.found = False, None
-        state.update({"busy": "calibrating", "progress": 0, "found": ""})
+        state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": ""})
         self._panel.start_job(self._run())
 
     def cancel(self) -> None:
@@ -78,7 +71,7 @@ class CalibrationJob:
                     panel.state.found = summary(found)
         finally:
             with panel.state:
-                panel.state.busy = ""
+                panel.state.update({"busy": "", "calibrating": False})
 
     def show_progress(self, what: str, share: float) -> None:
         """Show the current step and the finished share, 0 to 1."""
@@ -146,7 +139,7 @@ class Playback:
         """Whether the playback task is running; after a stop it runs until it notices the stop."""
 
     def end(self) -> None:
-        """Stop the playback for good, and also a film that is being written."""
+        """Stop the playback for good."""
         self._ended = True
 
     def toggle(self) -> None:
@@ -173,8 +166,8 @@ class Playback:
             start_s = loop.time()
             with state:
                 if panel.move(float(state.start_ms) + 1e3 * elapsed_s * float(state.speed)):
-                    state.playing = False
-                panel.request("window")
+                    state.playing = bool(state.loop)
+                    panel.move(0.0 if state.loop else float(state.start_ms))
             await panel.wait_until_drawn()
             await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
@@ -188,52 +181,3 @@ class Playback:
             await panel.wait_until_drawn()
             await asyncio.sleep(FOLLOW_S)
         panel.slider_released()
-
-    def turntable(self) -> None:
-        """Write a film in which the camera moves once around the clouds."""
-        self._panel.start_job(self._film("turntable", lambda: self._panel.scene.turntable(FRAMES)))
-
-    def film(self) -> None:
-        """Write a film of the recording, starting at the current window."""
-        self._panel.start_job(self._film("film", self._frames))
-
-    async def _film(self, what: str, frames: Callable[[], Iterator[NDArray[np.uint8]]]) -> None:
-        """Draw the pictures one by one in the event loop, which serves pages in between; write them in a thread."""
-        panel, state, loop, pictures = self._panel, self._panel.state, asyncio.get_running_loop(), frames()
-        if state.busy:
-            return
-
-        async def draw() -> NDArray[np.uint8] | None:
-            await panel.wait_until_drawn()
-            if self._ended:
-                raise JobCancelled
-            with state:
-                state.progress += 100.0 / FRAMES
-                return next(pictures, None)
-
-        def drawn() -> Iterator[NDArray[np.uint8]]:
-            while (picture := asyncio.run_coroutine_threadsafe(draw(), loop).result()) is not None:
-                yield picture
-
-        with state:
-            state.update({"busy": f"writing the {what}", "progress": 0})
-        try:
-            with panel.errors_shown("export"):
-                path = panel.path(what, ".mp4", ".gif")
-                count = await panel.in_thread(save_film, drawn(), path, fps=FPS)
-                panel.show_message(f"{path}: {count} frames written", "success")
-            panel.server.controller.view_update()
-        finally:
-            with state:
-                state.busy = ""
-
-    def _frames(self) -> Iterator[Any]:
-        panel = self._panel
-        for _ in range(FRAMES):
-            picture = panel.scene.picture()
-            ended = panel.move(float(panel.state.start_ms) + 1e3 / FPS * float(panel.state.speed))
-            panel.request("window")  # drawn before the next picture is taken
-
-            yield picture
-            if ended:
-                return
