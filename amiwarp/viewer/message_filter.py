@@ -68,7 +68,13 @@ def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None =
     return check
 
 
+def _integer(value: Any) -> bool:
+    return type(value) is int and abs(value) <= LARGEST
+
+
 flag = one_of(True, False)
+ARGUMENTS: Mapping[str, Check] = {"str": text(MOST_CHARACTERS), "float": number(), "int": _integer}
+"""Checks of the arguments of functions that the page calls, by their annotation."""
 
 
 class MessageFilter:
@@ -107,16 +113,16 @@ class MessageFilter:
         return record(known, more)(call) and call["method"] in self._calls and self._calls[call["method"]](call["args"])
 
     def _is_trigger(self, args: list[Any]) -> bool:
-        """Return whether a function that the page may call exists and takes these strings, numbers or flags."""
-        plain = (text(MOST_CHARACTERS), number(), flag)
+        """Return whether a function that the page may call exists and takes arguments of these types."""
         if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
             return False
         name, given, _ = args
         called = self._server.controller.trigger_fn(name)
-        if called is None or not all(any(check(each) for check in plain) for each in given):
+        if called is None:
             return False
-        inspect.signature(called).bind(*given)
-        return True
+        signature = inspect.signature(called)
+        arguments = signature.bind(*given).arguments  # raises TypeError for another number of arguments
+        return all(ARGUMENTS[signature.parameters[k].annotation](value) for k, value in arguments.items())
 
     @staticmethod
     def _change(settable: Mapping[str, Check]) -> Check:

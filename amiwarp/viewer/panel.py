@@ -32,6 +32,11 @@ if TYPE_CHECKING:
 
 _CUDA_LOCK = asyncio.Lock()
 """Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
+CALLS = (
+    "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
+    "resize_window", "take_from_curve", "pick", "play", "calibrate", "take_truth",
+)  # fmt: skip
+"""Methods of the panel that the page calls."""
 EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms")
 """State variables with a number field, next to the prism's parameters."""
 QUICK, SLOW = {"window": ("clouds", "images"), "knobs": ("clouds", "images"), "look": ("clouds",)}, ("curve", "picture")
@@ -313,12 +318,8 @@ class Panel:
         }.items():  # fmt: skip
             self.state.change(*names)(_without_state(self.request, what))
         self.state.change("model", "kind", "polarity", "hide_hot", "noise_filter")(_without_state(self.slider_released))
-        for call in (
-            self.key, self.released, self.choose, self.typed, self.edge, self.draw, self.whole, self.suggest,
-            self.look_from, self.step, self.move_window, self.resize_window, self.take_from_curve, self.pick, self.play,
-            self.calibrate, self.take_truth,
-        ):  # fmt: skip
-            self.server.trigger(call.__name__)(call)
+        for name in CALLS:
+            self.server.trigger(name)(getattr(self, name))
 
     def _dragged(self, name: str) -> None:
         """Follow a slider. Values that the server itself has set are ignored."""
