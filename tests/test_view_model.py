@@ -16,7 +16,10 @@ from amiwarp.imaging.sharpness_costs import random_variance, relative_variance, 
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.simulator import simulate
+from amiwarp.viewer import log_intensity
+from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.parameters import Knobs, Selection, Source
 from amiwarp.viewer.suggestion import suggest_region
@@ -250,3 +253,86 @@ def test_a_constant_speed_equals_its_encoder(recording: Recording, inspector: In
     without.set(replace(inspector.knobs, rpm=720.0, phase=inspector.knobs.phase + zero))
     without.open(*with_encoder.first_window())
     np.testing.assert_allclose(without.show().after, with_encoder.show().after, atol=5e-3)
+
+
+# kinds of images
+
+
+def test_counts_and_polarities_are_those_of_the_window(inspector: Inspector) -> None:
+    region = (30, 20, 110, 80)
+    inspector.open(*inspector.first_window(), Selection(region=region))
+    shown, counts = inspector.show(), make_images(inspector, ImageKind.COUNT)
+    two = make_images(inspector, ImageKind.POLARITY)
+    left, top, right, bottom = region
+    for both, one, of_window in (
+        (two.before, counts.before, shown.image_before),
+        (two.after, counts.after, shown.image_after),
+    ):
+        assert both is not None
+        assert one is not None
+        np.testing.assert_array_equal(one, of_window[top:bottom, left:right])
+        np.testing.assert_allclose(both.sum(axis=0), one, atol=1e-3)
+    assert two.scale.colours == "polarity"
+    assert counts.scale.unit == "per pixel"
+    inspector.open(*inspector.first_window(), Selection(region=region, polarity=1))
+    only_on = make_images(inspector, ImageKind.POLARITY).after
+    assert not only_on[0].any()
+    np.testing.assert_allclose(only_on[1].sum(), two.after[1].sum(), rtol=5e-3)  # dither at the border
+
+
+def test_a_time_surface_holds_the_latest_times(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window())
+    found = make_images(inspector, ImageKind.TIME_SURFACE)
+    window = inspector.loaded
+    expected = np.full(found.after.shape, np.nan)
+    for x, y, t in zip(window.events.x, window.events.y, window.events.t, strict=True):
+        expected[y, x] = (t - window.span.start_us) * 1e-3
+    assert found.before is not None
+    np.testing.assert_allclose(found.before, expected, atol=1e-4)
+    assert np.isfinite(found.after).sum() < np.isfinite(found.before).sum()  # compensated events gather
+    assert found.scale.unit == "ms"
+    assert np.nanmax(found.after) <= found.scale.high
+
+
+def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
+    region = (30, 20, 110, 80)
+    inspector.open(*inspector.first_window(), Selection(region=region))
+    found = make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert found.before is None
+    assert found.after.shape == (60, 80)
+    whole = reconstruct(
+        inspector.recording, model=inspector.model, start_us=inspector.loaded.span.start_us,
+        length_us=inspector.loaded.span.length_us,
+    ).log[20:80, 30:110]  # fmt: skip
+    assert np.corrcoef(found.after.ravel(), whole.ravel())[0, 1] > 0.95
+    wrong = replace(inspector.knobs, phase=inspector.knobs.phase + math.pi)
+    both = make_images(inspector, ImageKind.LOG_INTENSITY, against=wrong)
+    np.testing.assert_array_equal(both.after, found.after)
+    assert both.before is not None
+    assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
+
+
+def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
+    inspector: Inspector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inspector.open(*inspector.first_window())
+    whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
+    monkeypatch.setattr(log_intensity, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(log_intensity, "MOST_EVENTS", 40_000)
+    found = make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert found.after.shape == whole.shape
+    assert "25 % of the pixels" in found.note
+    assert "ms in the middle" in found.note
+    assert np.corrcoef(found.after.ravel(), whole.ravel())[0, 1] > 0.5
+
+
+def test_a_scale_gives_colours_and_marks() -> None:
+    scale = Scale("events", "per pixel", 0.0, 100.0, "gray", 0.5)
+    colours = scale.rgb(np.array([[0.0, 25.0, 100.0, 400.0, np.nan]]))
+    assert colours[0, :, 0].tolist() == [0, 127, 255, 255, 0]
+    assert scale.ticks() == ((0.0, "0"), (0.5, "25"), (pytest.approx(0.7071, abs=1e-3), "50"),
+                             (pytest.approx(0.866, abs=1e-3), "75"), (1.0, "100"))  # fmt: skip
+    two = Scale("events", "per pixel", 0.0, 10.0, "polarity").rgb(np.array([[[10.0, 0.0, 0.0]], [[0.0, 10.0, 0.0]]]))
+    assert two[0, 0, 2] > two[0, 0, 0]  # OFF is blue
+    assert two[0, 1, 0] > two[0, 1, 2]
+    assert not two[0, 2].any()
