@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ from amiwarp.imaging.background_activity import find_background_activity
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import random_variance, relative_variance, sharpness
 from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.io import open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import log_intensity
+from amiwarp.viewer import event_rates, log_intensity
+from amiwarp.viewer.event_rates import EventRates
 from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.parameters import Knobs, Selection, Source
@@ -336,3 +339,64 @@ def test_a_scale_gives_colours_and_marks() -> None:
     assert two[0, 0, 2] > two[0, 0, 0]  # OFF is blue
     assert two[0, 1, 0] > two[0, 1, 2]
     assert not two[0, 2].any()
+
+
+# event rates
+
+
+def expected_rates(events: Events, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    on, off = (np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (1, 0))
+    return on / np.diff(edges) * 1e6, off / np.diff(edges) * 1e6
+
+
+def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_rates, "MOST_BINS", 4096)
+    events = random_events(50_000, 16, 16)
+    rates = EventRates(MemoryEvents(events, 16, 16))
+    assert rates.share == 0.0
+    assert rates.fill(60.0)
+    assert rates.share == 1.0
+    first, stop = int(events.t[0]), int(events.t[-1]) + 1
+    for start, end, bins in ((first, stop, 100), (first, stop, 7), (first - 5000, stop + 5000, 50),
+                             (40_000, 41_000, 200), (40_000, 40_010, 200), (0, 60_000, 4000)):  # fmt: skip
+        found = rates.curve(start, end, bins)
+        assert found.edges_us[0] == start
+        assert found.edges_us[-1] == end
+        assert len(found.on) <= bins
+        on, off = expected_rates(events, found.edges_us)
+        lengths = np.diff(found.edges_us)
+        # an edge between two edges of the recording's bins counts part of a bin in the next one
+        most = 3.0 * 25.0 / lengths.min() * 1e6 * 0.5
+        assert np.abs(found.on - on).max() <= most
+        assert (found.on * lengths).sum() == pytest.approx((on * lengths).sum(), rel=2e-3)
+        assert (found.off * lengths).sum() == pytest.approx((off * lengths).sum(), rel=2e-3)
+    exact = rates.curve(40_000, 41_000, 200)
+    assert len(exact.on) == 200
+    np.testing.assert_array_equal(exact.on, expected_rates(events, exact.edges_us)[0])
+    monkeypatch.setattr(event_rates, "MOST_EXACT", 10)
+    coarse = rates.curve(40_000, 41_000, 200)
+    assert 30 < len(coarse.on) < 60
+    np.testing.assert_allclose(coarse.off[1:-1], expected_rates(events, coarse.edges_us)[1][1:-1])
+
+
+def test_rates_are_known_as_far_as_the_recording_is_read(tmp_path: Path) -> None:
+    events = random_events(3 * (1 << 20), 16, 16)
+    stretched = Events(events.x, events.y, events.t * 1000, events.p)
+    rates = EventRates(MemoryEvents(stretched, 16, 16))
+    first, stop = int(stretched.t[0]), int(stretched.t[-1]) + 1
+    assert np.isnan(rates.curve(first, stop, 100).on).all()
+    assert not rates.fill(0.0)
+    assert rates.share == pytest.approx(1 / 3, abs=0.01)
+    some = rates.curve(first, stop, 90)
+    assert np.isfinite(some.on[:29]).all()
+    assert np.isnan(some.on[31:]).all()
+    while not rates.fill(0.0):
+        pass
+    full = rates.curve(first, stop, 90)
+    np.testing.assert_array_equal(full.on[:29], some.on[:29])
+    assert (full.on * np.diff(full.edges_us)).sum() * 1e-6 == pytest.approx(stretched.p.sum())
+    text = tmp_path / "events.txt"
+    text.write_text("".join(f"{k * 1e-3:.6f} 1 2 {k % 2}\n" for k in range(1000)))
+    of_file = EventRates(open_recording(text).events)
+    assert of_file.fill(60.0)
+    np.testing.assert_allclose(of_file.curve(0, 999_000, 9).on, 500.0, rtol=0.02)

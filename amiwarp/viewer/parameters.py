@@ -76,12 +76,13 @@ class Selection:
 
 def first_sources(recording: Recording) -> dict[str, Source]:
     """Return the sources of a recording's camera and of the parameters that the page shows, without a calibration."""
-    encoder, apex = recording.encoder is not None, getattr(recording.prism, "apex", None)
+    apex = getattr(recording.prism, "apex", None)
     return {
-        "camera": Source.ASSUMED if recording.camera is None else Source.FILE, "model": Source.ASSUMED, "apex": Source.ASSUMED if apex is None else Source.FILE,
-        **dict.fromkeys(("phase", "tilt_x", "tilt_y"), Source.ASSUMED),
-        **({"clock_offset": Source.FILE} if encoder else {"rpm": Source.ASSUMED}),
-    }  # fmt: skip
+        "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
+        "apex": Source.ASSUMED if apex is None else Source.FILE,
+        **dict.fromkeys(("model", "phase", "tilt_x", "tilt_y"), Source.ASSUMED),
+        **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
+    }
 
 
 def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
