@@ -21,11 +21,13 @@ from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import event_rates, log_intensity
+from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.event_rates import EventRates
 from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.parameters import Knobs, Selection, Source
 from amiwarp.viewer.suggestion import suggest_region
+from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
 
 TRUE = Prism(math.radians(1.0))
 
@@ -400,3 +402,102 @@ def test_rates_are_known_as_far_as_the_recording_is_read(tmp_path: Path) -> None
     of_file = EventRates(open_recording(text).events)
     assert of_file.fill(60.0)
     np.testing.assert_allclose(of_file.curve(0, 999_000, 9).on, 500.0, rtol=0.02)
+
+
+# state
+
+
+def decode(query: str, default: ViewState, inspector: Inspector) -> tuple[ViewState, tuple[str, ...]]:
+    events = inspector.recording.events
+    return decode_state(query, default, size=events.size, duration_us=events.t_last - events.t_first + 1)
+
+
+def test_a_state_comes_back_from_its_address(inspector: Inspector, recording: Recording) -> None:
+    default = current_state(Inspector(recording))
+    assert encode_state(default, default) == ""
+    assert decode("", default, inspector) == (default, ())
+    state = replace(
+        default, start_us=12_345, length_us=40_001, selection=Selection(0, (3, 4, 90, 100), True, 1500),
+        knobs=replace(inspector.knobs, phase=-0.5, clock_offset=-120.5, model="circle"), image=ImageKind.TIME_SURFACE,
+        colour=Colour.RESIDUAL, axis=Axis.TIME, view=View.XY, overlaid=True, against=replace(inspector.knobs, apex=0.0),
+        sources=tuple(inspector.sources.items()),
+    )  # fmt: skip
+    query = encode_state(state, default)
+    assert len(query) < 600
+    found, wrong = decode("?" + query, default, inspector)
+    assert wrong == ()
+    for ours, given in ((found.knobs, state.knobs), (found.against, state.against)):
+        assert ours is not None
+        assert given is not None
+        assert ours.model == given.model
+        assert ours.phase == pytest.approx(given.phase, rel=1e-9)
+        assert ours.apex == pytest.approx(given.apex, rel=1e-9)
+        assert ours.clock_offset == given.clock_offset
+    assert replace(found, knobs=state.knobs, against=state.against) == state
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "apex=nan", "apex=inf", "apex=-1", "apex=1e400", "apex=", "apex", "phase=x", "model=sphere", "image=film",
+        "region=1,2,3", "region=5,5,5,9", "region=0,0,999,9", "region=-1,0,9,9", "region=1.5,0,9,9", "start_ms=-1",
+        "start_ms=1e99", "length_ms=0", "polarity=2", "hide_hot=yes", "noise_us=-5", "noise_us=\u0663", "sources=apex",
+        "sources=x:hand", "sources=apex:god", "unknown=1", "b_=1", "b_model=", "%ff=%ff", "<script>=1",
+        "focal_length=0",
+    ],
+)  # fmt: skip
+def test_a_wrong_address_is_explained_and_the_rest_is_taken(inspector: Inspector, query: str) -> None:
+    default = current_state(inspector)
+    found, wrong = decode(f"{query}&polarity=on", default, inspector)
+    assert found.selection == Selection(polarity=1)
+    assert replace(found, selection=default.selection) == default
+    assert len(wrong) == 1
+    assert wrong[0].startswith("the address gives")
+
+
+def test_a_long_address_is_refused(inspector: Inspector) -> None:
+    default = current_state(inspector)
+    found, wrong = decode("apex=1&" * 2000, default, inspector)
+    assert found == default
+    assert "14,000 characters" in wrong[0]
+
+
+def test_states_are_undone_and_redone(inspector: Inspector) -> None:
+    first = current_state(inspector)
+    history = History(first)
+    assert not history.can_undo
+    assert history.undo() == history.redo() == first
+    dragged = [replace(first, knobs=replace(first.knobs, apex=apex)) for apex in (0.01, 0.02, 0.03)]
+    for state in dragged:
+        history.add(state, "apex")
+    moved = replace(dragged[-1], start_us=5)
+    history.add(moved, "window")
+    assert history.undo() == dragged[-1]
+    assert history.can_redo
+    assert history.undo() == first
+    assert history.redo() == dragged[-1]
+    assert history.redo() == history.redo() == moved
+    history.undo()
+    history.add(first)
+    assert not history.can_redo
+    assert history.undo() == dragged[-1]
+    for k in range(1000):
+        history.add(replace(first, start_us=k))
+    undone = 0
+    while history.can_undo:
+        history.undo()
+        undone += 1
+    assert undone == 199
+
+
+def test_a_state_sets_the_inspector(inspector: Inspector, recording: Recording) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(10, 10, 80, 70)))
+    state, shown = current_state(inspector), inspector.show()
+    other = Inspector(recording)
+    apply_state(other, state)
+    assert current_state(other) == state
+    np.testing.assert_array_equal(other.show().after, shown.after)
+    empty = replace(state, selection=Selection(region=(0, 0, 1, 1)), length_us=1, knobs=Knobs())
+    with pytest.raises(AmiwarpError, match="another window"):
+        apply_state(other, empty)
+    assert current_state(other) == state
