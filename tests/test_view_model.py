@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,12 +15,19 @@ from amiwarp.imaging.background_activity import find_background_activity
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import random_variance, relative_variance, sharpness
 from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.io import open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.simulator import simulate
+from amiwarp.viewer import event_rates, log_intensity
+from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.event_rates import EventRates
+from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.parameters import Knobs, Selection, Source
 from amiwarp.viewer.suggestion import suggest_region
+from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
 
 TRUE = Prism(math.radians(1.0))
 
@@ -250,3 +258,246 @@ def test_a_constant_speed_equals_its_encoder(recording: Recording, inspector: In
     without.set(replace(inspector.knobs, rpm=720.0, phase=inspector.knobs.phase + zero))
     without.open(*with_encoder.first_window())
     np.testing.assert_allclose(without.show().after, with_encoder.show().after, atol=5e-3)
+
+
+# kinds of images
+
+
+def test_counts_and_polarities_are_those_of_the_window(inspector: Inspector) -> None:
+    region = (30, 20, 110, 80)
+    inspector.open(*inspector.first_window(), Selection(region=region))
+    shown, counts = inspector.show(), make_images(inspector, ImageKind.COUNT)
+    two = make_images(inspector, ImageKind.POLARITY)
+    left, top, right, bottom = region
+    for both, one, of_window in (
+        (two.before, counts.before, shown.image_before),
+        (two.after, counts.after, shown.image_after),
+    ):
+        assert both is not None
+        assert one is not None
+        np.testing.assert_array_equal(one, of_window[top:bottom, left:right])
+        np.testing.assert_allclose(both.sum(axis=0), one, atol=1e-3)
+    assert two.scale.colours == "polarity"
+    assert counts.scale.unit == "per pixel"
+    inspector.open(*inspector.first_window(), Selection(region=region, polarity=1))
+    only_on = make_images(inspector, ImageKind.POLARITY).after
+    assert not only_on[0].any()
+    np.testing.assert_allclose(only_on[1].sum(), two.after[1].sum(), rtol=5e-3)  # dither at the border
+
+
+def test_a_time_surface_holds_the_latest_times(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window())
+    found = make_images(inspector, ImageKind.TIME_SURFACE)
+    window = inspector.loaded
+    expected = np.full(found.after.shape, np.nan)
+    for x, y, t in zip(window.events.x, window.events.y, window.events.t, strict=True):
+        expected[y, x] = (t - window.span.start_us) * 1e-3
+    assert found.before is not None
+    np.testing.assert_allclose(found.before, expected, atol=1e-4)
+    assert np.isfinite(found.after).sum() < np.isfinite(found.before).sum()  # compensated events gather
+    assert found.scale.unit == "ms"
+    assert np.nanmax(found.after) <= found.scale.high
+
+
+def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
+    region = (30, 20, 110, 80)
+    inspector.open(*inspector.first_window(), Selection(region=region))
+    found = make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert found.before is None
+    assert found.after.shape == (60, 80)
+    whole = reconstruct(
+        inspector.recording, model=inspector.model, start_us=inspector.loaded.span.start_us,
+        length_us=inspector.loaded.span.length_us,
+    ).log[20:80, 30:110]  # fmt: skip
+    assert np.corrcoef(found.after.ravel(), whole.ravel())[0, 1] > 0.95
+    wrong = replace(inspector.knobs, phase=inspector.knobs.phase + math.pi)
+    both = make_images(inspector, ImageKind.LOG_INTENSITY, against=wrong)
+    np.testing.assert_array_equal(both.after, found.after)
+    assert both.before is not None
+    assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
+
+
+def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
+    inspector: Inspector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inspector.open(*inspector.first_window())
+    whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
+    monkeypatch.setattr(log_intensity, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(log_intensity, "MOST_EVENTS", 40_000)
+    found = make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert found.after.shape == whole.shape
+    assert "25 % of the pixels" in found.note
+    assert "ms in the middle" in found.note
+    assert np.corrcoef(found.after.ravel(), whole.ravel())[0, 1] > 0.5
+
+
+def test_a_scale_gives_colours_and_marks() -> None:
+    scale = Scale("events", "per pixel", 0.0, 100.0, "gray", 0.5)
+    colours = scale.rgb(np.array([[0.0, 25.0, 100.0, 400.0, np.nan]]))
+    assert colours[0, :, 0].tolist() == [0, 127, 255, 255, 0]
+    assert scale.ticks() == ((0.0, "0"), (0.5, "25"), (pytest.approx(0.7071, abs=1e-3), "50"),
+                             (pytest.approx(0.866, abs=1e-3), "75"), (1.0, "100"))  # fmt: skip
+    two = Scale("events", "per pixel", 0.0, 10.0, "polarity").rgb(np.array([[[10.0, 0.0, 0.0]], [[0.0, 10.0, 0.0]]]))
+    assert two[0, 0, 2] > two[0, 0, 0]  # OFF is blue
+    assert two[0, 1, 0] > two[0, 1, 2]
+    assert not two[0, 2].any()
+
+
+# event rates
+
+
+def expected_rates(events: Events, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    on, off = (np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (1, 0))
+    return on / np.diff(edges) * 1e6, off / np.diff(edges) * 1e6
+
+
+def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_rates, "MOST_BINS", 4096)
+    events = random_events(50_000, 16, 16)
+    rates = EventRates(MemoryEvents(events, 16, 16))
+    assert rates.share == 0.0
+    assert rates.fill(60.0)
+    assert rates.share == 1.0
+    first, stop = int(events.t[0]), int(events.t[-1]) + 1
+    for start, end, bins in ((first, stop, 100), (first, stop, 7), (first - 5000, stop + 5000, 50),
+                             (40_000, 41_000, 200), (40_000, 40_010, 200), (0, 60_000, 4000)):  # fmt: skip
+        found = rates.curve(start, end, bins)
+        assert found.edges_us[0] == start
+        assert found.edges_us[-1] == end
+        assert len(found.on) <= bins
+        on, off = expected_rates(events, found.edges_us)
+        lengths = np.diff(found.edges_us)
+        # an edge between two edges of the recording's bins counts part of a bin in the next one
+        most = 3.0 * 25.0 / lengths.min() * 1e6 * 0.5
+        assert np.abs(found.on - on).max() <= most
+        assert (found.on * lengths).sum() == pytest.approx((on * lengths).sum(), rel=2e-3)
+        assert (found.off * lengths).sum() == pytest.approx((off * lengths).sum(), rel=2e-3)
+    exact = rates.curve(40_000, 41_000, 200)
+    assert len(exact.on) == 200
+    np.testing.assert_array_equal(exact.on, expected_rates(events, exact.edges_us)[0])
+    monkeypatch.setattr(event_rates, "MOST_EXACT", 10)
+    coarse = rates.curve(40_000, 41_000, 200)
+    assert 30 < len(coarse.on) < 60
+    np.testing.assert_allclose(coarse.off[1:-1], expected_rates(events, coarse.edges_us)[1][1:-1])
+
+
+def test_rates_are_known_as_far_as_the_recording_is_read(tmp_path: Path) -> None:
+    events = random_events(3 * (1 << 20), 16, 16)
+    stretched = Events(events.x, events.y, events.t * 1000, events.p)
+    rates = EventRates(MemoryEvents(stretched, 16, 16))
+    first, stop = int(stretched.t[0]), int(stretched.t[-1]) + 1
+    assert np.isnan(rates.curve(first, stop, 100).on).all()
+    assert not rates.fill(0.0)
+    assert rates.share == pytest.approx(1 / 3, abs=0.01)
+    some = rates.curve(first, stop, 90)
+    assert np.isfinite(some.on[:29]).all()
+    assert np.isnan(some.on[31:]).all()
+    while not rates.fill(0.0):
+        pass
+    full = rates.curve(first, stop, 90)
+    np.testing.assert_array_equal(full.on[:29], some.on[:29])
+    assert (full.on * np.diff(full.edges_us)).sum() * 1e-6 == pytest.approx(stretched.p.sum())
+    text = tmp_path / "events.txt"
+    text.write_text("".join(f"{k * 1e-3:.6f} 1 2 {k % 2}\n" for k in range(1000)))
+    of_file = EventRates(open_recording(text).events)
+    assert of_file.fill(60.0)
+    np.testing.assert_allclose(of_file.curve(0, 999_000, 9).on, 500.0, rtol=0.02)
+
+
+# state
+
+
+def decode(query: str, default: ViewState, inspector: Inspector) -> tuple[ViewState, tuple[str, ...]]:
+    events = inspector.recording.events
+    return decode_state(query, default, size=events.size, duration_us=events.t_last - events.t_first + 1)
+
+
+def test_a_state_comes_back_from_its_address(inspector: Inspector, recording: Recording) -> None:
+    default = current_state(Inspector(recording))
+    assert encode_state(default, default) == ""
+    assert decode("", default, inspector) == (default, ())
+    state = replace(
+        default, start_us=12_345, length_us=40_001, selection=Selection(0, (3, 4, 90, 100), True, 1500),
+        knobs=replace(inspector.knobs, phase=-0.5, clock_offset=-120.5, model="circle"), image=ImageKind.TIME_SURFACE,
+        colour=Colour.RESIDUAL, axis=Axis.TIME, view=View.XY, overlaid=True, against=replace(inspector.knobs, apex=0.0),
+        sources=tuple(inspector.sources.items()),
+    )  # fmt: skip
+    query = encode_state(state, default)
+    assert len(query) < 600
+    found, wrong = decode("?" + query, default, inspector)
+    assert wrong == ()
+    for ours, given in ((found.knobs, state.knobs), (found.against, state.against)):
+        assert ours is not None
+        assert given is not None
+        assert ours.model == given.model
+        assert ours.phase == pytest.approx(given.phase, rel=1e-9)
+        assert ours.apex == pytest.approx(given.apex, rel=1e-9)
+        assert ours.clock_offset == given.clock_offset
+    assert replace(found, knobs=state.knobs, against=state.against) == state
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "apex=nan", "apex=inf", "apex=-1", "apex=1e400", "apex=", "apex", "phase=x", "model=sphere", "image=film",
+        "region=1,2,3", "region=5,5,5,9", "region=0,0,999,9", "region=-1,0,9,9", "region=1.5,0,9,9", "start_ms=-1",
+        "start_ms=1e99", "length_ms=0", "polarity=2", "hide_hot=yes", "noise_us=-5", "noise_us=\u0663", "sources=apex",
+        "sources=x:hand", "sources=apex:god", "unknown=1", "b_=1", "b_model=", "%ff=%ff", "<script>=1",
+        "focal_length=0",
+    ],
+)  # fmt: skip
+def test_a_wrong_address_is_explained_and_the_rest_is_taken(inspector: Inspector, query: str) -> None:
+    default = current_state(inspector)
+    found, wrong = decode(f"{query}&polarity=on", default, inspector)
+    assert found.selection == Selection(polarity=1)
+    assert replace(found, selection=default.selection) == default
+    assert len(wrong) == 1
+    assert wrong[0].startswith("the address gives")
+
+
+def test_a_long_address_is_refused(inspector: Inspector) -> None:
+    default = current_state(inspector)
+    found, wrong = decode("apex=1&" * 2000, default, inspector)
+    assert found == default
+    assert "14,000 characters" in wrong[0]
+
+
+def test_states_are_undone_and_redone(inspector: Inspector) -> None:
+    first = current_state(inspector)
+    history = History(first)
+    assert not history.can_undo
+    assert history.undo() == history.redo() == first
+    dragged = [replace(first, knobs=replace(first.knobs, apex=apex)) for apex in (0.01, 0.02, 0.03)]
+    for state in dragged:
+        history.add(state, "apex")
+    moved = replace(dragged[-1], start_us=5)
+    history.add(moved, "window")
+    assert history.undo() == dragged[-1]
+    assert history.can_redo
+    assert history.undo() == first
+    assert history.redo() == dragged[-1]
+    assert history.redo() == history.redo() == moved
+    history.undo()
+    history.add(first)
+    assert not history.can_redo
+    assert history.undo() == dragged[-1]
+    for k in range(1000):
+        history.add(replace(first, start_us=k))
+    undone = 0
+    while history.can_undo:
+        history.undo()
+        undone += 1
+    assert undone == 199
+
+
+def test_a_state_sets_the_inspector(inspector: Inspector, recording: Recording) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(10, 10, 80, 70)))
+    state, shown = current_state(inspector), inspector.show()
+    other = Inspector(recording)
+    apply_state(other, state)
+    assert current_state(other) == state
+    np.testing.assert_array_equal(other.show().after, shown.after)
+    empty = replace(state, selection=Selection(region=(0, 0, 1, 1)), length_us=1, knobs=Knobs())
+    with pytest.raises(AmiwarpError, match="another window"):
+        apply_state(other, empty)
+    assert current_state(other) == state

@@ -19,7 +19,7 @@ from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.imager import MeasuredImage, WindowImager
-from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source, first_sources
+from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source, first_sources, true_knobs
 from amiwarp.viewer.suggestion import Suggestion, suggest_region
 from amiwarp.viewer.timeline import Span, event_rate, read_span
 from amiwarp.viewer.window import DisplayedWindow, LoadedWindow, WindowAngles
@@ -29,12 +29,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import Events
+    from amiwarp.imaging.device_events import UploadedEvents
     from amiwarp.optics.models import Model
 
 MOST_EVENTS = 4_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
+NO_ENCODER = "no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion"
+NO_CAMERA = f"camera unknown: {FOV_DEG:g}° field of view assumed; give it with --fov-deg or --camera"
 CURVE_POINTS = 25
 """Number of points of a sharpness curve."""
 ORBIT_POINTS = 181
@@ -65,18 +69,13 @@ class Inspector:
         source = recording.events
         if not len(source):
             raise AmiwarpError(f"{recording.name}: holds no events; give a recording with events")
-        self.notes: tuple[str, ...] = ()
-        if recording.encoder is None and calibration is None:
-            self.notes = ("no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion",)
+        no_speed = recording.encoder is None and calibration is None
+        self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
+        """What is missing to compensate the prism's motion, one sentence each."""
         self.sources = first_sources(recording)
         """Where the value of each parameter, and the camera, come from."""
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
-            self.notes = (
-                *self.notes,
-                f"camera unknown: {FOV_DEG:g}° field of view assumed; give it with --fov-deg or --camera",
-            )
-            self.sources["camera"] = Source.ASSUMED
         self.recording, self.device, self.latest = recording, device, latest
         self.prism = nominal(recording.prism)
         """Nominal prism of the recording, with an assumed apex if it is unknown."""
@@ -125,13 +124,17 @@ class Inspector:
     @property
     def adjusted_encoder(self) -> Encoder:
         """Encoder with the clock offset set on the page."""
-        encoder = self.encoder
-        return encoder.with_clock_offset(self.knobs.clock_offset) if self.has_encoder else encoder
+        return self.encoder_of(self.knobs)
+
+    @property
+    def margin_px(self) -> int:
+        """How far outside a region the events of its images may be [px]."""
+        return margin(self.camera, self.prism)
 
     @property
     def model(self) -> Model:
         """Optical model with the parameters that are set on the page."""
-        return self._model(self.knobs)
+        return self.model_of(self.knobs)
 
     @cached_property
     def rate(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -196,11 +199,7 @@ class Inspector:
     @property
     def truth(self) -> Knobs | None:
         """Known parameters of a simulated recording; None if the recording has no ground truth of its prism."""
-        if self.recording.truth is None or not {"apex", "phase"} <= set(self.recording.truth.parameters):
-            return None
-        p = self.recording.truth.parameters
-        offset, tilts = p.get("clock_offset_us", self._recorded_offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
-        return Knobs("exact", p["apex"], p["phase"], offset, *tilts, self.knobs.rpm, p.get("index"))
+        return true_knobs(self.recording, rpm=self.knobs.rpm)
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
@@ -218,7 +217,7 @@ class Inspector:
         size = ("deflection",) if k.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
         kept = {n: values[n] for n in (*size, "phase", *k.calibrated_only)}
         kept |= {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
-        w = self._loaded
+        w = self.loaded
         before, after = self._unmoved(w), self._measured(w, k)
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
@@ -244,7 +243,7 @@ class Inspector:
 
     def suggest_region(self) -> Suggestion:
         """Return the region in which compensation gains most sharpness in the current time window."""
-        loaded = self._loaded
+        loaded = self.loaded
         if self.selection.region is not None:
             loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
         return suggest_region(self._unmoved(loaded).image, self._measured(loaded, self.knobs).image)
@@ -255,7 +254,7 @@ class Inspector:
         ``knobs``: parameters to show, by default the current ones. ``against``: parameters to compare with; they
         replace the recorded events as the first of the two clouds and images.
         """
-        w, knobs = self._loaded, knobs or self.knobs
+        w, knobs = self.loaded, knobs or self.knobs
         first = self._unmoved(w) if against is None else self._measured(w, against)
         xy = w.xy if against is None else self._moved(w, against)
         second, theta = self._measured(w, knobs), np.mod(self._theta(w, knobs), math.tau)
@@ -266,7 +265,7 @@ class Inspector:
 
     def sharpness_of(self, knobs: Knobs) -> float:
         """Return the sharpness of the region with these parameters."""
-        return self._measured(self._loaded, knobs).sharpness
+        return self._measured(self.loaded, knobs).sharpness
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
@@ -283,14 +282,14 @@ class Inspector:
 
         It uses at most :data:`CURVE_EVENTS`, and belongs to the thread that uses the imager.
         """
-        w, on_device = self._loaded, {}
+        w, on_device = self.loaded, {}
 
         def sharpness(knobs: Knobs) -> float:
             rpm = 0.0 if self.has_encoder else knobs.rpm
             if rpm not in on_device:
                 on_device.clear()
                 on_device[rpm] = upload(w.curve_events, self._encoder(rpm), self.device, drifting=self.has_encoder)
-            return imager.measure(self._model(knobs), on_device[rpm], self._drift_us(knobs), w.region).sharpness
+            return imager.measure(self.model_of(knobs), on_device[rpm], self._drift_us(knobs), w.region).sharpness
 
         return sharpness
 
@@ -309,7 +308,8 @@ class Inspector:
         return 0.0 if self.recording.encoder is None else self.recording.encoder.clock_offset_us
 
     @property
-    def _loaded(self) -> LoadedWindow:
+    def loaded(self) -> LoadedWindow:
+        """Selected events of the time window. They are read first if necessary."""
         if self._window is None:
             self.open(*(self.window or self.first_window()))
         assert self._window is not None
@@ -325,16 +325,44 @@ class Inspector:
         return {**more, "apex": apex, "deflection": prism.deflection, "phase": knobs.phase, "tilt_x": knobs.tilt_x,
                 "tilt_y": knobs.tilt_y}  # fmt: skip
 
-    def _model(self, knobs: Knobs) -> Model:
-        return build_model(knobs.model, self.camera, self.prism, self._values(knobs))
+    def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
+        """Return the optical model with given parameters, of the recording's camera or another one."""
+        return build_model(knobs.model, camera or self.camera, self.prism, self._values(knobs))
+
+    def encoder_of(self, knobs: Knobs) -> Encoder:
+        """Return the encoder with the clock offset or the speed of given parameters."""
+        encoder = self._encoder(knobs.rpm)
+        return encoder.with_clock_offset(knobs.clock_offset) if self.has_encoder else encoder
+
+    def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
+        """Return the model, the events on the device and their drift [us], to vote the events of a window.
+
+        ``knobs``: the parameters; None for the events as recorded.
+        """
+        given = replace(self.knobs, model="exact", apex=0.0) if knobs is None else knobs
+        return self.model_of(given), self._angles(w, given).on_device, self._drift_us(given)
+
+    def positions(self, events: Events, knobs: Knobs | None) -> NDArray[np.float32]:
+        """Return the compensated positions of events [px], shape ``(n, 2)``; those recorded if ``knobs`` is None."""
+        xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
+        if knobs is None:
+            return xy
+        theta = self.encoder_of(knobs).angle_at(events.t).astype(np.float32)
+        return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
         if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
             self._span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
+        return self._select(self._span, selection)
+
+    def select(self, span: Span) -> Events:
+        """Return the events of a time window that meet the selection."""
+        return self._select(span, self.selection).events
+
+    def _select(self, span: Span, selection: Selection) -> LoadedWindow:
         hot = self.hot if selection.hide_hot else None
-        margin_px = margin(self.camera, self.prism)
-        return load_window(self.recording, self._span, selection, margin_px=margin_px, hot=hot)
+        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot)
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
@@ -359,15 +387,14 @@ class Inspector:
     def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
         theta = self._theta(w, knobs).astype(np.float32)
-        return np.asarray(self._model(knobs).compensate_points(w.xy, theta), np.float32)
+        return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
 
-    def _measured(self, w: LoadedWindow, knobs: Knobs) -> MeasuredImage:
-        """Return the image of a window with these parameters."""
-        events = self._angles(w, knobs).on_device
-        return self._imager.measure(self._model(knobs), events, self._drift_us(knobs), w.region)
+    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
+        """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
+        return self._imager.measure(*self.warped(w, knobs), w.region)
 
     def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
         """Return the image of a window as recorded."""
         if not w.unmoved:
-            w.unmoved.append(self._measured(w, replace(self.knobs, model="exact", apex=0.0)))
+            w.unmoved.append(self._measured(w, None))
         return w.unmoved[0]

@@ -76,9 +76,23 @@ class Selection:
 
 def first_sources(recording: Recording) -> dict[str, Source]:
     """Return the sources of a recording's camera and of the parameters that the page shows, without a calibration."""
-    encoder, apex = recording.encoder is not None, getattr(recording.prism, "apex", None)
+    apex = getattr(recording.prism, "apex", None)
     return {
-        "camera": Source.FILE, "model": Source.ASSUMED, "apex": Source.ASSUMED if apex is None else Source.FILE,
-        **dict.fromkeys(("phase", "tilt_x", "tilt_y"), Source.ASSUMED),
-        **({"clock_offset": Source.FILE} if encoder else {"rpm": Source.ASSUMED}),
-    }  # fmt: skip
+        "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
+        "apex": Source.ASSUMED if apex is None else Source.FILE,
+        **dict.fromkeys(("model", "phase", "tilt_x", "tilt_y"), Source.ASSUMED),
+        **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
+    }
+
+
+def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
+    """Return the known parameters of a simulated recording; None without ground truth of its prism.
+
+    ``rpm``: the speed, which ground truth does not hold [1/min].
+    """
+    p = {} if recording.truth is None else recording.truth.parameters
+    if not {"apex", "phase"} <= set(p):
+        return None
+    recorded_us = 0.0 if recording.encoder is None else recording.encoder.clock_offset_us
+    tilts = p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)
+    return Knobs("exact", p["apex"], p["phase"], p.get("clock_offset_us", recorded_us), *tilts, rpm, p.get("index"))
