@@ -58,9 +58,7 @@ def serve_panel(
         asyncio.run(_serve(make_inspector, host, port, ready))
 
 
-async def _serve(
-    make_inspector: Callable[[], Inspector], host: str, port: int, ready: Callable[[str], None]
-) -> None:
+async def _serve(make_inspector: Callable[[], Inspector], host: str, port: int, ready: Callable[[str], None]) -> None:
     token = secrets.token_urlsafe(16)
     build = partial(_build_tab, make_inspector)
     await serve(build, settable=SETTABLE, host=host, port=port, token=token, ready=ready)
@@ -78,9 +76,7 @@ def open_window(make_inspector: Callable[[], Inspector], ready: Callable[[str], 
 
     async def serve_and_show() -> None:
         address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        serving: asyncio.Future[Any] = asyncio.create_task(
-            _serve(make_inspector, LOCALHOST, 0, address.set_result)
-        )
+        serving: asyncio.Future[Any] = asyncio.create_task(_serve(make_inspector, LOCALHOST, 0, address.set_result))
         await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
         if serving.done():
             serving.result()

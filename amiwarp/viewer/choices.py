@@ -1,4 +1,4 @@
-"""Options of the page: colour, third axis and view of the event clouds, and kinds of images."""
+"""Options of the event clouds: colour, third axis and view."""
 
 import enum
 
@@ -35,12 +35,3 @@ class View(enum.StrEnum):
     XY = "x-y"
     X_AXIS = "x-θ"
     Y_AXIS = "y-θ"
-
-
-class ImageKind(enum.StrEnum):
-    """Kind of the image that the page shows next to the image as recorded."""
-
-    COMPENSATED = "compensated"
-    DIFFERENCE = "difference"
-    """Image of the compensated events minus the image that the left tile shows."""
-    LOG_INTENSITY = "log intensity"

@@ -19,12 +19,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.events import Events
+    from amiwarp.viewer.image_kinds import Scale
     from amiwarp.viewer.window import DisplayedWindow
 
 JPEG_QUALITY = 90
 LEGEND_ROWS = 8
 """Largest number of causes, instances or depths in a legend."""
-STOPS = 12
+DIFFERENCES = np.array([[0, 114, 178], [255, 255, 255], [213, 94, 0]], np.float64)
+"""Colours of fewer, equally many and more events in an image of differences."""
+STOPS = 16
 """Number of colours from which the browser draws a colour scale."""
 
 
@@ -57,10 +60,36 @@ def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool, start_ms: floa
     return {"title": title, "rows": [], "bar": gradient(colour_table(colour, dark=dark)), "low": low, "high": high}
 
 
-def gradient(table: NDArray[np.uint8]) -> str:
+def gradient(table: NDArray[Any]) -> str:
     """Return a colour map, shape ``(n, 3)``, as a gradient of CSS."""
-    chosen = table[np.linspace(0, len(table) - 1, STOPS).round().astype(int)]
-    return "linear-gradient(90deg, " + ", ".join(f"rgb({r} {g} {b})" for r, g, b in chosen.tolist()) + ")"
+    chosen = table[np.linspace(0, len(table) - 1, min(STOPS, len(table))).round().astype(int)]
+    colours = ", ".join(f"rgb({r} {g} {b})" for r, g, b in chosen.round().astype(int).tolist())
+    return f"linear-gradient(90deg, {colours})"
+
+
+def scale_state(scale: Scale) -> dict[str, Any]:
+    """Return the colour bar of an image: its colours, its ticks from 0 to 1, and its title."""
+    title = f"{scale.title} [{scale.unit}]" if scale.unit else scale.title
+    values = scale.low + np.linspace(0.0, 1.0, 256) ** (1.0 / scale.gamma) * (scale.high - scale.low)
+    if scale.colours != "polarity":
+        ticks = [list(tick) for tick in scale.ticks()]
+        return {"bar": gradient(scale.rgb(values[None])[0]), "ticks": ticks, "title": title}
+    off_on = np.concatenate([values[::-2], values[::2]])  # from many OFF events over none to many ON events
+    is_on = np.arange(len(off_on)) >= len(off_on) // 2
+    table = scale.rgb(np.where(is_on, [[0.0], [1.0]], [[1.0], [0.0]])[:, None] * off_on)[0]
+    ticks = [[0.0, f"{scale.high:.3g} OFF"], [0.5, "0"], [1.0, f"{scale.high:.3g} ON"]]
+    return {"bar": gradient(table), "ticks": ticks, "title": title}
+
+
+def difference_state(before: NDArray[Any], after: NDArray[Any]) -> dict[str, Any]:
+    """Return the state variables of an image of differences: blue where ``after`` is lower, red where it is higher."""
+    most = max(float(np.abs(after - before).max()), 1.0)
+    share = (after - before) / (2.0 * most) + 0.5
+    ends = np.linspace(0.0, 1.0, len(DIFFERENCES))
+    colours = np.stack([np.interp(share, ends, DIFFERENCES[:, k]) for k in range(3)], axis=-1)
+    ticks = [[0.0, f"−{most:.3g}"], [0.5, "0"], [1.0, f"+{most:.3g}"]]
+    scale = {"bar": gradient(DIFFERENCES), "ticks": ticks, "title": "difference [events per pixel]"}
+    return {"after": jpeg(colours / 255.0), "after_scale": scale}
 
 
 def orbit_state(theta: NDArray[Any], orbit: NDArray[Any], point: NDArray[Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.parameters import Knobs
-    from amiwarp.viewer.window import LoadedWindow
+    from amiwarp.viewer.window import DisplayedWindow, LoadedWindow
 
 
 SURFACE_GAMMA = 4.0
@@ -125,6 +125,14 @@ def make_images(
     colours = "polarity" if per_polarity else "gray"
     scale = Scale("events", "per pixel", 0.0, _top(*images), colours, GAMMA)
     return ShownImages(kind, images[0], images[1], scale)
+
+
+def count_images(shown: DisplayedWindow) -> ShownImages:
+    """Return the images of kind :attr:`ImageKind.COUNT` of a window that is already shown."""
+    left, top, right, bottom = shown.region
+    images = [each[top:bottom, left:right] for each in (shown.image_before, shown.image_after)]
+    scale = Scale("events", "per pixel", 0.0, _top(*images), "gray", GAMMA)
+    return ShownImages(ImageKind.COUNT, images[0], images[1], scale)
 
 
 def _top(*images: NDArray[np.float32]) -> float:

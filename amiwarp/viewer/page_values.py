@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer.choices import Axis, Colour, ImageKind, View
-from amiwarp.viewer.drawing import NO_ORBIT, gradient
+from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.comparison import AGAINST
+from amiwarp.viewer.drawing import NO_ORBIT
 from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
+from amiwarp.viewer.image_kinds import ImageKind
 from amiwarp.viewer.layout import KEYS, NAMES, SPEEDS, TOOLS, UNITS, VIEWS
 from amiwarp.viewer.message_filter import Check, flag, number, one_of
 
@@ -18,12 +18,6 @@ if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.window import DisplayedWindow
 
-AGAINST = {
-    "recorded": "the recorded events", "B": "B", "found": "the result of the calibration", "truth": "the known truth",
-}  # fmt: skip
-"""What the left cloud and image can show: name, and the text of the choice."""
-KINDS = {ImageKind.DIFFERENCE: "compensated minus left image"}
-"""Texts of those kinds of images whose name says too little."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
 SETTABLE: dict[str, Check] = {
@@ -32,15 +26,16 @@ SETTABLE: dict[str, Check] = {
     "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
     "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
     "message": one_of(""),
-    **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop"),
+    **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop",
+                     "difference"),
                     flag),
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 calls."""
 CLIENT_ONLY = ("hover", "hover_region", "measured", "tool")
 """State variables that the browser keeps to itself."""
-GREYS = gradient(np.repeat((255.0 * np.sqrt(np.linspace(0.0, 1.0, 256)))[:, None], 3, axis=1).astype(np.uint8))
-"""Scale of an image of events, on which the brightness is the square root of the count."""
+NO_SCALE = {"bar": "", "ticks": [], "title": ""}
+"""Scale of an image before the first update."""
 
 
 def initial_state(inspector: Inspector) -> dict[str, Any]:
@@ -62,10 +57,11 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "hover": "", "hover_region": "", "measured": "", "orbit_shown": True, "help_shown": False,
         "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
         "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
+        "rate_on": b"", "rate_off": b"", "rate_note": "",
         "picked_text": "",
-        "overview": "", "before": "", "after": "", "image_bar": GREYS, "kind": ImageKind.COMPENSATED.value,
-        "kinds": [[each.value, KINDS.get(each, each.value)] for each in ImageKind], "kind_title": "", "kind_note": "",
-        "kind_low": "", "kind_high": "", "kind_bar": "", "image_top": "", "image_slow": False, "against_title": "",
+        "overview": "", "before": "", "after": "", "kind": ImageKind.COUNT.value,
+        "kinds": [each.value for each in ImageKind], "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
+        "after_scale": NO_SCALE, "difference": False, "against_title": "",
         "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
         "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES), "calibrate_on": "",
@@ -76,9 +72,7 @@ def source_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables that depend on the events; they change in a live stream."""
     source = inspector.recording.events
     whole_ms = (source.t_last - source.t_first + 1) * 1e-3
-    rates = inspector.rate[1].astype(np.float32)
-    return {"whole_ms": whole_ms, "rate_on": rates.tobytes(), "rate_off": b"", "rate_span": [0.0, whole_ms],
-            "rate_note": ""}
+    return {"whole_ms": whole_ms, "rate_span": [0.0, whole_ms]}
 
 
 def truths(inspector: Inspector) -> dict[str, float | None]:

@@ -17,14 +17,16 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.choices import Axis, View
+from amiwarp.viewer.comparison import Comparison
 from amiwarp.viewer.frames import wait_until_page_keeps_up
 from amiwarp.viewer.jobs import CalibrationJob, Playback
-from amiwarp.viewer.layout import KEYS, NAMES, SLIDERS, UNITS, template
-from amiwarp.viewer.message_filter import finite
+from amiwarp.viewer.layout import NAMES, SLIDERS, UNITS, template
+from amiwarp.viewer.page_calls import PageCalls
 from amiwarp.viewer.page_files import use_page
+from amiwarp.viewer.page_history import PageHistory
 from amiwarp.viewer.page_values import CLIENT_ONLY, initial_state, source_state
 from amiwarp.viewer.parameters import Selection
+from amiwarp.viewer.rate_view import RateView
 from amiwarp.viewer.updates import Updates
 
 if TYPE_CHECKING:
@@ -32,14 +34,8 @@ if TYPE_CHECKING:
 
 _CUDA_LOCK = asyncio.Lock()
 """Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
-CALLS = (
-    "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
-    "resize_window", "take_from_curve", "pick", "play", "calibrate", "take_truth",
-)  # fmt: skip
-"""Methods of the panel that the page calls."""
-EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms")
-"""State variables with a number field, next to the prism's parameters."""
-QUICK, SLOW = {"window": ("clouds", "images"), "knobs": ("clouds", "images"), "look": ("clouds",)}, ("curve", "picture")
+QUICK = {**dict.fromkeys(("window", "suggestion", "state", "knobs"), ("clouds", "images")), "look": ("clouds",)}
+SLOW = ("curve", "picture")
 """Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
 
 
@@ -51,6 +47,10 @@ class Panel:
         self.server, self.state, self.inspector = server, server.state, inspector
         self.device_lock: Any = _CUDA_LOCK if "cuda" in str(inspector.device) else contextlib.nullcontext()
         self.calibration_job, self.playback, self.updates = CalibrationJob(self), Playback(self), Updates(self)
+        self.calls = PageCalls(self)
+        self.comparison, self.history, self.rates = Comparison(self), PageHistory(self), RateView(self)
+        self.change = ""
+        """What the user changes, such as the name of a slider; successive changes of one name are undone together."""
         self._quick_requests: set[str] = set()
         self._slow_requests: set[str] = set()
         self._doing: set[str] = set()
@@ -73,6 +73,9 @@ class Panel:
                       "region_wanted": [0, 0, *inspector.recording.events.size], "knob": "apex"})  # fmt: skip
         self.show_knobs()
         self.updates.first()
+        self.history.forget()
+        self.comparison.b = None
+        self.rates.start()
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.slider_released()
         if inspector.latest is not None:
@@ -95,122 +98,6 @@ class Panel:
     def compensates(self) -> bool:
         """Whether the prism rotates, so that there is a motion to compensate."""
         return math.isfinite(self.inspector.turn_us)
-
-    # called by the page
-
-    def key(self, key: str) -> None:
-        """Run the action of a key that was pressed outside of a text field."""
-        for known, (name, *given), _ in KEYS:
-            if key == known:
-                getattr(self, name)(*given)
-
-    def released(self) -> None:
-        """Update the slow parts of the page after a slider or the timeline was released."""
-        self.slider_released()
-
-    def choose(self, name: str) -> None:
-        """Select the parameter over which the sharpness curve is drawn."""
-        if name in NAMES and name != self.state.knob:
-            self.state.knob = name
-            self.request_slow("curve")
-
-    def typed(self, name: str, text: str) -> None:
-        """Set the value that a user typed into a number field."""
-        if name not in (*NAMES, *EDITABLE):
-            return
-        try:
-            value = finite(text)
-        except ValueError:
-            self.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
-            return
-        if name == "turns":
-            name, value = "length_ms", value * float(self.state.turn_ms)
-        self.state[name] = round(value, 4)
-        if name in NAMES:
-            self.state.knob = name
-            self.request("knobs")
-        else:
-            self.request("window")
-        self.slider_released()
-
-    def edge(self, side: int, text: str) -> None:
-        """Set one side of the region (0: left, 1: top, 2: right, 3: bottom) to a typed number [px]."""
-        with contextlib.suppress(ValueError):
-            wanted = [*self.state.region]
-            if side in (0, 1, 2, 3):
-                wanted[int(side)] = round(finite(text))
-                self.draw(*wanted)
-
-    def draw(self, left: float, top: float, right: float, bottom: float) -> None:
-        """Show a region of the image [px] that was drawn or typed."""
-        self.show_region([int(each) for each in (left, top, right, bottom)], "drawn")
-
-    def whole(self) -> None:
-        """Show the whole image."""
-        self.show_region([0, 0, *self.state.size], "whole")
-
-    def suggest(self) -> None:
-        """Show the region in which compensation gains most sharpness."""
-        self.request("suggestion", "window")
-        self.slider_released()
-
-    def toggle(self, name: str) -> None:
-        """Invert a state variable that is true or false."""
-        self.state[name] = not self.state[name]
-
-    def toggle_axis(self) -> None:
-        """Switch the third axis between angle and time."""
-        angle, time = Axis.ANGLE.value, Axis.TIME.value
-        self.state.axis = time if self.state.axis == angle else angle
-
-    def look_from(self, view: str) -> None:
-        """Set the view, and reset a camera that the mouse has moved."""
-        if view in list(View):
-            self.state.view = [view, self.state.view[1] + 1]
-
-    def step(self, count: int) -> None:
-        """Move the time window by one turn, forward (1) or back (-1); without a prism, by the window's length."""
-        if count in (-1, 1):
-            turn = self.inspector.turn_us * 1e-3 if self.compensates else float(self.state.length_ms)
-            self.move(float(self.state.start_ms) + count * turn)
-            self.slider_released()
-
-    def move_window(self, start_ms: float) -> None:
-        """Move the time window to a start [ms]; playing stops, except a live stream's."""
-        if not self.state.live:
-            self.state.playing = False
-        self.move(float(start_ms))
-
-    def resize_window(self, start_ms: float, end_ms: float) -> None:
-        """Set the ends of the time window [ms]."""
-        start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self.state.whole_ms))
-        if end > start:
-            self.state.update({"start_ms": round(start, 3), "length_ms": round(end - start, 3)})
-            self.request("window")
-
-    def take_from_curve(self, value: float) -> None:
-        """Set the parameter of the sharpness curve to a clicked value."""
-        self.state[self.state.knob] = round(float(value), 4)
-        self.request("knobs")
-        self.slider_released()
-
-    def pick(self, k: int) -> None:
-        """Describe a drawn event; -1 for none."""
-        self.updates.pick(int(k))
-
-    def play(self) -> None:
-        self.playback.toggle()
-
-    def calibrate(self) -> None:
-        self.calibration_job.toggle()
-
-    def take_truth(self) -> None:
-        """Set the parameters to the known truth of a simulated recording."""
-        with self.errors_shown("knobs"):
-            self.inspector.take_truth()
-        self.knobs_taken()
-
-    # called by jobs
 
     def knobs_taken(self) -> None:
         """Show parameters that the inspector has taken from elsewhere."""
@@ -286,6 +173,7 @@ class Panel:
         with self.errors_shown("stream"):
             self.inspector.renew()
         self.state.update(source_state(self.inspector))
+        self.rates.start()
         self.move(float(self.state.whole_ms))
 
     def download(self, name: str, content: bytes, kind: str) -> None:
@@ -314,17 +202,17 @@ class Panel:
             self.state.change(name)(_without_state(self._dragged, name))
         for what, names in {
             "window": ("polarity", "hide_hot", "noise_filter"), "look": ("colour", "axis", "dark", "orbit_shown"),
-            "knobs": ("model", "against", "kind"),
+            "knobs": ("model", "against", "kind", "difference"),
         }.items():  # fmt: skip
             self.state.change(*names)(_without_state(self.request, what))
         self.state.change("model", "kind", "polarity", "hide_hot", "noise_filter")(_without_state(self.slider_released))
-        for name in CALLS:
-            self.server.trigger(name)(getattr(self, name))
+        for name, call in self.calls.offered.items():
+            self.server.trigger(name)(call)
 
     def _dragged(self, name: str) -> None:
         """Follow a slider. Values that the server itself has set are ignored."""
         if self.state[name] != self._knobs()[name]:
-            self.state.knob = name
+            self.state.knob = self.change = name
             self.request("knobs")
 
     def _knobs(self) -> dict[str, float]:

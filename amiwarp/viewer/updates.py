@@ -2,36 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.plotting.figures import Images
-from amiwarp.reconstruction.choices import Tone
-from amiwarp.reconstruction.export import tones
-from amiwarp.reconstruction.picture import reconstruct
-from amiwarp.viewer.choices import Axis, Colour, ImageKind
+from amiwarp.viewer.choices import Axis, Colour
 from amiwarp.viewer.drawing import (
     NO_ORBIT,
     cloud_state,
+    difference_state,
     event_text,
-    gradient,
     jpeg,
     orbit_state,
+    scale_state,
     whole_image,
-)  # fmt: skip
+)
+from amiwarp.viewer.image_kinds import ImageKind, ShownImages, count_images, make_images
 from amiwarp.viewer.layout import UNITS
-from amiwarp.viewer.page_values import AGAINST, GREYS, events_text, sharpness_text, truths
+from amiwarp.viewer.page_values import events_text, sharpness_text, truths
 
 if TYPE_CHECKING:
     from amiwarp.viewer.panel import Panel
-    from amiwarp.viewer.parameters import Knobs
     from amiwarp.viewer.window import DisplayedWindow
-
-DIFFERENCES = np.array([[0, 114, 178], [255, 255, 255], [213, 94, 0]], np.uint8)
-"""Colours of fewer, equally many and more events in an image of differences."""
 
 
 class Updates:
@@ -41,13 +34,11 @@ class Updates:
         self._panel, self._state = panel, panel.state
         self.shown: DisplayedWindow | None = None
         """Window as the page shows it; None before the first update."""
-        self.b: Knobs | None = None
-        """Parameters that were kept to compare with."""
         self._picked = -1
 
     def first(self) -> None:
         """Forget what another recording has left, and show what there is before the first update."""
-        self.shown, self.b, self._picked = None, None, -1
+        self.shown, self._picked = None, -1
         nothing = np.zeros((0, 2), np.float32).tobytes()
         names = ("cloud_before", "cloud_after", "cloud_third", "colours_before", "colours_after")
         self._state.update({**dict.fromkeys(names, nothing), "region": [0, 0, *self._state.size], "titles": [],
@@ -56,7 +47,7 @@ class Updates:
         self._show_prism()
 
     async def make(self, todo: set[str]) -> None:
-        """Make quick updates: "suggestion", "window", "knobs" and "look"."""
+        """Make quick updates: "suggestion", "window", "knobs", "look" and "state"."""
         panel, state = self._panel, self._state
         if todo & {"window", "suggestion"}:
             with panel.errors_shown("window"):
@@ -64,12 +55,18 @@ class Updates:
         with panel.errors_shown("knobs"):
             if "knobs" in todo:
                 panel.set_knobs()
+            if self.shown is None:
+                panel.history.remember("")
+            if "state" in todo:
+                await panel.history.apply()
             shown, values = await panel.in_thread(self._compute)
             self.shown = shown
             state.update(values)
             state.curve_mark = float(state[state.knob])
             self._show_prism()
             panel.show_knobs()
+            if not state.playing:
+                panel.history.remember("" if todo & {"suggestion", "state"} else panel.change)
 
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve" or "picture"."""
@@ -99,53 +96,41 @@ class Updates:
         """Return what is to be shown, and the state variables that show it."""
         panel, s, inspector = self._panel, self._state, self._panel.inspector
         new = self.shown is None
-        shown = inspector.show(against=self._against())
+        shown = inspector.show(against=panel.comparison.knobs)
         values = cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark), zero_us=panel.zero_us)
         values |= self._images(shown) | self._orbit(shown)
         if new or shown.span is not self.shown.span:  # type: ignore[union-attr]
             values["overview"] = whole_image(shown.span.events, inspector.recording.events.size)
         compensated = panel.compensates
-        left = "as recorded" if s.against == "recorded" else AGAINST[s.against]
-        pair = [[0, left], [1, "compensated"]]
+        left = panel.comparison.title
+        pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
         text = "" if self._picked < 0 else event_text(shown, self._picked, panel.zero_us)
         return shown, {
             **values, "titles": pair if compensated else [[0, "events as recorded"]], "events": events_text(shown),
             "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
-            "against_title": f"region, {left}", "against_choices": [
-                [name, words] for name, words in AGAINST.items() if self._has(name)],
+            "against_title": f"region, {left}", "against_choices": panel.comparison.choices,
         }  # fmt: skip
 
-    def _has(self, name: str) -> bool:
-        """Return whether the parameters exist that the left cloud can show."""
-        panel = self._panel
-        return {"recorded": True, "B": self.b is not None, "found": panel.calibration_job.found is not None,
-                "truth": panel.inspector.truth is not None}[name]  # fmt: skip
-
-    def _against(self) -> Knobs | None:
-        """Return the parameters that the left cloud shows; None for the recorded events."""
-        panel, name = self._panel, self._state.against
-        if name == "recorded" or not self._has(name):
-            return None
-        found = panel.calibration_job.found
-        knobs = {"B": self.b, "found": None if found is None else panel.inspector.knobs_of(found),
-                 "truth": panel.inspector.truth}  # fmt: skip
-        return knobs[name]
-
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the state variables of the images of the region."""
-        kind, (left, top, right, bottom) = ImageKind(self._state.kind), shown.region
-        images = Images(*(i[top:bottom, left:right] for i in (shown.image_before, shown.image_after)))
-        scale = f"{images.top:.3g} events per pixel"
-        values: dict[str, Any] = {"before": _grey(images.before, images.top), "image_top": scale, "kind_note": "",
-                                  "image_slow": kind is ImageKind.LOG_INTENSITY, "kind_title": kind.value}  # fmt: skip
-        if kind is ImageKind.COMPENSATED:
-            values |= {"after": _grey(images.after, images.top), "kind_bar": GREYS, "kind_low": "0", "kind_high": scale}
-        elif kind is ImageKind.DIFFERENCE:
-            most = max(float(np.abs(images.after - images.before).max()), 1.0)
-            share = (images.after - images.before) / (2.0 * most) + 0.5
-            values |= {"after": jpeg(_mixed(share)), "kind_bar": gradient(DIFFERENCES), "kind_low": f"−{most:.3g}",
-                       "kind_high": f"+{most:.3g} events per pixel"}  # fmt: skip
-        return values
+        """Return the state variables of the images of the region; of slow kinds, only that they are."""
+        s, kind = self._state, ImageKind(self._state.kind)
+        if kind is ImageKind.LOG_INTENSITY:
+            return {"image_slow": True}
+        images = count_images(shown) if kind is ImageKind.COUNT else self._make_images()
+        return {"image_slow": False, **self._image_values(images)} | (
+            difference_state(images.before, images.after) if s.difference and kind is ImageKind.COUNT else {}
+        )
+
+    def _make_images(self) -> ShownImages:
+        panel = self._panel
+        return make_images(panel.inspector, ImageKind(self._state.kind), against=panel.comparison.knobs)
+
+    def _image_values(self, images: ShownImages) -> dict[str, Any]:
+        scale = scale_state(images.scale)
+        before, after = (
+            "" if image is None else jpeg(images.scale.rgb(image) / 255.0) for image in (images.before, images.after)
+        )
+        return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": images.note}
 
     def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
         """Return the orbit of the scene point of the picked event, or of the middle of the region."""
@@ -179,32 +164,11 @@ class Updates:
         s.curve_mark = float(s[name])
 
     async def _picture(self) -> None:
-        panel, s, shown = self._panel, self._state, self.shown
-        if s.kind != ImageKind.LOG_INTENSITY.value or shown is None:
+        """Make images of a slow kind."""
+        s = self._state
+        if s.kind != ImageKind.LOG_INTENSITY.value or self.shown is None:
             return
-        inspector = panel.inspector
         try:
-            if not math.isfinite(inspector.turn_us):
-                raise AmiwarpError("the log intensity needs a prism that rotates: set its speed or calibrate")
-            picture = await panel.in_thread(
-                reconstruct, inspector.recording, model=inspector.model, encoder=inspector.adjusted_encoder,
-                start_us=shown.span.start_us, length_us=shown.span.length_us, device=inspector.device,
-            )  # fmt: skip
+            s.update(await self._panel.in_thread(lambda: self._image_values(self._make_images())))
         except AmiwarpError as error:
-            s.update({"after": "", "kind_note": str(error)})
-            return
-        left, top, right, bottom = shown.region
-        image = jpeg(tones(picture, Tone.MAPPED)[top:bottom, left:right])
-        s.update({"after": image, "kind_bar": GREYS, "kind_low": "dark",
-                  "kind_high": f"bright; residual {picture.residual:.2f} thresholds"})  # fmt: skip
-
-
-def _grey(image: Any, top: float) -> str:
-    """Return the address of an image of events; brightness is the square root of the count."""
-    return jpeg(np.sqrt(np.clip(image / top, 0.0, 1.0)))
-
-
-def _mixed(share: Any) -> Any:
-    """Return the colours (0 to 1) of differences from 0 to 1, shape ``(height, width, 3)``."""
-    ends = np.linspace(0.0, 1.0, len(DIFFERENCES))
-    return np.stack([np.interp(share, ends, DIFFERENCES[:, k] / 255.0) for k in range(3)], axis=-1)
+            s.update({"before": "", "after": "", "image_note": str(error)})

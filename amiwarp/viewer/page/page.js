@@ -3,7 +3,7 @@
 import { EventClouds } from './clouds.js';
 import { KnobField } from './fields.js';
 import { EventPicture } from './pictures.js';
-import { CostSurface, CurvePlot } from './plots.js';
+import { ColourBar, CostSurface, CurvePlot } from './plots.js';
 import { savePicture } from './snapshot.js';
 import { RateTimeline } from './timeline.js';
 
@@ -108,6 +108,7 @@ window.amiwarp_page = {
     app.component('RateTimeline', RateTimeline);
     app.component('CurvePlot', CurvePlot);
     app.component('CostSurface', CostSurface);
+    app.component('ColourBar', ColourBar);
     app.component('KnobField', KnobField);
     app.component('PageFrame', PageFrame);
     app.component('PageDialog', PageDialog);

@@ -83,3 +83,9 @@ export const CostSurface = {
     return { canvas, share, placed };
   },
 };
+
+export const ColourBar = {
+  props: { scale: Object },
+  template: `<small class="colour-bar"><span class="bar" :style="{ background: scale.bar }"></span>
+    <span v-for="t in scale.ticks" class="mark" :style="{ left: 100 * t[0] + '%' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
+};
