@@ -17,9 +17,16 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.imager import MeasuredImage, WindowImager
-from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source, first_sources, true_knobs
+from amiwarp.viewer.parameters import (
+    CURVE_HALF_WIDTH,
+    Knobs,
+    Selection,
+    Source,
+    calibrated_knobs,
+    first_sources,
+    true_knobs,
+)
 from amiwarp.viewer.suggestion import Suggestion, suggest_region
 from amiwarp.viewer.timeline import Span, event_rate, read_span
 from amiwarp.viewer.window import DisplayedWindow, LoadedWindow, WindowAngles
@@ -188,13 +195,7 @@ class Inspector:
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        p, prism = calibration.parameters, calibration.prism
-        apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
-        offset, tilts = p.get("clock_offset", self._recorded_offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
-        rpm, phase = p.get("rpm", 0.0), p["phase"]
-        if calibration.zero_us is not None:
-            phase += rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us)
-        return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
+        return calibrated_knobs(calibration, recorded_offset_us=self._recorded_offset_us, zero_us=self.zero_us)
 
     @property
     def truth(self) -> Knobs | None:
@@ -263,10 +264,6 @@ class Inspector:
             first.sharpness, second.sharpness,
         )  # fmt: skip
 
-    def sharpness_of(self, knobs: Knobs) -> float:
-        """Return the sharpness of the region with these parameters."""
-        return self._measured(self.loaded, knobs).sharpness
-
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
         current = self.knobs
@@ -277,19 +274,22 @@ class Inspector:
         changed = [replace(current, **{name: float(value)}) for value in values]  # type: ignore[arg-type]
         return values, np.array([sharpness(knobs) for knobs in changed])
 
-    def sharpness_meter(self, imager: WindowImager) -> Callable[[Knobs], float]:
+    def sharpness_meter(self, imager: WindowImager) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
 
-        It uses at most :data:`CURVE_EVENTS`, and belongs to the thread that uses the imager.
+        Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
+        thread that uses the imager.
         """
         w, on_device = self.loaded, {}
 
-        def sharpness(knobs: Knobs) -> float:
-            rpm = 0.0 if self.has_encoder else knobs.rpm
+        def sharpness(knobs: Knobs | None) -> float:
+            given = self._unprismed if knobs is None else knobs
+            rpm = 0.0 if self.has_encoder else given.rpm
             if rpm not in on_device:
                 on_device.clear()
                 on_device[rpm] = upload(w.curve_events, self._encoder(rpm), self.device, drifting=self.has_encoder)
-            return imager.measure(self.model_of(knobs), on_device[rpm], self._drift_us(knobs), w.region).sharpness
+            model, drift_us = self.model_of(given), self._drift_us(given)
+            return imager.measure(model, on_device[rpm], drift_us, w.region).sharpness
 
         return sharpness
 
@@ -334,12 +334,17 @@ class Inspector:
         encoder = self._encoder(knobs.rpm)
         return encoder.with_clock_offset(knobs.clock_offset) if self.has_encoder else encoder
 
+    @property
+    def _unprismed(self) -> Knobs:
+        """Parameters that leave all events where they were recorded."""
+        return replace(self.knobs, model="exact", apex=0.0)
+
     def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
 
         ``knobs``: the parameters; None for the events as recorded.
         """
-        given = replace(self.knobs, model="exact", apex=0.0) if knobs is None else knobs
+        given = self._unprismed if knobs is None else knobs
         return self.model_of(given), self._angles(w, given).on_device, self._drift_us(given)
 
     def positions(self, events: Events, knobs: Knobs | None) -> NDArray[np.float32]:
