@@ -1,13 +1,17 @@
 """The inspector's values for its page: suggested region, sharpness, residuals, event rates and state."""
 
+import io
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from amiwarp.calib import Settings
+from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -21,8 +25,10 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import event_rates, log_intensity, selected_part
+from amiwarp.viewer import downloads, event_rates, log_intensity, selected_part
+from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.downloads import as_bytes, write_events, write_image
 from amiwarp.viewer.event_rates import EventRates
 from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
@@ -567,3 +573,63 @@ def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording
     surface = cost_surface(without, points=(5, 7))
     assert surface.names == ("apex", "rpm")
     assert surface.best[1] == pytest.approx(720.0, abs=2.1)
+
+
+# downloads
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("most_events", [4_000_000, 6400])
+def test_the_events_of_the_window_are_downloaded(
+    inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compensated: bool, most_events: int
+) -> None:
+    monkeypatch.setattr(viewer, "MOST_EVENTS", most_events)
+    monkeypatch.setattr(downloads, "BLOCK", 10_000)
+    region, (start, length) = (20, 10, 140, 110), inspector.first_window()
+    inspector.open(start, length, Selection(1, region))
+    path = tmp_path / "events.h5"
+    count = write_events(inspector, path, compensated=compensated)
+    events = inspector.recording.events.between(start, start + length)
+    inside = (events.x >= 20) & (events.x < 140) & (events.y >= 10) & (events.y < 110)
+    expected = events[(events.p == 1) & inside]
+    assert count == len(expected) > inspector.loaded.selected * (1 if most_events == 6400 else 0)
+    written = open_recording(path)
+    found = written.events.slice(0, count)
+    np.testing.assert_array_equal(found.t, expected.t)
+    xy = np.stack([found.x, found.y], axis=1).astype(np.float32)
+    moved = compensate_events(expected, inspector.model, inspector.encoder)
+    np.testing.assert_allclose(xy, moved if compensated else np.stack([expected.x, expected.y], axis=1), atol=1e-3)
+    assert written.encoder is not None
+    assert inspector.recording.encoder is not None
+    np.testing.assert_allclose(written.encoder.angle_at(found.t), inspector.encoder.angle_at(found.t))
+    assert len(written.encoder.t) < len(inspector.recording.encoder.t)
+    with pytest.raises(AmiwarpError, match="write to another file"):
+        write_events(inspector, path, compensated=compensated)
+
+
+def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
+    for kind in (ImageKind.COUNT, ImageKind.POLARITY, ImageKind.TIME_SURFACE):
+        images = make_images(inspector, kind)
+        values = np.load(
+            io.BytesIO(as_bytes(".npy", lambda path, images=images: write_image(images, path, before=True)))
+        )
+        np.testing.assert_array_equal(values, images.before)
+        with Image.open(io.BytesIO(as_bytes(".png", lambda path, images=images: write_image(images, path)))) as picture:
+            np.testing.assert_array_equal(np.asarray(picture), images.scale.rgb(images.after))
+        with Image.open(io.BytesIO(as_bytes(".tif", lambda path, images=images: write_image(images, path)))) as picture:
+            assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
+            first = images.after[0] if kind is ImageKind.POLARITY else images.after
+            np.testing.assert_array_equal(np.asarray(picture), first)
+    with pytest.raises(AmiwarpError, match=r"\.png, \.tif, \.npy"):
+        write_image(images, tmp_path / "image.jpg")
+    with pytest.raises(AmiwarpError, match="no image of count before"):
+        write_image(replace(images, kind=ImageKind.COUNT, before=None), tmp_path / "image.png", before=True)
+    write_image(images, tmp_path / "image.png")
+    with pytest.raises(AmiwarpError, match="exists"):
+        write_image(images, tmp_path / "image.png")
+
+
+def test_a_calibration_is_downloaded(inspector: Inspector) -> None:
+    data = json.loads(as_bytes(".json", inspector.as_calibration().save))
+    assert data["parameters"]["apex"]["value"] == TRUE.apex

@@ -17,16 +17,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.camera import Camera
+from amiwarp.viewer import parameters
 from amiwarp.viewer.imager import MeasuredImage, WindowImager
-from amiwarp.viewer.parameters import (
-    CURVE_HALF_WIDTH,
-    Knobs,
-    Selection,
-    Source,
-    calibrated_knobs,
-    first_sources,
-    true_knobs,
-)
+from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source
 from amiwarp.viewer.suggestion import Suggestion, suggest_region
 from amiwarp.viewer.timeline import Span, event_rate, read_span
 from amiwarp.viewer.window import DisplayedWindow, LoadedWindow, WindowAngles
@@ -79,7 +72,7 @@ class Inspector:
         no_speed = recording.encoder is None and calibration is None
         self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
         """What is missing to compensate the prism's motion, one sentence each."""
-        self.sources = first_sources(recording)
+        self.sources = parameters.first_sources(recording)
         """Where the value of each parameter, and the camera, come from."""
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
@@ -184,23 +177,21 @@ class Inspector:
                 f"the calibration is of {given[0]}x{given[1]} pixels, the events are of {size[0]}x{size[1]}; "
                 "calibrate this recording"
             )
-        p, self.prism = calibration.parameters, calibration.prism
-        self.recording = replace(self.recording, camera=calibration.camera)
+        self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
         self.set(self.knobs_of(calibration))
-        calibrated = {"apex" if name == "deflection" else name for name in calibration.free}
-        given = {"apex" if name == "deflection" else name for name in p}
-        self.sources |= dict.fromkeys(given & set(self.sources), Source.FILE)
-        self.sources |= dict.fromkeys(("model", *(calibrated & set(self.sources))), Source.CALIBRATED)
+        self.sources |= parameters.calibrated_sources(calibration, self.sources)
         self._found = self.knobs, calibration
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        return calibrated_knobs(calibration, recorded_offset_us=self._recorded_offset_us, zero_us=self.zero_us)
+        return parameters.calibrated_knobs(
+            calibration, recorded_offset_us=self._recorded_offset_us, zero_us=self.zero_us
+        )
 
     @property
     def truth(self) -> Knobs | None:
         """Known parameters of a simulated recording; None if the recording has no ground truth of its prism."""
-        return true_knobs(self.recording, rpm=self.knobs.rpm)
+        return parameters.true_knobs(self.recording, rpm=self.knobs.rpm)
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
@@ -280,7 +271,8 @@ class Inspector:
         Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
         thread that uses the imager.
         """
-        w, on_device = self.loaded, {}
+        w = self.loaded
+        on_device: dict[float, UploadedEvents] = {}
 
         def sharpness(knobs: Knobs | None) -> float:
             given = self._unprismed if knobs is None else knobs

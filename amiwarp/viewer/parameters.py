@@ -11,6 +11,8 @@ from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.imager import Region
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from amiwarp.calib.result import Calibration
     from amiwarp.events.recording import Recording
 
@@ -113,3 +115,13 @@ def calibrated_knobs(calibration: Calibration, *, recorded_offset_us: float, zer
     if calibration.zero_us is not None:
         phase += rpm * math.tau / 60e6 * (zero_us - calibration.zero_us)
     return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
+
+
+def calibrated_sources(calibration: Calibration, known: Iterable[str]) -> dict[str, Source]:
+    """Return the sources of those ``known`` parameters that a calibration has."""
+
+    def named(names: Iterable[str]) -> set[str]:
+        return {"apex" if name == "deflection" else name for name in names} & set(known)
+
+    given = dict.fromkeys(named(calibration.parameters), Source.FILE)
+    return given | dict.fromkeys(("model", *named(calibration.free)), Source.CALIBRATED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -124,6 +124,6 @@ def cost_surface(
     for row, second in enumerate(values[1]):
         progress(f"sharpness over {names[0]} and {names[1]}", row / len(out))
         for column, first in enumerate(values[0]):
-            knobs = replace(current, **{names[0]: float(first), names[1]: float(second)})
-            out[row, column] = sharpness(knobs)
+            changes: dict[str, Any] = {names[0]: float(first), names[1]: float(second)}
+            out[row, column] = sharpness(replace(current, **changes))
     return CostSurface(names, values, out)
