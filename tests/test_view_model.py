@@ -1,12 +1,17 @@
 """The inspector's values for its page: suggested region, sharpness, residuals, event rates and state."""
 
+import io
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from amiwarp.calib import Settings
+from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -20,12 +25,15 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import event_rates, log_intensity
+from amiwarp.viewer import downloads, event_rates, log_intensity, selected_part
+from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.downloads import as_bytes, write_events, write_image
 from amiwarp.viewer.event_rates import EventRates
 from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.parameters import Knobs, Selection, Source
+from amiwarp.viewer.selected_calibration import calibrate_selected, cost_surface, scope_text
 from amiwarp.viewer.suggestion import suggest_region
 from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
 
@@ -99,7 +107,6 @@ def test_the_curve_and_the_images_have_one_sharpness(inspector: Inspector) -> No
     values, scores = inspector.curve("apex")
     at_apex = np.interp(inspector.knobs.apex, values, scores)
     assert at_apex == pytest.approx(inspector.show().sharpness_after, rel=0.03)
-    assert inspector.sharpness_of(inspector.knobs) == inspector.show().sharpness_after
 
 
 def test_events_that_move_into_a_region_are_in_its_image(inspector: Inspector) -> None:
@@ -323,7 +330,7 @@ def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
     inspector.open(*inspector.first_window())
     whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
     monkeypatch.setattr(log_intensity, "MOST_PIXELS", 1000)
-    monkeypatch.setattr(log_intensity, "MOST_EVENTS", 40_000)
+    monkeypatch.setattr(selected_part, "MOST_EVENTS", 40_000)
     found = make_images(inspector, ImageKind.LOG_INTENSITY)
     assert found.after.shape == whole.shape
     assert "25 % of the pixels" in found.note
@@ -501,3 +508,128 @@ def test_a_state_sets_the_inspector(inspector: Inspector, recording: Recording) 
     with pytest.raises(AmiwarpError, match="another window"):
         apply_state(other, empty)
     assert current_state(other) == state
+
+
+# calibration
+
+
+@pytest.mark.parametrize("region", [None, (20, 10, 140, 110)])
+def test_a_calibration_uses_what_is_selected(
+    recording: Recording, inspector: Inspector, region: tuple[int, int, int, int] | None
+) -> None:
+    first, truth = recording.events.t_first, inspector.truth
+    assert truth is not None
+    inspector.open(first + 20_000, 180_000, Selection(region=region))
+    inspector.set(replace(truth, apex=0.5 * truth.apex))
+    said: list[str] = []
+    settings = Settings(model="exact", stages=("sharpness",))
+    found = calibrate_selected(inspector, settings, progress=lambda what, share: said.append(what))
+    assert said
+    assert found.calibration.camera == recording.camera
+    assert found.calibration.parameters["apex"] == pytest.approx(truth.apex, abs=math.radians(0.12))
+    assert found.before < found.current < found.after
+    assert found.after == pytest.approx(inspector.show(truth).sharpness_after, rel=0.1)
+    assert found.scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
+    assert ("x 20 to 139, y 10 to 109 px" in found.scope) is (region is not None)
+    assert scope_text(inspector) == found.scope
+    assert inspector.knobs.apex == 0.5 * truth.apex  # nothing is accepted yet
+    inspector.accept(found.calibration)
+    assert inspector.sources["apex"] is Source.CALIBRATED
+    shown = inspector.show()
+    assert (shown.sharpness_before, shown.sharpness_after) == pytest.approx((found.before, found.after), rel=0.03)
+
+
+def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) -> None:
+    start, length = inspector.first_window()
+    inspector.open(start, length // 10, Selection(1, (20, 10, 140, 110), noise_us=3000))
+    assert scope_text(inspector).count(",") >= 3
+    assert "ON events" in scope_text(inspector)
+    assert "without background activity (3 ms)" in scope_text(inspector)
+    with pytest.raises(AmiwarpError, match=r"quarter turn|too few"):
+        calibrate_selected(inspector)
+
+
+def test_the_cost_surface_has_its_top_at_the_truth(inspector: Inspector) -> None:
+    truth = inspector.knobs
+    inspector.set(replace(truth, apex=0.8 * truth.apex, phase=truth.phase + 0.6))
+    shares: list[float] = []
+    surface = cost_surface(inspector, points=(9, 13), progress=lambda what, share: shares.append(share))
+    assert surface.names == ("apex", "phase")
+    assert surface.sharpness.shape == (13, 9)
+    assert shares == pytest.approx(np.arange(13) / 13)
+    apex, phase = surface.best
+    assert apex == pytest.approx(truth.apex, abs=0.21 * truth.apex)
+    assert abs(math.remainder(phase - truth.phase, math.tau)) < math.radians(31.0)
+    still = np.ptp(surface.sharpness[:, 0])
+    assert still < 0.01 * np.ptp(surface.sharpness)  # without an apex, the phase does not matter
+
+
+def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording, inspector: Inspector) -> None:
+    without = Inspector(replace(recording, encoder=None))
+    encoder = recording.encoder
+    assert encoder is not None
+    zero = float(encoder.angle_at([without.zero_us])[0])
+    without.set(replace(inspector.knobs, rpm=718.0, phase=inspector.knobs.phase + zero))
+    surface = cost_surface(without, points=(5, 7))
+    assert surface.names == ("apex", "rpm")
+    assert surface.best[1] == pytest.approx(720.0, abs=2.1)
+
+
+# downloads
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("most_events", [4_000_000, 6400])
+def test_the_events_of_the_window_are_downloaded(
+    inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compensated: bool, most_events: int
+) -> None:
+    monkeypatch.setattr(viewer, "MOST_EVENTS", most_events)
+    monkeypatch.setattr(downloads, "BLOCK", 10_000)
+    region, (start, length) = (20, 10, 140, 110), inspector.first_window()
+    inspector.open(start, length, Selection(1, region))
+    path = tmp_path / "events.h5"
+    count = write_events(inspector, path, compensated=compensated)
+    events = inspector.recording.events.between(start, start + length)
+    inside = (events.x >= 20) & (events.x < 140) & (events.y >= 10) & (events.y < 110)
+    expected = events[(events.p == 1) & inside]
+    assert count == len(expected) > inspector.loaded.selected * (1 if most_events == 6400 else 0)
+    written = open_recording(path)
+    found = written.events.slice(0, count)
+    np.testing.assert_array_equal(found.t, expected.t)
+    xy = np.stack([found.x, found.y], axis=1).astype(np.float32)
+    moved = compensate_events(expected, inspector.model, inspector.encoder)
+    np.testing.assert_allclose(xy, moved if compensated else np.stack([expected.x, expected.y], axis=1), atol=1e-3)
+    assert written.encoder is not None
+    assert inspector.recording.encoder is not None
+    np.testing.assert_allclose(written.encoder.angle_at(found.t), inspector.encoder.angle_at(found.t))
+    assert len(written.encoder.t) < len(inspector.recording.encoder.t)
+    with pytest.raises(AmiwarpError, match="write to another file"):
+        write_events(inspector, path, compensated=compensated)
+
+
+def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
+    for kind in (ImageKind.COUNT, ImageKind.POLARITY, ImageKind.TIME_SURFACE):
+        images = make_images(inspector, kind)
+        values = np.load(
+            io.BytesIO(as_bytes(".npy", lambda path, images=images: write_image(images, path, before=True)))
+        )
+        np.testing.assert_array_equal(values, images.before)
+        with Image.open(io.BytesIO(as_bytes(".png", lambda path, images=images: write_image(images, path)))) as picture:
+            np.testing.assert_array_equal(np.asarray(picture), images.scale.rgb(images.after))
+        with Image.open(io.BytesIO(as_bytes(".tif", lambda path, images=images: write_image(images, path)))) as picture:
+            assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
+            first = images.after[0] if kind is ImageKind.POLARITY else images.after
+            np.testing.assert_array_equal(np.asarray(picture), first)
+    with pytest.raises(AmiwarpError, match=r"\.png, \.tif, \.npy"):
+        write_image(images, tmp_path / "image.jpg")
+    with pytest.raises(AmiwarpError, match="no image of count before"):
+        write_image(replace(images, kind=ImageKind.COUNT, before=None), tmp_path / "image.png", before=True)
+    write_image(images, tmp_path / "image.png")
+    with pytest.raises(AmiwarpError, match="exists"):
+        write_image(images, tmp_path / "image.png")
+
+
+def test_a_calibration_is_downloaded(inspector: Inspector) -> None:
+    data = json.loads(as_bytes(".json", inspector.as_calibration().save))
+    assert data["parameters"]["apex"]["value"] == TRUE.apex

@@ -17,9 +17,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import apex_from_deflection
+from amiwarp.viewer import parameters
 from amiwarp.viewer.imager import MeasuredImage, WindowImager
-from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source, first_sources, true_knobs
+from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source
 from amiwarp.viewer.suggestion import Suggestion, suggest_region
 from amiwarp.viewer.timeline import Span, event_rate, read_span
 from amiwarp.viewer.window import DisplayedWindow, LoadedWindow, WindowAngles
@@ -72,7 +72,7 @@ class Inspector:
         no_speed = recording.encoder is None and calibration is None
         self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
         """What is missing to compensate the prism's motion, one sentence each."""
-        self.sources = first_sources(recording)
+        self.sources = parameters.first_sources(recording)
         """Where the value of each parameter, and the camera, come from."""
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
@@ -177,29 +177,21 @@ class Inspector:
                 f"the calibration is of {given[0]}x{given[1]} pixels, the events are of {size[0]}x{size[1]}; "
                 "calibrate this recording"
             )
-        p, self.prism = calibration.parameters, calibration.prism
-        self.recording = replace(self.recording, camera=calibration.camera)
+        self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
         self.set(self.knobs_of(calibration))
-        calibrated = {"apex" if name == "deflection" else name for name in calibration.free}
-        given = {"apex" if name == "deflection" else name for name in p}
-        self.sources |= dict.fromkeys(given & set(self.sources), Source.FILE)
-        self.sources |= dict.fromkeys(("model", *(calibrated & set(self.sources))), Source.CALIBRATED)
+        self.sources |= parameters.calibrated_sources(calibration, self.sources)
         self._found = self.knobs, calibration
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        p, prism = calibration.parameters, calibration.prism
-        apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
-        offset, tilts = p.get("clock_offset", self._recorded_offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
-        rpm, phase = p.get("rpm", 0.0), p["phase"]
-        if calibration.zero_us is not None:
-            phase += rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us)
-        return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
+        return parameters.calibrated_knobs(
+            calibration, recorded_offset_us=self._recorded_offset_us, zero_us=self.zero_us
+        )
 
     @property
     def truth(self) -> Knobs | None:
         """Known parameters of a simulated recording; None if the recording has no ground truth of its prism."""
-        return true_knobs(self.recording, rpm=self.knobs.rpm)
+        return parameters.true_knobs(self.recording, rpm=self.knobs.rpm)
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
@@ -263,10 +255,6 @@ class Inspector:
             first.sharpness, second.sharpness,
         )  # fmt: skip
 
-    def sharpness_of(self, knobs: Knobs) -> float:
-        """Return the sharpness of the region with these parameters."""
-        return self._measured(self.loaded, knobs).sharpness
-
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
         current = self.knobs
@@ -277,19 +265,23 @@ class Inspector:
         changed = [replace(current, **{name: float(value)}) for value in values]  # type: ignore[arg-type]
         return values, np.array([sharpness(knobs) for knobs in changed])
 
-    def sharpness_meter(self, imager: WindowImager) -> Callable[[Knobs], float]:
+    def sharpness_meter(self, imager: WindowImager) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
 
-        It uses at most :data:`CURVE_EVENTS`, and belongs to the thread that uses the imager.
+        Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
+        thread that uses the imager.
         """
-        w, on_device = self.loaded, {}
+        w = self.loaded
+        on_device: dict[float, UploadedEvents] = {}
 
-        def sharpness(knobs: Knobs) -> float:
-            rpm = 0.0 if self.has_encoder else knobs.rpm
+        def sharpness(knobs: Knobs | None) -> float:
+            given = self._unprismed if knobs is None else knobs
+            rpm = 0.0 if self.has_encoder else given.rpm
             if rpm not in on_device:
                 on_device.clear()
                 on_device[rpm] = upload(w.curve_events, self._encoder(rpm), self.device, drifting=self.has_encoder)
-            return imager.measure(self.model_of(knobs), on_device[rpm], self._drift_us(knobs), w.region).sharpness
+            model, drift_us = self.model_of(given), self._drift_us(given)
+            return imager.measure(model, on_device[rpm], drift_us, w.region).sharpness
 
         return sharpness
 
@@ -334,12 +326,17 @@ class Inspector:
         encoder = self._encoder(knobs.rpm)
         return encoder.with_clock_offset(knobs.clock_offset) if self.has_encoder else encoder
 
+    @property
+    def _unprismed(self) -> Knobs:
+        """Parameters that leave all events where they were recorded."""
+        return replace(self.knobs, model="exact", apex=0.0)
+
     def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
 
         ``knobs``: the parameters; None for the events as recorded.
         """
-        given = replace(self.knobs, model="exact", apex=0.0) if knobs is None else knobs
+        given = self._unprismed if knobs is None else knobs
         return self.model_of(given), self._angles(w, given).on_device, self._drift_us(given)
 
     def positions(self, events: Events, knobs: Knobs | None) -> NDArray[np.float32]:

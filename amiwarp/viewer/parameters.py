@@ -7,9 +7,13 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.imager import Region
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from amiwarp.calib.result import Calibration
     from amiwarp.events.recording import Recording
 
 
@@ -96,3 +100,28 @@ def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
     recorded_us = 0.0 if recording.encoder is None else recording.encoder.clock_offset_us
     tilts = p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)
     return Knobs("exact", p["apex"], p["phase"], p.get("clock_offset_us", recorded_us), *tilts, rpm, p.get("index"))
+
+
+def calibrated_knobs(calibration: Calibration, *, recorded_offset_us: float, zero_us: int) -> Knobs:
+    """Return the parameters of a calibration.
+
+    ``recorded_offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
+    prism without encoder is 0 [us]; the phase is converted to it.
+    """
+    p, prism = calibration.parameters, calibration.prism
+    apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
+    offset, tilts = p.get("clock_offset", recorded_offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
+    rpm, phase = p.get("rpm", 0.0), p["phase"]
+    if calibration.zero_us is not None:
+        phase += rpm * math.tau / 60e6 * (zero_us - calibration.zero_us)
+    return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
+
+
+def calibrated_sources(calibration: Calibration, known: Iterable[str]) -> dict[str, Source]:
+    """Return the sources of those ``known`` parameters that a calibration has."""
+
+    def named(names: Iterable[str]) -> set[str]:
+        return {"apex" if name == "deflection" else name for name in names} & set(known)
+
+    given = dict.fromkeys(named(calibration.parameters), Source.FILE)
+    return given | dict.fromkeys(("model", *named(calibration.free)), Source.CALIBRATED)

@@ -46,15 +46,15 @@ def load_window(
     region = selection.region or (0, 0, *recording.events.size)
     left, top, right, bottom = region
     wide = (left - margin_px, top - margin_px, right + margin_px, bottom + margin_px)
-    near = np.flatnonzero(_kept(recording, span.events, selection, wide, hot))
+    near = np.flatnonzero(kept(recording, span.events, selection, wide, hot))
     events = span.events if len(near) == len(span.events) else span.events[near]
-    inside = np.flatnonzero(_inside(events, region)) if selection.region else np.arange(len(events))
-    n = len(inside)
+    within = np.flatnonzero(inside(events, region)) if selection.region else np.arange(len(events))
+    n = len(within)
     if not n:
         what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
         raise AmiwarpError(f"{what} from {(span.start_us - recording.events.t_first) * 1e-3:.3f} ms on for "
                            f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
-    thin = inside[np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)]
+    thin = within[np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)]
     drawn, truth = events[thin], DrawnTruth(recording.truth, span, near[thin])
     xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
     curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
@@ -75,7 +75,7 @@ def margin(camera: Camera, prism: Prism) -> int:
     return math.ceil(1.2 * math.tan(abs(largest.deflection)) * max(camera.fx, camera.fy))
 
 
-def _kept(
+def kept(
     recording: Recording, events: Events, selection: Selection, region: Region, hot: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_]:
     """Return whether each event meets the selection, with another region, shape ``(n,)``."""
@@ -86,7 +86,7 @@ def _kept(
     if selection.polarity is not None:
         keep &= events.p == selection.polarity
     if selection.region is not None:
-        keep &= _inside(events, region)
+        keep &= inside(events, region)
     if hot is not None:
         keep &= ~hot[events.y, events.x]
     if selection.noise_us is not None:
@@ -94,7 +94,7 @@ def _kept(
     return keep
 
 
-def _inside(events: Events, region: Region) -> NDArray[np.bool_]:
+def inside(events: Events, region: Region) -> NDArray[np.bool_]:
     """Return whether each event lies in a region, shape ``(n,)``."""
     left, top, right, bottom = region
     return (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
