@@ -24,6 +24,7 @@ from amiwarp.viewer.host_names import warning
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
     from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.library import Library
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
@@ -140,10 +141,12 @@ class PageOptions:
         int, typer.Option(min=0, max=65535, help="Port to serve on; 0 for any free port.", rich_help_panel=_SERVER)
     ] = 0
 
-    def show(self, new_inspector: Callable[[], Inspector], *, name: str, common: Common) -> None:
+    def show(
+        self, new_inspector: Callable[[], Inspector], library: Library | None, *, name: str, common: Common
+    ) -> None:
         """Show the inspector's page in a window, or serve the page for a browser, until closed or interrupted.
 
-        ``name``: name of the recording.
+        ``library``: other recordings that the page may open; ``name``: name of the recording.
         """
         from amiwarp.viewer.app import has_display, open_window, serve_panel
 
@@ -155,9 +158,9 @@ class PageOptions:
             report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
 
         if in_browser:
-            serve_panel(new_inspector, host=self.host, port=self.port, ready=ready)
+            serve_panel(new_inspector, library, host=self.host, port=self.port, ready=ready)
         else:
-            open_window(new_inspector, ready)
+            open_window(new_inspector, library, ready)
 
 
 @dataclass(frozen=True)
@@ -219,11 +222,10 @@ def run(
     common: Common,
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
-    from amiwarp.viewer.cloud_scene import check_display
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.library import Library
 
     device = choose_device(common.device)
-    check_display()
-
     with stream.follow(str(recording)) as latest:
 
         def new_inspector() -> Inspector:
@@ -236,10 +238,15 @@ def run(
             report(common, data, _lines(data))
             return
 
+        def open_other(path: Path) -> Inspector:
+            return Inspector(complete(open_recording(path), camera, prism), device=device)
+
+        library = None if stream.live else Library(recording.parent, open_other)
+
         def inspector_of_tab() -> Inspector:
             return waiting.pop() if waiting else new_inspector()
 
-        page.show(inspector_of_tab, name=recording.name, common=common)
+        page.show(inspector_of_tab, library, name=recording.name, common=common)
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

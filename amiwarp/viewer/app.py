@@ -24,6 +24,7 @@ from amiwarp.io.atomic_output import check_output
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.library import Library
 from amiwarp.viewer.page_values import SETTABLE
 from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.serve import serve
@@ -44,6 +45,7 @@ def has_display() -> bool:
 
 def serve_panel(
     make_inspector: Callable[[], Inspector],
+    library: Library | None = None,
     *,
     host: str = LOCALHOST,
     port: int = 0,
@@ -51,24 +53,27 @@ def serve_panel(
 ) -> None:
     """Serve the inspector's page until interrupted; each browser tab gets its own inspector.
 
-    ``ready`` is called with the page's address as soon as it can be opened.
+    ``library``: other recordings that the page may open. ``ready`` is called with the page's address as soon as it can
+    be opened.
     Raises :class:`AmiwarpError` if the host or the port cannot be used.
     """
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make_inspector, host, port, ready))
+        asyncio.run(_serve(make_inspector, library, host, port, ready))
 
 
-async def _serve(make_inspector: Callable[[], Inspector], host: str, port: int, ready: Callable[[str], None]) -> None:
+async def _serve(
+    make_inspector: Callable[[], Inspector], library: Library | None, host: str, port: int, ready: Callable[[str], None]
+) -> None:
     token = secrets.token_urlsafe(16)
-    build = partial(_build_tab, make_inspector)
+    build = partial(_build_tab, make_inspector, library)
     await serve(build, settable=SETTABLE, host=host, port=port, token=token, ready=ready)
 
 
-def _build_tab(make_inspector: Callable[[], Inspector], server: Any) -> Callable[[], None]:
-    return Panel(server, make_inspector()).close
+def _build_tab(make_inspector: Callable[[], Inspector], library: Library | None, server: Any) -> Callable[[], None]:
+    return Panel(server, make_inspector(), library).close
 
 
-def open_window(make_inspector: Callable[[], Inspector], ready: Callable[[str], None]) -> None:
+def open_window(make_inspector: Callable[[], Inspector], library: Library | None, ready: Callable[[str], None]) -> None:
     """Open the page in a window and serve it until the window is closed.
 
     If none of :data:`BROWSERS` is installed, open a tab of the default browser and serve until interrupted.
@@ -76,7 +81,9 @@ def open_window(make_inspector: Callable[[], Inspector], ready: Callable[[str], 
 
     async def serve_and_show() -> None:
         address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        serving: asyncio.Future[Any] = asyncio.create_task(_serve(make_inspector, LOCALHOST, 0, address.set_result))
+        serving: asyncio.Future[Any] = asyncio.create_task(
+            _serve(make_inspector, library, LOCALHOST, 0, address.set_result)
+        )
         await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
         if serving.done():
             serving.result()
@@ -139,7 +146,7 @@ def view(
 
     Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
     make_inspector = partial(Inspector, recording, calibration, device=device)
-    serving = _serve(make_inspector, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
+    serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
     return asyncio.get_running_loop().create_task(serving)
 
 

@@ -6,13 +6,23 @@ import asyncio
 import math
 import traceback
 import weakref
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.errors import AmiwarpError
 from amiwarp.progress import Progress
+from amiwarp.viewer.layout import SCOPES, SLIDERS, UNITS
+from amiwarp.viewer.selected_calibration import (
+    CostSurface,
+    FoundCalibration,
+    calibrate_selected,
+    calibrate_whole,
+    cost_surface,
+)
 
 if TYPE_CHECKING:
+    from amiwarp.calib import Calibration
+    from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.panel import Panel
 
 PLAY_S, FOLLOW_S = 0.05, 0.25
@@ -29,7 +39,7 @@ class JobCancelled(Exception):
 
 
 class CalibrationJob:
-    """Calibration of the panel's recording, in a thread."""
+    """Calibration on what the page shows or on the whole recording, in a thread, and its map of sharpness."""
 
     def __init__(self, panel: Panel) -> None:
         self._panel, self.cancelled = panel, False
@@ -45,7 +55,7 @@ class CalibrationJob:
                 state.busy = "calibrating: cancelling"
             return
         self.cancelled, self.found = False, None
-        state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": ""})
+        state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": "", "surface": None})
         self._panel.start_job(self._run())
 
     def cancel(self) -> None:
@@ -53,25 +63,30 @@ class CalibrationJob:
 
     async def _run(self) -> None:
         panel, inspector = self._panel, self._panel.inspector
-        rpm = inspector.knobs.rpm
-        settings = Settings(start={} if inspector.has_encoder or not rpm else {"rpm": rpm})
+        call = calibrate_selected if panel.state.scope == SCOPES[0] else calibrate_whole
         try:
-            async with panel.device_lock:
-                progress = _progress_callback(self)
-                found = await panel.in_thread(
-                    _calibrate, inspector.recording, settings, device=inspector.device, progress=progress
-                )
-            if self.cancelled:
-                panel.show_message("calibration cancelled", "info")
-            elif isinstance(found, str):
-                panel.show_message(found, "error")
-            else:
-                self.found = found
+            found = await self._in_thread(call, inspector)
+            if isinstance(found, str):
+                text, severity = ("calibration cancelled", "info") if self.cancelled else (found, "error")
+                panel.show_message(text, severity)
+                return
+            self.found = found.calibration
+            with panel.state:
+                panel.state.found = summary(found)
+                panel.state.against_choices = panel.comparison.choices
+            surface = await self._in_thread(cost_surface, inspector)
+            if not isinstance(surface, str) and panel.inspector is inspector:
                 with panel.state:
-                    panel.state.found = summary(found)
+                    panel.state.surface = surface_state(surface, inspector, self.found)
         finally:
             with panel.state:
                 panel.state.update({"busy": "", "calibrating": False})
+
+    async def _in_thread(self, call: Callable[..., Any], inspector: Inspector) -> Any:
+        """Return the result of a call with progress, or the text of its error."""
+        progress = _progress_callback(self)
+        async with self._panel.device_lock:
+            return await self._panel.in_thread(_guarded, call, inspector, progress=progress)
 
     def show_progress(self, what: str, share: float) -> None:
         """Show the current step and the finished share, 0 to 1."""
@@ -107,27 +122,47 @@ def _progress_callback(job: CalibrationJob) -> Progress:
     return progress
 
 
-def _calibrate(*args: Any, **options: Any) -> Calibration | str:
-    """Return the result of :func:`calibrate`, or the text of its error.
+def _guarded(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    """Return the result of a call, or the text of its error.
 
     NLopt also keeps the last error, and its traceback would keep all local variables alive.
     """
     try:
-        return calibrate(*args, **options)
+        return call(*args, **options)
     except (AmiwarpError, JobCancelled) as error:
         traceback.clear_frames(error.__traceback__)
         return str(error)
 
 
-def summary(c: Calibration) -> str:
-    """Return a one-line description of a calibration."""
+def summary(found: FoundCalibration) -> str:
+    """Return a description of the result of a calibration."""
+    c = found.calibration
     p, exact = c.parameters, c.exact.parameters
     warnings = "".join(f"; {text}" for text in c.warnings)
     apex, phase = (math.degrees(x) for x in (exact.get("apex", 0.0), p["phase"]))
     return (
-        f"{c.model_name} model, apex {apex:.4g}°, phase {phase:.4g}°; "
-        f"sharpness {c.sharpness_before:.3g} to {c.sharpness_after:.3g}; {c.seconds:.1f} s{warnings}"
+        f"found on {found.scope}: {c.model_name} model, apex {apex:.4g}°, phase {phase:.4g}°; sharpness of the region "
+        f"{found.before:.3g} as recorded, {found.current:.3g} now, {found.after:.3g} with the result; "
+        f"{c.seconds:.1f} s{warnings}"
     )
+
+
+def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration | None) -> dict[str, Any]:
+    """Return the map of sharpness for the page, with marks of the current, the found and the true parameters."""
+    names, scales = surface.names, [UNITS[name] for name in surface.names]
+    x, y = ((values / scale).tolist() for values, scale in zip(surface.values, scales, strict=True))
+    known = {"now": ("○", inspector.knobs), "truth": ("◇", inspector.truth),
+             "result": ("✕", None if found is None else inspector.knobs_of(found))}  # fmt: skip
+    marks = []
+    for title, (sign, knobs) in known.items():
+        if knobs is not None:
+            place = [getattr(knobs, name) / scale for name, scale in zip(names, scales, strict=True)]
+            if names[1] == "phase":
+                place[1] += 360.0 * round((inspector.knobs.phase / scales[1] - place[1]) / 360.0)
+            marks.append({"x": place[0], "y": place[1], "sign": sign, "title": title})
+    titles = [f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names]
+    return {"x": x, "y": y, "values": surface.sharpness.tolist(), "marks": marks, "x_title": titles[0],
+            "y_title": titles[1]}  # fmt: skip
 
 
 class Playback:

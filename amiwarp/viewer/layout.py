@@ -28,6 +28,8 @@ SPEEDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
 """Choices of the playback speed, relative to real time."""
 VIEWS = ((View.FREE.value, "corner"), (View.XY.value, "x-y"), (View.X_AXIS.value, "x-θ"), (View.Y_AXIS.value, "y-θ"))
 """Viewpoints of the clouds, with the texts of their buttons."""
+SCOPES = ("selection", "whole recording")
+"""Choices of the events that a calibration uses."""
 TOOLS = (
     ("region", "region", "drag on the whole image to draw a region"),
     ("move", "move", "drag to move the image"),

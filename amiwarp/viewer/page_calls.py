@@ -31,7 +31,7 @@ class PageCalls:
             self.key, self.released, self.choose, self.typed, self.edge, self.draw, self.whole, self.suggest,
             self.look_from, self.step, self.move_window, self.resize_window, self.take_from_curve, self.pick, self.play,
             self.calibrate, self.accept, self.discard, self.take_truth, self.zoom_timeline, self.undo, self.redo,
-            self.reset, self.keep_b,
+            self.reset, self.keep_b, self.export, self.open_file,
         )  # fmt: skip
         return {call.__name__: call for call in (*own, comparison.swap_b, comparison.compare_found, history.restore)}
 
@@ -174,6 +174,15 @@ class PageCalls:
     def zoom_timeline(self, start_ms: float, end_ms: float) -> None:
         """Show another part of the time on the timeline [ms]."""
         self._panel.rates.zoom(float(start_ms), float(end_ms))
+
+    def export(self, what: str) -> None:
+        """Give the browser a file."""
+        self._panel.exports.export(what)
+
+    def open_file(self, name: str) -> None:
+        """Show another recording of the folder."""
+        self._state.open_shown = False
+        self._panel.start_job(self._panel.open_file(name))
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth of a simulated recording."""

@@ -11,15 +11,14 @@ from amiwarp.viewer.comparison import AGAINST
 from amiwarp.viewer.drawing import NO_ORBIT
 from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
 from amiwarp.viewer.image_kinds import ImageKind
-from amiwarp.viewer.layout import KEYS, NAMES, SPEEDS, TOOLS, UNITS, VIEWS
+from amiwarp.viewer.layout import KEYS, NAMES, SCOPES, SPEEDS, TOOLS, UNITS, VIEWS
 from amiwarp.viewer.message_filter import Check, flag, number, one_of
+from amiwarp.viewer.page_exports import export_state
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.window import DisplayedWindow
 
-SCOPES = ("selection", "whole recording")
-"""Choices of the events that a calibration uses."""
 SETTABLE: dict[str, Check] = {
     **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
     "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
@@ -47,7 +46,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "size": list(recording.events.size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
         "notes": list(inspector.notes), "has_encoder": inspector.has_encoder, "models": list(MODELS),
         "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "truths": truths(inspector),
-        "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth), "files": [], "folder": "",
+        "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth), **export_state(),
         "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
         "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],

@@ -22,6 +22,7 @@ from amiwarp.viewer.frames import wait_until_page_keeps_up
 from amiwarp.viewer.jobs import CalibrationJob, Playback
 from amiwarp.viewer.layout import NAMES, SLIDERS, UNITS, template
 from amiwarp.viewer.page_calls import PageCalls
+from amiwarp.viewer.page_exports import Exports
 from amiwarp.viewer.page_files import use_page
 from amiwarp.viewer.page_history import PageHistory
 from amiwarp.viewer.page_values import CLIENT_ONLY, initial_state, source_state
@@ -31,6 +32,7 @@ from amiwarp.viewer.updates import Updates
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.library import Library
 
 _CUDA_LOCK = asyncio.Lock()
 """Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
@@ -42,13 +44,16 @@ SLOW = ("curve", "picture")
 class Panel:
     """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed."""
 
-    def __init__(self, server: Any, inspector: Inspector) -> None:
-        """Build the page on a new trame server."""
-        self.server, self.state, self.inspector = server, server.state, inspector
+    def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
+        """Build the page on a new trame server. ``library``: other recordings that the page may open."""
+        self.server, self.state, self.inspector, self.library = server, server.state, inspector, library
+        self.buffers_lock = asyncio.Lock()
+        """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
         self.device_lock: Any = _CUDA_LOCK if "cuda" in str(inspector.device) else contextlib.nullcontext()
         self.calibration_job, self.playback, self.updates = CalibrationJob(self), Playback(self), Updates(self)
         self.calls = PageCalls(self)
         self.comparison, self.history, self.rates = Comparison(self), PageHistory(self), RateView(self)
+        self.exports = Exports(self)
         self.change = ""
         """What the user changes, such as the name of a slider; successive changes of one name are undone together."""
         self._quick_requests: set[str] = set()
@@ -67,7 +72,9 @@ class Panel:
     def start(self, inspector: Inspector) -> None:
         """Show an inspector from its first state."""
         self.inspector, state = inspector, self.state
-        state.update(initial_state(inspector))
+        files = [] if self.library is None else self.library.files()
+        folder = "" if self.library is None else str(self.library.folder)
+        state.update({**initial_state(inspector), "files": files, "folder": folder})
         start, length = inspector.window or inspector.first_window()
         state.update({"start_ms": round((start - self.zero_us) * 1e-3, 3), "length_ms": round(length * 1e-3, 3),
                       "region_wanted": [0, 0, *inspector.recording.events.size], "knob": "apex"})  # fmt: skip
@@ -81,10 +88,23 @@ class Panel:
         if inspector.latest is not None:
             self.playback.toggle()
 
+    async def open_file(self, name: str) -> None:
+        """Show another recording of the library."""
+        if self.library is None:
+            return
+        self.calibration_job.cancel()
+        self.state.playing = False
+        with self.errors_shown("file"):
+            inspector = await self.in_thread(self.library.open, name)
+            await self.wait_until_drawn()
+            with self.state:
+                self.start(inspector)
+
     def close(self) -> None:
         """Stop all work of the browser tab. A thread ends when its current work is done."""
         self.calibration_job.cancel()
         self.playback.end()
+        self.exports.end()
         for task in [*self._tasks, *filter(None, [self._quick, self._slow])]:
             task.cancel()
         self._threads.shutdown(wait=False, cancel_futures=True)
@@ -241,7 +261,7 @@ class Panel:
             while self._quick_requests:
                 await wait_until_page_keeps_up(self.server)
                 todo, self._quick_requests = self._quick_requests, set()
-                async with self._done(todo), self.device_lock:
+                async with self._done(todo), self.device_lock, self.buffers_lock:
                     await self.updates.make(todo)
                 await asyncio.sleep(0)
         finally:

@@ -52,16 +52,37 @@ def calibrate_selected(
     Without an encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if these events
     cannot determine the parameters.
     """
-    part, knobs = _part(inspector), inspector.knobs
+    part = _part(inspector)
     scope = _text(inspector, part)
-    settings = settings or Settings()
-    if not inspector.has_encoder and knobs.rpm:
-        settings = replace(settings, start={"rpm": knobs.rpm, **settings.start})
-    found = calibrate(part.recording, settings, device=inspector.device, progress=progress)
+    found = calibrate(part.recording, _started(inspector, settings), device=inspector.device, progress=progress)
     whole = replace(found, camera=inspector.camera)
+    return _compared(inspector, whole, scope)
+
+
+def calibrate_whole(
+    inspector: Inspector, settings: Settings | None = None, *, progress: Progress | None = None
+) -> FoundCalibration:
+    """Calibrate on the whole recording, as ``amiwarp calibrate`` does.
+
+    Without an encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if the recording
+    cannot determine the parameters.
+    """
+    recording = inspector.recording
+    found = calibrate(recording, _started(inspector, settings), device=inspector.device, progress=progress)
+    return _compared(inspector, found, f"the whole recording, {len(recording.events):,} events")
+
+
+def _started(inspector: Inspector, settings: Settings | None) -> Settings:
+    """Return settings that start at the speed set on the page if there is no encoder."""
+    settings, rpm = settings or Settings(), inspector.knobs.rpm
+    return settings if inspector.has_encoder or not rpm else replace(settings, start={"rpm": rpm, **settings.start})
+
+
+def _compared(inspector: Inspector, found: Calibration, scope: str) -> FoundCalibration:
+    """Return a calibration with the sharpness of the shown region before and after it."""
     sharpness = inspector.sharpness_meter(WindowImager(inspector.recording.events.size, inspector.device))
-    values = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(whole)))
-    return FoundCalibration(whole, scope, *values)
+    values = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
+    return FoundCalibration(found, scope, *values)
 
 
 def _part(inspector: Inspector) -> SelectedPart:

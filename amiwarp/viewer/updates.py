@@ -21,6 +21,7 @@ from amiwarp.viewer.drawing import (
 from amiwarp.viewer.image_kinds import ImageKind, ShownImages, count_images, make_images
 from amiwarp.viewer.layout import UNITS
 from amiwarp.viewer.page_values import events_text, sharpness_text, truths
+from amiwarp.viewer.selected_calibration import scope_text
 
 if TYPE_CHECKING:
     from amiwarp.viewer.panel import Panel
@@ -151,6 +152,7 @@ class Updates:
 
     async def _curve(self) -> None:
         panel, s, name = self._panel, self._state, self._state.knob
+        s.calibrate_on = await panel.in_thread(scope_text, panel.inspector)
         if not panel.compensates:
             return
         values, scores = await panel.in_thread(panel.inspector.curve, name)
