@@ -30,12 +30,8 @@ VIEWS = ((View.FREE.value, "corner"), (View.XY.value, "x-y"), (View.X_AXIS.value
 """Viewpoints of the clouds, with the texts of their buttons."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
-TOOLS = (
-    ("region", "region", "drag on the whole image to draw a region"),
-    ("move", "move", "drag to move the image"),
-    ("measure", "measure", "drag to measure a distance"),
-)
-"""Uses of the mouse on the images: name, text of the button and help text."""
+TOOLS = (("region", "draw region"), ("move", "move"), ("measure", "measure"))
+"""What a drag of the mouse does on the images: name and text."""
 KEYS = (
     ("ArrowRight", ("step", 1), "forward by one turn, or by the window's length"),
     ("ArrowLeft", ("step", -1), "back by one turn, or by the window's length"),

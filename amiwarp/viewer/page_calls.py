@@ -43,7 +43,6 @@ class PageCalls:
 
     def released(self) -> None:
         """Update the slow parts of the page after a slider or the timeline was released."""
-        self._panel.change = ""
         self._panel.slider_released()
 
     def choose(self, name: str) -> None:
@@ -117,16 +116,14 @@ class PageCalls:
         """Move the time window to a start [ms]; playing stops, except a live stream's."""
         if not self._state.live:
             self._state.playing = False
-        self._panel.change = "start_ms"
-        self._panel.move(float(start_ms))
+        self._panel.move(float(start_ms), change="start_ms")
 
     def resize_window(self, start_ms: float, end_ms: float) -> None:
         """Set the ends of the time window [ms]."""
         start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self._state.whole_ms))
         if end > start:
-            self._panel.change = "length_ms"
             self._state.update({"start_ms": round(start, 3), "length_ms": round(end - start, 3)})
-            self._panel.request("window")
+            self._panel.request("window", change="length_ms")
 
     def take_from_curve(self, value: float) -> None:
         """Set the parameter of the sharpness curve to a clicked value."""

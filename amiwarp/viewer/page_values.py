@@ -14,6 +14,7 @@ from amiwarp.viewer.image_kinds import ImageKind
 from amiwarp.viewer.layout import KEYS, NAMES, SCOPES, SPEEDS, TOOLS, UNITS, VIEWS
 from amiwarp.viewer.message_filter import Check, flag, number, one_of
 from amiwarp.viewer.page_exports import export_state
+from amiwarp.viewer.parameters import Source
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector
@@ -44,7 +45,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         **source_state(inspector), **NO_ORBIT, "trame__title": f"amiwarp: {recording.name}",
         "trame_error_report_msg": "", "name": recording.name,
         "size": list(recording.events.size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
-        "notes": list(inspector.notes), "has_encoder": inspector.has_encoder, "models": list(MODELS),
+        "notes": notes(inspector), "has_encoder": inspector.has_encoder, "models": list(MODELS),
         "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "truths": truths(inspector),
         "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth), **export_state(),
         "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
@@ -94,3 +95,9 @@ def events_text(shown: DisplayedWindow) -> str:
     total, drawn = shown.span.count, len(shown.events)
     selected = "" if shown.selected == total else f", {shown.selected:,} selected"
     return f"{total:,} events{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
+
+
+def notes(inspector: Inspector) -> list[str]:
+    """Return what the recording lacks or what is only assumed, for the place where it matters."""
+    assumed = inspector.sources.get("phase") is Source.ASSUMED and math.isfinite(inspector.turn_us)
+    return [*inspector.notes, *(["phase assumed, not known: calibrate, or set it"] if assumed else [])]

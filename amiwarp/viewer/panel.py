@@ -25,7 +25,7 @@ from amiwarp.viewer.page_calls import PageCalls
 from amiwarp.viewer.page_exports import Exports
 from amiwarp.viewer.page_files import use_page
 from amiwarp.viewer.page_history import PageHistory
-from amiwarp.viewer.page_values import CLIENT_ONLY, initial_state, source_state
+from amiwarp.viewer.page_values import CLIENT_ONLY, initial_state, notes, source_state
 from amiwarp.viewer.parameters import Selection
 from amiwarp.viewer.rate_view import RateView
 from amiwarp.viewer.updates import Updates
@@ -55,7 +55,8 @@ class Panel:
         self.comparison, self.history, self.rates = Comparison(self), PageHistory(self), RateView(self)
         self.exports = Exports(self)
         self.change = ""
-        """What the user changes, such as the name of a slider; successive changes of one name are undone together."""
+        """What the user changes; successive changes of one name are undone together."""
+        self._drags = 0
         self._quick_requests: set[str] = set()
         self._slow_requests: set[str] = set()
         self._doing: set[str] = set()
@@ -97,8 +98,8 @@ class Panel:
         with self.errors_shown("file"):
             inspector = await self.in_thread(self.library.open, name)
             await self.wait_until_drawn()
-            with self.state:
-                self.start(inspector)
+            self.start(inspector)
+        self.state.flush()
 
     def close(self) -> None:
         """Stop all work of the browser tab. A thread ends when its current work is done."""
@@ -126,6 +127,8 @@ class Panel:
         self.slider_released()
 
     def slider_released(self) -> None:
+        """Update the slow parts of the page after a change, and end what is undone in one step."""
+        self._drags += 1
         self.request_slow(*SLOW)
 
     def show_region(self, region: list[int], kind: str) -> None:
@@ -137,8 +140,12 @@ class Panel:
         self.request("window")
         self.slider_released()
 
-    def request(self, *what: str) -> None:
-        """Request quick updates of the page: "window", "knobs", "look" or "suggestion"."""
+    def request(self, *what: str, change: str = "") -> None:
+        """Request quick updates of the page: "window", "knobs", "look", "suggestion" or "state".
+
+        ``change``: name of a change that lasts, such as a drag; it is undone in one step.
+        """
+        self.change = f"{change} {self._drags}" if change else ""
         self._quick_requests.update(what)
         self._show_pending()
         if self._quick is None:
@@ -181,11 +188,11 @@ class Panel:
             if self.state.severity == "error" and self._error_source == what:
                 self.state.update({"message": "", "severity": "info"})
 
-    def move(self, start_ms: float) -> bool:
+    def move(self, start_ms: float, change: str = "") -> bool:
         """Move the time window to a start [ms], limited to the recording. Return whether the window is at the end."""
         last = max(0.0, float(self.state.whole_ms) - float(self.state.length_ms))
         self.state.start_ms = round(min(max(start_ms, 0.0), last), 3)
-        self.request("window")
+        self.request("window", change=change)
         return start_ms >= last
 
     def renew(self) -> None:
@@ -212,7 +219,9 @@ class Panel:
         """Show the inspector's parameters on the page."""
         inspector = self.inspector
         sources = {name: str(source.value) for name, source in inspector.sources.items()}
-        self.state.update({**self._knobs(), "model": inspector.knobs.model, "sources": sources})
+        self.state.update(
+            {**self._knobs(), "model": inspector.knobs.model, "sources": sources, "notes": notes(inspector)}
+        )
 
     # internal
 
@@ -232,8 +241,8 @@ class Panel:
     def _dragged(self, name: str) -> None:
         """Follow a slider. Values that the server itself has set are ignored."""
         if self.state[name] != self._knobs()[name]:
-            self.state.knob = self.change = name
-            self.request("knobs")
+            self.state.knob = name
+            self.request("knobs", change=name)
 
     def _knobs(self) -> dict[str, float]:
         """Return the prism's parameters in the page's units, rounded as the page shows them."""

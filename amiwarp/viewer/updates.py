@@ -109,7 +109,7 @@ class Updates:
         return shown, {
             **values, "titles": pair if compensated else [[0, "events as recorded"]], "events": events_text(shown),
             "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
-            "against_title": f"region, {left}", "against_choices": panel.comparison.choices,
+            "against_title": left, "against_choices": panel.comparison.choices,
         }  # fmt: skip
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:

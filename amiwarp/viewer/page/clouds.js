@@ -8,6 +8,7 @@ const { onBeforeUnmount, onMounted, ref, watch } = window.Vue;
 const MOST_PIXELS = 3e6; // of the picture; a finer screen gets a coarser picture
 const HEIGHT = 0.75; // length of the third axis as a share of the width of the region
 const CLICK_PX = 3;
+const NARROW_PX = 480;
 const REACH_PX = 8;
 const GREY = 0xff909090;
 const ORBIT = '#009e73';
@@ -80,8 +81,10 @@ export const EventClouds = {
     function panes() {
       const [W, H] = [canvas.value.clientWidth, canvas.value.clientHeight];
       const count = props.overlaid ? 1 : props.titles.length;
+      const [across, down] = W < NARROW_PX ? [1, count] : [count, 1]; // on a phone, one cloud is below the other
       return Array.from({ length: count }, (_, k) => ({
-        left: Math.round((k * W) / count), width: Math.round(((k + 1) * W) / count) - Math.round((k * W) / count), height: H,
+        left: Math.round(((k % across) * W) / across), top: Math.round((Math.floor(k / across) * H) / down),
+        width: Math.floor(W / across), height: Math.floor(H / down),
         clouds: props.overlaid && props.titles.length > 1 ? [0, 1] : [props.titles[k][0]],
         title: props.overlaid ? props.titles.map(([, title]) => title).join(' (grey), ') : props.titles[k][1],
       }));
@@ -103,7 +106,7 @@ export const EventClouds = {
         const projection = camera.project(scene.half, pane.width, pane.height);
         pane.projection = projection;
         const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
-        raster.resize(Math.max(1, Math.round(pane.width * ratio)), size[1]);
+        raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
         raster.clear(packed(paper));
         const dot = Math.max(1, Math.round(props.dot * ratio * Math.max(1, Math.min(2.5, H / 420))));
         for (const k of pane.clouds) {
@@ -111,8 +114,8 @@ export const EventClouds = {
           raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, grey);
         }
         context.setTransform(1, 0, 0, 1, 0, 0);
-        context.putImageData(raster.image, Math.round(pane.left * ratio), 0);
-        context.setTransform(ratio, 0, 0, ratio, pane.left * ratio, 0);
+        context.putImageData(raster.image, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
+        context.setTransform(ratio, 0, 0, ratio, pane.left * ratio, pane.top * ratio);
         context.save();
         context.beginPath();
         context.rect(0, 0, pane.width, pane.height);
@@ -128,7 +131,7 @@ export const EventClouds = {
       const axes = [
         { low: left, high: right, title: 'x (px)' }, { low: top, high: bottom, title: 'y (px)', flipped: true }, props.axis,
       ];
-      drawFrame(context, projection, scene.half, axes, ink, size);
+      drawFrame(context, projection, scene.half, axes, ink, size, [pane.width, pane.height]);
       context.strokeStyle = ORBIT;
       context.lineWidth = 2.5;
       for (const k of pane.clouds) line(context, scene.lines[k], projection);
@@ -158,11 +161,15 @@ export const EventClouds = {
     }
 
     function pick(x, y) {
-      const pane = panes().find((each) => x >= each.left && x < each.left + each.width);
-      if (!pane) return;
+      const pane = paneAt(x, y);
       const cloud = pane.clouds[pane.clouds.length - 1];
       const projection = camera.project(scene.half, pane.width, pane.height);
-      emit('pick', nearest(scene.places[cloud], projection, x - pane.left, y, REACH_PX));
+      emit('pick', nearest(scene.places[cloud], projection, x - pane.left, y - pane.top, REACH_PX));
+    }
+
+    function paneAt(x, y) {
+      const all = panes();
+      return all.find((each) => x < each.left + each.width && y < each.top + each.height) || all[0];
     }
 
     function pressed(event) {
@@ -189,8 +196,10 @@ export const EventClouds = {
     function wheeled(event) {
       event.preventDefault();
       const box = canvas.value.getBoundingClientRect();
-      const pane = panes().find((each) => event.clientX - box.left < each.left + each.width) || panes()[0];
-      const place = [event.clientX - box.left - pane.left - pane.width / 2, event.clientY - box.top - pane.height / 2];
+      const pane = paneAt(event.clientX - box.left, event.clientY - box.top);
+      const place = [
+        event.clientX - box.left - pane.left - pane.width / 2, event.clientY - box.top - pane.top - pane.height / 2,
+      ];
       camera.scale(Math.exp(-0.0015 * event.deltaY), ...place);
       ask();
     }

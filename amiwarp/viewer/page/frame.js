@@ -6,7 +6,7 @@ import { text, ticks } from './ticks.js';
 const TICK_PX = [52, 32]; // least distance between two ticks along a flat and an upright axis
 
 // Draw the frame of a box. `axes` holds low, high and title of x, y and the third axis; y points down in images.
-export function drawFrame(context, projection, half, axes, ink, size) {
+export function drawFrame(context, projection, half, axes, ink, size, [width, height]) {
   const places = corners(half).map((corner) => projection.at(corner));
   const middle = projection.at([0, 0, 0]);
   context.strokeStyle = context.fillStyle = ink;
@@ -23,7 +23,7 @@ export function drawFrame(context, projection, half, axes, ink, size) {
   const taken = [];
   const labels = [0, 1, 2].flatMap((axis) => axisLabels(places, middle, axis, axes[axis], size));
   for (const label of labels.filter((each) => each.title).concat(labels.filter((each) => !each.title))) {
-    write(context, label, taken, size + 2);
+    write(context, label, taken, size + 2, [width, height]);
   }
 }
 
@@ -56,10 +56,7 @@ function axisLabels(places, middle, axis, { low, high, title, flipped }, size) {
 }
 
 // Write a label, unless it would cover another one or leave the picture.
-function write(context, label, taken, tall) {
-  const { canvas } = context;
-  const ratio = context.getTransform().a;
-  const [W, H] = [canvas.width / ratio, canvas.height / ratio];
+function write(context, label, taken, tall, [W, H]) {
   const width = context.measureText(label.text).width;
   let [x, y] = label.place;
   const turned = label.title && label.upright;

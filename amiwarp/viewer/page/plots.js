@@ -87,5 +87,5 @@ export const CostSurface = {
 export const ColourBar = {
   props: { scale: Object },
   template: `<small class="colour-bar"><span class="bar" :style="{ background: scale.bar }"></span>
-    <span v-for="t in scale.ticks" class="mark" :style="{ left: 100 * t[0] + '%' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
+    <span v-for="t in scale.ticks" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
 };
