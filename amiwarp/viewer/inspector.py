@@ -14,6 +14,7 @@ from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder_speed import turn_between
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.camera import Camera
@@ -63,8 +64,8 @@ class Inspector:
     ) -> None:
         """Start with a recording; a calibration sets the prism's parameters.
 
-        ``latest`` is a function that returns the current events of a live stream; see :meth:`renew`. Raises
-        :class:`AmiwarpError` if there are no events, or if the calibration belongs to another camera.
+        ``latest`` returns the current events of a live stream, see :meth:`renew`. Raises :class:`AmiwarpError` if there
+        are no events, or if the calibration belongs to another camera.
         """
         source = recording.events
         if not len(source):
@@ -105,9 +106,12 @@ class Inspector:
 
     @property
     def turn_us(self) -> float:
-        """Duration of one turn of the prism [us]; infinite if the prism does not rotate."""
-        rpm = self.knobs.rpm if self.recording.encoder is None else self.recording.encoder.rpm
-        return 60e6 / abs(rpm) if abs(rpm) > 1e-3 else math.inf
+        """Duration of one turn of the prism in the time window [us]; infinite if the prism does not rotate."""
+        if not self.has_encoder:
+            return 60e6 / abs(self.knobs.rpm) if self.knobs.rpm else math.inf
+        source = self.recording.events
+        start, length = self.window or (source.t_first, source.t_last - source.t_first)
+        return turn_between(self.encoder, start, start + length) or math.inf
 
     @property
     def encoder(self) -> Encoder:
@@ -184,9 +188,7 @@ class Inspector:
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        return parameters.calibrated_knobs(
-            calibration, recorded_offset_us=self._recorded_offset_us, zero_us=self.zero_us
-        )
+        return parameters.calibrated_knobs(calibration, offset_us=self._recorded_offset_us, zero_us=self.zero_us)
 
     @property
     def truth(self) -> Knobs | None:

@@ -102,15 +102,15 @@ def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
     return Knobs("exact", p["apex"], p["phase"], p.get("clock_offset_us", recorded_us), *tilts, rpm, p.get("index"))
 
 
-def calibrated_knobs(calibration: Calibration, *, recorded_offset_us: float, zero_us: int) -> Knobs:
+def calibrated_knobs(calibration: Calibration, *, offset_us: float, zero_us: int) -> Knobs:
     """Return the parameters of a calibration.
 
-    ``recorded_offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
+    ``offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
     prism without encoder is 0 [us]; the phase is converted to it.
     """
     p, prism = calibration.parameters, calibration.prism
     apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
-    offset, tilts = p.get("clock_offset", recorded_offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
+    offset, tilts = p.get("clock_offset", offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
     rpm, phase = p.get("rpm", 0.0), p["phase"]
     if calibration.zero_us is not None:
         phase += rpm * math.tau / 60e6 * (zero_us - calibration.zero_us)
