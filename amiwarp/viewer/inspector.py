@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cached_property
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from amiwarp.imaging.device_events import UploadedEvents
     from amiwarp.optics.models import Model
 
-MOST_EVENTS = 4_000_000
+MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
@@ -89,6 +90,8 @@ class Inspector:
         self._found: tuple[Knobs, Calibration] | None = None
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
+        self.lock = Lock()
+        """Lock for the events on the device and the buffers of their images."""
         self._imager, self._curve_imager = (WindowImager(source.size, device) for _ in range(2))
         if calibration is not None:
             self.accept(calibration)
@@ -207,11 +210,8 @@ class Inspector:
         """Return the accepted calibration if no parameter was changed since, else one of the current parameters."""
         if self._found is not None and self._found[0] == self.knobs:
             return self._found[1]
-        k, values = self.knobs, self._values(self.knobs)
-        size = ("deflection",) if k.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
-        kept = {n: values[n] for n in (*size, "phase", *k.calibrated_only)}
-        kept |= {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
-        w = self.loaded
+        k, w = self.knobs, self.loaded
+        kept = parameters.kept_values(k, self._values(k), has_encoder=self.has_encoder)
         before, after = self._unmoved(w), self._measured(w, k)
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
@@ -390,7 +390,8 @@ class Inspector:
 
     def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
         """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
-        return self._imager.measure(*self.warped(w, knobs), w.region)
+        with self.lock:
+            return self._imager.measure(*self.warped(w, knobs), w.region)
 
     def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
         """Return the image of a window as recorded."""

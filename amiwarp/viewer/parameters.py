@@ -11,7 +11,7 @@ from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.imager import Region
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from amiwarp.calib.result import Calibration
     from amiwarp.events.recording import Recording
@@ -125,3 +125,10 @@ def calibrated_sources(calibration: Calibration, known: Iterable[str]) -> dict[s
 
     given = dict.fromkeys(named(calibration.parameters), Source.FILE)
     return given | dict.fromkeys(("model", *named(calibration.free)), Source.CALIBRATED)
+
+
+def kept_values(knobs: Knobs, values: Mapping[str, float], *, has_encoder: bool) -> dict[str, float]:
+    """Return the parameters that a calibration file of a model keeps, of the ``values`` for all models."""
+    size = ("deflection",) if knobs.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
+    time = {"clock_offset": knobs.clock_offset} if has_encoder else {"rpm": knobs.rpm}
+    return {name: values[name] for name in (*size, "phase", *knobs.calibrated_only)} | time
