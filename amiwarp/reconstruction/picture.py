@@ -19,6 +19,7 @@ from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_source import DeviceMemoryEvents, read_between
+from amiwarp.events.encoder_speed import turn_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.known import dilated, known_nodes
@@ -123,7 +124,7 @@ class Reconstruction:
             device = recording.events.device if isinstance(recording.events, DeviceMemoryEvents) else "cpu"
         self.camera_rotation, self.device = camera_rotation or CameraRotation(), device
         self.fill = choice(Fill, fill, "fill")
-        self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
+        self.turn_us = turn_between(encoder, first, last)
         self._smoothness: float | None = None
 
     def span(

@@ -147,9 +147,10 @@ def _counts(
     """Return the events per pixel, with the place of each event dithered in its pixel."""
     size = inspector.recording.events.size
     votes = Votes(CanvasShape(*size, per_polarity=per_polarity, dither=True), inspector.device)
-    model, events, drift_us = inspector.warped(window, knobs)
-    votes.add_events(model, events, drift=drift_us)
-    image = votes.take()
+    with inspector.lock:
+        model, events, drift_us = inspector.warped(window, knobs)
+        votes.add_events(model, events, drift=drift_us)
+        image = votes.take()
     return image if per_polarity else image[0]
 
 
@@ -161,9 +162,10 @@ def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | Non
         pixel = np.rint(xy)
         inside = ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
     column, row = pixel[inside].astype(np.int64).T
-    surface = np.full(width * height, -np.inf)
-    np.maximum.at(surface, row * width + column, (events.t[inside] - window.span.start_us) * 1e-3)
-    return np.where(np.isfinite(surface), surface, np.nan).reshape(height, width).astype(np.float32)
+    surface = np.full(width * height, np.nan, np.float32)
+    # events are in order of time; of several values for one pixel, NumPy keeps the last
+    surface[row * width + column] = (events.t[inside] - window.span.start_us) * 1e-3
+    return surface.reshape(height, width)
 
 
 def _log_images(inspector: Inspector, window: LoadedWindow, knobs: Knobs, against: Knobs | None) -> ShownImages:

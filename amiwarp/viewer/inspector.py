@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cached_property
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder_speed import turn_between
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.camera import Camera
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from amiwarp.imaging.device_events import UploadedEvents
     from amiwarp.optics.models import Model
 
-MOST_EVENTS = 4_000_000
+MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
@@ -63,8 +65,8 @@ class Inspector:
     ) -> None:
         """Start with a recording; a calibration sets the prism's parameters.
 
-        ``latest`` is a function that returns the current events of a live stream; see :meth:`renew`. Raises
-        :class:`AmiwarpError` if there are no events, or if the calibration belongs to another camera.
+        ``latest`` returns the current events of a live stream, see :meth:`renew`. Raises :class:`AmiwarpError` if there
+        are no events, or if the calibration belongs to another camera.
         """
         source = recording.events
         if not len(source):
@@ -88,6 +90,8 @@ class Inspector:
         self._found: tuple[Knobs, Calibration] | None = None
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
+        self.lock = Lock()
+        """Lock for the events on the device and the buffers of their images."""
         self._imager, self._curve_imager = (WindowImager(source.size, device) for _ in range(2))
         if calibration is not None:
             self.accept(calibration)
@@ -105,9 +109,12 @@ class Inspector:
 
     @property
     def turn_us(self) -> float:
-        """Duration of one turn of the prism [us]; infinite if the prism does not rotate."""
-        rpm = self.knobs.rpm if self.recording.encoder is None else self.recording.encoder.rpm
-        return 60e6 / abs(rpm) if abs(rpm) > 1e-3 else math.inf
+        """Duration of one turn of the prism in the time window [us]; infinite if the prism does not rotate."""
+        if not self.has_encoder:
+            return 60e6 / abs(self.knobs.rpm) if self.knobs.rpm else math.inf
+        source = self.recording.events
+        start, length = self.window or (source.t_first, source.t_last - source.t_first)
+        return turn_between(self.encoder, start, start + length) or math.inf
 
     @property
     def encoder(self) -> Encoder:
@@ -184,9 +191,7 @@ class Inspector:
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        return parameters.calibrated_knobs(
-            calibration, recorded_offset_us=self._recorded_offset_us, zero_us=self.zero_us
-        )
+        return parameters.calibrated_knobs(calibration, offset_us=self._recorded_offset_us, zero_us=self.zero_us)
 
     @property
     def truth(self) -> Knobs | None:
@@ -205,11 +210,8 @@ class Inspector:
         """Return the accepted calibration if no parameter was changed since, else one of the current parameters."""
         if self._found is not None and self._found[0] == self.knobs:
             return self._found[1]
-        k, values = self.knobs, self._values(self.knobs)
-        size = ("deflection",) if k.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
-        kept = {n: values[n] for n in (*size, "phase", *k.calibrated_only)}
-        kept |= {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
-        w = self.loaded
+        k, w = self.knobs, self.loaded
+        kept = parameters.kept_values(k, self._values(k), has_encoder=self.has_encoder)
         before, after = self._unmoved(w), self._measured(w, k)
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
@@ -388,7 +390,8 @@ class Inspector:
 
     def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
         """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
-        return self._imager.measure(*self.warped(w, knobs), w.region)
+        with self.lock:
+            return self._imager.measure(*self.warped(w, knobs), w.region)
 
     def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
         """Return the image of a window as recorded."""

@@ -11,7 +11,7 @@ from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.imager import Region
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from amiwarp.calib.result import Calibration
     from amiwarp.events.recording import Recording
@@ -102,15 +102,15 @@ def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
     return Knobs("exact", p["apex"], p["phase"], p.get("clock_offset_us", recorded_us), *tilts, rpm, p.get("index"))
 
 
-def calibrated_knobs(calibration: Calibration, *, recorded_offset_us: float, zero_us: int) -> Knobs:
+def calibrated_knobs(calibration: Calibration, *, offset_us: float, zero_us: int) -> Knobs:
     """Return the parameters of a calibration.
 
-    ``recorded_offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
+    ``offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
     prism without encoder is 0 [us]; the phase is converted to it.
     """
     p, prism = calibration.parameters, calibration.prism
     apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
-    offset, tilts = p.get("clock_offset", recorded_offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
+    offset, tilts = p.get("clock_offset", offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
     rpm, phase = p.get("rpm", 0.0), p["phase"]
     if calibration.zero_us is not None:
         phase += rpm * math.tau / 60e6 * (zero_us - calibration.zero_us)
@@ -125,3 +125,10 @@ def calibrated_sources(calibration: Calibration, known: Iterable[str]) -> dict[s
 
     given = dict.fromkeys(named(calibration.parameters), Source.FILE)
     return given | dict.fromkeys(("model", *named(calibration.free)), Source.CALIBRATED)
+
+
+def kept_values(knobs: Knobs, values: Mapping[str, float], *, has_encoder: bool) -> dict[str, float]:
+    """Return the parameters that a calibration file of a model keeps, of the ``values`` for all models."""
+    size = ("deflection",) if knobs.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
+    time = {"clock_offset": knobs.clock_offset} if has_encoder else {"rpm": knobs.rpm}
+    return {name: values[name] for name in (*size, "phase", *knobs.calibrated_only)} | time
