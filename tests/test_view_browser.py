@@ -293,7 +293,7 @@ def test_while_a_slider_moves_the_page_follows_and_the_curve_is_that_of_the_slid
     title.filter(has_text="sharpness over tilt in x").wait_for()
     ready(page)
     assert page.locator("#curve .plot-x").inner_text() == "tilt in x (°)"
-    assert page.locator("#curve-text").inner_text().endswith("now 0.05")
+    until(lambda: page.locator("#curve-text").inner_text().endswith("now 0.05"))
     points = curve.get_attribute("points")
     enter(page, "apex", 0.9)
     title.filter(has_text="sharpness over apex angle").wait_for()
@@ -447,6 +447,7 @@ def test_bad_values_are_said_and_good_ones_make_the_page_go_on(page: Any, record
     page.locator("#events").filter(has_text="selected").wait_for()
     page.locator("#polarity-both").check()
     page.locator("#noise").check()
+    enter(page, "start_ms", 0)
     enter(page, "length_ms", "1e300")
     page.locator("#events").filter(has_text=f"{len(recording.events):,} events, ").wait_for()
 

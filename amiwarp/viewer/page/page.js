@@ -1,7 +1,7 @@
 // Entry of the page's own code: registers the components, handles keys, the address and downloads.
 
 import { EventClouds } from './clouds.js';
-import { KnobField } from './fields.js';
+import { KnobField, NumberField } from './fields.js';
 import { EventPicture } from './pictures.js';
 import { ColourBar, CostSurface, CurvePlot } from './plots.js';
 import { savePicture } from './snapshot.js';
@@ -110,6 +110,7 @@ window.amiwarp_page = {
     app.component('CostSurface', CostSurface);
     app.component('ColourBar', ColourBar);
     app.component('KnobField', KnobField);
+    app.component('NumberField', NumberField);
     app.component('PageFrame', PageFrame);
     app.component('PageDialog', PageDialog);
   },
