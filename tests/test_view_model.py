@@ -324,6 +324,11 @@ def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
     assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
 
 
+def test_a_log_intensity_needs_a_prism_that_rotates(recording: Recording) -> None:
+    with pytest.raises(AmiwarpError, match="a prism that rotates"):
+        make_images(Inspector(replace(recording, encoder=None)), ImageKind.LOG_INTENSITY)
+
+
 def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
     inspector: Inspector, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.viewer.selected_part import select_part
 
@@ -37,11 +39,14 @@ class LogIntensity:
 def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs) -> LogIntensity:
     """Reconstruct the log intensity of a window's region with given parameters.
 
-    Raises :class:`AmiwarpError` if no pixel fires twice.
+    Raises :class:`AmiwarpError` if the prism does not rotate, or if no pixel fires twice.
     """
+    turn_us = inspector.turn_us if inspector.has_encoder or knobs.rpm else math.inf
+    if not math.isfinite(turn_us):
+        raise AmiwarpError("the log intensity needs a prism that rotates; set its speed (rpm), or calibrate")
     left, top, right, bottom = _wide(inspector, window)
     step = 1 if (right - left) * (bottom - top) <= MOST_PIXELS else 2
-    part = select_part(inspector, window, (left, top, right, bottom), step=step, longest_us=inspector.turn_us)
+    part = select_part(inspector, window, (left, top, right, bottom), step=step, longest_us=turn_us)
     if knobs.focal_length is not None:
         knobs = replace(knobs, focal_length=knobs.focal_length / step)
     picture = reconstruct(
