@@ -124,4 +124,5 @@ from .studies.evaluate.run import evaluate as evaluate
 from .translation.datasets import DataSet as DataSet
 from .translation.interpolation import Interpolation as Interpolation
 from .translation.translator import translate as translate
+from .viewer.app import NotebookPage as NotebookPage
 from .viewer.app import view as view

@@ -35,7 +35,6 @@ from amiwarp.viewer.host_names import HostNames, address, is_local, reachable, w
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.message_filter import MOST_BYTES, MessageFilter
 from amiwarp.viewer.page_values import SETTABLE
-from amiwarp.viewer.panel import CALLS
 from amiwarp.viewer.serve import serve
 
 pytest.importorskip("trame_client")
@@ -174,7 +173,7 @@ def test_junk_changes_nothing_and_the_page_goes_on(
                 for junk in JUNK:
                     if name not in SETTABLE or not SETTABLE[name](junk):
                         await page.send("trame.state.update", [{"key": name, "value": junk}])
-            for name in (*CALLS, "close", "trigger__1"):
+            for name in (*build.panels[0].calls.offered, "close", "trigger__1"):
                 for junk in JUNK:
                     if not isinstance(junk, str | int | float):
                         await page.send("trame.trigger", name, [junk], {})
@@ -210,9 +209,7 @@ def test_junk_changes_nothing_and_the_page_goes_on(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_all_that_the_page_may_set_leaves_it_alive(
-    recording: Recording, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_all_that_the_page_may_set_leaves_it_alive(recording: Recording, caplog: pytest.LogCaptureFixture) -> None:
     """Send the extreme values that the filter allows, to every variable and trigger."""
     build = Panels(recording)
 
@@ -227,7 +224,7 @@ def test_all_that_the_page_may_set_leaves_it_alive(
             for name in ("apex", "start_ms", "length_ms", "turns", "rpm", "message", "trame__title", "__class__"):
                 for text in ("", "nan", "inf", "-inf", "1e308", "-1e308", "1e-308", "x", "0x10", "1_0", "٣"):
                     await page.call("trame.trigger", "typed", [name, text], {})
-            for name in CALLS:
+            for name in build.panels[0].calls.offered:
                 for plain in ("", "c", "?", "__class__", "apex", 0, -1, 1e12, True):
                     for args in ([], [plain], [plain] * 2, [plain] * 4):
                         await page.send("trame.trigger", name, args, {})
@@ -238,10 +235,9 @@ def test_all_that_the_page_may_set_leaves_it_alive(
             for name, value in first.items():
                 if name in SETTABLE and SETTABLE[name](value):
                     await page.call("trame.state.update", [{"key": name, "value": value}])
-            await page.call("trame.trigger", "typed", ["length_ms", str(first["length_ms"])], {})
-            state = await page.state()
-            while state["sharpness"] != first["sharpness"]:
-                state = await page.state()
+            await page.call("trame.trigger", "reset", [], {})
+            while (await page.settled())["sharpness"] != first["sharpness"]:
+                await page.call("trame.trigger", "reset", [], {})
 
     with served(build, SETTABLE) as (url, _):
         run(lambda: attack(url))
@@ -484,7 +480,7 @@ def test_for_a_page_that_takes_nothing_nothing_more_is_computed(
             assert MessageFilter(server, SETTABLE).passes(message)
             await connection.send(True, aiohttp.WSMessage(aiohttp.WSMsgType.BINARY, message, None))
             panel.state.update({"playing": False, "loop": True, "speed": 10})
-            panel.play()
+            panel.calls.play()
             await until_async(lambda: monitor.pending > MOST_IN_FLIGHT)
             computed.clear()
             for number in range(200):

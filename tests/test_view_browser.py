@@ -28,6 +28,7 @@ from amiwarp.viewer import jobs, page_exports, selected_calibration
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.layout import KEYS
 from amiwarp.viewer.library import Library
+from amiwarp.viewer.live_source import LiveFigures, LiveSource
 from amiwarp.viewer.page_values import SETTABLE
 
 pytest.importorskip("trame_client")
@@ -550,7 +551,7 @@ def test_a_click_on_an_event_tells_all_about_it(page: Any, kept: Any, recording:
     seen = cloud(page)
     rows, columns = np.nonzero(seen.max(axis=2) - seen.min(axis=2) > 100)
     half = seen.shape[1] // 2
-    for k, compensated in ((np.flatnonzero(columns < half)[300], False), (np.flatnonzero(columns >= half)[300], True)):
+    for k in (np.flatnonzero(columns < half)[300], np.flatnonzero(columns >= half)[300]):
         before = page.locator("#picked").all_inner_texts()
         page.locator(".clouds canvas").click(position={"x": float(columns[k]), "y": float(rows[k])})
         until(lambda before=before: page.locator("#picked").all_inner_texts() not in ([], before))
@@ -568,8 +569,11 @@ def test_a_click_on_an_event_tells_all_about_it(page: Any, kept: Any, recording:
 
 
 def test_the_page_fits_windows_of_all_sizes(page: Any) -> None:
-    parts = ("header.bar", ".clouds canvas", ".side", ".strip", "#timeline", "#image-overview", "#image-before", "#image-after",
-             "#curve", *(f"header.bar > *:nth-child({k})" for k in range(1, 10)), *(f"#view-{v}" for v in ("free", "x-y")))  # fmt: skip
+    parts = (
+        "header.bar", ".clouds canvas", ".side", ".strip", "#timeline", "#image-overview", "#image-before",
+        "#image-after",
+        "#curve", "#view-free", "#view-x-y", *(f"header.bar > *:nth-child({k})" for k in range(1, 10)),
+    )  # fmt: skip
     try:
         for width, height in SIZES:
             page.set_viewport_size({"width": width, "height": height})
@@ -608,7 +612,7 @@ def test_labels_focus_and_contrast_meet_the_rules_of_axe(page: Any, dark: bool) 
         page.keyboard.press("Escape")
 
 
-def test_without_encoder_and_prism_there_is_one_cloud_until_the_speed_is_set(opened: Open, recording: Recording) -> None:
+def test_without_encoder_there_is_one_cloud_until_the_speed_is_set(opened: Open, recording: Recording) -> None:
     page = opened(of=replace(recording, encoder=None, prism=None))
     assert page.locator("#image-before, #curve, #slider-clock_offset").count() == 0
     assert "no encoder" in page.locator("#prism .missing").first.inner_text()
@@ -621,6 +625,7 @@ def test_without_encoder_and_prism_there_is_one_cloud_until_the_speed_is_set(ope
     page.locator("#image-before").wait_for()
     assert page.locator("#do-step").inner_text() == "turn ▶"
     page.locator("#curve-title").filter(has_text="speed of the prism").wait_for()
+    page.locator("#name").click()
     page.keyboard.press("t")
     until(lambda: page.locator("#axis").input_value() == "angle")
 
@@ -630,12 +635,27 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     events, asked = recording.events, [0]
     width, height = events.size
 
-    def latest() -> Recording:
-        asked.append(asked[-1] + 1)
-        end = events.t_first + round(1.2e3 * TURN_MS) + 5000 * asked[-1]
-        return replace(recording, events=MemoryEvents(events.between(events.t_first, end), width, height))
+    class Stream(LiveSource):
+        problem = ""
 
+        def __init__(self) -> None: ...
+
+        def __call__(self) -> Recording:
+            asked.append(asked[-1] + 1)
+            end = events.t_first + round(1.2e3 * TURN_MS) + 5000 * asked[-1]
+            return replace(recording, events=MemoryEvents(events.between(events.t_first, end), width, height))
+
+        def figures(self) -> LiveFigures:
+            return LiveFigures(not self.problem, self.problem, 1.25, 12.0, 1.0, 3, 0, RPM, "")
+
+    latest = Stream()
     page = opened(of=latest(), latest=latest)
+    page.locator("#live").filter(has_text="1.25 million events/s").wait_for()
+    latest.problem = "no events for 2 s"
+    page.locator("#stream-note").filter(has_text="The stream is interrupted: no events for 2 s").wait_for()
+    latest.problem = ""
+    page.locator("#stream-note").wait_for(state="detached")
+    assert page.locator("#live dd.bad").inner_text() == "3"
     assert page.locator("#do-play").inner_text() == "stop"
     shown = field(page, "start_ms")
     until(lambda: field(page, "start_ms") > shown + 8.0)

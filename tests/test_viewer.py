@@ -341,35 +341,6 @@ def test_pictures_are_as_they_were(scene: Scene, inspector: Inspector, recording
     assert all(away(picture, known[n]) > 4.0 for n in LOOKS if n != name)
 
 
-def test_the_model_s_orbit_is_drawn_in_front(scene: Scene, inspector: Inspector) -> None:
-    look, view = LOOKS["image"]
-    scene.show(inspector.show(), look)
-    scene.look_from(view, look)
-    before = scene.picture()
-    theta, xy = inspector.orbit(80.0, 60.0)
-    scene.mark([(0, scene.box.positions(xy, np.degrees(theta)), "#009e73")])
-    after = scene.picture()
-    green = (np.abs(after.astype(int) - [0, 158, 115]).max(axis=2) < 12).sum()
-    assert green > 20
-    scene.mark([])
-    assert away(scene.picture(), before) < 0.05
-
-
-def test_an_event_is_picked_where_it_is_seen(scene: Scene, inspector: Inspector) -> None:
-    look, view = LOOKS["image"]
-    shown = inspector.show()
-    scene.show(shown, look)
-    scene.look_from(view, look)
-    k = scene.pick(0.25, 0.5)
-    assert k is not None
-    x, y = shown.before[k]
-    assert (x, y) == pytest.approx((80.0, 60.0), abs=6.0)  # the left half shows the whole image
-    right = scene.pick(0.75, 0.5)
-    assert right is not None
-    assert tuple(shown.after[right]) == pytest.approx((80.0, 60.0), abs=6.0)
-    assert scene.pick(0.001, 0.001) is None
-
-
 def test_a_turntable_ends_where_it_began(scene: Scene, inspector: Inspector) -> None:
     look = Look()
     scene.show(inspector.show(), look)

@@ -108,13 +108,43 @@ def open_window(make_inspector: Callable[[], Inspector], library: Library | None
         asyncio.run(serve_and_show())
 
 
+class NotebookPage:
+    """The inspector's page below a notebook cell.
+
+    Parameters
+    ----------
+    serving : asyncio.Task
+        Task that serves the page.
+
+    Examples
+    --------
+    >>> page = amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
+    >>> page.close()  # doctest: +SKIP
+    """
+
+    def __init__(self, serving: asyncio.Task[None]) -> None:
+        self._serving = serving
+
+    def close(self) -> None:
+        """Stop serving the page.
+
+        Examples
+        --------
+        >>> page.close()  # doctest: +SKIP
+        """
+        self._serving.cancel()
+
+    def _ipython_display_(self) -> None:
+        """Show nothing more than the page, which is already shown."""
+
+
 def view(
     recording: Recording,
     calibration: Calibration | None = None,
     *,
     device: Any = "cpu",
     height: int = 700,
-) -> Any:
+) -> NotebookPage:
     """Show the inspector below a notebook cell.
 
     Parameters
@@ -130,8 +160,8 @@ def view(
 
     Returns
     -------
-    asyncio.Task
-        Task that serves the page in the notebook's event loop until the kernel ends. Cancel it to close the page.
+    NotebookPage
+        The page, which is served until the kernel ends or its ``close`` is called.
 
     Raises
     ------
@@ -147,7 +177,7 @@ def view(
     Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
     make_inspector = partial(Inspector, recording, calibration, device=device)
     serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
-    return asyncio.get_running_loop().create_task(serving)
+    return NotebookPage(asyncio.get_running_loop().create_task(serving))
 
 
 def save_screenshot(

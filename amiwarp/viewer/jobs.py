@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.errors import AmiwarpError
 from amiwarp.progress import Progress
 from amiwarp.viewer.layout import SCOPES, SLIDERS, UNITS
+from amiwarp.viewer.live_source import LiveFigures, LiveSource
 from amiwarp.viewer.selected_calibration import (
     CostSurface,
     FoundCalibration,
@@ -86,7 +87,7 @@ class CalibrationJob:
         """Return the result of a call with progress, or the text of its error."""
         progress = _progress_callback(self)
         async with self._panel.device_lock:
-            return await self._panel.in_thread(_guarded, call, inspector, progress=progress)
+            return await self._panel.in_thread(_guarded, call, weakref.ref(inspector), progress)
 
     def show_progress(self, what: str, share: float) -> None:
         """Show the current step and the finished share, 0 to 1."""
@@ -122,16 +123,19 @@ def _progress_callback(job: CalibrationJob) -> Progress:
     return progress
 
 
-def _guarded(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
-    """Return the result of a call, or the text of its error.
+def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:
+    """Return the result of a call, or the text of its error; None if the inspector is gone.
 
-    NLopt also keeps the last error, and its traceback would keep all local variables alive.
+    NLopt keeps the last error, and its traceback would keep all local variables of this call and its callers alive.
     """
+    known = inspector()
     try:
-        return call(*args, **options)
+        return None if known is None else call(known, progress=progress)
     except (AmiwarpError, JobCancelled) as error:
         traceback.clear_frames(error.__traceback__)
         return str(error)
+    finally:
+        known = None
 
 
 def summary(found: FoundCalibration) -> str:
@@ -145,6 +149,23 @@ def summary(found: FoundCalibration) -> str:
         f"{found.before:.3g} as recorded, {found.current:.3g} now, {found.after:.3g} with the result; "
         f"{c.seconds:.1f} s{warnings}"
     )
+
+
+def live_state(f: LiveFigures) -> dict[str, Any]:
+    """Return the figures of a stream for the page: rows of name, value and whether it is bad, and what is wrong."""
+    rows = [
+        ["connection", "receiving" if f.connected else f.problem, not f.connected],
+        ["rate", f"{f.rate_mev_s:.2f} million events/s", False],
+        ["latency", f"{f.latency_ms:.0f} ms", f.latency_ms > 1e3],
+        ["turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0],
+        ["speed of the prism", "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm", f.rpm is None],
+        ["lost events", f"{f.dropped:,}", f.dropped > 0], ["out of order", f"{f.late:,}", f.late > 0],
+    ]  # fmt: skip
+    note = f"The stream is interrupted: {f.problem}. The last events are shown. {f.message}".strip()
+    return {
+        "live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows],
+        "stream_note": "" if f.connected else note,
+    }
 
 
 def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration | None) -> dict[str, Any]:
@@ -213,6 +234,9 @@ class Playback:
         while state.playing:
             with state:
                 panel.renew()
+                latest = panel.inspector.latest
+                if isinstance(latest, LiveSource):
+                    state.update(live_state(latest.figures()))
             await panel.wait_until_drawn()
             await asyncio.sleep(FOLLOW_S)
         panel.slider_released()
