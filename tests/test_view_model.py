@@ -324,6 +324,24 @@ def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
     assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
 
 
+def test_the_smoothness_of_a_log_intensity_is_chosen_again_if_the_residual_changes(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    (first,) = inspector.loaded.chosen
+    truth = inspector.knobs
+    inspector.set(replace(truth, apex=1.01 * truth.apex))
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert inspector.loaded.chosen == [first]
+    inspector.set(replace(truth, phase=truth.phase + math.pi))
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    (other,) = inspector.loaded.chosen
+    assert other.residual > 2.0 * first.residual
+    inspector.set(truth)
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    (again,) = inspector.loaded.chosen
+    np.testing.assert_array_equal(again.log, first.log)
+
+
 def test_a_log_intensity_needs_a_prism_that_rotates(recording: Recording) -> None:
     with pytest.raises(AmiwarpError, match="a prism that rotates"):
         make_images(Inspector(replace(recording, encoder=None)), ImageKind.LOG_INTENSITY)

@@ -125,7 +125,7 @@ class Reconstruction:
         self.camera_rotation, self.device = camera_rotation or CameraRotation(), device
         self.fill = choice(Fill, fill, "fill")
         self.turn_us = turn_between(encoder, first, last)
-        self._smoothness: float | None = None
+        self.smoothness: float | None = None  # weight of the prior; None: the next window chooses it
 
     def span(
         self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
@@ -199,8 +199,8 @@ class Reconstruction:
             where = f"{start_us} .. {start_us + length_us} us"
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
         off = off_excess_by_counts(recording.events, self.turn_us, start_us, length_us)
-        if self._smoothness is None:
-            self._smoothness = self._choose(count, pairs, start_us, length_us, off)
+        if self.smoothness is None:
+            self.smoothness = self._choose(count, pairs, start_us, length_us, off)
         left, top, tiles = self._tile(start_us, length_us)
         solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
         residual, covered = _solve(solver, pair_count, last)
@@ -213,7 +213,7 @@ class Reconstruction:
         hot = int((table.tile_of.numpy() < 0).sum())
         return Picture(
             log=log.astype(np.float32), known=known, start_us=start_us, length_us=length_us, pairs=pair_count,
-            off_excess=off, smoothness=self._smoothness, residual=residual, hot=hot,
+            off_excess=off, smoothness=self.smoothness, residual=residual, hot=hot,
             seconds=time.perf_counter() - began, unknowns=unknowns,
         )  # fmt: skip
 
@@ -284,7 +284,7 @@ class Reconstruction:
 
     def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:
         """Return a solver for the pairs on the given tiles, with the pairs displaced by the optical model."""
-        prior = Smoothness(self._smoothness or SMOOTHNESS[0], EDGE_STEP if self.fill is Fill.EDGE else 0.0)
+        prior = Smoothness(self.smoothness or SMOOTHNESS[0], EDGE_STEP if self.fill is Fill.EDGE else 0.0)
         solver = BrightnessMap(
             pairs, tiles, off_excess=off, damping=MEAN_DAMPING, smoothness=prior, middle_us=middle_us
         )

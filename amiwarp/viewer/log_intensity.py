@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.reconstruction.picture import reconstruct
-from amiwarp.viewer.selected_part import select_part
+from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.viewer.selected_part import SelectedPart, select_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.reconstruction.result import Picture
     from amiwarp.viewer.imager import Region
     from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.parameters import Knobs
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 MOST_PIXELS = 30_000
 """Largest number of pixels that are all reconstructed. Of a larger region, every second column and row is used."""
+
+SAME_RESIDUAL = 0.25
+"""Relative change of the residual up to which the weight of the smoothness prior is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +53,9 @@ def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs) -> L
     part = select_part(inspector, window, (left, top, right, bottom), step=step, longest_us=turn_us)
     if knobs.focal_length is not None:
         knobs = replace(knobs, focal_length=knobs.focal_length / step)
-    picture = reconstruct(
-        part.recording, model=inspector.model_of(knobs, part.recording.camera), encoder=inspector.encoder_of(knobs),
-        start_us=part.start_us, length_us=part.length_us, device=inspector.device,
-    )  # fmt: skip
+    model, encoder = inspector.model_of(knobs, part.recording.camera), inspector.encoder_of(knobs)
+    work = Reconstruction(part.recording, model=model, encoder=encoder, device=inspector.device)
+    picture = _picture(work, part, window.chosen)
     rows, columns = (np.arange(window.region[k], window.region[k + 2]) for k in (1, 0))
     cut = np.ix_((rows - top) // step, (columns - left) // step)
     limits = [f"{100 // step**2} % of the pixels"] if step > 1 else []
@@ -60,6 +63,22 @@ def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs) -> L
         limits.append(f"{part.length_us * 1e-3:.3g} ms in the middle")
     note = "; ".join([f"{picture.pairs:,} pairs, residual {picture.residual:.2f}", *limits])
     return LogIntensity(picture.log[cut], picture.known[cut], note)
+
+
+def _picture(work: Reconstruction, part: SelectedPart, chosen: list[Picture]) -> Picture:
+    """Return the picture of a part.
+
+    The choice of the smoothness takes most of the time. That of the picture in ``chosen`` is taken if the residual is
+    about the same; otherwise, the new picture replaces it.
+    """
+    if chosen:
+        work.smoothness = chosen[0].smoothness
+        picture = work.window(part.start_us, part.length_us)
+        if abs(picture.residual - chosen[0].residual) <= SAME_RESIDUAL * chosen[0].residual:
+            return picture
+        work.smoothness = None
+    chosen[:] = [work.window(part.start_us, part.length_us)]
+    return chosen[0]
 
 
 def _wide(inspector: Inspector, window: LoadedWindow) -> Region:

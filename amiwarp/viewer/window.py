@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from amiwarp.reconstruction.result import Picture
+
 
 @dataclass(frozen=True, eq=False)
 class WindowAngles:
@@ -52,6 +54,8 @@ class LoadedWindow:
     """Prism angles by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
     unmoved: list[MeasuredImage] = field(default_factory=list)
     """Image of the events as recorded, once it is measured."""
+    chosen: list[Picture] = field(default_factory=list)
+    """Reconstructed picture for which the weight of the smoothness prior was chosen last."""
 
 
 @dataclass(frozen=True, eq=False)
