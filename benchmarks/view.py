@@ -33,8 +33,8 @@ from amiwarp.optics.prism import Prism
 from amiwarp.studies.machine_info import machine
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.cloud_scene import Look, Scene
+from amiwarp.viewer.drawing import jpeg
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.page_values import jpeg
 
 SIZE, WIDTH, HEIGHT = (1048, 514), 640, 480
 """Width and height of the clouds' picture in a browser window of 1366 x 768 [px], and width and height of the sensor
