@@ -112,7 +112,7 @@ def knob(device: str, *, drawn: bool) -> dict[str, Any]:
             scene.show(shown, Look())
             scene.picture()
         for image in (shown.image_before, shown.image_after):
-            jpeg(np.sqrt(np.clip(image / image.max(), 0.0, 1.0)))
+            jpeg(255.0 * np.sqrt(np.clip(image / image.max(), 0.0, 1.0)))
         times.append(1e3 * (time.perf_counter() - began))
     expected = compensate_events(shown.events, inspector.model, inspector.encoder)
     error = float(np.nanmax(np.abs(expected - shown.after)))

@@ -89,7 +89,7 @@ def difference_state(before: NDArray[Any], after: NDArray[Any]) -> dict[str, Any
     colours = np.stack([np.interp(share, ends, DIFFERENCES[:, k]) for k in range(3)], axis=-1)
     ticks = [[0.0, f"−{most:.3g}"], [0.5, "0"], [1.0, f"+{most:.3g}"]]
     scale = {"bar": gradient(DIFFERENCES), "ticks": ticks, "title": "difference [events per pixel]"}
-    return {"after": jpeg(colours / 255.0), "after_scale": scale}
+    return {"after": jpeg(colours), "after_scale": scale}
 
 
 def orbit_state(theta: NDArray[Any], orbit: NDArray[Any], point: NDArray[Any]) -> dict[str, Any]:
@@ -110,18 +110,18 @@ def whole_image(events: Events, size: tuple[int, int]) -> str:
     counts = np.bincount(events.y.astype(np.int64) * width + events.x, minlength=width * height)
     positive = counts[counts > 0]
     top = max(float(np.percentile(positive, 99.0)), 1.0) if len(positive) else 1.0
-    return jpeg(np.sqrt(np.minimum(counts.reshape(height, width) / top, 1.0)))
+    return jpeg(255.0 * np.sqrt(np.minimum(counts.reshape(height, width) / top, 1.0)))
 
 
 def jpeg(values: NDArray[Any]) -> str:
     """Return an image as the address of a JPEG.
 
-    ``values``: from 0 to 1, shape ``(height, width)``, or ``(height, width, 3)`` for colours.
+    ``values``: from 0 to 255, shape ``(height, width)``, or ``(height, width, 3)`` for colours.
     """
     from PIL import Image
 
     data = io.BytesIO()
-    Image.fromarray((255.0 * values).astype(np.uint8)).save(data, "JPEG", quality=JPEG_QUALITY)
+    Image.fromarray(values.astype(np.uint8)).save(data, "JPEG", quality=JPEG_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(data.getvalue()).decode()
 
 

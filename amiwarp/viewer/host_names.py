@@ -63,7 +63,8 @@ def warning(host: str) -> str | None:
         return None
     return (
         f"warning: served on {host} without encryption: everybody on the network who has the address can see the "
-        "recording, control the inspector and open the recordings in its folder; use an SSH tunnel if you are the only user"
+        "recording, control the inspector and open the recordings in its folder; if you are the only user, use an SSH "
+        "tunnel"
     )
 
 

@@ -129,7 +129,7 @@ class Updates:
     def _image_values(self, images: ShownImages) -> dict[str, Any]:
         scale = scale_state(images.scale)
         before, after = (
-            "" if image is None else jpeg(images.scale.rgb(image) / 255.0) for image in (images.before, images.after)
+            "" if image is None else jpeg(images.scale.rgb(image)) for image in (images.before, images.after)
         )
         return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": images.note}
 
