@@ -54,8 +54,8 @@ def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool, start_ms: floa
     if colour is Colour.POLARITY:
         rows = [[ON_COLOUR, "ON: brighter"], [OFF_COLOUR, "OFF: darker"]]
         return {"title": "polarity", "rows": rows, "bar": "", "low": "", "high": ""}
-    if rows := legend_of(shown.truth, colour, LEGEND_ROWS):
-        return {"title": rows[0][1], "rows": [list(row) for row in rows[1:]], "bar": "", "low": "", "high": ""}
+    if known := legend_of(shown.truth, colour, LEGEND_ROWS):
+        return {"title": known[0][1], "rows": [list(row) for row in known[1:]], "bar": "", "low": "", "high": ""}
     low, high, title = scale_of(shown, colour, start_ms=start_ms)
     return {"title": title, "rows": [], "bar": gradient(colour_table(colour, dark=dark)), "low": low, "high": high}
 

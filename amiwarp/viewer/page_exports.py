@@ -99,7 +99,7 @@ class Exports:
                 if what == "turntable":
                     yield from scene.turntable(FRAMES)
                     return
-                start_us, last_us = window[0], inspector.recording.events.t_last + 1 - window[1]
+                start_us, last_us = float(window[0]), inspector.recording.events.t_last + 1 - window[1]
                 while (start_us := start_us + step_us) <= last_us:
                     yield scene.picture()
                     inspector.open(round(start_us), window[1], selection)

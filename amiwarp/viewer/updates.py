@@ -119,7 +119,9 @@ class Updates:
             return {"image_slow": True}
         images = count_images(shown) if kind is ImageKind.COUNT else self._make_images()
         return {"image_slow": False, **self._image_values(images)} | (
-            difference_state(images.before, images.after) if s.difference and kind is ImageKind.COUNT else {}
+            difference_state(images.before, images.after)
+            if s.difference and kind is ImageKind.COUNT and images.before is not None
+            else {}
         )
 
     def _make_images(self) -> ShownImages:
