@@ -23,8 +23,9 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import app as viewer_app
-from amiwarp.viewer.app import BROWSERS, export_folder, has_display, open_window
+from amiwarp.viewer.app import BROWSERS, has_display, open_window
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.library import Library
 
 
 @pytest.fixture(scope="module")
@@ -121,22 +122,22 @@ def test_a_window_opens_only_where_there_is_a_display(monkeypatch: pytest.Monkey
     assert "chromium" in BROWSERS
 
 
-def test_a_page_in_the_network_prints_a_warning(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A warning names who can reach the page. Exports go to the recording's folder or to ``--out-dir``."""
+def test_a_page_in_the_network_prints_a_warning(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A warning names who can reach the page. The page may open the other files of the recording's folder."""
     folders: list[Path] = []
 
-    def serve_panel(make: object, folder: Path, *, host: str, port: int, ready: Callable[[str], None]) -> None:
-        folders.append(folder)
+    def serve_panel(make: object, library: Library, *, host: str, port: int, ready: Callable[[str], None]) -> None:
+        folders.append(library.folder)
         ready(f"http://{host}:{port}/")
 
     monkeypatch.setattr(viewer_app, "serve_panel", serve_panel)
-    code, said, error = view(files / "recording.h5", "--web", "--host", "0.0.0.0", "--out-dir", tmp_path)
+    code, said, error = view(files / "recording.h5", "--web", "--host", "0.0.0.0")
     assert code == 0
     assert "everybody on the network" in error
     assert "control the inspector" in error
     assert said.startswith("recording.h5: http://")
     assert view(files / "recording.h5", "--web")[2] == ""
-    assert folders == [tmp_path.resolve(), files.resolve()]
+    assert folders == [files.resolve()] * 2
 
 
 @pytest.mark.parametrize(
@@ -144,24 +145,15 @@ def test_a_page_in_the_network_prints_a_warning(files: Path, tmp_path: Path, mon
     [
         (["--host", "192.0.2.1"], "is not an address of this machine"),
         (["--port", "{port}"], "is in use"),
-        (["--out-dir", "none"], "is not a folder"),
-        (["--out-dir", "{file}"], "is not a folder"),
     ],
 )
 def test_a_page_that_cannot_be_served_is_reported_in_one_line(files: Path, args: list[str], says: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
-        given = [a.format(port=other.getsockname()[1], file=files / "c.json") for a in args]
+        given = [a.format(port=other.getsockname()[1]) for a in args]
         code, said, error = view(files / "recording.h5", "--web", *given)
     assert (code, said) == (1, "")
     assert says in error.splitlines()[-1]
     assert error.count("\n") == 1
-
-
-def test_exports_of_a_notebook_s_page_have_a_folder_too(files: Path, tmp_path: Path) -> None:
-    recording = open_recording(files / "recording.h5")
-    assert export_folder(getattr(recording.events, "path", None), None) == files.resolve()
-    assert export_folder(None, None) == Path.cwd()
-    assert export_folder(files / "recording.h5", tmp_path) == tmp_path.resolve()
 
 
 def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,7 +168,7 @@ def test_closing_the_window_ends_the_command(files: Path, tmp_path: Path, monkey
     browser.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     said: list[str] = []
-    open_window(lambda: Inspector(open_recording(files / "recording.h5")), tmp_path, said.append)
+    open_window(lambda: Inspector(open_recording(files / "recording.h5")), None, said.append)
     assert said[0].startswith("http://127.0.0.1:")
     assert b"<html" in (tmp_path / "page").read_bytes().lower()
     with pytest.raises(OSError, match="refused"):
@@ -192,12 +184,13 @@ def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pyte
     monkeypatch.setitem(sys.modules, "IPython.display", shown)
 
     async def cell() -> bytes:
-        task = amiwarp.view(open_recording(files / "recording.h5"))
+        shown = amiwarp.view(open_recording(files / "recording.h5"))
         while not pages:
             await asyncio.sleep(0.01)
         page = await asyncio.to_thread(lambda: urllib.request.urlopen(str(pages[0])).read())
-        task.cancel()
-        await asyncio.wait([task])
+        assert shown._ipython_display_() is None  # the cell shows the page and nothing else
+        shown.close()
+        await asyncio.wait([shown._serving])
         return bytes(page)
 
     assert b"<html" in asyncio.run(cell()).lower()

@@ -13,7 +13,7 @@ import typer
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
-from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, Common
+from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.cli.rig import parse_size
 from amiwarp.cli.streams import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
@@ -24,10 +24,13 @@ from amiwarp.viewer.host_names import warning
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
     from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.library import Library
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
 _PICTURE, _SERVER = "Picture", "Server"
+RETURN_S = 3600.0
+"""How long to wait for the sender of a socket to return after its stream broke off [s]."""
 LEAST_PX, MOST_PX = 100, 8000
 """Smallest and largest width or height of a screenshot [px]."""
 
@@ -110,16 +113,23 @@ class StreamOptions:
             yield None
             return
         from amiwarp.live.stream.recent_events import RecentEvents, followed
+        from amiwarp.live.stream.reconnecting_source import SOCKETS
         from amiwarp.live.stream.source_opening import open_source
+        from amiwarp.viewer.live_source import LiveSource
+
+        messages: list[str] = []
+
+        def tell(text: str) -> None:
+            messages[:] = [text]
+            say(text)
 
         with SourceOptions(port=self.controller).link() as link:
-            stream = open_source(source)
+            wait_s = RETURN_S if source.partition(":")[0] in SOCKETS else 0.0
+            stream = open_source(source, wait_s=wait_s, say=tell)
             check_angles(stream, link)
             recent = RecentEvents(stream)
-            with followed(stream, link, recent, say):
-                first = recent.recording()
-                assert first is not None
-                yield lambda: recent.recording() or first
+            with followed(stream, link, recent, tell):
+                yield LiveSource(recent, messages)
 
 
 @dataclass(frozen=True)
@@ -139,20 +149,13 @@ class PageOptions:
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port to serve on; 0 for any free port.", rich_help_panel=_SERVER)
     ] = 0
-    out_dir: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for the files that the page exports. Default: the recording's folder; for a stream the "
-            "current folder.",
-            rich_help_panel=_SERVER,
-        ),
-        OUTPUT_FOLDER,
-    ] = None
 
-    def show(self, new_inspector: Callable[[], Inspector], *, name: str, folder: Path, common: Common) -> None:
+    def show(
+        self, new_inspector: Callable[[], Inspector], library: Library | None, *, name: str, common: Common
+    ) -> None:
         """Show the inspector's page in a window, or serve the page for a browser, until closed or interrupted.
 
-        ``name``: name of the recording; ``folder``: folder for exported files.
+        ``library``: other recordings that the page may open; ``name``: name of the recording.
         """
         from amiwarp.viewer.app import has_display, open_window, serve_panel
 
@@ -164,9 +167,9 @@ class PageOptions:
             report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
 
         if in_browser:
-            serve_panel(new_inspector, folder, host=self.host, port=self.port, ready=ready)
+            serve_panel(new_inspector, library, host=self.host, port=self.port, ready=ready)
         else:
-            open_window(new_inspector, folder, ready)
+            open_window(new_inspector, library, ready)
 
 
 @dataclass(frozen=True)
@@ -228,12 +231,10 @@ def run(
     common: Common,
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
-    from amiwarp.viewer.app import export_folder
-    from amiwarp.viewer.cloud_scene import check_display
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.library import Library
 
     device = choose_device(common.device)
-    check_display()
-
     with stream.follow(str(recording)) as latest:
 
         def new_inspector() -> Inspector:
@@ -245,12 +246,16 @@ def run(
             data = {**picture.write(waiting[0], picture.screenshot), "device": device}
             report(common, data, _lines(data))
             return
-        folder = export_folder(None if stream.live else recording, page.out_dir)
+
+        def open_other(path: Path) -> Inspector:
+            return Inspector(complete(open_recording(path), camera, prism), device=device)
+
+        library = None if stream.live else Library(recording.parent, open_other)
 
         def inspector_of_tab() -> Inspector:
             return waiting.pop() if waiting else new_inspector()
 
-        page.show(inspector_of_tab, name=recording.name, folder=folder, common=common)
+        page.show(inspector_of_tab, library, name=recording.name, common=common)
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

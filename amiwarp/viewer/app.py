@@ -20,11 +20,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import check_output
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.library import Library
 from amiwarp.viewer.page_values import SETTABLE
 from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.serve import serve
@@ -45,7 +45,7 @@ def has_display() -> bool:
 
 def serve_panel(
     make_inspector: Callable[[], Inspector],
-    folder: Path,
+    library: Library | None = None,
     *,
     host: str = LOCALHOST,
     port: int = 0,
@@ -53,37 +53,27 @@ def serve_panel(
 ) -> None:
     """Serve the inspector's page until interrupted; each browser tab gets its own inspector.
 
-    Exports are written to ``folder``. ``ready`` is called with the page's address as soon as it can be opened.
+    ``library``: other recordings that the page may open. ``ready`` is called with the page's address as soon as it can
+    be opened.
     Raises :class:`AmiwarpError` if the host or the port cannot be used.
     """
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make_inspector, folder, host, port, ready))
+        asyncio.run(_serve(make_inspector, library, host, port, ready))
 
 
 async def _serve(
-    make_inspector: Callable[[], Inspector], folder: Path, host: str, port: int, ready: Callable[[str], None]
+    make_inspector: Callable[[], Inspector], library: Library | None, host: str, port: int, ready: Callable[[str], None]
 ) -> None:
     token = secrets.token_urlsafe(16)
-    build = partial(_build_tab, make_inspector, folder)
+    build = partial(_build_tab, make_inspector, library)
     await serve(build, settable=SETTABLE, host=host, port=port, token=token, ready=ready)
 
 
-def _build_tab(make_inspector: Callable[[], Inspector], folder: Path, server: Any) -> Callable[[], None]:
-    return Panel(server, make_inspector(), folder).close
+def _build_tab(make_inspector: Callable[[], Inspector], library: Library | None, server: Any) -> Callable[[], None]:
+    return Panel(server, make_inspector(), library).close
 
 
-def export_folder(recording: Path | None, given: Path | None) -> Path:
-    """Return the folder for exports: ``given``, else the recording's folder, else the current folder.
-
-    Raises :class:`AmiwarpError` if this folder does not exist.
-    """
-    folder = given or (recording.parent if recording is not None else Path())
-    if not folder.is_dir():
-        raise AmiwarpError(f"{folder}: is not a folder; create it first, or give another --out-dir")
-    return folder.resolve()
-
-
-def open_window(make_inspector: Callable[[], Inspector], folder: Path, ready: Callable[[str], None]) -> None:
+def open_window(make_inspector: Callable[[], Inspector], library: Library | None, ready: Callable[[str], None]) -> None:
     """Open the page in a window and serve it until the window is closed.
 
     If none of :data:`BROWSERS` is installed, open a tab of the default browser and serve until interrupted.
@@ -92,7 +82,7 @@ def open_window(make_inspector: Callable[[], Inspector], folder: Path, ready: Ca
     async def serve_and_show() -> None:
         address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         serving: asyncio.Future[Any] = asyncio.create_task(
-            _serve(make_inspector, folder, LOCALHOST, 0, address.set_result)
+            _serve(make_inspector, library, LOCALHOST, 0, address.set_result)
         )
         await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
         if serving.done():
@@ -118,14 +108,43 @@ def open_window(make_inspector: Callable[[], Inspector], folder: Path, ready: Ca
         asyncio.run(serve_and_show())
 
 
+class NotebookPage:
+    """The inspector's page below a notebook cell.
+
+    Parameters
+    ----------
+    serving : asyncio.Task
+        Task that serves the page.
+
+    Examples
+    --------
+    >>> page = amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
+    >>> page.close()  # doctest: +SKIP
+    """
+
+    def __init__(self, serving: asyncio.Task[None]) -> None:
+        self._serving = serving
+
+    def close(self) -> None:
+        """Stop serving the page.
+
+        Examples
+        --------
+        >>> page.close()  # doctest: +SKIP
+        """
+        self._serving.cancel()
+
+    def _ipython_display_(self) -> None:
+        """Show nothing more than the page, which is already shown."""
+
+
 def view(
     recording: Recording,
     calibration: Calibration | None = None,
     *,
     device: Any = "cpu",
     height: int = 700,
-    out_dir: str | os.PathLike[str] | None = None,
-) -> Any:
+) -> NotebookPage:
     """Show the inspector below a notebook cell.
 
     Parameters
@@ -138,20 +157,16 @@ def view(
         Device that compensates the events.
     height : int
         Height of the page in the notebook [px].
-    out_dir : str or path-like or None
-        Folder for the files that the page exports. Without it, the folder of the recording's file is used, or the
-        current folder for a recording in memory.
 
     Returns
     -------
-    asyncio.Task
-        Task that serves the page in the notebook's event loop until the kernel ends. Cancel it to close the page.
+    NotebookPage
+        The page, which is served until the kernel ends or its ``close`` is called.
 
     Raises
     ------
     AmiwarpError
-        If the recording holds no events, the calibration belongs to a camera of another size, or the folder does not
-        exist.
+        If the recording holds no events, or the calibration belongs to a camera of another size.
 
     Examples
     --------
@@ -159,12 +174,10 @@ def view(
     """
     from IPython.display import IFrame, display
 
-    folder = export_folder(getattr(recording.events, "path", None), None if out_dir is None else Path(out_dir))
-
     Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
     make_inspector = partial(Inspector, recording, calibration, device=device)
-    serving = _serve(make_inspector, folder, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
-    return asyncio.get_running_loop().create_task(serving)
+    serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
+    return NotebookPage(asyncio.get_running_loop().create_task(serving))
 
 
 def save_screenshot(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,12 +23,10 @@ from amiwarp.viewer.truth_colours import Legend, legend_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.viewer.inspector import DisplayedWindow
+    from amiwarp.viewer.window import DisplayedWindow
 
 AXIS_HEIGHT = 0.75
 """Length of the drawn third axis, as a multiple of the region's width."""
-ORBIT_COLOUR = "#009e73"
-MARK_COLOUR = "#f0e442"
 BACKGROUND_AND_INK = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
 """Colours of background and lines, for light (False) and dark (True) mode."""
 CAMERA_DIRECTIONS = {
@@ -129,16 +126,13 @@ class Scene:
         self.plotter = pyvista.Plotter(off_screen=True, shape=(1, 3), border=False, window_size=list(size))
         self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
         self.plotter.link_views((0, 1))
-        self.plotter.renderers[2].InteractiveOff()
         self._divide(0.0, overlaid=False)
         self.view = View.FREE
         self._clouds: list[Any] = []
-        self._marks: list[tuple[int, Any]] = []
         self._frame: list[tuple[int, Any]] = []
         self._explained: tuple[Legend, str] | None = None
         self._framed: tuple[Any, ...] | None = None
         self.box = Box(0, 0, 1, 1, 1.0)
-        self._points: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)] * 2
 
     def show(self, shown: DisplayedWindow, look: Look) -> None:
         """Draw the events of a window. The camera moves only if the region of the image has changed."""
@@ -146,8 +140,8 @@ class Scene:
         depth = 360.0 if look.axis is Axis.ANGLE else shown.span.length_us * 1e-3
         self.box = Box(*shown.region, depth)
         third = third_axis(shown, look.axis)
-        self._points = [self.box.positions(xy, third) for xy in (shown.before, shown.after)]
-        for k, points in enumerate(self._points):
+        for k, xy in enumerate((shown.before, shown.after)):
+            points = self.box.positions(xy, third)
             colours = colours_of(shown, look, after=k == 1)
             valid = np.isfinite(points).all(axis=1)
             self._cloud(k, points[valid], colours[valid], look)
@@ -181,42 +175,6 @@ class Scene:
         for renderer in self._views:
             renderer.camera = camera
             renderer.reset_camera_clipping_range()
-
-    def mark(self, curves: Sequence[tuple[int, NDArray[np.float32], str]]) -> None:
-        """Draw lines in the clouds, each given by its cloud (0 or 1), points, shape ``(n, 3)``, and a colour."""
-        import pyvista
-
-        for k, actor in self._marks:
-            self.plotter.renderers[k].remove_actor(actor, render=False)
-        self._marks = []
-        for k, points, colour in curves:
-            line = pyvista.lines_from_points(points[np.isfinite(points).all(axis=1)])
-            actor = self._add(k, line, color=colour, line_width=4.0)
-            actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
-            actor.mapper.SetRelativeCoincidentTopologyLineOffsetParameters(0.0, -1e6)  # in front of all points
-            self._marks.append((k, actor))
-
-    def pick(self, x: float, y: float) -> int | None:
-        """Return the index of the point drawn nearest to (x, y), or None if no point is within 8 px.
-
-        x and y are shares of the picture's width and height from its top left.
-        """
-        side = int(x >= self.plotter.renderers[1].GetViewport()[0] and not self._overlaid)
-        renderer, points = self.plotter.renderers[side], self._points[side]
-        width, height = self.plotter.window_size
-        matrix = renderer.camera.GetCompositeProjectionTransformMatrix(renderer.GetTiledAspectRatio(), -1.0, 1.0)
-        m = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
-        clip = np.c_[points, np.ones(len(points))] @ m.T
-        left, bottom, right, top = renderer.GetViewport()
-        at = clip[:, :2] / clip[:, 3:]
-        px = np.stack([(left + (at[:, 0] + 1.0) / 2.0 * (right - left)) * width,
-                       (1.0 - bottom - (at[:, 1] + 1.0) / 2.0 * (top - bottom)) * height], axis=1)  # fmt: skip
-        away = np.nan_to_num(np.linalg.norm(px - [x * width, y * height], axis=1), nan=np.inf)
-        if not len(away) or away.min() > 8.0:
-            return None
-        near = np.flatnonzero(away <= away.min() + 2.0)
-        # of points at nearly equal distances from the mouse, the one in front
-        return int(near[np.argmin(clip[near, 2] / clip[near, 3])])
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the drawn picture, shape ``(height, width, 3)``."""

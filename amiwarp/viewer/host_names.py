@@ -53,8 +53,8 @@ def reachable(host: str) -> str:
 
 
 def address(host: str, port: int, token: str) -> str:
-    """Return the URL to open in a browser, with the token."""
-    return str(URL.build(scheme="http", host=reachable(host), port=port, path="/") % {"token": token})
+    """Return the URL to open in a browser. Its path is the token."""
+    return str(URL.build(scheme="http", host=reachable(host), port=port) / token / "")
 
 
 def warning(host: str) -> str | None:
@@ -63,7 +63,8 @@ def warning(host: str) -> str | None:
         return None
     return (
         f"warning: served on {host} without encryption: everybody on the network who has the address can see the "
-        "recording, control the inspector and write files with its exports; if you are the only user, use an SSH tunnel"
+        "recording, control the inspector and open the recordings in its folder; if you are the only user, use an SSH "
+        "tunnel"
     )
 
 

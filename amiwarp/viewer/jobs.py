@@ -1,4 +1,4 @@
-"""Long-running jobs of a page: calibration, playback of the recording, and writing of films."""
+"""Long-running jobs of a page: calibration, and playback of the recording."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ import asyncio
 import math
 import traceback
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.errors import AmiwarpError
 from amiwarp.progress import Progress
-from amiwarp.reconstruction.export import save_film
+from amiwarp.viewer.layout import SCOPES, SLIDERS, UNITS
+from amiwarp.viewer.live_source import LiveFigures, LiveSource
+from amiwarp.viewer.selected_calibration import (
+    CostSurface,
+    FoundCalibration,
+    calibrate_selected,
+    calibrate_whole,
+    cost_surface,
+)
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from amiwarp.calib import Calibration
+    from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.panel import Panel
 
-FRAMES, FPS = 90, 25.0
-"""Number of pictures of a film, and pictures per second."""
 PLAY_S, FOLLOW_S = 0.05, 0.25
 """Shortest interval between two pictures while a recording is played, and while a live stream is followed [s]."""
 PROGRESS_S = 0.1
@@ -36,7 +40,7 @@ class JobCancelled(Exception):
 
 
 class CalibrationJob:
-    """Calibration of the panel's recording, in a thread."""
+    """Calibration on what the page shows or on the whole recording, in a thread, and its map of sharpness."""
 
     def __init__(self, panel: Panel) -> None:
         self._panel, self.cancelled = panel, False
@@ -47,12 +51,12 @@ class CalibrationJob:
         """Start a calibration, or cancel the running one."""
         state = self._panel.state
         if state.busy:
-            if state.busy.startswith("calibrating"):
+            if state.calibrating:
                 self.cancelled = True
                 state.busy = "calibrating: cancelling"
             return
         self.cancelled, self.found = False, None
-        state.update({"busy": "calibrating", "progress": 0, "found": ""})
+        state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": "", "surface": None})
         self._panel.start_job(self._run())
 
     def cancel(self) -> None:
@@ -60,25 +64,30 @@ class CalibrationJob:
 
     async def _run(self) -> None:
         panel, inspector = self._panel, self._panel.inspector
-        rpm = inspector.knobs.rpm
-        settings = Settings(start={} if inspector.has_encoder or not rpm else {"rpm": rpm})
+        call = calibrate_selected if panel.state.scope == SCOPES[0] else calibrate_whole
         try:
-            async with panel.device_lock:
-                progress = _progress_callback(self)
-                found = await panel.in_thread(
-                    _calibrate, inspector.recording, settings, device=inspector.device, progress=progress
-                )
-            if self.cancelled:
-                panel.show_message("calibration cancelled", "info")
-            elif isinstance(found, str):
-                panel.show_message(found, "error")
-            else:
-                self.found = found
+            found = await self._in_thread(call, inspector)
+            if isinstance(found, str):
+                text, severity = ("calibration cancelled", "info") if self.cancelled else (found, "error")
+                panel.show_message(text, severity)
+                return
+            self.found = found.calibration
+            with panel.state:
+                panel.state.found = summary(found)
+                panel.state.against_choices = panel.comparison.choices
+            surface = await self._in_thread(cost_surface, inspector)
+            if not isinstance(surface, str) and panel.inspector is inspector:
                 with panel.state:
-                    panel.state.found = summary(found)
+                    panel.state.surface = surface_state(surface, inspector, self.found)
         finally:
             with panel.state:
-                panel.state.busy = ""
+                panel.state.update({"busy": "", "calibrating": False})
+
+    async def _in_thread(self, call: Callable[..., Any], inspector: Inspector) -> Any:
+        """Return the result of a call with progress, or the text of its error."""
+        progress = _progress_callback(self)
+        async with self._panel.device_lock:
+            return await self._panel.in_thread(_guarded, call, weakref.ref(inspector), progress)
 
     def show_progress(self, what: str, share: float) -> None:
         """Show the current step and the finished share, 0 to 1."""
@@ -114,27 +123,67 @@ def _progress_callback(job: CalibrationJob) -> Progress:
     return progress
 
 
-def _calibrate(*args: Any, **options: Any) -> Calibration | str:
-    """Return the result of :func:`calibrate`, or the text of its error.
+def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:
+    """Return the result of a call, or the text of its error; None if the inspector is gone.
 
-    NLopt also keeps the last error, and its traceback would keep all local variables alive.
+    NLopt keeps the last error, and its traceback would keep all local variables of this call and its callers alive.
     """
+    known = inspector()
     try:
-        return calibrate(*args, **options)
+        return None if known is None else call(known, progress=progress)
     except (AmiwarpError, JobCancelled) as error:
         traceback.clear_frames(error.__traceback__)
         return str(error)
+    finally:
+        known = None
 
 
-def summary(c: Calibration) -> str:
-    """Return a one-line description of a calibration."""
+def summary(found: FoundCalibration) -> str:
+    """Return a description of the result of a calibration."""
+    c = found.calibration
     p, exact = c.parameters, c.exact.parameters
     warnings = "".join(f"; {text}" for text in c.warnings)
     apex, phase = (math.degrees(x) for x in (exact.get("apex", 0.0), p["phase"]))
     return (
-        f"{c.model_name} model, apex {apex:.4g}°, phase {phase:.4g}°; "
-        f"sharpness {c.sharpness_before:.3g} to {c.sharpness_after:.3g}; {c.seconds:.1f} s{warnings}"
+        f"found on {found.scope}: {c.model_name} model, apex {apex:.4g}°, phase {phase:.4g}°; sharpness of the region "
+        f"{found.before:.3g} as recorded, {found.current:.3g} now, {found.after:.3g} with the result; "
+        f"{c.seconds:.1f} s{warnings}"
     )
+
+
+def live_state(f: LiveFigures) -> dict[str, Any]:
+    """Return the figures of a stream for the page: rows of name, value and whether it is bad, and what is wrong."""
+    rows = [
+        ["connection", "receiving" if f.connected else f.problem, not f.connected],
+        ["rate", f"{f.rate_mev_s:.2f} million events/s", False],
+        ["latency", f"{f.latency_ms:.0f} ms", f.latency_ms > 1e3],
+        ["turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0],
+        ["speed of the prism", "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm", f.rpm is None],
+        ["lost events", f"{f.dropped:,}", f.dropped > 0], ["out of order", f"{f.late:,}", f.late > 0],
+    ]  # fmt: skip
+    note = f"The stream is interrupted: {f.problem}. The last events are shown. {f.message}".strip()
+    return {
+        "live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows],
+        "stream_note": "" if f.connected else note,
+    }
+
+
+def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration | None) -> dict[str, Any]:
+    """Return the map of sharpness for the page, with marks of the current, the found and the true parameters."""
+    names, scales = surface.names, [UNITS[name] for name in surface.names]
+    x, y = ((values / scale).tolist() for values, scale in zip(surface.values, scales, strict=True))
+    known = {"now": ("○", inspector.knobs), "truth": ("◇", inspector.truth),
+             "result": ("✕", None if found is None else inspector.knobs_of(found))}  # fmt: skip
+    marks = []
+    for title, (sign, knobs) in known.items():
+        if knobs is not None:
+            place = [getattr(knobs, name) / scale for name, scale in zip(names, scales, strict=True)]
+            if names[1] == "phase":
+                place[1] += 360.0 * round((inspector.knobs.phase / scales[1] - place[1]) / 360.0)
+            marks.append({"x": place[0], "y": place[1], "sign": sign, "title": title})
+    titles = [f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names]
+    return {"x": x, "y": y, "values": surface.sharpness.tolist(), "marks": marks, "x_title": titles[0],
+            "y_title": titles[1]}  # fmt: skip
 
 
 class Playback:
@@ -146,7 +195,7 @@ class Playback:
         """Whether the playback task is running; after a stop it runs until it notices the stop."""
 
     def end(self) -> None:
-        """Stop the playback for good, and also a film that is being written."""
+        """Stop the playback for good."""
         self._ended = True
 
     def toggle(self) -> None:
@@ -173,8 +222,8 @@ class Playback:
             start_s = loop.time()
             with state:
                 if panel.move(float(state.start_ms) + 1e3 * elapsed_s * float(state.speed)):
-                    state.playing = False
-                panel.request("window")
+                    state.playing = bool(state.loop)
+                    panel.move(0.0 if state.loop else float(state.start_ms))
             await panel.wait_until_drawn()
             await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
@@ -185,55 +234,9 @@ class Playback:
         while state.playing:
             with state:
                 panel.renew()
+                latest = panel.inspector.latest
+                if isinstance(latest, LiveSource):
+                    state.update(live_state(latest.figures()))
             await panel.wait_until_drawn()
             await asyncio.sleep(FOLLOW_S)
         panel.slider_released()
-
-    def turntable(self) -> None:
-        """Write a film in which the camera moves once around the clouds."""
-        self._panel.start_job(self._film("turntable", lambda: self._panel.scene.turntable(FRAMES)))
-
-    def film(self) -> None:
-        """Write a film of the recording, starting at the current window."""
-        self._panel.start_job(self._film("film", self._frames))
-
-    async def _film(self, what: str, frames: Callable[[], Iterator[NDArray[np.uint8]]]) -> None:
-        """Draw the pictures one by one in the event loop, which serves pages in between; write them in a thread."""
-        panel, state, loop, pictures = self._panel, self._panel.state, asyncio.get_running_loop(), frames()
-        if state.busy:
-            return
-
-        async def draw() -> NDArray[np.uint8] | None:
-            await panel.wait_until_drawn()
-            if self._ended:
-                raise JobCancelled
-            with state:
-                state.progress += 100.0 / FRAMES
-                return next(pictures, None)
-
-        def drawn() -> Iterator[NDArray[np.uint8]]:
-            while (picture := asyncio.run_coroutine_threadsafe(draw(), loop).result()) is not None:
-                yield picture
-
-        with state:
-            state.update({"busy": f"writing the {what}", "progress": 0})
-        try:
-            with panel.errors_shown("export"):
-                path = panel.path(what, ".mp4", ".gif")
-                count = await panel.in_thread(save_film, drawn(), path, fps=FPS)
-                panel.show_message(f"{path}: {count} frames written", "success")
-            panel.server.controller.view_update()
-        finally:
-            with state:
-                state.busy = ""
-
-    def _frames(self) -> Iterator[Any]:
-        panel = self._panel
-        for _ in range(FRAMES):
-            picture = panel.scene.picture()
-            ended = panel.move(float(panel.state.start_ms) + 1e3 / FPS * float(panel.state.speed))
-            panel.request("window")  # drawn before the next picture is taken
-
-            yield picture
-            if ended:
-                return

@@ -16,8 +16,9 @@ never splits them into parts."""
 HEADER_BYTES = 12
 """Size of the header of each message part [bytes]: message number, start of the part and length of the message, 32 bits
 each."""
-MOST_PX, MOST_SIDE = 16_000_000, 8192
-"""Largest accepted number of pixels and largest side [px] of the picture of the event clouds."""
+MOST_CHARACTERS = 2000
+"""Largest accepted length of a text that the page gives to a function of the server, such as the state in its address.
+"""
 LARGEST = 1e12
 """Largest accepted number in a message; in ms it is 30 years."""
 
@@ -67,17 +68,13 @@ def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None =
     return check
 
 
+def _integer(value: Any) -> bool:
+    return type(value) is int and abs(value) <= LARGEST
+
+
 flag = one_of(True, False)
-_switch = one_of(0, 1, True, False)
-_place = number(-16.0, 16.0)
-_side = number(0, MOST_SIDE)
-_mouse = {
-    "action": one_of("down", "up", "move", "dblclick"), "x": _place, "y": _place,
-    **dict.fromkeys(
-        ("buttonLeft", "buttonMiddle", "buttonRight", "shiftKey", "altKey", "ctrlKey", "metaKey"), _switch
-    ),
-}  # fmt: skip
-_wheel = one_of(*(f"{when}{what}" for when in ("Start", "", "End") for what in ("MouseWheel", "Pinch")))
+ARGUMENTS: Mapping[str, Check] = {"str": text(MOST_CHARACTERS), "float": number(), "int": _integer}
+"""Checks of the arguments of functions that the page calls, by their annotation."""
 
 
 class MessageFilter:
@@ -89,7 +86,6 @@ class MessageFilter:
         ``settable`` maps each state variable that the page may set to the check of its values.
         """
         self._server, self._warned = server, False
-        view = self._is_view
         change = self._change(settable)
         self._calls: dict[str, Check] = {
             "wslink.hello": list_of(record({"secret": text(64)})),
@@ -98,17 +94,6 @@ class MessageFilter:
             "trame.error.client": list_of(text(4000)),
             "trame.state.update": list_of(lambda changes: isinstance(changes, list) and all(map(change, changes))),
             "trame.trigger": self._is_trigger,
-            "viewport.image.push": list_of(record({"view": view}, {"size": list_of(_side, _side)})),
-            "viewport.image.push.observer.add": list_of(view),
-            "viewport.image.push.observer.remove": list_of(view),
-            "viewport.image.push.original.size": _is_size(view),
-            "viewport.image.push.quality": list_of(view, number(0, 100), number(0.05, 1)),
-            "viewport.image.push.enabled": list_of(view, flag),
-            "viewport.image.push.invalidate.cache": list_of(view),
-            "viewport.mouse.interaction": list_of(record({**_mouse, "view": view})),
-            "viewport.mouse.zoom.wheel": list_of(
-                record({"type": _wheel, "view": view}, {**_mouse, "spinY": number(-10, 10)})
-            ),
         }
 
     def passes(self, message: bytes) -> bool:
@@ -127,20 +112,17 @@ class MessageFilter:
         more = {"wslink": text(10), "kwargs": one_of({})}
         return record(known, more)(call) and call["method"] in self._calls and self._calls[call["method"]](call["args"])
 
-    def _is_view(self, value: Any) -> bool:
-        return isinstance(value, str) and value == self._server.state.viewId
-
     def _is_trigger(self, args: list[Any]) -> bool:
-        """Return whether a function that the page may call exists and takes these strings, numbers or flags."""
-        plain = (text(200), number(), flag)
+        """Return whether a function that the page may call exists and takes arguments of these types."""
         if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
             return False
         name, given, _ = args
         called = self._server.controller.trigger_fn(name)
-        if called is None or not all(any(check(each) for check in plain) for each in given):
+        if called is None:
             return False
-        inspect.signature(called).bind(*given)
-        return True
+        signature = inspect.signature(called)
+        arguments = signature.bind(*given).arguments  # raises TypeError for another number of arguments
+        return all(ARGUMENTS[signature.parameters[k].annotation](value) for k, value in arguments.items())
 
     @staticmethod
     def _change(settable: Mapping[str, Check]) -> Check:
@@ -154,11 +136,6 @@ def _unpacked(message: bytes) -> Any:
     if (start, length) != (0, len(message) - HEADER_BYTES):
         raise ValueError("received a part of a message; expected the complete message")
     return msgpack.unpackb(message[HEADER_BYTES:])
-
-
-def _is_size(view: Check) -> Check:
-    shape = list_of(view, _side, _side)
-    return lambda args: shape(args) and args[1] * args[2] <= MOST_PX
 
 
 def finite(given: str) -> float:

@@ -1,101 +1,103 @@
-"""Values of the page's state: numbers converted to text, image addresses and SVG points."""
+"""Values of the page's state: what the page may set, its state at the start, and texts."""
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.comparison import AGAINST
+from amiwarp.viewer.drawing import NO_ORBIT
 from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
-from amiwarp.viewer.layout import NAMES, SPEEDS
-from amiwarp.viewer.message_filter import Check, flag, list_of, number, one_of, text
+from amiwarp.viewer.image_kinds import ImageKind
+from amiwarp.viewer.layout import KEYS, NAMES, SCOPES, SPEEDS, TOOLS, UNITS, VIEWS
+from amiwarp.viewer.message_filter import Check, flag, number, one_of
+from amiwarp.viewer.page_exports import export_state
+from amiwarp.viewer.parameters import Source
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.window import DisplayedWindow
 
-    from amiwarp.viewer.inspector import DisplayedWindow, Inspector
-
-JPEG_QUALITY = 90
-_pixels = number(0, LARGEST_SIZE)
 SETTABLE: dict[str, Check] = {
-    **dict.fromkeys(NAMES, number()), "start_ms": number(), "region_x": list_of(_pixels, _pixels),
-    "region_y": list_of(_pixels, _pixels), "point_size": number(0.1, 20.0), "opacity": number(0.0, 1.0),
+    **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
     "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
     "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
-    "view": one_of(*(each.value for each in View)), "out": text(200), "playing": one_of(False), "picked": one_of(""),
-    "message": one_of(""), **dict.fromkeys(("hide_hot", "dark", "overlaid", "orbit_shown", "help_shown"), flag),
+    "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
+    "message": one_of(""),
+    **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop",
+                     "difference"),
+                    flag),
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 calls."""
+CLIENT_ONLY = ("hover", "hover_region", "measured", "tool")
+"""State variables that the browser keeps to itself."""
+NO_SCALE = {"bar": "", "ticks": [], "title": ""}
+"""Scale of an image before the first update."""
 
 
 def initial_state(inspector: Inspector) -> dict[str, Any]:
-    """Return the page's state at the start, without the prism's parameters."""
-    source, recording = inspector.recording.events, inspector.recording
-    start, length = inspector.window or inspector.first_window()
-    has_turns = math.isfinite(inspector.turn_us)
+    """Return the page's state at the start, without the events' window and the prism's parameters."""
+    recording = inspector.recording
     return {
-        **source_state(inspector), "live": inspector.latest is not None,
-        "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "size": list(source.size),
-        "start_ms": round((start - source.t_first) * 1e-3, 3),
-        "length_ms": round(length * 1e-3, 3), "turn_ms": inspector.turn_us * 1e-3 if has_turns else 0.0,
-        "playing": False, "speed": 0.1, "polarity": "both", "hide_hot": False, "region_x": [0, source.size[0]],
-        "region_y": [0, source.size[1]], "colour": Colour.POLARITY.value, "point_size": 2.0, "opacity": 1.0,
-        "axis": (Axis.ANGLE if has_turns else Axis.TIME).value, "dark": False, "overlaid": False,
-        "view": View.FREE.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
-        "truth": truth_text(recording.truth),
-        "knob": "apex", "has_encoder": inspector.has_encoder, "orbit_shown": True, "help_shown": False, "out": "",
-        "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "events": "", "sharpness": "",
-        "before": "", "after": "", "picture": "", "picture_note": "", "curve": "", "curve_mark": 0.0, "curve_text": "",
-        "curve_low": 0.0, "curve_high": 1.0, "shown_from": 0.0, "shown_part": 1.0, "severity": "info",
-        "message": "; ".join(inspector.notes), "busy": "", "progress": 0, "found": "", "picked": "",
+        **source_state(inspector), **NO_ORBIT, "trame__title": f"amiwarp: {recording.name}",
+        "trame_error_report_msg": "", "name": recording.name,
+        "size": list(recording.events.size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
+        "notes": notes(inspector), "has_encoder": inspector.has_encoder, "models": list(MODELS),
+        "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "truths": truths(inspector),
+        "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth), **export_state(),
+        "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
+        "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
+        "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
+        "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
+        "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
+        "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
+        "hover": "", "hover_region": "", "measured": "", "orbit_shown": True, "help_shown": False,
+        "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
+        "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
+        "rate_on": b"", "rate_off": b"", "rate_note": "",
+        "picked_text": "",
+        "overview": "", "before": "", "after": "", "kind": ImageKind.COUNT.value,
+        "kinds": [each.value for each in ImageKind], "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
+        "after_scale": NO_SCALE, "difference": False, "against_title": "",
+        "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
+        "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
+        "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES), "calibrate_on": "",
     }  # fmt: skip
 
 
 def source_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables that depend on the events; they change in a live stream."""
-    source, (times, rates) = inspector.recording.events, inspector.rate
-    return {
-        "whole_ms": (source.t_last - source.t_first + 1) * 1e-3, "rate": polyline(times[:-1], rates),
-        "rate_top": f"{rates.max() * 1e-6:.3g} Mev/s" if len(rates) else "",
-    }  # fmt: skip
+    source = inspector.recording.events
+    whole_ms = (source.t_last - source.t_first + 1) * 1e-3
+    return {"whole_ms": whole_ms, "rate_span": [0.0, whole_ms]}
 
 
-def event_text(shown: DisplayedWindow, k: int) -> str:
-    """Return the description of point ``k``: pixel, time, angle, polarity, compensated position and ground truth."""
-    e, (x, y), truth = shown.events, shown.after[k], shown.truth.text(k)
-    return (
-        f"x {e.x[k]}, y {e.y[k]} px; t {e.t[k]} µs; θ {math.degrees(shown.theta[k]):.2f}°; "
-        f"{'ON' if e.p[k] else 'OFF'}; compensated {x:.2f}, {y:.2f} px{truth and f'; {truth}'}"
-    )
+def truths(inspector: Inspector) -> dict[str, float | None]:
+    """Return the known true parameters in the page's units; None for an unknown one."""
+    known = inspector.truth
+    return {n: None if known is None else round(getattr(known, n) / scale, 4) for n, scale in UNITS.items()}
 
 
-def jpeg(values: NDArray[Any]) -> str:
-    """Return an image with values from 0 to 1, shape (height, width), as the address (data URL) of a JPEG."""
-    from PIL import Image
-
-    data = io.BytesIO()
-    Image.fromarray((255.0 * values).astype(np.uint8)).save(data, "JPEG", quality=JPEG_QUALITY)
-    return "data:image/jpeg;base64," + base64.b64encode(data.getvalue()).decode()
-
-
-def polyline(x: NDArray[Any], y: NDArray[Any]) -> str:
-    """Return the SVG points of a curve, scaled to a box of 100 x 40."""
-    if not len(x):
-        return ""
-    across = 100.0 * (x - x[0]) / max(float(x[-1] - x[0]), 1e-12)
-    low, high = float(np.min(y)), float(np.max(y))
-    up = 38.0 - 36.0 * (y - low) / max(high - low, 1e-12)
-    return " ".join(f"{a:.2f},{b:.2f}" for a, b in zip(across, up, strict=True))
+def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
+    """Return the sharpness of the images as text, with the gain if there are two images."""
+    before, after = shown.sharpness_before, shown.sharpness_after
+    if not compensated:
+        return f"{before:.3f}"
+    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
+    return f"{before:.3f} → {after:.3f}{gain}"
 
 
-def percent_of_range(value: float, low: float, high: float) -> float:
-    """Return the position of ``value`` between ``low`` and ``high`` [%], from 0 to 100."""
+def events_text(shown: DisplayedWindow) -> str:
+    """Return the numbers of events of the window, in the selection and drawn."""
+    total, drawn = shown.span.count, len(shown.events)
+    selected = "" if shown.selected == total else f", {shown.selected:,} selected"
+    return f"{total:,} events{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
 
-    return min(max(100.0 * (value - low) / max(high - low, 1e-12), 0.0), 100.0)
+
+def notes(inspector: Inspector) -> list[str]:
+    """Return what the recording lacks or what is only assumed, for the place where it matters."""
+    assumed = inspector.sources.get("phase") is Source.ASSUMED and math.isfinite(inspector.turn_us)
+    return [*inspector.notes, *(["phase assumed, not known: calibrate, or set it"] if assumed else [])]

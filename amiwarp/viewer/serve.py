@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import gc
-import hashlib
 import logging
 import os
 import secrets
@@ -18,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.frames import PictureThrottle
 from amiwarp.viewer.host_names import ALL_INTERFACES, HostNames, address, cannot_serve, normalised
 from amiwarp.viewer.message_filter import MOST_BYTES, Check, MessageFilter
+from amiwarp.viewer.page_files import first_page
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -31,7 +30,7 @@ Closing = Callable[[], object] | None
 Session = Callable[[Any], Closing]
 """Function that builds a page on a new ``trame_server.Server`` (vue3), in the event loop."""
 MOST_TABS = 16
-"""Largest number of open browser tabs. Each tab holds a scene, a window of the recording and threads."""
+"""Largest number of open browser tabs. Each tab holds a window of the recording and threads."""
 TOO_MANY_TABS = f"{MOST_TABS} tabs of this inspector are open, which is the maximum; close one, then reload this page"
 HEARTBEAT_S = 30.0
 """Interval between pings of a page [s]. A page that does not answer within half of it is closed."""
@@ -39,6 +38,8 @@ CLEANUP_S = 0.5
 """Delay between closing a tab and releasing its memory [s]; tabs closed within this time are released together."""
 LONGEST_CLEANUP_S = 30.0
 """Longest interval between two attempts to release closed tabs whose threads still run [s]."""
+FAILURE = '<main role="alert" style="white-space: pre-wrap; padding: 24px; font: 16px system-ui">{{ failure }}</main>'
+"""Page that is shown if the inspector's page cannot be built."""
 HEADERS = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 """Headers of every HTTP answer. The first one keeps the page's address, which contains the token, from other sites."""
 
@@ -162,41 +163,24 @@ def _release_memory() -> None:
 def _application(tabs: Tabs, token: str, names: HostNames) -> web.Application:
     from aiohttp import web
 
-    application = web.Application(middlewares=[_guard(token, names)], client_max_size=MOST_BYTES)
-    application.add_routes([web.get("/ws", tabs.open), web.get("/{path:.*}", partial(_file, tabs.folders))])
+    application = web.Application(middlewares=[_guard(names)], client_max_size=MOST_BYTES)
+    application.add_routes([web.get("/{path:.*}", partial(_answer, tabs, token))])
     application.on_shutdown.append(tabs.close)
     return application
 
 
-def _guard(token: str, names: HostNames) -> Any:
-    """Return HTTP middleware that requires the token in the URL or in this server's cookie.
-
-    A request with the token in its URL sets the cookie.
-    """
+def _guard(names: HostNames) -> Any:
+    """Return HTTP middleware that refuses unknown host names and requests with a body, and sets the headers."""
     from aiohttp import web
-
-    cookie = "amiwarp_" + hashlib.sha256(token.encode()).hexdigest()[:16]
-
-    def knows(given: str) -> bool:
-        return secrets.compare_digest(given.encode(errors="surrogatepass"), token.encode())
-
-    async def answer(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if not names.accept(request):
-            raise web.HTTPForbidden(text="Not allowed: unknown host name; open the URL that was printed.")
-        if request.body_exists:
-            raise web.HTTPRequestEntityTooLarge(0, 0, text="Not allowed: requests with a body are refused.")
-        fresh = knows(request.query.get("token", ""))
-        if not fresh and not knows(request.cookies.get(cookie, "")):
-            raise web.HTTPForbidden(text="Not allowed: open the URL that was printed when this server was started.")
-        response = await handler(request)
-        if fresh and not response.prepared:
-            response.set_cookie(cookie, token, httponly=True, samesite="Strict")
-        return response
 
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
         try:
-            response = await answer(request, handler)
+            if not names.accept(request):
+                raise web.HTTPForbidden(text="Not allowed: unknown host name; open the URL that was printed.")
+            if request.body_exists:
+                raise web.HTTPRequestEntityTooLarge(0, 0, text="Not allowed: requests with a body are refused.")
+            response = await handler(request)
         except web.HTTPException as error:
             error.headers.update(HEADERS)
             error.force_close()
@@ -208,19 +192,35 @@ def _guard(token: str, names: HostNames) -> Any:
     return guard
 
 
-async def _file(folders: dict[str, Path], request: web.Request) -> web.FileResponse:
-    """Return the requested file from the folder of the longest matching route.
+async def _answer(tabs: Tabs, token: str, request: web.Request) -> web.StreamResponse:
+    """Answer a request whose path begins with the token.
+
+    The page asks for its files and for its WebSocket below its own path. A cookie would not do: browsers withhold
+    cookies from a frame inside a page of another site, such as a notebook's.
+    """
+    from aiohttp import web
+
+    given, slash, path = request.path[1:].partition("/")
+    if not slash or not secrets.compare_digest(given.encode(errors="surrogatepass"), token.encode()):
+        raise web.HTTPForbidden(text="Not allowed: open the URL that was printed when this server was started.")
+    return await tabs.open(request) if path == "ws" else _file(tabs.folders, f"/{path}")
+
+
+def _file(folders: dict[str, Path], path: str) -> web.StreamResponse:
+    """Return the file at a path, from the folder of the longest matching route.
 
     Raises ``HTTPNotFound`` if the file does not exist or lies outside that folder.
     """
     from aiohttp import web
 
-    path = "/index.html" if request.path == "/" else request.path
+    if path in ("/", "/index.html"):
+        page = first_page(folders["/"] / "index.html")
+        return web.Response(text=page, content_type="text/html", headers={"Cache-Control": "no-store"})
     route = max(filter(path.startswith, folders), key=len)
     with suppress(OSError, ValueError):
         file = (folders[route] / path.removeprefix(route)).resolve()
         if file.is_relative_to(folders[route]) and file.is_file():
-            return web.FileResponse(file, headers={"Cache-Control": "no-store"} if file.suffix == ".html" else None)
+            return web.FileResponse(file)
     raise web.HTTPNotFound
 
 
@@ -244,9 +244,6 @@ async def _connection(
             folders[f"/{route.strip('/')}/"] = Path(source if isinstance(source, str) else source[0]).resolve()
         await server.ready
         server.controller.on_error.add(_log_report)
-        for delivery in server.protocol.getLinkProtocols():
-            if hasattr(delivery, "push_render"):
-                stack.callback(PictureThrottle(server, delivery).close)
 
         async def send(_: bool, content: bytes) -> None:
             with suppress(ConnectionResetError):
@@ -264,9 +261,6 @@ def _log_report(message: str) -> None:
 
 def _build(build: Session) -> tuple[Any, Closing]:
     """Return a new server with its page; if building the page fails, the page shows the reason."""
-    from trame.ui.vuetify3 import VAppLayout
-    from trame.widgets import vuetify3
-
     server = _server()
     try:
         return server, build(server)
@@ -276,8 +270,7 @@ def _build(build: Session) -> tuple[Any, Closing]:
         _remove_from_trame(server)
         server = _server()
         server.state.failure = str(error) or type(error).__name__
-        with VAppLayout(server):
-            vuetify3.VAlert(text=("failure",), type="error", classes="ma-4", style="white-space: pre-wrap")
+        server.state.trame__template_main = FAILURE
         return server, None
 
 
@@ -313,6 +306,5 @@ def _remove_from_trame(server: Any) -> None:
 
     from trame_client.widgets.core import HTML_CTX
 
-    getattr(sys.modules.get("trame_vtk.modules.vtk"), "HELPERS_PER_SERVER", {}).pop(server.name, None)
     if HTML_CTX._server is server:
         HTML_CTX._server = None

@@ -1,0 +1,243 @@
+// Component with the event clouds: draws the points in the browser, and lets the mouse and the keys turn them.
+
+import { Camera } from './camera.js';
+import { drawFrame } from './frame.js';
+import { Raster, nearest } from './raster.js';
+
+const { onBeforeUnmount, onMounted, ref, watch } = window.Vue;
+const MOST_PIXELS = 3e6; // of the picture; a finer screen gets a coarser picture
+const HEIGHT = 0.75; // length of the third axis as a share of the width of the region
+const CLICK_PX = 3;
+const NARROW_PX = 480;
+const REACH_PX = 8;
+const GREY = 0xff909090;
+const ORBIT = '#009e73';
+const KEYS = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, -12], ArrowDown: [0, 12] };
+
+export function floats(bytes) {
+  if (!bytes || !bytes.byteLength) return new Float32Array(0);
+  return new Float32Array(bytes.slice().buffer);
+}
+
+function words(bytes) {
+  return bytes && bytes.byteLength ? new Uint32Array(bytes.slice().buffer) : new Uint32Array(0);
+}
+
+export const EventClouds = {
+  props: {
+    before: null, after: null, third: null, coloursBefore: null, coloursAfter: null, orbit: null, column: null,
+    box: Array, axis: Object, titles: Array, view: Array, dot: Number, opacity: Number, overlaid: Boolean,
+    dark: Boolean, picked: Number,
+  },
+  emits: ['pick'],
+  template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label"></canvas></div>`,
+  setup(props, { emit }) {
+    const canvas = ref(null);
+    const camera = new Camera();
+    const raster = new Raster();
+    const scene = { places: [new Float32Array(0), new Float32Array(0)], colours: [], half: [1, 1, 1] };
+    const label = window.Vue.computed(() => {
+      const names = props.titles.map(([, title]) => title).join(' and ');
+      return `Event cloud${props.titles.length > 1 ? 's' : ''}, ${names}, over x, y and ${props.axis.title}. `
+        + 'Drag or shift and arrow keys to turn, wheel or plus and minus to zoom.';
+    });
+    let waiting = false;
+    let observer;
+
+    function build() {
+      const [left, top, right, bottom] = props.box;
+      const { low, high } = props.axis;
+      const tall = HEIGHT * Math.max(right - left, bottom - top);
+      scene.half = [(right - left) / 2, (bottom - top) / 2, tall / 2];
+      const third = floats(props.third);
+      const stretch = tall / Math.max(high - low, 1e-9);
+      const centre = [(left + right) / 2, (top + bottom) / 2, (low + high) / 2];
+      scene.place = (xy, z) => {
+        const out = new Float32Array((3 * xy.length) / 2);
+        for (let i = 0; i < xy.length / 2; i++) {
+          out[3 * i] = xy[2 * i] - centre[0];
+          out[3 * i + 1] = centre[1] - xy[2 * i + 1];
+          out[3 * i + 2] = (z[i] - centre[2]) * stretch;
+        }
+        return out;
+      };
+      scene.places = [props.before, props.after].map((xy) => scene.place(floats(xy), third));
+      scene.colours = [props.coloursBefore, props.coloursAfter].map(words);
+      const turns = floats(props.orbit).filter((_, k) => k % 3 === 2);
+      const xy = (bytes) => floats(bytes).filter((_, k) => k % 3 !== 2);
+      scene.lines = [props.orbit, props.column].map((bytes) => scene.place(xy(bytes), turns));
+      ask();
+    }
+
+    function ask() {
+      if (waiting) return;
+      waiting = true;
+      window.requestAnimationFrame(() => {
+        waiting = false;
+        if (canvas.value) draw();
+      });
+    }
+
+    function panes() {
+      const [W, H] = [canvas.value.clientWidth, canvas.value.clientHeight];
+      const count = props.overlaid ? 1 : props.titles.length;
+      const [across, down] = W < NARROW_PX ? [1, count] : [count, 1]; // on a phone, one cloud is below the other
+      return Array.from({ length: count }, (_, k) => ({
+        left: Math.round(((k % across) * W) / across), top: Math.round((Math.floor(k / across) * H) / down),
+        width: Math.floor(W / across), height: Math.floor(H / down),
+        clouds: props.overlaid && props.titles.length > 1 ? [0, 1] : [props.titles[k][0]],
+        title: props.overlaid ? props.titles.map(([, title]) => title).join(' (grey), ') : props.titles[k][1],
+      }));
+    }
+
+    function draw() {
+      const view = canvas.value;
+      const [W, H] = [view.clientWidth, view.clientHeight];
+      if (!W || !H || !props.titles.length) return;
+      const ratio = Math.min(window.devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / (W * H)));
+      const size = [Math.round(W * ratio), Math.round(H * ratio)];
+      if (view.width !== size[0] || view.height !== size[1]) [view.width, view.height] = size;
+      const style = window.getComputedStyle(view);
+      const font = Math.round(0.92 * parseFloat(style.fontSize));
+      const ink = style.getPropertyValue('--ink').trim() || '#333';
+      const paper = style.getPropertyValue('--paper').trim() || '#ffffff';
+      const context = view.getContext('2d');
+      for (const pane of panes()) {
+        const projection = camera.project(scene.half, pane.width, pane.height);
+        pane.projection = projection;
+        const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
+        raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
+        raster.clear(packed(paper));
+        const dot = Math.max(1, Math.round(props.dot * ratio * Math.max(1, Math.min(2.5, H / 420))));
+        for (const k of pane.clouds) {
+          const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
+          raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, grey);
+        }
+        context.setTransform(1, 0, 0, 1, 0, 0);
+        context.putImageData(raster.image, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
+        context.setTransform(ratio, 0, 0, ratio, pane.left * ratio, pane.top * ratio);
+        context.save();
+        context.beginPath();
+        context.rect(0, 0, pane.width, pane.height);
+        context.clip();
+        drawContent(context, projection, pane, ink, font);
+        context.restore();
+      }
+      view.dataset.frames = Number(view.dataset.frames || 0) + 1;
+    }
+
+    function drawContent(context, projection, pane, ink, size) {
+      const [left, top, right, bottom] = props.box;
+      const axes = [
+        { low: left, high: right, title: 'x (px)' }, { low: top, high: bottom, title: 'y (px)', flipped: true }, props.axis,
+      ];
+      drawFrame(context, projection, scene.half, axes, ink, size, [pane.width, pane.height]);
+      context.strokeStyle = ORBIT;
+      context.lineWidth = 2.5;
+      for (const k of pane.clouds) line(context, scene.lines[k], projection);
+      if (props.picked >= 0) {
+        for (const k of pane.clouds) ring(context, scene.places[k], projection, ink);
+      }
+      context.fillStyle = ink;
+      context.font = `600 ${size + 1}px system-ui, sans-serif`;
+      context.textAlign = 'center';
+      context.textBaseline = 'top';
+      context.fillText(pane.title, pane.width / 2, 7);
+    }
+
+    function line(context, places, projection) {
+      context.beginPath();
+      for (let i = 0; i < places.length; i += 3) context.lineTo(...projection.at(places.subarray(i, i + 3)).slice(0, 2));
+      context.stroke();
+    }
+
+    function ring(context, places, projection, ink) {
+      const [x, y] = projection.at(places.subarray(3 * props.picked, 3 * props.picked + 3));
+      context.strokeStyle = ink;
+      context.lineWidth = 2;
+      context.beginPath();
+      context.arc(x, y, 7, 0, 2 * Math.PI);
+      context.stroke();
+    }
+
+    function pick(x, y) {
+      const pane = paneAt(x, y);
+      const cloud = pane.clouds[pane.clouds.length - 1];
+      const projection = camera.project(scene.half, pane.width, pane.height);
+      emit('pick', nearest(scene.places[cloud], projection, x - pane.left, y - pane.top, REACH_PX));
+    }
+
+    function paneAt(x, y) {
+      const all = panes();
+      return all.find((each) => x < each.left + each.width && y < each.top + each.height) || all[0];
+    }
+
+    function pressed(event) {
+      const start = [event.clientX, event.clientY];
+      let last = start;
+      let moved = false;
+      canvas.value.setPointerCapture(event.pointerId);
+      canvas.value.onpointermove = (now) => {
+        const by = [now.clientX - last[0], now.clientY - last[1]];
+        moved = moved || Math.hypot(now.clientX - start[0], now.clientY - start[1]) > CLICK_PX;
+        if (!moved) return;
+        last = [now.clientX, now.clientY];
+        if (event.button > 0 || event.shiftKey) camera.move(...by);
+        else camera.turn(...by);
+        ask();
+      };
+      canvas.value.onpointerup = canvas.value.onpointercancel = (end) => {
+        canvas.value.onpointermove = canvas.value.onpointerup = canvas.value.onpointercancel = null;
+        const box = canvas.value.getBoundingClientRect();
+        if (!moved && end.type === 'pointerup') pick(end.clientX - box.left, end.clientY - box.top);
+      };
+    }
+
+    function wheeled(event) {
+      event.preventDefault();
+      const box = canvas.value.getBoundingClientRect();
+      const pane = paneAt(event.clientX - box.left, event.clientY - box.top);
+      const place = [
+        event.clientX - box.left - pane.left - pane.width / 2, event.clientY - box.top - pane.top - pane.height / 2,
+      ];
+      camera.scale(Math.exp(-0.0015 * event.deltaY), ...place);
+      ask();
+    }
+
+    function typed(event) {
+      if (event.shiftKey && KEYS[event.key]) camera.turn(...KEYS[event.key]);
+      else if (event.key === '+') camera.scale(1.25);
+      else if (event.key === '-') camera.scale(0.8);
+      else return;
+      event.preventDefault();
+      event.stopPropagation();
+      ask();
+    }
+
+    onMounted(() => {
+      observer = new window.ResizeObserver(ask);
+      observer.observe(canvas.value);
+      canvas.value.addEventListener('pointerdown', pressed);
+      canvas.value.addEventListener('wheel', wheeled, { passive: false });
+      canvas.value.addEventListener('keydown', typed);
+      canvas.value.addEventListener('contextmenu', (event) => event.preventDefault());
+      camera.look(props.view[0]);
+      build();
+    });
+    onBeforeUnmount(() => observer.disconnect());
+    const content = ['before', 'after', 'third', 'coloursBefore', 'coloursAfter', 'box', 'axis', 'orbit', 'column'];
+    watch(content.map((name) => () => props[name]), build);
+    watch(['titles', 'dot', 'opacity', 'overlaid', 'dark', 'picked'].map((name) => () => props[name]), () => setTimeout(ask));
+    watch(() => props.view, ([view]) => {
+      camera.look(view);
+      ask();
+    });
+    return { canvas, label };
+  },
+};
+
+// Return a colour such as #15181c as a pixel of an image.
+function packed(hex) {
+  const value = parseInt(hex.slice(1), 16);
+  return (0xff000000 | ((value & 0xff) << 16) | (value & 0xff00) | (value >>> 16)) >>> 0;
+}

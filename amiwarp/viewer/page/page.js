@@ -1,0 +1,117 @@
+// Entry of the page's own code: registers the components, handles keys, the address and downloads.
+
+import { EventClouds } from './clouds.js';
+import { KnobField, NumberField } from './fields.js';
+import { EventPicture } from './pictures.js';
+import { ColourBar, CostSurface, CurvePlot } from './plots.js';
+import { savePicture } from './snapshot.js';
+import { RateTimeline } from './timeline.js';
+
+const { inject, nextTick, onBeforeUnmount, onMounted, ref, watch } = window.Vue;
+const FIELDS = 'input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select';
+const RETRY_MS = 1500;
+
+// Saves a file that the server sends, or that the page makes.
+function download(name, content, type) {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(content instanceof Blob ? content : new Blob([content], { type }));
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60e3);
+}
+
+// Element around the page: keys, the state in the address, downloads, and the loss of the connection.
+const PageFrame = {
+  props: { address: String, lost: String },
+  template: '<div ref="root"><slot/></div>',
+  setup(props) {
+    const trame = inject('trame');
+    const root = ref(null);
+    let timer = 0;
+
+    function pressed(event) {
+      if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches(FIELDS)) return;
+      if (event.target.matches('button, summary, a, input') && [' ', 'Enter'].includes(event.key)) return;
+      if (event.target.matches('input') && event.key.startsWith('Arrow')) return;
+      if (!trame.state.get('keys').some(([key]) => key === event.key)) return;
+      event.preventDefault();
+      trame.trigger('key', [event.key]);
+    }
+
+    // After a click, the keys belong to the page again and not to the control that was clicked.
+    function released(event) {
+      const control = event.target.closest('button, select, summary, input[type=checkbox], input[type=radio]');
+      if (control && event.detail > 0 && !control.matches('select')) control.blur();
+    }
+
+    function restore() {
+      const address = window.location.hash.slice(1);
+      if (address && address !== props.address) trame.trigger('restore', [address]);
+    }
+
+    async function retry() {
+      try {
+        const answer = await fetch(window.location.pathname, { cache: 'no-store' });
+        if (answer.ok) window.location.reload();
+      } catch {
+        // still away: try again
+      }
+    }
+
+    trame.refs.page = { download, picture: (name, words) => savePicture(name, words, download) };
+    watch(() => props.address, (address) => {
+      if (address) window.history.replaceState(null, '', `#${address}`);
+    });
+    watch(() => props.lost, (lost) => {
+      window.clearInterval(timer);
+      if (lost) timer = window.setInterval(retry, RETRY_MS);
+    }, { immediate: true });
+    onMounted(() => {
+      window.addEventListener('keydown', pressed);
+      window.addEventListener('hashchange', restore);
+      root.value.addEventListener('click', released);
+      root.value.addEventListener('change', (event) => event.target.matches('select') && event.target.blur());
+      restore();
+    });
+    onBeforeUnmount(() => {
+      window.removeEventListener('keydown', pressed);
+      window.removeEventListener('hashchange', restore);
+      window.clearInterval(timer);
+    });
+    return { root };
+  },
+};
+
+// Dialog that takes the focus, and closes by its button, by Escape, or by the page's state.
+const PageDialog = {
+  props: { open: Boolean, title: String, name: String },
+  emits: ['close'],
+  template: `<dialog ref="box" :id="name" :aria-label="title" @close="$emit('close')" @click.self="$emit('close')">
+    <header><h2>{{ title }}</h2><button type="button" :id="name + '-close'" @click="$emit('close')">close</button></header>
+    <slot/></dialog>`,
+  setup(props) {
+    const box = ref(null);
+    const follow = () => nextTick(() => {
+      if (props.open && !box.value.open) box.value.showModal();
+      else if (!props.open && box.value.open) box.value.close();
+    });
+    onMounted(follow);
+    watch(() => props.open, follow);
+    return { box };
+  },
+};
+
+window.amiwarp_page = {
+  install(app) {
+    app.component('EventClouds', EventClouds);
+    app.component('EventPicture', EventPicture);
+    app.component('RateTimeline', RateTimeline);
+    app.component('CurvePlot', CurvePlot);
+    app.component('CostSurface', CostSurface);
+    app.component('ColourBar', ColourBar);
+    app.component('KnobField', KnobField);
+    app.component('NumberField', NumberField);
+    app.component('PageFrame', PageFrame);
+    app.component('PageDialog', PageDialog);
+  },
+};

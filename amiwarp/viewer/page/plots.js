@@ -1,0 +1,91 @@
+// Components with plots: the sharpness over a parameter, and the sharpness over two parameters as a map.
+
+import { text, ticks } from './ticks.js';
+
+const { computed, onMounted, ref, watch } = window.Vue;
+
+// Return the ticks of an axis with their places as shares of its length.
+function placed(low, high, most) {
+  return ticks(low, high, most).map((value) => ({ text: text(value), at: (value - low) / Math.max(high - low, 1e-12) }));
+}
+
+export const CurvePlot = {
+  props: { x: Array, y: Array, mark: Number, best: Number, truth: Number, xTitle: String, yTitle: String, label: String },
+  emits: ['pick'],
+  template: `<div class="plot" role="img" :aria-label="label">
+    <div class="plot-y">{{ yTitle }}</div>
+    <div class="plot-box" @click="clicked">
+      <svg viewBox="0 0 100 100" preserveAspectRatio="none" aria-hidden="true">
+        <line v-for="t in across" :x1="100 * t.at" :x2="100 * t.at" y1="0" y2="100" class="grid"/>
+        <line v-for="t in up" x1="0" x2="100" :y1="100 - 100 * t.at" :y2="100 - 100 * t.at" class="grid"/>
+        <line v-if="truth !== null && truth !== undefined" class="truth" :x1="share(truth)" :x2="share(truth)" y1="0" y2="100"/>
+        <line class="mark" :x1="share(mark)" :x2="share(mark)" y1="0" y2="100"/>
+        <polyline :points="points"/>
+      </svg>
+      <span v-for="t in up" class="tick-y" :style="{ bottom: 100 * t.at + '%' }">{{ t.text }}</span>
+      <span v-for="t in across" class="tick-x" :style="{ left: 100 * t.at + '%' }">{{ t.text }}</span>
+    </div>
+    <div class="plot-x">{{ xTitle }}</div>
+  </div>`,
+  setup(props, { emit }) {
+    const range = computed(() => [props.x[0], props.x[props.x.length - 1]]);
+    const tall = computed(() => {
+      const [low, high] = [Math.min(...props.y), Math.max(...props.y)];
+      const gap = 0.08 * (high - low) || 0.01;
+      return [low - gap, high + gap];
+    });
+    const share = (value) => 100 * Math.max(0, Math.min(1, (value - range.value[0]) / (range.value[1] - range.value[0])));
+    const points = computed(() => {
+      const [low, high] = tall.value;
+      return props.x.map((x, k) => `${share(x)},${100 - (100 * (props.y[k] - low)) / (high - low)}`).join(' ');
+    });
+    const across = computed(() => placed(...range.value, 5));
+    const up = computed(() => placed(...tall.value, 4));
+    function clicked(event) {
+      const box = event.currentTarget.getBoundingClientRect();
+      const at = (event.clientX - box.left) / box.width;
+      emit('pick', range.value[0] + at * (range.value[1] - range.value[0]));
+    }
+    return { share, points, across, up, clicked };
+  },
+};
+
+export const CostSurface = {
+  props: { x: Array, y: Array, values: Array, marks: Array, xTitle: String, yTitle: String, label: String },
+  template: `<div class="plot surface" role="img" :aria-label="label">
+    <div class="plot-y">{{ yTitle }}</div>
+    <div class="plot-box"><canvas ref="canvas"></canvas>
+      <span v-for="m in marks" class="cross" :class="m.kind" :style="{ left: share(m.x, x), bottom: share(m.y, y) }"
+        :title="m.title">{{ m.sign }}</span>
+      <span v-for="t in placed(y[0], y[y.length - 1], 4)" class="tick-y" :style="{ bottom: 100 * t.at + '%' }">{{ t.text }}</span>
+      <span v-for="t in placed(x[0], x[x.length - 1], 4)" class="tick-x" :style="{ left: 100 * t.at + '%' }">{{ t.text }}</span>
+    </div>
+    <div class="plot-x">{{ xTitle }}</div>
+  </div>`,
+  setup(props) {
+    const canvas = ref(null);
+    const share = (value, axis) => `${100 * Math.max(0, Math.min(1, (value - axis[0]) / (axis[axis.length - 1] - axis[0])))}%`;
+    function draw() {
+      const [width, height, flat] = [props.x.length, props.y.length, props.values.flat()];
+      const [low, high] = [Math.min(...flat), Math.max(...flat)];
+      Object.assign(canvas.value, { width, height });
+      const context = canvas.value.getContext('2d');
+      const image = context.createImageData(width, height);
+      flat.forEach((value, k) => {
+        const [row, column] = [height - 1 - Math.floor(k / width), k % width];
+        const tone = (value - low) / Math.max(high - low, 1e-12);
+        image.data.set([Math.round(20 + 235 * tone), Math.round(30 + 190 * tone), Math.round(90 + 30 * tone), 255], 4 * (row * width + column));
+      });
+      context.putImageData(image, 0, 0);
+    }
+    onMounted(draw);
+    watch(() => props.values, draw);
+    return { canvas, share, placed };
+  },
+};
+
+export const ColourBar = {
+  props: { scale: Object },
+  template: `<small class="colour-bar"><span class="bar" :style="{ background: scale.bar }"></span>
+    <span v-for="t in scale.ticks" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
+};

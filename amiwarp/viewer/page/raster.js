@@ -1,0 +1,66 @@
+// Drawing of points into a picture by the processor. It needs no graphics card: on machines with software rendering it
+// is many times faster than WebGL, and it draws the same picture everywhere.
+
+export class Raster {
+  // Set the size of the picture [px].
+  resize(width, height) {
+    if (this.image && this.image.width === width && this.image.height === height) return;
+    this.image = new ImageData(width, height);
+    this.pixels = new Uint32Array(this.image.data.buffer);
+    this.depth = new Float32Array(width * height);
+  }
+
+  clear(colour) {
+    this.pixels.fill(colour);
+    this.depth.fill(-Infinity);
+  }
+
+  // Draw n points (x, y, z interleaved, NaN for none) as squares; the nearest point covers the others. With an opacity
+  // below 1, points are mixed in their order. `fixed` is one colour for all points.
+  points(places, colours, projection, size, opacity, fixed = 0) {
+    const { pixels, depth, image } = this;
+    const { away, right, up, depth: near, scale, x: cx, y: cy } = projection;
+    const [W, H, n, low] = [image.width, image.height, places.length / 3, Math.floor((size - 1) / 2)];
+    const [r0, r1, u0, u1, u2, a0, a1, a2] = [...right.slice(0, 2), ...up, ...away];
+    const mix = Math.round(256 * opacity);
+    for (let i = 0, j = 0; i < n; i++, j += 3) {
+      const x = places[j], y = places[j + 1], z = places[j + 2];
+      const d = a0 * x + a1 * y + a2 * z;
+      const s = scale / (1 - near * d);
+      const left = Math.round(cx + s * (r0 * x + r1 * y)) - low;
+      const top = Math.round(cy - s * (u0 * x + u1 * y + u2 * z)) - low;
+      if (!(left >= 0 && top >= 0 && left + size <= W && top + size <= H)) continue;
+      const colour = fixed || colours[i];
+      for (let row = top * W + left, stop = row + size * W; row < stop; row += W) {
+        for (let at = row; at < row + size; at++) {
+          if (mix < 256) {
+            pixels[at] = mixed(pixels[at], colour, mix);
+          } else if (d > depth[at]) {
+            depth[at] = d;
+            pixels[at] = colour;
+          }
+        }
+      }
+    }
+  }
+}
+
+function mixed(below, above, share) {
+  const rest = 256 - share;
+  const even = (((below & 0xff00ff) * rest + (above & 0xff00ff) * share) >>> 8) & 0xff00ff;
+  const green = (((below & 0xff00) * rest + (above & 0xff00) * share) >>> 8) & 0xff00;
+  return (0xff000000 | even | green) >>> 0;
+}
+
+// Return the index of the point that is drawn nearest to (x, y) [px], or -1 if none is within `reach` [px].
+export function nearest(places, projection, x, y, reach) {
+  let [best, least, front] = [-1, reach, -Infinity];
+  for (let i = 0; i < places.length / 3; i++) {
+    const [px, py, d] = projection.at([places[3 * i], places[3 * i + 1], places[3 * i + 2]]);
+    const distance = Math.hypot(px - x, py - y);
+    if (distance < least - 2 || (distance < least + 2 && distance <= reach && d > front)) {
+      [best, least, front] = [i, Math.min(distance, least), d];
+    }
+  }
+  return best;
+}

@@ -1,0 +1,178 @@
+"""Updates of a page: windows, parameters and looks are computed in threads, and their results sent to the browser."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.viewer.choices import Axis, Colour
+from amiwarp.viewer.drawing import (
+    NO_ORBIT,
+    cloud_state,
+    difference_state,
+    event_text,
+    jpeg,
+    orbit_state,
+    scale_state,
+    whole_image,
+)
+from amiwarp.viewer.image_kinds import ImageKind, ShownImages, count_images, make_images
+from amiwarp.viewer.layout import UNITS
+from amiwarp.viewer.page_values import events_text, sharpness_text, truths
+from amiwarp.viewer.selected_calibration import scope_text
+
+if TYPE_CHECKING:
+    from amiwarp.viewer.panel import Panel
+    from amiwarp.viewer.window import DisplayedWindow
+
+
+class Updates:
+    """Makes the updates of one page."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel, self._state = panel, panel.state
+        self.shown: DisplayedWindow | None = None
+        """Window as the page shows it; None before the first update."""
+        self._picked = -1
+
+    def first(self) -> None:
+        """Forget what another recording has left, and show what there is before the first update."""
+        self.shown, self._picked = None, -1
+        nothing = np.zeros((0, 2), np.float32).tobytes()
+        names = ("cloud_before", "cloud_after", "cloud_third", "colours_before", "colours_after")
+        self._state.update({**dict.fromkeys(names, nothing), "region": [0, 0, *self._state.size], "titles": [],
+                            "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
+                            "third_axis": {"low": 0.0, "high": 1.0, "title": ""}})  # fmt: skip
+        self._show_prism()
+
+    async def make(self, todo: set[str]) -> None:
+        """Make quick updates: "suggestion", "window", "knobs", "look" and "state"."""
+        panel, state = self._panel, self._state
+        if todo & {"window", "suggestion"}:
+            with panel.errors_shown("window"):
+                await self._open(suggest="suggestion" in todo)
+        with panel.errors_shown("knobs"):
+            if "knobs" in todo:
+                panel.set_knobs()
+            if self.shown is None:
+                panel.history.remember("")
+            if "state" in todo:
+                await panel.history.apply()
+            shown, values = await panel.in_thread(self._compute)
+            self.shown = shown
+            state.update(values)
+            state.curve_mark = float(state[state.knob])
+            self._show_prism()
+            panel.show_knobs()
+            if not state.playing:
+                panel.history.remember("" if todo & {"suggestion", "state"} else panel.change)
+
+    async def make_slow(self, name: str) -> None:
+        """Make a slow update: "curve" or "picture"."""
+        await (self._curve() if name == "curve" else self._picture())
+
+    def pick(self, k: int) -> None:
+        """Describe a drawn event, and show its orbit; -1 for none."""
+        known = self.shown is not None and 0 <= k < len(self.shown.events)
+        self._picked = k if known else -1
+        self._panel.request("look")
+
+    async def _open(self, *, suggest: bool) -> None:
+        """Read the window and the selection that the page shows."""
+        panel, s = self._panel, self._state
+        start, length = float(s.start_ms), min(float(s.length_ms), float(s.whole_ms))
+        if not length > 0.0:
+            raise AmiwarpError(f"a window of {length:g} ms; give a length above 0")
+        start_us, length_us = panel.zero_us + round(start * 1e3), max(1, round(length * 1e3))
+        await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
+        if suggest:
+            region = (await panel.in_thread(panel.inspector.suggest_region)).region
+            s.update({"region_wanted": list(region), "region_kind": "suggested"})
+            await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
+        self._picked = -1
+
+    def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
+        """Return what is to be shown, and the state variables that show it."""
+        panel, s, inspector = self._panel, self._state, self._panel.inspector
+        new = self.shown is None
+        shown = inspector.show(against=panel.comparison.knobs)
+        values = cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark), zero_us=panel.zero_us)
+        values |= self._images(shown) | self._orbit(shown)
+        if new or shown.span is not self.shown.span:  # type: ignore[union-attr]
+            values["overview"] = whole_image(shown.span.events, inspector.recording.events.size)
+        compensated = panel.compensates
+        left = panel.comparison.title
+        pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
+        text = "" if self._picked < 0 else event_text(shown, self._picked, panel.zero_us)
+        return shown, {
+            **values, "titles": pair if compensated else [[0, "events as recorded"]], "events": events_text(shown),
+            "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
+            "against_title": left, "against_choices": panel.comparison.choices,
+        }  # fmt: skip
+
+    def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
+        """Return the state variables of the images of the region; of slow kinds, only that they are."""
+        s, kind = self._state, ImageKind(self._state.kind)
+        if kind is ImageKind.LOG_INTENSITY:
+            return {"image_slow": True}
+        images = count_images(shown) if kind is ImageKind.COUNT else self._make_images()
+        return {"image_slow": False, **self._image_values(images)} | (
+            difference_state(images.before, images.after)
+            if s.difference and kind is ImageKind.COUNT and images.before is not None
+            else {}
+        )
+
+    def _make_images(self) -> ShownImages:
+        panel = self._panel
+        return make_images(panel.inspector, ImageKind(self._state.kind), against=panel.comparison.knobs)
+
+    def _image_values(self, images: ShownImages) -> dict[str, Any]:
+        scale = scale_state(images.scale)
+        before, after = (
+            "" if image is None else jpeg(images.scale.rgb(image)) for image in (images.before, images.after)
+        )
+        return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": images.note}
+
+    def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
+        """Return the orbit of the scene point of the picked event, or of the middle of the region."""
+        s, inspector = self._state, self._panel.inspector
+        if not (s.orbit_shown and s.axis == Axis.ANGLE.value and self._panel.compensates):
+            return NO_ORBIT
+        left, top, right, bottom = shown.region
+        middle = np.array([left + right, top + bottom]) / 2.0
+        point = middle if self._picked < 0 else shown.after[self._picked]
+        theta, xy = inspector.orbit(float(point[0]), float(point[1]))
+        return orbit_state(theta, xy, point)
+
+    def _show_prism(self) -> None:
+        """Show what depends on the rotation of the prism."""
+        turn, compensates = self._panel.inspector.turn_us, self._panel.compensates
+        self._state.update({"turn_ms": turn * 1e-3 if compensates else 0.0, "has_model": compensates,
+                            "step_name": "turn" if compensates else "window"})  # fmt: skip
+
+    async def _curve(self) -> None:
+        panel, s, name = self._panel, self._state, self._state.knob
+        s.calibrate_on = await panel.in_thread(scope_text, panel.inspector)
+        if not panel.compensates:
+            return
+        values, scores = await panel.in_thread(panel.inspector.curve, name)
+        label, title = panel.knob_title()
+        x = (values / UNITS[name]).tolist()
+        if not x:
+            return
+        best = x[int(np.argmax(scores))]
+        s.curve = {"name": label, "title": title, "text": f"highest at {best:.4g}; now {s[name]:.4g}", "x": x,
+                   "y": scores.tolist(), "truth": truths(panel.inspector)[name]}  # fmt: skip
+        s.curve_mark = float(s[name])
+
+    async def _picture(self) -> None:
+        """Make images of a slow kind."""
+        s = self._state
+        if s.kind != ImageKind.LOG_INTENSITY.value or self.shown is None:
+            return
+        try:
+            s.update(await self._panel.in_thread(lambda: self._image_values(self._make_images())))
+        except AmiwarpError as error:
+            s.update({"before": "", "after": "", "image_note": str(error)})
