@@ -32,6 +32,7 @@ from amiwarp.viewer.downloads import as_bytes, write_events, write_image
 from amiwarp.viewer.event_rates import EventRates
 from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.page_values import events_text
 from amiwarp.viewer.parameters import Knobs, Selection, Source
 from amiwarp.viewer.selected_calibration import calibrate_selected, cost_surface, scope_text
 from amiwarp.viewer.suggestion import suggest_region
@@ -596,6 +597,22 @@ def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording
     surface = cost_surface(without, points=(5, 7))
     assert surface.names == ("apex", "rpm")
     assert surface.best[1] == pytest.approx(720.0, abs=2.1)
+
+
+def test_the_page_says_how_many_events_were_read_of_a_full_window(
+    inspector: Inspector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window = inspector.first_window()
+    inspector.open(*window)
+    total = inspector.loaded.span.count
+    assert events_text(inspector.show()) == f"{total:,} events, all drawn"
+    monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
+    thinned = Inspector(inspector.recording)
+    thinned.open(*window, Selection(polarity=1))
+    selected = thinned.loaded.selected
+    assert 0 < selected < 6400 < total
+    text = events_text(thinned.show())
+    assert text == f"{total:,} events, 6,400 of them read, {selected:,} selected, all drawn"
 
 
 # downloads

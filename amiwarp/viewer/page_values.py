@@ -91,10 +91,11 @@ def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
 
 
 def events_text(shown: DisplayedWindow) -> str:
-    """Return the numbers of events of the window, in the selection and drawn."""
-    total, drawn = shown.span.count, len(shown.events)
-    selected = "" if shown.selected == total else f", {shown.selected:,} selected"
-    return f"{total:,} events{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
+    """Return the numbers of events of the window, of those that were read, in the selection and drawn."""
+    total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
+    thinned = "" if read == total else f", {read:,} of them read"
+    selected = "" if shown.selected == read else f", {shown.selected:,} selected"
+    return f"{total:,} events{thinned}{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
 
 
 def notes(inspector: Inspector) -> list[str]:

@@ -50,7 +50,7 @@ export class Camera {
       tall = Math.max(tall, Math.abs(dot(up, corner)) / w);
     }
     const free = [width - MARGIN.left - MARGIN.right, height - MARGIN.top - MARGIN.bottom];
-    const scale = this.zoom * Math.max(0.5, Math.min(free[0] / (2 * wide), free[1] / (2 * tall)));
+    const scale = this.zoom * Math.max(1e-3, Math.min(free[0] / (2 * wide), free[1] / (2 * tall)));
     const x = MARGIN.left + free[0] / 2 + this.right;
     const y = MARGIN.top + free[1] / 2 + this.up;
     return {
