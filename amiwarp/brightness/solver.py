@@ -7,7 +7,8 @@ L. L is in units of the ON threshold. See ``docs/explanation/photometric.md``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -74,6 +75,11 @@ class Tiles:
     def nodes(self) -> int:
         """Total number of map nodes."""
         return len(self.origin) * self.rows * self.columns
+
+    def at_density(self, density: float) -> Tiles:
+        """Return tiles of the same place and size with another number of nodes per pixel along each axis."""
+        rows, columns = (math.ceil((n - 1) * density / self.density) + 1 for n in (self.rows, self.columns))
+        return replace(self, rows=rows, columns=columns, density=density)
 
 
 class BrightnessMap:

@@ -83,7 +83,23 @@ class Cost:
         return self(v, steps=3 * self.steps // 2)
 
     def slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Slopes:
-        """Return the residuals' derivatives at ``v``, minus the part that a change of the map can explain."""
+        """Return the residuals' derivatives at ``v``, minus the part that a change of the map can explain.
+
+        The gradient uses these differences too. The derivatives themselves are a biased gradient: damping makes the map
+        too flat, so that a larger orbit explains more.
+        """
+        b, n = self.brightness, len(v)
+        left = self._unexplained_slopes(v)
+        upper = np.triu_indices(n)
+        pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]
+        sums = b.residuals.products([*pairs, *((row, b.residuals.values) for row in left)])
+        hessian = np.zeros((n, n))
+        hessian[upper] = sums[:-n]
+        hessian.T[upper] = sums[:-n]
+        return Slopes(hessian, sums[-n:], b.residuals.clusters(left) if with_parts else np.empty((n, 0)))
+
+    def _unexplained_slopes(self, v: NDArray[np.float64]) -> list[Any]:
+        """Return for each parameter the part of the residuals' derivative that no change of the map explains."""
         b, n = self.brightness, len(v)
         if self._solved is None or not np.array_equal(self._solved, v):
             self.residuals(v)
@@ -91,13 +107,6 @@ class Cost:
             self._changes = [b.new_change() for _ in v]
         b.prepare_projection()
         steps = np.eye(n) * SLOPE_PX
-        plain = [b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX) for step in steps]
-        both = zip(plain, self._changes, strict=True)
-        left = [b.unexplained(row, change, steps=self.steps // 2) for row, change in both]
-        upper = np.triu_indices(n)
-        pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]
-        sums = b.residuals.products([*pairs, *((row, b.residuals.values) for row in plain)])
-        hessian = np.zeros((n, n))
-        hessian[upper] = sums[:-n]
-        hessian.T[upper] = sums[:-n]
-        return Slopes(hessian, sums[-n:], b.residuals.clusters(left) if with_parts else np.empty((n, 0)))
+        slopes = [b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX) for step in steps]
+        both = zip(slopes, self._changes, strict=True)
+        return [b.unexplained(slope, change, steps=self.steps // 2) for slope, change in both]

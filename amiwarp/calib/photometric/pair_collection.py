@@ -30,6 +30,8 @@ FEWEST_PAIRS = 1_500
 """Smallest number of pairs of events for the photometric stage."""
 PAIRS_PER_NODE = 1.5
 """Smallest number of equations per unknown of the brightness map. A map with fewer fits any parameters."""
+FINE_PAIRS_PER_NODE = 4.2
+"""Smallest number of equations per unknown of a map with more than one node per pixel along each axis."""
 FEWEST_TURNS = 2
 """Number of turns of the prism that are always used, if the recording has them."""
 FEWEST_TILES = 6
@@ -118,12 +120,17 @@ def van_der_corput(n: int) -> list[int]:
     return [k for k in order if k < n]
 
 
+def pairs_per_node(coverage: NDArray[np.float32], pairs: int) -> float:
+    """Return the number of pairs of events per node of the map that they touch."""
+    return pairs / max(1, int((coverage > 0.5).sum()))
+
+
 def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
     """Return 1 minus the ratio of map unknowns to pairs of events; raise :class:`AmiwarpError` for too few pairs."""
-    touched = int((coverage > 0.5).sum())
-    if pairs < max(FEWEST_PAIRS, PAIRS_PER_NODE * touched):
+    ratio = pairs_per_node(coverage, pairs)
+    if pairs < FEWEST_PAIRS or ratio < PAIRS_PER_NODE:
         raise AmiwarpError(
-            f"{name}: {pairs} pairs of events are too few for the {touched} unknowns of a brightness map; record for "
-            "longer"
+            f"{name}: {pairs} pairs of events are too few for the {pairs / ratio:.0f} unknowns of a brightness map; "
+            "record for longer"
         )
-    return 1.0 - touched / pairs
+    return 1.0 - 1.0 / ratio

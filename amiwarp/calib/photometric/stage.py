@@ -22,7 +22,12 @@ from amiwarp.calib.photometric.acceptance import LARGEST_MOVE_PX, judge_optimum
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined, iterate
 from amiwarp.calib.photometric.minimum_check import cost_around_optimum
-from amiwarp.calib.photometric.pair_collection import check_pairs, collect_pairs
+from amiwarp.calib.photometric.pair_collection import (
+    FINE_PAIRS_PER_NODE,
+    check_pairs,
+    collect_pairs,
+    pairs_per_node,
+)
 from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.summaries import PhotometricSummary, StageSummary
 from amiwarp.validation import real, whole
@@ -30,6 +35,7 @@ from amiwarp.validation import real, whole
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.brightness.solver import Tiles
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.recording import Recording
@@ -68,8 +74,9 @@ class PhotometricSettings:
     steps: int = 20
     """Number of conjugate-gradient steps that solve the brightness map in each evaluation, starting from the previous
     map."""
-    density: float = 1.0
-    """Nodes of the brightness map per pixel along each axis."""
+    density: float = 2.0
+    """Nodes of the brightness map per pixel along each axis. With too few pairs of events for it, there is one node per
+    pixel."""
     sensor: SensorTiming = field(default_factory=SensorTiming)
     """Known latency and refractory period of the sensor. If they are unknown, the calibrated phase contains their
     effect."""
@@ -104,14 +111,25 @@ def refine(
     duration_us = recording.events.t_last - recording.events.t_first
     whole_turn = abs(search.calibration_events.encoder.rpm) * duration_us >= 60e6
     excess = off_excess(pairs, with_leak="leak" in linear) if whole_turn else 0.0
-    brightness = BrightnessMap(
-        pairs, tiles, off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
-        middle_us=space.middle_us,
-    )  # fmt: skip
-    cost = Cost(space, brightness, settings.steps)
+
+    def cost_on(tiles: Tiles) -> Cost:
+        brightness = BrightnessMap(
+            pairs, tiles, off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
+            middle_us=space.middle_us,
+        )  # fmt: skip
+        cost = Cost(space, brightness, settings.steps)
+        cost.warm_up(v)
+        return cost
+
     v = space.to_vector({**space.start, **search.best})
-    cost.warm_up(v)
-    left = check_pairs(recording.name, brightness.coverage(cost.scale), len(pairs))
+    cost = cost_on(tiles)
+    coverage = cost.brightness.coverage(cost.scale)
+    few = pairs_per_node(coverage, len(pairs)) < FINE_PAIRS_PER_NODE
+    # a fine map converges too slowly for parameters that make nearly the same motion
+    if tiles.density > 1.0 and (few or any(n in DEGENERATE_WITH_APEX for n in space.names)):
+        cost = cost_on(tiles.at_density(1.0))
+        coverage = cost.brightness.coverage(cost.scale)
+    left = check_pairs(recording.name, coverage, len(pairs))
     keep = determined(cost.slopes(v, with_parts=True), space, left)
     held = tuple(n for n in space.names if n not in keep)
     # undetermined parameters stay at the answer of sharpness, because the others were found together with them
