@@ -43,6 +43,7 @@ from .events.truth import KnownStore as KnownStore
 from .events.truth import Poses as Poses
 from .events.truth import PoseStore as PoseStore
 from .events.truth import WorldLabels as WorldLabels
+from .imaging.background_activity import find_background_activity as find_background_activity
 from .imaging.choices import CornerMethod as CornerMethod
 from .imaging.choices import Layers as Layers
 from .imaging.choices import Sharpness as Sharpness

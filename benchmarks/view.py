@@ -122,6 +122,18 @@ def knob(device: str, *, drawn: bool) -> dict[str, Any]:
             "ok": error < 0.01 and median <= most}  # fmt: skip
 
 
+def write_long(path: Path, n: int) -> int:
+    """Write a recording of about ``n`` random events at 10 million events/s, and return their number."""
+    block, seconds = min(n, 5_000_000), 0.5
+    camera = Camera.from_fov(WIDTH, HEIGHT, 1.0)
+    encoder = Encoder.constant_speed(720.0, 0, round(n / block * seconds * 1e6))
+    with RecordingWriter(path, width=WIDTH, height=HEIGHT, camera=camera, encoder=encoder, prism=Prism(0.02)) as writer:
+        for k in range(n // block):
+            e = made(block, seconds, k)
+            writer.append(Events(e.x, e.y, e.t + round(k * seconds * 1e6), e.p))
+    return n // block * block
+
+
 def opening(device: str, n: int) -> dict[str, Any]:
     """Measure the time from the start of a process to its first picture and event rate.
 
@@ -129,15 +141,7 @@ def opening(device: str, n: int) -> dict[str, Any]:
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.h5"
-        block, seconds = 5_000_000, 0.5
-        camera = Camera.from_fov(WIDTH, HEIGHT, 1.0)
-        encoder = Encoder.constant_speed(720.0, 0, round(n / block * seconds * 1e6))
-        with RecordingWriter(
-            path, width=WIDTH, height=HEIGHT, camera=camera, encoder=encoder, prism=Prism(0.02)
-        ) as writer:
-            for k in range(n // block):
-                e = made(block, seconds, k)
-                writer.append(Events(e.x, e.y, e.t + round(k * seconds * 1e6), e.p))
+        n = write_long(path, n)
         os.sync()  # finish writing before the timed reading
         command = [sys.executable, "-c", OPENED, str(path), device]
         runs = [

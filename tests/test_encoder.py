@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.encoder_speed import rpm_between
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.io import read_encoder_csv
 
@@ -255,3 +256,12 @@ def test_csv_refuses(tmp_path, text, message):
 def test_csv_missing(tmp_path):
     with pytest.raises(AmiwarpError, match="no such file"):
         read_encoder_csv(tmp_path / "none.csv")
+
+
+def test_the_speed_is_that_between_two_times() -> None:
+    t = np.arange(0, 2_000_001, 1000)
+    encoder = Encoder(t, np.maximum(t - 1_000_000, 0) * 7.5e-5, 250.0)
+    assert rpm_between(encoder, 1_000_000, 2_000_000) == pytest.approx(7.5e-5 * 60e6 / TWO_PI, rel=1e-3)
+    assert rpm_between(encoder, 0, 900_000) == 0.0
+    assert rpm_between(encoder, -(10**9), 10**9) == pytest.approx(encoder.rpm, rel=2e-3)
+    assert rpm_between(encoder, 5, 5) == rpm_between(encoder, 10**8, 10**9) == encoder.rpm

@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -26,6 +27,7 @@ from typer.testing import CliRunner
 
 from amiwarp.calib.result import Calibration
 from amiwarp.cli.app import app
+from amiwarp.cli.streams import describe
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -34,6 +36,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
 from amiwarp.live.stream.connections import close_listener, listen
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
+from amiwarp.live.stream.status import SessionStatus
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -325,3 +328,18 @@ def test_another_camera_is_refused(folder: Path, tmp_path: Path) -> None:
     )
     assert done.exit_code == 1
     assert re.search(r"is 64x48, the calibration is for 32x24", done.stderr)
+
+
+def test_the_status_line_fits_the_terminal() -> None:
+    """The figures that matter least are left out first; losses are always shown."""
+    plain = SessionStatus(seconds=3.04, events=1_234_567, rate_mev_s=0.4)
+    assert describe(plain) == "3.0 s, 0.40 Mev/s, 1,234,567 events"
+    full = replace(
+        plain, seconds=99_999.0, events=10**12, rate_mev_s=1234.5, dropped=10**9, late=10**6, waiting=8_000_000, done=5,
+        latency_ms=(12.3, 99.0), covered=0.987, sharpness=12.3, rpm=720.0, coverage=0.5,
+    )  # fmt: skip
+    for width in (40, 80, 100, 200):
+        assert len(describe(full, width)) <= width
+    assert describe(full).startswith("99999.0 s, 1234.50 Mev/s, 1,000,000,000 dropped, 1,000,000 late")
+    assert "8,000,000 waiting" in describe(full, 200)
+    assert "latency 12.3 ms, encoder 98.7 %, 720 rpm, sharpness 12.30, edges 50 %" in describe(full, 200)

@@ -36,6 +36,8 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import simulate
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.live_source import LiveSource
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
 BIAS_DEG = 3.5
@@ -205,6 +207,26 @@ def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:
     assert (found.camera, found.prism) == (CAMERA, PRISM)
 
 
+def test_the_speed_is_that_of_the_first_turn() -> None:
+    """The motor was at rest for a second before the first events."""
+    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made"})()
+    ring, speed = RecentEvents(source), 720.0 * math.tau / 60e6
+    samples = np.arange(0, 1_090_000, 1000)
+    ring.append_encoder(samples, np.maximum(samples - 1_000_000, 0) * speed)
+    assert ring.turn_share == 0.0
+    for start, complete in ((1_000_000, False), (1_030_000, False), (1_060_000, True)):
+        t = np.linspace(start, start + 29_000, 50).astype(np.int64)
+        ring.append(Events.from_arrays(np.full(50, 5), np.full(50, 5), t, np.zeros(50)))
+        assert (ring.recording() is not None) is complete
+        assert ring.turn_share == pytest.approx(min((start + 29_000 - 1_000_000) * 720 / 60e6, 1.0), abs=1e-3)
+    assert ring.age_s < 60.0
+    figures = LiveSource(ring, ["moved"]).figures()
+    assert figures.rpm == pytest.approx(720.0, rel=1e-3)
+    assert figures.message == "moved"
+    shown = Inspector(LiveSource(ring, [])())
+    assert shown.turn_us == pytest.approx(60e6 / 720.0, rel=1e-3)
+
+
 def test_a_stream_is_followed_while_one_looks(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -227,6 +249,11 @@ def test_a_stream_is_followed_while_one_looks(
     with followed(source, None, ring, said.append):
         first = ring.recording()
         assert first is not None
+        live = LiveSource(ring, said)
+        assert live().events.t_last >= first.events.t_last
+        running = live.figures()
+        assert (running.problem, running.message, running.turn_share) == ("", "", 1.0)
+        assert running.rpm == pytest.approx(720.0, rel=1e-3)
         looked_at.set()
         end = time.monotonic() + 120.0
         while not said:
@@ -236,6 +263,11 @@ def test_a_stream_is_followed_while_one_looks(
     assert last is not None
     assert last.events.t_last > first.events.t_last
     assert "the stream has ended" in said[0]
+    over = live.figures()
+    assert not over.connected
+    assert over.problem == over.message == said[0]
+    assert over.dropped == 0
+    assert live().events.t_last == last.events.t_last
     assert not [t for t in threading.enumerate() if t.name == "amiwarp-follow"]
 
 

@@ -19,12 +19,14 @@ from amiwarp.events.recording import Recording, Truth
 from amiwarp.events.truth import Cause, WorldLabels
 from amiwarp.io import open_recording, save_recording
 from amiwarp.viewer import inspector as viewer
+from amiwarp.viewer import window_loading
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.colouring import colours_of
 from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
-from amiwarp.viewer.inspector import Inspector, Selection
+from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.page_values import event_text, initial_state
+from amiwarp.viewer.parameters import Selection
 from amiwarp.viewer.truth_colours import CAUSE_COLOURS, GREY, legend_of
 
 COUNT, SIZE = 6000, (40, 30)
@@ -102,7 +104,7 @@ def test_each_drawn_event_has_its_own_truth(
     check(inspector)
     save_recording(tmp_path / "box.h5", recording)
     monkeypatch.setattr(viewer, "MOST_EVENTS", 1280)
-    monkeypatch.setattr(viewer, "MOST_POINTS", 200)
+    monkeypatch.setattr(window_loading, "MOST_POINTS", 200)
     for each in (recording, open_recording(tmp_path / "box.h5")):
         thinned = Inspector(each)
         thinned.open(10_000, 45_000, some)

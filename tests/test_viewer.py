@@ -25,11 +25,12 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import inspector as viewer
+from amiwarp.viewer import window_loading
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.cloud_scene import Look, Scene
-from amiwarp.viewer.colouring import colours_of, residual
-from amiwarp.viewer.inspector import Inspector, Knobs, Selection
+from amiwarp.viewer.colouring import WIDEST_PX, colours_of, residual
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.parameters import Knobs, Selection
 from amiwarp.viewer.timeline import event_rate, read_span
 
 TRUE = Prism(math.radians(1.0))
@@ -152,7 +153,7 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
 
 
 def test_points_are_thinned_evenly(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer, "MOST_POINTS", 1000)
+    monkeypatch.setattr(window_loading, "MOST_POINTS", 1000)
     shown = inspector.show()
     assert len(shown.events) == len(shown.after) == 1000
     parts = np.histogram(shown.events.t, 4, (shown.span.start_us, shown.span.start_us + shown.span.length_us))[0]
@@ -385,10 +386,36 @@ def test_colours_tell_what_they_say(inspector: Inspector, recording: Recording) 
     on = colours_of(shown, Look(), after=True)
     assert len({tuple(c) for c in on}) == 2
     assert np.array_equal(on[shown.events.p == 1][0], on[shown.events.p == 1][-1])
-    sharp, raw = (residual(image, xy).mean() for image, xy in (
-        (shown.image_after, shown.after), (shown.image_before, shown.before)))  # fmt: skip
-    assert sharp != raw
-    spike = np.zeros((20, 30), np.float32)
-    spike[10, 12] = 5.0
-    near = residual(spike, np.array([[12.0, 10.0], [13.0, 10.0], [12.0, 12.0]], np.float32))
-    np.testing.assert_allclose(near, [0.0, 1.0, 2.0], atol=0.01)
+
+
+def test_residuals_fall_when_the_calibration_gets_better(inspector: Inspector, recording: Recording) -> None:
+    true = true_knobs(recording)
+    wrong = [
+        [replace(true, phase=true.phase + math.radians(step)) for step in (0.0, 25.0, 60.0, 180.0)],
+        [replace(true, apex=factor * true.apex) for factor in (1.0, 1.4, 1.8)],
+        [replace(true, apex=factor * true.apex) for factor in (1.0, 0.6, 0.2)],
+    ]
+    for worse_and_worse in wrong:
+        shown = [inspector.show(knobs) for knobs in worse_and_worse]
+        means = [residual(each.image_after, each.after).mean() for each in shown]
+        assert (np.diff(means) > 0.05).all()
+    right = inspector.show(true)
+    assert residual(right.image_after, right.after).mean() < residual(right.image_before, right.before).mean() - 0.3
+
+
+def test_a_residual_is_the_width_of_an_edge() -> None:
+    rng = np.random.default_rng(0)
+    for width in (0.3, 1.0, 2.0):
+        x, y = 40.0 + rng.normal(0.0, width, 200_000) + rng.uniform(-0.5, 0.5, 200_000), rng.uniform(0.0, 79.0, 200_000)
+        xy = np.stack([x, y], axis=1).astype(np.float32)
+        none = np.zeros(len(x), np.uint8)
+        image = iwe(Events(xy[:, 0], xy[:, 1], none.astype(np.int64), none), 80, 80)
+        middle = np.array([[40.0, 40.0]], np.float32)
+        assert residual(image, middle)[0] == pytest.approx(width, abs=0.15)
+        part = residual(image, middle, (slice(30, 50), slice(20, 60)))
+        assert part[0] == pytest.approx(residual(image, middle)[0], abs=1e-6)
+    lone = np.zeros((20, 30), np.float32)
+    lone[10, 12] = 1.0
+    places = np.array([[12.0, 10.0], [25.0, 3.0], [np.nan, np.nan], [-5.0, 99.0]], np.float32)
+    assert (residual(lone, places) > 3.0).all()
+    assert residual(lone, places)[1:] == pytest.approx(WIDEST_PX)

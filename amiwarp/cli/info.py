@@ -13,6 +13,7 @@ import typer
 from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.inputs import Topic
 from amiwarp.cli.options import Common
+from amiwarp.events.encoder_speed import rpm_between
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.sensors import mean_rate
 from amiwarp.events.truth import Cause
@@ -142,7 +143,7 @@ def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
     first, last = encoder.coverage
     return {
         "samples": len(encoder.t),
-        "rpm": encoder.rpm,
+        "rpm": rpm_between(encoder, source.t_first, source.t_last) if len(source) else encoder.rpm,
         "turns": float(np.ptp(encoder.angle)) / (2.0 * math.pi),
         "interval_us": encoder.interval_us,
         "clock_offset_us": encoder.clock_offset_us,

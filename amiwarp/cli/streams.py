@@ -128,7 +128,7 @@ class StatusLine:
         if self._seconds is not None and status.seconds >= self._seconds:
             self._stop.set()
         if self._console.is_terminal:
-            self._live.update(Text(describe(status), no_wrap=True, overflow="ellipsis"))
+            self._live.update(Text(describe(status, self._console.width), no_wrap=True, overflow="ellipsis"))
 
     def report_lost_packets(self, *sinks: SocketSink | PipeSink | None) -> None:
         """Print for each sink how many packets its receivers missed."""
@@ -137,21 +137,19 @@ class StatusLine:
                 self.say(f"{sink.lost:,} packets were not sent: a receiver is too slow")
 
 
-def describe(s: SessionStatus) -> str:
-    """Return the text of the status line."""
-    parts = [f"{s.seconds:.1f} s", f"{s.events:,} events", f"{s.rate_mev_s:.2f} Mev/s"]
+def describe(s: SessionStatus, width: int = 80) -> str:
+    """Return the text of the status line: the most important figures that fit into ``width`` characters."""
+    lost = [f"{n:,} {what}" for n, what in ((s.dropped, "dropped"), (s.late, "late"), (s.waiting, "waiting")) if n]
+    parts = [f"{s.seconds:.1f} s", f"{s.rate_mev_s:.2f} Mev/s", *lost[:2]]
     if s.done:
-        parts.append(f"latency {s.latency_ms[0]:.1f} ms (p99 {s.latency_ms[1]:.1f})")
-        parts.append(f"encoder covers {100.0 * s.covered:.1f} %")
-    if s.sharpness is not None:
-        parts.append(f"sharpness {s.sharpness:.2f}")
-    if s.coverage is not None:
-        parts.append(f"edges seen {100.0 * s.coverage:.1f} %")
-    if s.rpm is not None:
-        parts.append(f"{s.rpm:.0f} rpm")
-    if s.clock is not None:
-        parts.append(f"clocks ±{s.clock.offset_std_us:.0f} us")
-    parts += [f"{n:,} {what}" for n, what in ((s.dropped, "dropped"), (s.late, "late"), (s.waiting, "waiting")) if n]
+        parts += [f"latency {s.latency_ms[0]:.1f} ms", f"encoder {100.0 * s.covered:.1f} %"]
+    parts += [] if s.rpm is None else [f"{s.rpm:.0f} rpm"]
+    parts += [] if s.sharpness is None else [f"sharpness {s.sharpness:.2f}"]
+    parts += [] if s.coverage is None else [f"edges {100.0 * s.coverage:.0f} %"]
+    parts += [f"{s.events:,} events", *lost[2:]]
+    parts += [] if s.clock is None else [f"clocks ±{s.clock.offset_std_us:.0f} µs"]
+    while len(", ".join(parts)) > width:
+        parts.pop()
     return ", ".join(parts)
 
 

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
 _PICTURE, _SERVER = "Picture", "Server"
+RETURN_S = 3600.0
+"""How long to wait for the sender of a socket to return after its stream broke off [s]."""
 LEAST_PX, MOST_PX = 100, 8000
 """Smallest and largest width or height of a screenshot [px]."""
 
@@ -110,16 +112,23 @@ class StreamOptions:
             yield None
             return
         from amiwarp.live.stream.recent_events import RecentEvents, followed
+        from amiwarp.live.stream.reconnecting_source import SOCKETS
         from amiwarp.live.stream.source_opening import open_source
+        from amiwarp.viewer.live_source import LiveSource
+
+        messages: list[str] = []
+
+        def tell(text: str) -> None:
+            messages[:] = [text]
+            say(text)
 
         with SourceOptions(port=self.controller).link() as link:
-            stream = open_source(source)
+            wait_s = RETURN_S if source.partition(":")[0] in SOCKETS else 0.0
+            stream = open_source(source, wait_s=wait_s, say=tell)
             check_angles(stream, link)
             recent = RecentEvents(stream)
-            with followed(stream, link, recent, say):
-                first = recent.recording()
-                assert first is not None
-                yield lambda: recent.recording() or first
+            with followed(stream, link, recent, tell):
+                yield LiveSource(recent, messages)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_source import DeviceMemoryEvents, device_of, read_between
+from amiwarp.events.encoder_speed import turn_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.known import dilated, known_nodes
@@ -122,8 +123,8 @@ class Reconstruction:
             camera_rotation = calibration.camera_rotation
         self.camera_rotation, self.device = camera_rotation or CameraRotation(), device_of(recording.events, device)
         self.fill = choice(Fill, fill, "fill")
-        self.turn_us = abs(60e6 / encoder.rpm) if abs(encoder.rpm) > 1e-3 else None
-        self._smoothness: float | None = None
+        self.turn_us = turn_between(encoder, first, last)
+        self.smoothness: float | None = None  # weight of the prior; None: the next window chooses it
 
     def span(
         self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
@@ -197,8 +198,8 @@ class Reconstruction:
             where = f"{start_us} .. {start_us + length_us} us"
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
         off = off_excess_by_counts(recording.events, self.turn_us, start_us, length_us)
-        if self._smoothness is None:
-            self._smoothness = self._choose(count, pairs, start_us, length_us, off)
+        if self.smoothness is None:
+            self.smoothness = self._choose(count, pairs, start_us, length_us, off)
         left, top, tiles = self._tile(start_us, length_us)
         solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
         residual, covered = _solve(solver, pair_count, last)
@@ -211,7 +212,7 @@ class Reconstruction:
         hot = int((table.tile_of.numpy() < 0).sum())
         found = Picture(
             log=log.astype(np.float32), known=known, start_us=start_us, length_us=length_us, pairs=pair_count,
-            off_excess=off, smoothness=self._smoothness, residual=residual, hot=hot,
+            off_excess=off, smoothness=self.smoothness, residual=residual, hot=hot,
             seconds=time.perf_counter() - began, unknowns=unknowns,
         )  # fmt: skip
         return upload_picture(found, self.device) if isinstance(recording.events, DeviceMemoryEvents) else found
@@ -283,7 +284,7 @@ class Reconstruction:
 
     def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:
         """Return a solver for the pairs on the given tiles, with the pairs displaced by the optical model."""
-        prior = Smoothness(self._smoothness or SMOOTHNESS[0], EDGE_STEP if self.fill is Fill.EDGE else 0.0)
+        prior = Smoothness(self.smoothness or SMOOTHNESS[0], EDGE_STEP if self.fill is Fill.EDGE else 0.0)
         solver = BrightnessMap(
             pairs, tiles, off_excess=off, damping=MEAN_DAMPING, smoothness=prior, middle_us=middle_us
         )

@@ -12,8 +12,7 @@ class Colour(enum.StrEnum):
     DENSITY = "density"
     """Number of events in the point's pixel; the scale ends at the 99th percentile."""
     RESIDUAL = "residual"
-    """Distance of an event from the centre of the neighbouring events, up to 2 px; for an edge, the distance from its
-    crest."""
+    """Width of the edge on which an event lies, up to 6 px. It falls when the calibration gets better."""
     CAUSE = "cause"
     """Cause of the event, from the ground truth of a simulation."""
     INSTANCE = "instance"

@@ -24,7 +24,7 @@ from amiwarp.viewer.truth_colours import Legend, legend_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.viewer.inspector import DisplayedWindow
+    from amiwarp.viewer.window import DisplayedWindow
 
 AXIS_HEIGHT = 0.75
 """Length of the drawn third axis, as a multiple of the region's width."""

@@ -16,10 +16,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.viewer.cloud_scene import Look
-    from amiwarp.viewer.inspector import DisplayedWindow
+    from amiwarp.viewer.window import DisplayedWindow
 
-NEAR_PX = 3.0
-"""Diameter of the neighbourhood whose centre an event is compared with: two standard deviations [px]."""
+NEAR_PX = 2.0
+"""Standard deviation of the Gaussian weights of the events near an event [px]."""
+WIDEST_PX = 3.0 * NEAR_PX
+"""Largest residual [px]. Wider edges look the same as spread events."""
+VOTE_VARIANCE = 1.0 / 6.0 + 1.0 / 12.0
+"""Variance that bilinear votes and dither add to the place of an event in an image [px²]."""
+WIDE_EVENTS = 2.0
+"""Number of spread events that are assumed near each event, so that a lone event has a large residual."""
 
 
 def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
@@ -62,7 +68,8 @@ def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> tuple[ND
     if colour is Colour.DENSITY:
         top = max(float(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0, 1.0)
         return np.sqrt(at_pixels(image, xy) / top), "cividis"
-    return residual(image, xy) / 2.0, "cividis"
+    left, top, right, bottom = shown.region
+    return residual(image, xy, (slice(top, bottom), slice(left, right))) / WIDEST_PX, "cividis"
 
 
 def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -75,15 +82,40 @@ def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float6
     return out
 
 
-def residual(image: NDArray[np.float32], xy: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the distance of each point from the centre of the events near it [px], shape ``(n,)``.
+def residual(
+    image: NDArray[np.float32], xy: NDArray[np.float32], where: tuple[slice, slice] = (slice(None), slice(None))
+) -> NDArray[np.float64]:
+    """Return the width of the edge at each point, or what is left of the prism's motion [px], shape ``(n,)``.
 
-    The centre is a mean with Gaussian weights of standard deviation ``NEAR_PX / 2``.
+    It is the standard deviation across the edge of the events near the point: near 0 on a sharp edge, and
+    :data:`WIDEST_PX` among spread events and outside the rows and columns ``where``, in which it is computed. The event
+    itself does not count.
+    """
+    wide = np.full(image.shape, WIDEST_PX)
+    spread = _spread_across_edges(image, where)
+    # Gaussian weights of variance n² and an edge of variance w² give a spread of 1 / (1 / n² + 1 / w²).
+    width = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - VOTE_VARIANCE
+    wide[where] = np.sqrt(np.clip(width, 1e-6, WIDEST_PX**2))
+    found = at_pixels(wide, xy)
+    return np.where(found > 0.0, found, WIDEST_PX)
+
+
+def _spread_across_edges(image: NDArray[np.float32], where: tuple[slice, slice]) -> NDArray[np.float64]:
+    """Return the smallest eigenvalue of the second moments of the weighted events about each pixel [px²].
+
+    The moments with weights G of variance s are s G + s² G'', so they follow from derivatives of the smoothed image.
     """
     from scipy.ndimage import gaussian_filter
 
-    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
-    weight = np.maximum(gaussian_filter(image, NEAR_PX / 2.0), 1e-6)
-    centre = [gaussian_filter(image * m, NEAR_PX / 2.0) / weight for m in (columns, rows)]
-    distance = [at_pixels(m, xy) - xy[:, k] for k, m in enumerate(centre)]
-    return np.asarray(np.nan_to_num(np.hypot(*distance)), np.float64)
+    reach = 4 * math.ceil(NEAR_PX)
+    rows, columns = (range(size)[axis] for size, axis in zip(image.shape, where, strict=True))
+    top, left = max(rows.start - reach, 0), max(columns.start - reach, 0)
+    part = image[top : rows.stop + reach, left : columns.stop + reach].astype(np.float64)
+    orders = ((0, 0), (2, 0), (1, 1), (0, 2))
+    smooth, yy, xy, xx = (gaussian_filter(part, NEAR_PX, order=order, mode="constant") for order in orders)
+    own_variance = NEAR_PX**2 + VOTE_VARIANCE
+    own = 1.0 / (math.tau * own_variance)
+    second = 0.5 * (xx + yy) + own / own_variance - np.hypot(0.5 * (xx - yy), xy)
+    density = np.maximum(smooth - own, 0.0) + WIDE_EVENTS * own
+    spread = np.clip(NEAR_PX**2 + NEAR_PX**4 * second / density, 0.0, NEAR_PX**2)
+    return np.asarray(spread[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left])

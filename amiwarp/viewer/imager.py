@@ -7,13 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.device_events import UploadedEvents
-from amiwarp.imaging.sharpness_costs import SharpnessMeter
+from amiwarp.imaging.sharpness_costs import SharpnessMeter, relative_variance
 from amiwarp.imaging.warped_image import CanvasShape, Votes
-from amiwarp.viewer.drawn_truth import DrawnTruth
-from amiwarp.viewer.timeline import Span
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,6 +21,23 @@ SMOOTHING_PX = 1.0
 """Standard deviation of the Gaussian that smooths the image before its sharpness is measured, as in calibration [px].
 """
 
+Region = tuple[int, int, int, int]
+"""Part of the image: left, top, right and bottom [px]; right and bottom are exclusive."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredImage:
+    """Image of warped events with its sharpness in a region."""
+
+    image: NDArray[np.float32]
+    """The whole image [events per pixel], shape ``(height, width)``."""
+    variance: float
+    """Variance over mean of the smoothed region, as :attr:`amiwarp.Sharpness.VARIANCE`. It grows with the number of
+    events."""
+    sharpness: float
+    """Relative variance of the smoothed region, see
+    :func:`amiwarp.imaging.sharpness_costs.relative_variance`. It does not depend on the number of events."""
+
 
 class WindowImager:
     """Makes images of warped events and measures their sharpness.
@@ -32,44 +46,32 @@ class WindowImager:
     """
 
     def __init__(self, size: tuple[int, int], device: Any) -> None:
-        canvas = CanvasShape(*size, dither=True)
-        self._votes = Votes(canvas, device)
-        self._meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device)
+        self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
+        self._meters: dict[tuple[int, int], SharpnessMeter] = {}
 
-    def measure(self, model: Model, events: UploadedEvents, offset_us: float) -> tuple[NDArray[np.float32], float]:
-        """Return the image [events per pixel], shape ``(height, width)``, and its sharpness.
+    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> MeasuredImage:
+        """Return the image, and its sharpness in the region.
 
         ``offset_us`` is added to the encoder's clock offset [us].
         """
         self._votes.clear()
         self._votes.add_events(model, events, drift=offset_us)
-        self._votes.read(self._meter.image)
-        return self._meter.image.numpy()[0], self._meter.measure()
+        left, top, right, bottom = region
+        meter = self._meter(right - left, bottom - top)
+        if meter.image.shape == self._votes.canvas.shape:
+            self._votes.read(meter.image)
+            image = part = meter.image.numpy()[0]
+        else:
+            image = self._votes.take()[0]
+            part = image[top:bottom, left:right]
+            meter.image.write(part[None])
+        variance, mean = meter.measure(), float(part.mean())
+        return MeasuredImage(image, variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0)
 
-
-@dataclass(frozen=True, eq=False)
-class LoadedWindow:
-    """Selected events of a window, in memory and on the device, and their image without compensation."""
-
-    span: Span
-    """Time window, with all events that were read from it."""
-    drawn: Events
-    """Selected events that are drawn as points."""
-    truth: DrawnTruth
-    """Ground truth of the drawn events."""
-    xy: NDArray[np.float32]
-    """Pixels of the drawn events [px], shape ``(n, 2)``."""
-    theta: NDArray[np.float64]
-    """Prism angles of the drawn events [rad], shape ``(n,)``, without the clock offset that is set on the page."""
-    speed: NDArray[np.float64]
-    """Speed of the prism at the drawn events [rad/us], shape ``(n,)``."""
-    on_device: UploadedEvents
-    """All selected events, on the device."""
-    curve_events: Events
-    """Selected events from which the sharpness curve is computed."""
-    curve_events_on_device: UploadedEvents
-    """Events of the sharpness curve, on the device."""
-    image: NDArray[np.float32]
-    """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
-    sharpness: float
-    """Sharpness of the image of the events as recorded."""
+    def _meter(self, width: int, height: int) -> SharpnessMeter:
+        """Return the meter of images of this size. Only the last one is kept."""
+        if (width, height) not in self._meters:
+            canvas = CanvasShape(width, height, dither=True)
+            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
+            self._meters = {(width, height): meter}
+        return self._meters[width, height]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from functools import cached_property
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,103 +15,38 @@ from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.encoder_speed import turn_between
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.device_events import UploadedEvents, upload_events
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import apex_from_deflection
-from amiwarp.viewer.drawn_truth import DrawnTruth
-from amiwarp.viewer.imager import LoadedWindow, WindowImager
+from amiwarp.viewer import parameters
+from amiwarp.viewer.imager import MeasuredImage, WindowImager
+from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source
+from amiwarp.viewer.suggestion import Suggestion, suggest_region
 from amiwarp.viewer.timeline import Span, event_rate, read_span
+from amiwarp.viewer.window import DisplayedWindow, LoadedWindow, WindowAngles
+from amiwarp.viewer.window_loading import load_window, margin, upload
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import Events
+    from amiwarp.imaging.device_events import UploadedEvents
     from amiwarp.optics.models import Model
 
-MOST_EVENTS = 4_000_000
+MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
-MOST_POINTS = 100_000
-"""Largest number of points in each event cloud."""
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
-CURVE_POINTS, CURVE_EVENTS = 25, 200_000
-"""Number of points of a sharpness curve, and largest number of events that it uses."""
+NO_ENCODER = "no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion"
+NO_CAMERA = f"camera unknown: {FOV_DEG:g}° field of view assumed; give it with --fov-deg or --camera"
+CURVE_POINTS = 25
+"""Number of points of a sharpness curve."""
 ORBIT_POINTS = 181
 """Number of points of the drawn orbit of a scene point."""
 WINDOW_US = 100_000
 """Length of the first time window if the prism does not rotate [us]."""
-
-
-@dataclass(frozen=True)
-class Knobs:
-    """Parameters of the prism that the page's sliders set."""
-
-    model: str = "exact"
-    """Name of the optical model."""
-    apex: float = 0.0
-    """Apex angle of the prism [rad]."""
-    phase: float = 0.0
-    """Phase θ_b of the prism [rad]."""
-    clock_offset: float = 0.0
-    """Offset between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
-    tilt_x: float = 0.0
-    """Tilt of the axis of rotation, x component [rad]."""
-    tilt_y: float = 0.0
-    """Tilt of the axis of rotation, y component [rad]."""
-    rpm: float = 0.0
-    """Speed of the prism if the recording has no encoder [1/min]."""
-
-
-CURVE_HALF_WIDTH = {
-    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "tilt_x": math.radians(5.0),
-    "tilt_y": math.radians(5.0), "rpm": 6.0,
-}  # fmt: skip
-"""Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Conditions for the events that are shown."""
-
-    polarity: int | None = None
-    """Polarity of the shown events: 1 for only ON, 0 for only OFF, None for both."""
-    region: tuple[int, int, int, int] | None = None
-    """Region of the image: left, top, right and bottom [px], right and bottom exclusive. None: the whole image."""
-    hide_hot: bool = False
-    """Whether the events of hot pixels are left out."""
-
-
-@dataclass(frozen=True, eq=False)
-class DisplayedWindow:
-    """Time window shown with the current parameters: images of all events, and points of evenly spaced events."""
-
-    span: Span
-    """Time window, with all events that were read from it."""
-    region: tuple[int, int, int, int]
-    """Part of the image that is shown: left, top, right and bottom [px]; right and bottom are exclusive."""
-    selected: int
-    """Number of selected events, which are all in the images."""
-    events: Events
-    """Events that are drawn as points."""
-    truth: DrawnTruth
-    """Ground truth of these events."""
-    before: NDArray[np.float32]
-    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
-    after: NDArray[np.float32]
-    """Compensated positions of the drawn events [px], shape ``(n, 2)``; NaN if the model has no solution."""
-    theta: NDArray[np.float64]
-    """Prism angles of the drawn events [rad], from 0 to 2π, shape ``(n,)``."""
-    image_before: NDArray[np.float32]
-    """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
-    image_after: NDArray[np.float32]
-    """Image of the compensated events [events per pixel], shape ``(height, width)``."""
-    sharpness_before: float
-    """Sharpness of ``image_before``, the image before compensation."""
-    sharpness_after: float
-    """Sharpness of ``image_after``, the image after compensation."""
 
 
 class Inspector:
@@ -129,21 +65,19 @@ class Inspector:
     ) -> None:
         """Start with a recording; a calibration sets the prism's parameters.
 
-        ``latest`` is a function that returns the current events of a live stream; see :meth:`renew`. Raises
-        :class:`AmiwarpError` if there are no events, or if the calibration belongs to another camera.
+        ``latest`` returns the current events of a live stream, see :meth:`renew`. Raises :class:`AmiwarpError` if there
+        are no events, or if the calibration belongs to another camera.
         """
         source = recording.events
         if not len(source):
             raise AmiwarpError(f"{recording.name}: holds no events; give a recording with events")
-        self.notes: tuple[str, ...] = ()
-        if recording.encoder is None and calibration is None:
-            self.notes = ("no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion",)
+        no_speed = recording.encoder is None and calibration is None
+        self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
+        """What is missing to compensate the prism's motion, one sentence each."""
+        self.sources = parameters.first_sources(recording)
+        """Where the value of each parameter, and the camera, come from."""
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
-            self.notes = (
-                *self.notes,
-                f"camera unknown: {FOV_DEG:g}° field of view assumed; give it with --fov-deg or --camera",
-            )
         self.recording, self.device, self.latest = recording, device, latest
         self.prism = nominal(recording.prism)
         """Nominal prism of the recording, with an assumed apex if it is unknown."""
@@ -155,6 +89,9 @@ class Inspector:
         self.selection = Selection()
         self._found: tuple[Knobs, Calibration] | None = None
         self._window: LoadedWindow | None = None
+        self._span: Span | None = None
+        self.lock = Lock()
+        """Lock for the events on the device and the buffers of their images."""
         self._imager, self._curve_imager = (WindowImager(source.size, device) for _ in range(2))
         if calibration is not None:
             self.accept(calibration)
@@ -172,9 +109,12 @@ class Inspector:
 
     @property
     def turn_us(self) -> float:
-        """Duration of one turn of the prism [us]; infinite if the prism does not rotate."""
-        rpm = self.knobs.rpm if self.recording.encoder is None else self.recording.encoder.rpm
-        return 60e6 / abs(rpm) if abs(rpm) > 1e-3 else math.inf
+        """Duration of one turn of the prism in the time window [us]; infinite if the prism does not rotate."""
+        if not self.has_encoder:
+            return 60e6 / abs(self.knobs.rpm) if self.knobs.rpm else math.inf
+        source = self.recording.events
+        start, length = self.window or (source.t_first, source.t_last - source.t_first)
+        return turn_between(self.encoder, start, start + length) or math.inf
 
     @property
     def encoder(self) -> Encoder:
@@ -182,19 +122,26 @@ class Inspector:
 
         The clock offset set on the page is not included.
         """
+        return self._encoder(self.knobs.rpm)
+
+    def _encoder(self, rpm: float) -> Encoder:
         source = self.recording.events
-        return self.recording.encoder or constant_speed(self.knobs.rpm, source.t_first, source.t_last, self.zero_us)
+        return self.recording.encoder or constant_speed(rpm, source.t_first, source.t_last, self.zero_us)
 
     @property
     def adjusted_encoder(self) -> Encoder:
         """Encoder with the clock offset set on the page."""
-        encoder = self.encoder
-        return encoder.with_clock_offset(self.knobs.clock_offset) if self.has_encoder else encoder
+        return self.encoder_of(self.knobs)
+
+    @property
+    def margin_px(self) -> int:
+        """How far outside a region the events of its images may be [px]."""
+        return margin(self.camera, self.prism)
 
     @property
     def model(self) -> Model:
         """Optical model with the parameters that are set on the page."""
-        return self._model(self.knobs)
+        return self.model_of(self.knobs)
 
     @cached_property
     def rate(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -225,6 +172,7 @@ class Inspector:
         if self.latest is not None:
             recording = self.latest()
             self.recording = replace(self.recording, events=recording.events, encoder=recording.encoder)
+            self._span = None
             for name in ("rate", "hot"):
                 self.__dict__.pop(name, None)
 
@@ -236,80 +184,108 @@ class Inspector:
                 f"the calibration is of {given[0]}x{given[1]} pixels, the events are of {size[0]}x{size[1]}; "
                 "calibrate this recording"
             )
-        p, self.prism = calibration.parameters, calibration.prism
-        apex = (
-            p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], self.prism.index, self.prism.flat_side)
-        )
-        self.recording = replace(self.recording, camera=calibration.camera)
-        self.zero_us = self.zero_us if calibration.zero_us is None else calibration.zero_us
-        offset, tilts = p.get("clock_offset", self._recorded_offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
-        self.set(Knobs(calibration.model_name, apex, p["phase"], offset, *tilts, p.get("rpm", 0.0)))
+        self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
+        self.set(self.knobs_of(calibration))
+        self.sources |= parameters.calibrated_sources(calibration, self.sources)
         self._found = self.knobs, calibration
+
+    def knobs_of(self, calibration: Calibration) -> Knobs:
+        """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
+        return parameters.calibrated_knobs(calibration, offset_us=self._recorded_offset_us, zero_us=self.zero_us)
+
+    @property
+    def truth(self) -> Knobs | None:
+        """Known parameters of a simulated recording; None if the recording has no ground truth of its prism."""
+        return parameters.true_knobs(self.recording, rpm=self.knobs.rpm)
+
+    def take_truth(self) -> None:
+        """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
+        if self.truth is None:
+            raise AmiwarpError(f"{self.recording.name}: holds no true parameters of its prism; simulate a recording")
+        self.set(self.truth)
+        known = set(self.sources) - {"camera", "rpm"}
+        self.sources |= dict.fromkeys(known, Source.TRUTH)
 
     def as_calibration(self) -> Calibration:
         """Return the accepted calibration if no parameter was changed since, else one of the current parameters."""
         if self._found is not None and self._found[0] == self.knobs:
             return self._found[1]
-        k, values = self.knobs, self._values(self.knobs)
-        size = ("deflection",) if k.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
-        kept = {n: values[n] for n in (*size, "phase", *self._calibrated_only)}
-        kept |= {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
-        shown = self.show()
+        k, w = self.knobs, self.loaded
+        kept = parameters.kept_values(k, self._values(k), has_encoder=self.has_encoder)
+        before, after = self._unmoved(w), self._measured(w, k)
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
-            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=shown.sharpness_before,
-            sharpness_after=shown.sharpness_after, stages=(), events=shown.selected, seconds=0.0,
-            warnings=("set by hand in the inspector",), zero_us=None if self.has_encoder else self.zero_us,
+            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before.variance, sharpness_after=after.variance,
+            stages=(), events=len(w.events), seconds=0.0, warnings=("set by hand in the inspector",),
+            zero_us=None if self.has_encoder else self.zero_us,
         )  # fmt: skip
 
     def set(self, knobs: Knobs) -> None:
-        """Set the parameters of the prism."""
-        speed_changed = not self.has_encoder and knobs.rpm != self.knobs.rpm
+        """Set the parameters of the prism. Parameters that change count as set by hand."""
+        changed = {f.name for f in fields(Knobs) if getattr(knobs, f.name) != getattr(self.knobs, f.name)}
+        self.sources |= dict.fromkeys(changed & set(self.sources), Source.HAND)
         self.knobs = knobs
-        if speed_changed and self._window is not None:
-            self._window = self._prepare(self._window.span)
 
     def open(self, start_us: int, length_us: int, selection: Selection | None = None) -> None:
         """Read a time window of events.
 
         Raises :class:`AmiwarpError` if it has no events that meet the ``selection``.
         """
-        before, self.selection = self.selection, selection or self.selection
-        try:
-            self._window = self._prepare(
-                read_span(self.recording.events, start_us, max(1, length_us), most_events=MOST_EVENTS)
-            )
-        except BaseException:
-            self.selection = before  # the page still shows the previous window
-            raise
-        self.window = start_us, length_us
+        chosen = selection or self.selection
+        self._window = self._load(start_us, max(1, length_us), chosen)
+        self.selection, self.window = chosen, (start_us, length_us)
 
-    def show(self) -> DisplayedWindow:
-        """Return the time window's images and points with the current parameters."""
-        w = self._loaded
-        offset_us = self.knobs.clock_offset - self._recorded_offset_us
-        image, sharpness = self._imager.measure(self.model, w.on_device, offset_us)
-        theta = w.theta + w.speed * offset_us
-        after = np.asarray(self.model.compensate_points(w.xy, theta.astype(np.float32)), np.float32)
-        region = self.selection.region or (0, 0, *self.recording.events.size)
+    def suggest_region(self) -> Suggestion:
+        """Return the region in which compensation gains most sharpness in the current time window."""
+        loaded = self.loaded
+        if self.selection.region is not None:
+            loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
+        return suggest_region(self._unmoved(loaded).image, self._measured(loaded, self.knobs).image)
+
+    def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
+        """Return the time window's images and points.
+
+        ``knobs``: parameters to show, by default the current ones. ``against``: parameters to compare with; they
+        replace the recorded events as the first of the two clouds and images.
+        """
+        w, knobs = self.loaded, knobs or self.knobs
+        first = self._unmoved(w) if against is None else self._measured(w, against)
+        xy = w.xy if against is None else self._moved(w, against)
+        second, theta = self._measured(w, knobs), np.mod(self._theta(w, knobs), math.tau)
         return DisplayedWindow(
-            w.span, region, w.on_device.count, w.drawn, w.truth, w.xy, after, np.mod(theta, math.tau), w.image,
-            image, w.sharpness, sharpness,
+            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, first.image, second.image,
+            first.sharpness, second.sharpness,
         )  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
-        w, current = self._loaded, self.knobs
+        current = self.knobs
         values = getattr(current, name) + np.linspace(-CURVE_HALF_WIDTH[name], CURVE_HALF_WIDTH[name], CURVE_POINTS)
         if name == "apex":
             values = values[values >= 0.0]
-        scores = []
-        for value in values:
-            knobs = replace(current, **{name: float(value)})  # type: ignore[arg-type]
-            events = self._upload(w.curve_events, knobs) if name == "rpm" else w.curve_events_on_device
-            offset_us = knobs.clock_offset - self._recorded_offset_us
-            scores.append(self._curve_imager.measure(self._model(knobs), events, offset_us)[1])
-        return values, np.array(scores)
+        sharpness = self.sharpness_meter(self._curve_imager)
+        changed = [replace(current, **{name: float(value)}) for value in values]  # type: ignore[arg-type]
+        return values, np.array([sharpness(knobs) for knobs in changed])
+
+    def sharpness_meter(self, imager: WindowImager) -> Callable[[Knobs | None], float]:
+        """Return a function that measures the sharpness of part of the window's events with given parameters.
+
+        Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
+        thread that uses the imager.
+        """
+        w = self.loaded
+        on_device: dict[float, UploadedEvents] = {}
+
+        def sharpness(knobs: Knobs | None) -> float:
+            given = self._unprismed if knobs is None else knobs
+            rpm = 0.0 if self.has_encoder else given.rpm
+            if rpm not in on_device:
+                on_device.clear()
+                on_device[rpm] = upload(w.curve_events, self._encoder(rpm), self.device, drifting=self.has_encoder)
+            model, drift_us = self.model_of(given), self._drift_us(given)
+            return imager.measure(model, on_device[rpm], drift_us, w.region).sharpness
+
+        return sharpness
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the orbit of the scene point that would appear at (x, y) [px] without the prism.
@@ -326,70 +302,99 @@ class Inspector:
         return 0.0 if self.recording.encoder is None else self.recording.encoder.clock_offset_us
 
     @property
-    def _loaded(self) -> LoadedWindow:
+    def loaded(self) -> LoadedWindow:
+        """Selected events of the time window. They are read first if necessary."""
         if self._window is None:
             self.open(*(self.window or self.first_window()))
         assert self._window is not None
         return self._window
-
-    @property
-    def _calibrated_only(self) -> dict[str, float]:
-        """Return the calibrated parameters that the page cannot change."""
-        found: Mapping[str, float] = {} if self._found is None else self._found[1].parameters
-        return {n: x for n, x in found.items() if n in ("index", "focal_length")}
 
     def _values(self, knobs: Knobs) -> dict[str, float]:
         """Return the parameters of every optical model.
 
         A prism that does not rotate gets apex 0, so that nothing is compensated.
         """
-        apex = knobs.apex if self.has_encoder or knobs.rpm else 0.0
-        prism = replace(self.prism, apex=apex, index=self._calibrated_only.get("index", self.prism.index))
-        return {**self._calibrated_only, "apex": apex, "deflection": prism.deflection, "phase": knobs.phase,
-                "tilt_x": knobs.tilt_x, "tilt_y": knobs.tilt_y}  # fmt: skip
+        apex, more = knobs.apex if self.has_encoder or knobs.rpm else 0.0, knobs.calibrated_only
+        prism = replace(self.prism, apex=apex, index=more.get("index", self.prism.index))
+        return {**more, "apex": apex, "deflection": prism.deflection, "phase": knobs.phase, "tilt_x": knobs.tilt_x,
+                "tilt_y": knobs.tilt_y}  # fmt: skip
 
-    def _model(self, knobs: Knobs) -> Model:
-        return build_model(knobs.model, self.camera, self.prism, self._values(knobs))
+    def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
+        """Return the optical model with given parameters, of the recording's camera or another one."""
+        return build_model(knobs.model, camera or self.camera, self.prism, self._values(knobs))
 
-    def _prepare(self, span: Span) -> LoadedWindow:
-        kept = np.flatnonzero(self._selected(span.events))
-        selected = span.events if len(kept) == len(span.events) else span.events[kept]
-        if not len(selected):
-            what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
-            raise AmiwarpError(f"{what} from {(span.start_us - self.recording.events.t_first) * 1e-3:.3f} ms on for "
-                               f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
-        encoder, n = self.encoder, len(selected)
-        thin = np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)
-        drawn, truth = selected[thin], DrawnTruth(self.recording.truth, span, kept[thin])
-        curve_events = selected[:: max(1, -(-n // CURVE_EVENTS))]
-        on_device = self._upload(selected, self.knobs)
-        no_prism = self._model(replace(self.knobs, model="exact", apex=0.0))
-        image, sharpness = self._imager.measure(no_prism, on_device, 0.0)
-        return LoadedWindow(
-            span, drawn, truth, np.stack([drawn.x, drawn.y], axis=1).astype(np.float32), encoder.angle_at(drawn.t),
-            encoder.speed_at(drawn.t) * 1e-6, on_device, curve_events, self._upload(curve_events, self.knobs), image,
-            sharpness,
-        )  # fmt: skip
+    def encoder_of(self, knobs: Knobs) -> Encoder:
+        """Return the encoder with the clock offset or the speed of given parameters."""
+        encoder = self._encoder(knobs.rpm)
+        return encoder.with_clock_offset(knobs.clock_offset) if self.has_encoder else encoder
 
-    def _upload(self, events: Events, knobs: Knobs) -> UploadedEvents:
-        source = self.recording.events
-        if self.recording.encoder is None:
-            encoder = constant_speed(knobs.rpm, source.t_first, source.t_last, self.zero_us)
-            return upload_events(events, encoder, self.device)
-        encoder = self.recording.encoder
-        return upload_events(events, encoder, self.device, slope=encoder.speed_at(events.t) * 1e-6)
+    @property
+    def _unprismed(self) -> Knobs:
+        """Parameters that leave all events where they were recorded."""
+        return replace(self.knobs, model="exact", apex=0.0)
 
-    def _selected(self, events: Events) -> NDArray[np.bool_]:
-        """Return whether each event meets the selection, shape ``(n,)``."""
-        s, keep = self.selection, np.ones(len(events), np.bool_)
-        if self.recording.encoder is not None:
-            first, last = self.recording.encoder.coverage
-            keep &= (events.t >= first) & (events.t <= last)
-        if s.polarity is not None:
-            keep &= events.p == s.polarity
-        if s.region is not None:
-            left, top, right, bottom = s.region
-            keep &= (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
-        if s.hide_hot:
-            keep &= ~self.hot[events.y, events.x]
-        return keep
+    def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
+        """Return the model, the events on the device and their drift [us], to vote the events of a window.
+
+        ``knobs``: the parameters; None for the events as recorded.
+        """
+        given = self._unprismed if knobs is None else knobs
+        return self.model_of(given), self._angles(w, given).on_device, self._drift_us(given)
+
+    def positions(self, events: Events, knobs: Knobs | None) -> NDArray[np.float32]:
+        """Return the compensated positions of events [px], shape ``(n, 2)``; those recorded if ``knobs`` is None."""
+        xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
+        if knobs is None:
+            return xy
+        theta = self.encoder_of(knobs).angle_at(events.t).astype(np.float32)
+        return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
+
+    def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
+        """Read and select the events of a time window. The events of the last one are not read again."""
+        if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
+            self._span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
+        return self._select(self._span, selection)
+
+    def select(self, span: Span) -> Events:
+        """Return the events of a time window that meet the selection."""
+        return self._select(span, self.selection).events
+
+    def _select(self, span: Span, selection: Selection) -> LoadedWindow:
+        hot = self.hot if selection.hide_hot else None
+        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot)
+
+    def _drift_us(self, knobs: Knobs) -> float:
+        """Return how far the clock offset is from that of the recording's own encoder [us]."""
+        return knobs.clock_offset - self._recorded_offset_us
+
+    def _angles(self, w: LoadedWindow, knobs: Knobs) -> WindowAngles:
+        """Return the prism angles of a window; those of the two last speeds are kept."""
+        rpm = 0.0 if self.has_encoder else knobs.rpm
+        if rpm not in w.angles:
+            encoder, t = self._encoder(rpm), w.drawn.t
+            for old in list(w.angles)[:-1]:
+                del w.angles[old]
+            on_device = upload(w.events, encoder, self.device, drifting=self.has_encoder)
+            w.angles[rpm] = WindowAngles(on_device, encoder.angle_at(t), encoder.speed_at(t) * 1e-6)
+        return w.angles[rpm]
+
+    def _theta(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
+        """Return the prism angles of the drawn events [rad], shape ``(n,)``."""
+        angles = self._angles(w, knobs)
+        return angles.theta + angles.speed * self._drift_us(knobs)
+
+    def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
+        """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
+        theta = self._theta(w, knobs).astype(np.float32)
+        return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
+
+    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
+        """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
+        with self.lock:
+            return self._imager.measure(*self.warped(w, knobs), w.region)
+
+    def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
+        """Return the image of a window as recorded."""
+        if not w.unmoved:
+            w.unmoved.append(self._measured(w, None))
+        return w.unmoved[0]

@@ -19,7 +19,8 @@ from amiwarp.viewer.message_filter import Check, flag, list_of, number, one_of, 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.viewer.inspector import DisplayedWindow, Inspector
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.window import DisplayedWindow
 
 JPEG_QUALITY = 90
 _pixels = number(0, LARGEST_SIZE)

@@ -29,14 +29,15 @@ from amiwarp.viewer.clicks import ClickDetector
 from amiwarp.viewer.cloud_scene import ORBIT_COLOUR, Look, Scene
 from amiwarp.viewer.exports import export_path
 from amiwarp.viewer.frames import wait_until_page_keeps_up
-from amiwarp.viewer.inspector import Selection
 from amiwarp.viewer.jobs import CalibrationJob, Playback
 from amiwarp.viewer.layout import KEYS, NAMES, UNITS, build
 from amiwarp.viewer.message_filter import finite
 from amiwarp.viewer.page_values import event_text, initial_state, jpeg, percent_of_range, polyline, source_state
+from amiwarp.viewer.parameters import Selection
 
 if TYPE_CHECKING:
-    from amiwarp.viewer.inspector import DisplayedWindow, Inspector
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.window import DisplayedWindow
 
 _CUDA_LOCK = asyncio.Lock()
 """Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""

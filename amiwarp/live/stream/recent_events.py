@@ -7,17 +7,19 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from amiwarp.compensation.streams import OVERHEAD, held_bytes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.live.stream.queue_policy import Policy
 from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.status import SessionStatus
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,11 +48,19 @@ class RecentEvents:
         self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self.event_bytes = self.sample_bytes = 0
         """Memory of the kept events and of the kept encoder samples [bytes]."""
+        self.turn_share = 0.0
+        """Share of a turn of the prism that the kept events cover, 0 to 1, at the last call of :meth:`recording`."""
+        self.status = SessionStatus()
+        """Rate, losses and speed of the stream, from its last report."""
+        self.ended = ""
+        """Why the stream has ended; empty while it runs."""
+        self._arrived_s = time.monotonic()
         self._lock = threading.Lock()
 
     def append(self, events: Events) -> None:
         """Append events, in order of time."""
         with self._lock:
+            self._arrived_s = time.monotonic()
             self._events.append(events)
             self.event_bytes += held_bytes(events)
             since = int(events.t[-1]) - round(SECONDS * 1e6)
@@ -71,6 +81,11 @@ class RecentEvents:
                     t_us, angle = self._samples.popleft()
                     self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
 
+    @property
+    def age_s(self) -> float:
+        """Time since the latest events arrived [s]."""
+        return time.monotonic() - self._arrived_s
+
     def tick(self) -> None:
         """Do nothing, because no data wait to be written."""
 
@@ -84,12 +99,14 @@ class RecentEvents:
         if len(t) < 2:
             return None
         joined = Events.concatenate(events)
-        # Encoder samples from before the events would distort the mean speed.
         since = max(min(int(np.searchsorted(t, joined.t[0])) - 2, len(t) - 2), 0)
         encoder = Encoder(t[since:], angle[since:])
         first, last = np.searchsorted(joined.t, encoder.coverage)
         covered = joined[first:last]
-        if not len(covered) or abs(encoder.rpm) * float(covered.t[-1] - covered.t[0]) < 60e6:
+        self.turn_share = (
+            min(float(np.ptp(encoder.angle_at(covered.t[[0, -1]]))) / TWO_PI, 1.0) if len(covered) else 0.0
+        )
+        if self.turn_share < 1.0:
             return None
         return Recording(MemoryEvents(covered, *self._size), self._camera, encoder, self._prism, name=self._name)
 
@@ -103,16 +120,23 @@ def followed(source: Source, link: Link | None, recent: RecentEvents, say: Calla
     """
     stop, failures = threading.Event(), []
 
+    def report(status: SessionStatus) -> None:
+        recent.status = replace(status)
+
+    def end(text: str) -> None:
+        recent.ended = text
+        say(text)
+
     def run() -> None:
         session = Session(source, link=link, raw=[recent], policy=Policy.DROP_OLDEST, say=say)
         try:
-            ended = session.run(stop, lambda status: None)
+            ended = session.run(stop, report)
             problem = getattr(source, "problem", None)
             how = "has ended" if problem is None else f"broke off: {problem}"
-            say(f"{source.name}: the stream {how}; the last of its {ended.events:,} events are shown")
+            end(f"{source.name}: the stream {how}; the last of its {ended.events:,} events are shown")
         except Exception as error:
             failures.append(error)
-            say(str(error))
+            end(str(error))
 
     thread = threading.Thread(target=run, name="amiwarp-follow", daemon=True)
     thread.start()

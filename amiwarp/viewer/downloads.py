@@ -1,0 +1,125 @@
+"""Files that the page offers as downloads: events of the window, images and calibrations."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.compensation.recordings import BlockCompensator
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.imaging.export import encode_image, encode_png
+from amiwarp.io import RecordingWriter
+from amiwarp.io.atomic_output import NewFile
+from amiwarp.io.file_scan import FileEvents
+from amiwarp.viewer.window_loading import kept
+
+if TYPE_CHECKING:
+    from amiwarp.events.events import Events
+    from amiwarp.viewer.image_kinds import ShownImages
+    from amiwarp.viewer.inspector import Inspector
+
+BLOCK = 1 << 20
+"""Number of events that are written at a time."""
+IMAGE_SUFFIXES = (".png", ".tif", ".npy")
+"""Suffixes of image files: colours as on the page, values as float32, values as an array."""
+
+
+def as_bytes(suffix: str, write: Callable[[Path], object]) -> bytes:
+    """Return the content of a file that ``write`` writes to the path that it is given, which ends in ``suffix``."""
+    with tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True) as folder:
+        path = Path(folder) / f"download{suffix}"
+        write(path)
+        return path.read_bytes()
+
+
+def write_events(inspector: Inspector, path: Path, *, compensated: bool) -> int:
+    """Write all selected events of the window to a new native file, and return their number.
+
+    Compensated events get sub-pixel coordinates, with the parameters set on the page. A window with more events than
+    the page reads is written completely. Raises :class:`AmiwarpError` if the file exists.
+    """
+    recording, span, encoder = inspector.recording, inspector.loaded.span, inspector.adjusted_encoder
+    width, height = recording.events.size
+    first_us = max(span.start_us, encoder.coverage[0])
+    last_us = min(span.start_us + span.length_us, encoder.coverage[1])
+    metadata = {**recording.metadata, **({"compensated_with": inspector.knobs.model} if compensated else {})}
+    with RecordingWriter(
+        path, width=width, height=height, camera=inspector.camera, prism=recording.prism, metadata=metadata,
+        encoder=_cut(encoder, first_us, last_us) if inspector.has_encoder else None,
+    ) as writer:  # fmt: skip
+        compensator = BlockCompensator(inspector.model, encoder, first_us, last_us, inspector.device)
+        for block in _selected_blocks(inspector):
+            if compensated:
+                moved, inside = compensator(block, all_cores=True)
+                writer.append(moved, inside=inside)
+            else:
+                writer.append(block)
+        return len(writer)
+
+
+def write_image(images: ShownImages, path: Path, *, before: bool = False) -> None:
+    """Write one of the images to a new file: .png with the page's colours, .tif or .npy with its values.
+
+    ``before``: write the first image instead of the second. A .tif of two polarities has two pages, OFF and ON. Raises
+    :class:`AmiwarpError` for another suffix, if the file exists, or if there is no such image.
+    """
+    from PIL import Image
+
+    values = images.before if before else images.after
+    if values is None:
+        raise AmiwarpError(f"there is no image of {images.kind.value} before compensation; export the compensated one")
+    if path.suffix not in IMAGE_SUFFIXES:
+        raise AmiwarpError(
+            f"{path.name}: images are written as {', '.join(IMAGE_SUFFIXES)}; give one of these suffixes"
+        )
+    with NewFile(path) as new:
+        if path.suffix == ".png":
+            encode_png(new.part, images.scale.rgb(values))
+        elif path.suffix == ".npy":
+            with open(new.part, "wb") as file:
+                np.save(file, np.asarray(values, np.float32))
+        else:
+            pages = values if values.ndim == 3 else values[None]
+            first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
+            encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
+
+
+def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
+    """Yield all selected events of the window, in blocks."""
+    window, hot = inspector.loaded, inspector.hot if inspector.selection.hide_hot else None
+    for block in _blocks(inspector):
+        chosen = kept(inspector.recording, block, inspector.selection, window.region, hot)
+        yield block if chosen.all() else block[chosen]
+
+
+def _blocks(inspector: Inspector) -> Iterator[Events]:
+    """Yield all events of the window, in blocks."""
+    source, span = inspector.recording.events, inspector.loaded.span
+    end_us = span.start_us + span.length_us
+    if span.count == len(span.events):
+        yield span.events
+    elif isinstance(source, FileEvents):  # can only be read from its start
+        for block in source.blocks():
+            first, stop = np.searchsorted(block.t, (span.start_us, end_us))
+            yield block[first:stop]
+            if stop < len(block):
+                return
+    else:
+        stop = source.find(end_us)
+        for start in range(source.find(span.start_us), stop, BLOCK):
+            yield source.slice(start, min(start + BLOCK, stop))
+
+
+def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:
+    """Return the samples of an encoder that cover a time span, with one more on each side."""
+    first = max(int(np.searchsorted(encoder.t, first_us + encoder.clock_offset_us)) - 2, 0)
+    stop = int(np.searchsorted(encoder.t, last_us + encoder.clock_offset_us)) + 2
+    t, pulses = encoder.t[first:stop], encoder.index_t
+    if pulses is not None:
+        pulses = pulses[(pulses >= t[0]) & (pulses <= t[-1])]
+    return Encoder(t, encoder.angle[first:stop], encoder.clock_offset_us, pulses)

@@ -1,0 +1,166 @@
+"""Speed of the inspector without its page: response to a parameter, images, event rates, first cloud of a file.
+
+    python -m benchmarks.inspector [--device cuda:0] [--events 100_000_000] [--out FILE.json]
+
+Wall times are medians. CPU times of all threads stand next to them, because other programs lengthen the wall times on
+a shared machine. Each figure is checked in the same run: positions are those of ``compensate_events``, counts are those
+of the recording.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import Prism
+from amiwarp.simulation.simulator import simulate
+from amiwarp.studies.machine_info import machine
+from amiwarp.viewer.image_kinds import ImageKind, make_images
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.parameters import Selection
+from benchmarks.view import made, recorded, write_long
+
+REPEATS = 20
+REGION = (260, 200, 380, 290)
+"""Region of the image in which the parameter is changed [px]."""
+TARGETS_MS = {"cpu": {"update": 150.0, "log_intensity": 1000.0}, "cuda": {"update": 40.0, "log_intensity": 100.0}}
+"""Longest times of an update and of a log intensity of a region [ms]."""
+MOST_S, MOST_GIB, MOST_RATE_MS = 3.0, 1.0, 50.0
+OPENED = """
+import sys, time
+began, cpu = time.perf_counter(), time.process_time()
+from amiwarp.io import open_recording
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.parameters import Selection
+opened = Inspector(open_recording(sys.argv[1]), device=sys.argv[2])
+start, length = opened.first_window()
+opened.open(start, int(sys.argv[3]) or length)
+opened.open(*opened.window, Selection(region=opened.suggest_region().region))
+shown = opened.show()
+took, cpu = time.perf_counter() - began, time.process_time() - cpu
+most = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+print(took, cpu, int(most.split()[1]) / 2**20, shown.span.count, len(shown.span.events), len(opened.recording.events))
+"""
+"""Program that opens a file as the page does: first window, suggested region, clouds."""
+
+
+def timed(work: Callable[[int], object], repeats: int = REPEATS) -> dict[str, float]:
+    """Return the median wall time and the mean CPU time of a function of the number of the repetition [ms]."""
+    work(0)
+    times, cpu = [], time.process_time()
+    for k in range(repeats):
+        began = time.perf_counter()
+        work(k + 1)
+        times.append(1e3 * (time.perf_counter() - began))
+    return {
+        "ms": float(np.median(times)),
+        "ms_slowest": max(times),
+        "cpu_ms": 1e3 * (time.process_time() - cpu) / repeats,
+    }
+
+
+def update(device: str, region: tuple[int, int, int, int] | None) -> dict[str, Any]:
+    """Measure the time from a new parameter to points, image and sharpness (1 million events)."""
+    inspector = Inspector(recorded(made(1_000_000, 0.2)), device=device)
+    inspector.open(0, 200_000, Selection(region=region))
+
+    def change(k: int) -> None:
+        inspector.set(replace(inspector.knobs, apex=0.01 + 0.0005 * k))
+        inspector.show()
+
+    found, shown = timed(change), inspector.show()
+    expected = compensate_events(shown.events, inspector.model, inspector.encoder)
+    error = float(np.nanmax(np.abs(expected - shown.after)))
+    most = TARGETS_MS["cuda" if "cuda" in device else "cpu"]["update"]
+    return {"events": shown.selected, **found, "error_px": error, "ok": error < 0.01 and found["ms"] <= most}
+
+
+def images(device: str) -> dict[str, Any]:
+    """Measure each kind of image of a region, and a log intensity of the whole image (simulated texture)."""
+    texture = np.kron(np.random.default_rng(0).integers(0, 255, (75, 100), dtype=np.uint8), np.ones((16, 16), np.uint8))
+    recording = simulate(texture, Camera.from_fov(640, 480, 1.0), Prism(0.02), duration_s=0.1, seed=1)
+    inspector, out = Inspector(recording, device=device), {}
+    inspector.take_truth()
+    for name, selection in (("region", Selection(region=REGION)), ("whole", Selection())):
+        inspector.open(*inspector.first_window(), selection)
+        began = time.perf_counter()
+        make_images(inspector, ImageKind.LOG_INTENSITY)  # chooses the smoothness
+        out[f"log_intensity_{name}_first"] = {"ms": 1e3 * (time.perf_counter() - began)}
+        for kind in ImageKind:
+            out[f"{kind.name.lower()}_{name}"] = timed(lambda _, kind=kind: make_images(inspector, kind), 3)
+        counts = make_images(inspector, ImageKind.COUNT).before
+        assert counts is not None
+        out[f"events_{name}"] = {"n": inspector.loaded.selected, "counted": float(counts.sum())}
+    most = TARGETS_MS["cuda" if "cuda" in device else "cpu"]["log_intensity"]
+    counted = all(math.isclose(*out[f"events_{n}"].values(), rel_tol=0.02) for n in ("region", "whole"))
+    return {**out, "ok": counted and out["log_intensity_region"]["ms"] <= most}
+
+
+def opening(path: Path, device: str, n: int, length_us: int) -> dict[str, Any]:
+    """Measure the time from the start of a process to its first cloud of the suggested region; median of three runs."""
+    command = [sys.executable, "-c", OPENED, str(path), device, str(length_us)]
+    runs = [subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-6:] for _ in range(3)]
+    took, cpu, gib, window, read, count = (float(np.median(v)) for v in np.array(runs, float).T)
+    return {"events": int(count), "window_events": int(window), "window_read": int(read), "s": took, "cpu_s": cpu,
+            "gib": gib, "ok": count == n and took <= MOST_S and gib <= MOST_GIB}  # fmt: skip
+
+
+def rates(path: Path, n: int) -> dict[str, Any]:
+    """Measure the count of all events over time, and a curve of 1,000 bins at four zooms."""
+    from amiwarp.io import open_recording
+    from amiwarp.viewer.event_rates import EventRates
+
+    source = open_recording(path).events
+    counted, began, cpu = EventRates(source), time.perf_counter(), time.process_time()
+    while not counted.fill(0.2):
+        pass
+    out: dict[str, Any] = {"fill_s": time.perf_counter() - began, "fill_cpu_s": time.process_time() - cpu}
+    whole = counted.curve(source.t_first, source.t_last + 1, 1000)
+    for length_us in (source.t_last - source.t_first, 1_000_000, 100_000, 10_000):
+        start = source.t_first + (source.t_last - source.t_first - length_us) // 2
+        out[f"curve_{length_us}_us"] = timed(lambda _, a=start, b=start + length_us: counted.curve(a, b, 1000))
+    total = float(((whole.on + whole.off) * np.diff(whole.edges_us)).sum() * 1e-6)
+    slowest = max(each["ms"] for name, each in out.items() if name.startswith("curve"))
+    return {**out, "ok": math.isclose(total, n, rel_tol=1e-6) and slowest <= MOST_RATE_MS}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--events", type=int, default=100_000_000)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    found: dict[str, Any] = {"machine": machine(args.device), "device": args.device}
+    found["update_whole"], found["update_region"] = update(args.device, None), update(args.device, REGION)
+    found["images"] = images(args.device)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "long.h5"
+        n = write_long(path, args.events)
+        os.sync()  # finish writing before the timed reading
+        found["opening_turn"] = opening(path, args.device, n, 0)
+        found["opening_second"] = opening(path, args.device, n, 1_000_000)
+        found["rates"] = rates(path, n)
+    print(json.dumps(found, indent=1))
+    if args.out:
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+    return int(not all(each["ok"] for each in found.values() if isinstance(each, dict) and "ok" in each))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,658 @@
+"""The inspector's values for its page: suggested region, sharpness, residuals, event rates and state."""
+
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from amiwarp.calib import Settings
+from amiwarp.compensation.recordings import compensate_events
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.background_activity import find_background_activity
+from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.sharpness_costs import random_variance, relative_variance, sharpness
+from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.io import open_recording
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import Prism
+from amiwarp.reconstruction.picture import reconstruct
+from amiwarp.simulation.simulator import simulate
+from amiwarp.viewer import downloads, event_rates, log_intensity, selected_part
+from amiwarp.viewer import inspector as viewer
+from amiwarp.viewer.choices import Axis, Colour, View
+from amiwarp.viewer.downloads import as_bytes, write_events, write_image
+from amiwarp.viewer.event_rates import EventRates
+from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.parameters import Knobs, Selection, Source
+from amiwarp.viewer.selected_calibration import calibrate_selected, cost_surface, scope_text
+from amiwarp.viewer.suggestion import suggest_region
+from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
+
+TRUE = Prism(math.radians(1.0))
+
+
+@pytest.fixture(scope="module")
+def recording(texture: np.ndarray) -> Recording:
+    camera, nominal = Camera.from_fov(160, 120, math.radians(60)), Prism(math.radians(1.2))
+    return simulate(texture, camera, TRUE, duration_s=0.25, seed=1, nominal_prism=nominal)
+
+
+@pytest.fixture
+def inspector(recording: Recording) -> Inspector:
+    made = Inspector(recording)
+    made.take_truth()
+    return made
+
+
+def random_events(n: int, width: int, height: int, seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, 100_000, n))
+    x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (width, height))
+    return Events(x, y, t, rng.integers(0, 2, n).astype(np.uint8))
+
+
+def every_other(recording: Recording) -> Recording:
+    """Return a recording with half of the events, chosen at random."""
+    events = recording.events.slice(0, len(recording.events))
+    kept = events[np.random.default_rng(3).random(len(events)) < 0.5]
+    return replace(recording, events=MemoryEvents(kept, *recording.events.size), truth=None)
+
+
+# sharpness
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("n", [20_000, 200_000])
+def test_random_events_have_no_sharpness(n: int, smoothing: float) -> None:
+    rng = np.random.default_rng(1)
+    width, height = 200, 150
+    votes = Votes(CanvasShape(width, height), "cpu")
+    x, y = (rng.uniform(-0.5, side - 0.5, n).astype(np.float32) for side in (width, height))
+    votes.add_unmoved(Events(x, y, np.zeros(n, np.int64), np.zeros(n, np.uint8)))
+    image = votes.take()[0][8:-8, 8:-8]
+    found = sharpness(image, Sharpness.VARIANCE, smoothing=smoothing)
+    pixels = image.size
+    noise = random_variance(smoothing) * math.sqrt(2.0 * 4.0 * math.pi * max(smoothing, 0.4) ** 2 / pixels)
+    border = 0.1 * smoothing * float(image.mean())  # smoothing darkens the border
+    assert found == pytest.approx(random_variance(smoothing), abs=4.0 * noise + border)
+    assert relative_variance(found, float(image.mean()), smoothing) == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("region", [None, (30, 20, 110, 80)])
+def test_half_of_the_events_have_the_same_sharpness(
+    recording: Recording, inspector: Inspector, region: tuple[int, int, int, int] | None
+) -> None:
+    window = inspector.first_window()
+    inspector.open(*window, Selection(region=region))
+    half = Inspector(every_other(recording))
+    half.open(*window, Selection(region=region))
+    all_of_them, some = inspector.show(), half.show(inspector.knobs)
+    assert some.selected == pytest.approx(0.5 * all_of_them.selected, rel=0.05)
+    for name in ("sharpness_before", "sharpness_after"):
+        assert getattr(some, name) == pytest.approx(getattr(all_of_them, name), rel=0.03)
+    assert all_of_them.sharpness_after > 1.2 * all_of_them.sharpness_before
+
+
+def test_the_curve_and_the_images_have_one_sharpness(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
+    values, scores = inspector.curve("apex")
+    at_apex = np.interp(inspector.knobs.apex, values, scores)
+    assert at_apex == pytest.approx(inspector.show().sharpness_after, rel=0.03)
+
+
+def test_events_that_move_into_a_region_are_in_its_image(inspector: Inspector) -> None:
+    window, region = inspector.first_window(), (40, 30, 90, 70)
+    inspector.open(*window)
+    whole = inspector.show()
+    inspector.open(*window, Selection(region=region))
+    part = inspector.show()
+    left, top, right, bottom = region
+    for name in ("image_before", "image_after"):
+        cut, expected = (getattr(shown, name)[top:bottom, left:right] for shown in (part, whole))
+        assert cut.sum() == pytest.approx(expected.sum(), rel=2e-3)
+    assert ((part.before >= (left, top)) & (part.before < (right, bottom))).all()
+
+
+# suggested region
+
+
+def test_the_region_with_the_largest_gain_is_suggested() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.poisson(4.0, (300, 400)).astype(np.float32)
+    before[40, 50] = before[41, 300] = 5000.0  # hot pixels
+    after = before.copy()
+    after[150:240, 230:340] = np.where(np.arange(110) % 10 < 2, 20.0, 0.0)
+    found = suggest_region(before, after)
+    assert found.gains
+    left, top, right, bottom = found.region
+    assert right - left == 120
+    assert bottom - top == 90
+    assert left == pytest.approx(225, abs=12)
+    assert top == pytest.approx(150, abs=12)
+    fallback = suggest_region(after, after)
+    assert not fallback.gains
+    assert fallback.region == pytest.approx(found.region, abs=12)
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (60, 80), (10, 1000), (1000, 10), (720, 1280)])
+def test_a_suggested_region_lies_in_the_image(shape: tuple[int, int]) -> None:
+    for image in (np.zeros(shape, np.float32), np.eye(*shape, dtype=np.float32)):
+        left, top, right, bottom = suggest_region(image, image).region
+        assert 0 <= left < right <= shape[1]
+        assert 0 <= top < bottom <= shape[0]
+        assert right - left <= 120
+
+
+def test_compensation_sharpens_the_suggested_region(inspector: Inspector, recording: Recording) -> None:
+    whole, found = inspector.show(), inspector.suggest_region()
+    assert found.gains
+    inspector.open(*inspector.first_window(), Selection(region=found.region))
+    shown = inspector.show()
+    assert shown.sharpness_after > 1.3 * shown.sharpness_before
+    assert shown.sharpness_after - shown.sharpness_before > whole.sharpness_after - whole.sharpness_before
+    assert inspector.suggest_region() == found  # a region that is shown does not matter
+    plain = Inspector(replace(recording, encoder=None, prism=None, camera=None, truth=None))
+    assert not plain.suggest_region().gains
+
+
+# background activity
+
+
+def reference_background(events: Events, window_us: int) -> np.ndarray:
+    out = np.ones(len(events), np.bool_)
+    for k in range(len(events)):
+        dx = np.abs(events.x[:k].astype(int) - int(events.x[k]))
+        dy = np.abs(events.y[:k].astype(int) - int(events.y[k]))
+        near = (np.maximum(dx, dy) == 1) & (events.t[k] - events.t[:k] <= window_us)
+        out[k] = not near.any()
+    return out
+
+
+def test_background_activity_is_what_no_neighbour_supports() -> None:
+    events = random_events(1500, 24, 17)
+    for window_us in (1, 500, 5000):
+        found = find_background_activity(events, (24, 17), window_us=window_us)
+        np.testing.assert_array_equal(found, reference_background(events, window_us))
+    assert not find_background_activity(Events.empty(), (4, 4)).size
+
+
+def test_background_activity_needs_events_of_a_sensor() -> None:
+    events = random_events(10, 24, 17)
+    with pytest.raises(AmiwarpError, match="window_us = 0"):
+        find_background_activity(events, (24, 17), window_us=0)
+    with pytest.raises(AmiwarpError, match="outside"):
+        find_background_activity(events, (5, 5))
+    moved = Events(events.x.astype(np.float32), events.y.astype(np.float32), events.t, events.p)
+    with pytest.raises(AmiwarpError, match="compensated"):
+        find_background_activity(moved, (24, 17))
+
+
+def test_the_noise_filter_leaves_events_out(inspector: Inspector) -> None:
+    window = inspector.first_window()
+    inspector.open(*window)
+    everything = inspector.show().selected
+    inspector.open(*window, Selection(noise_us=2000))
+    assert 0.3 * everything < inspector.show().selected < everything
+
+
+# parameters
+
+
+def test_every_parameter_has_a_source(recording: Recording, inspector: Inspector) -> None:
+    truth = inspector.truth
+    assert truth is not None
+    assert truth.apex == TRUE.apex
+    assert inspector.knobs == truth
+    assert set(inspector.sources.values()) == {Source.TRUTH, Source.FILE}
+    fresh = Inspector(recording)
+    assert fresh.sources["apex"] is Source.FILE
+    assert fresh.sources["phase"] is Source.ASSUMED
+    fresh.set(replace(fresh.knobs, phase=0.3))
+    assert fresh.sources["phase"] is Source.HAND
+    assert fresh.sources["tilt_x"] is Source.ASSUMED
+    made = fresh.as_calibration()
+    fresh.accept(replace(made, free=("apex", "phase")))
+    assert fresh.sources["apex"] is fresh.sources["model"] is Source.CALIBRATED
+    assert fresh.sources["tilt_x"] is Source.FILE
+    bare = Inspector(replace(recording, truth=None, prism=None, encoder=None, camera=None))
+    assert bare.truth is None
+    assert set(bare.sources.values()) == {Source.ASSUMED}
+    with pytest.raises(AmiwarpError, match="no true parameters"):
+        bare.take_truth()
+
+
+def test_two_sets_of_parameters_are_compared(inspector: Inspector) -> None:
+    wrong = replace(inspector.knobs, phase=inspector.knobs.phase + math.pi)
+    both = inspector.show(against=wrong)
+    alone = inspector.show(wrong)
+    np.testing.assert_array_equal(both.before, alone.after)
+    np.testing.assert_array_equal(both.image_before, alone.image_after)
+    assert both.sharpness_before == alone.sharpness_after < both.sharpness_after
+    np.testing.assert_array_equal(both.after, inspector.show().after)
+
+
+def test_a_calibration_without_encoder_keeps_its_phase(recording: Recording) -> None:
+    """The time at which the angle is 0 differs between inspector and calibration."""
+    encoder = recording.encoder
+    assert encoder is not None
+    inspector = Inspector(replace(recording, encoder=None))
+    inspector.set(replace(Knobs(), apex=TRUE.apex, phase=0.4, rpm=720.0))
+    made = inspector.as_calibration()
+    assert made.zero_us == inspector.zero_us
+    later = 10_000
+    shift = 720.0 * math.tau / 60e6 * later
+    moved = replace(made, zero_us=inspector.zero_us + later, parameters={**made.parameters, "phase": 0.4 + shift})
+    other = Inspector(replace(recording, encoder=None), moved)
+    np.testing.assert_allclose(other.show().after, inspector.show().after, atol=2e-3)
+    assert other.as_calibration() is moved
+
+
+def test_a_constant_speed_equals_its_encoder(recording: Recording, inspector: Inspector) -> None:
+    steady = Encoder.constant_speed(720.0, 0, recording.events.t_last)
+    with_encoder = Inspector(replace(recording, encoder=steady))
+    with_encoder.set(inspector.knobs)
+    without = Inspector(replace(recording, encoder=None))
+    zero = float(steady.angle_at([without.zero_us])[0])
+    without.set(replace(inspector.knobs, rpm=720.0, phase=inspector.knobs.phase + zero))
+    without.open(*with_encoder.first_window())
+    np.testing.assert_allclose(without.show().after, with_encoder.show().after, atol=5e-3)
+
+
+# kinds of images
+
+
+def test_counts_and_polarities_are_those_of_the_window(inspector: Inspector) -> None:
+    region = (30, 20, 110, 80)
+    inspector.open(*inspector.first_window(), Selection(region=region))
+    shown, counts = inspector.show(), make_images(inspector, ImageKind.COUNT)
+    two = make_images(inspector, ImageKind.POLARITY)
+    left, top, right, bottom = region
+    for both, one, of_window in (
+        (two.before, counts.before, shown.image_before),
+        (two.after, counts.after, shown.image_after),
+    ):
+        assert both is not None
+        assert one is not None
+        np.testing.assert_array_equal(one, of_window[top:bottom, left:right])
+        np.testing.assert_allclose(both.sum(axis=0), one, atol=1e-3)
+    assert two.scale.colours == "polarity"
+    assert counts.scale.unit == "per pixel"
+    inspector.open(*inspector.first_window(), Selection(region=region, polarity=1))
+    only_on = make_images(inspector, ImageKind.POLARITY).after
+    assert not only_on[0].any()
+    np.testing.assert_allclose(only_on[1].sum(), two.after[1].sum(), rtol=5e-3)  # dither at the border
+
+
+def test_a_time_surface_holds_the_latest_times(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window())
+    found = make_images(inspector, ImageKind.TIME_SURFACE)
+    window = inspector.loaded
+    expected = np.full(found.after.shape, np.nan)
+    for x, y, t in zip(window.events.x, window.events.y, window.events.t, strict=True):
+        expected[y, x] = (t - window.span.start_us) * 1e-3
+    assert found.before is not None
+    np.testing.assert_allclose(found.before, expected, atol=1e-4)
+    assert np.isfinite(found.after).sum() < np.isfinite(found.before).sum()  # compensated events gather
+    assert found.scale.unit == "ms"
+    assert np.nanmax(found.after) <= found.scale.high
+
+
+def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
+    region = (30, 20, 110, 80)
+    inspector.open(*inspector.first_window(), Selection(region=region))
+    found = make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert found.before is None
+    assert found.after.shape == (60, 80)
+    whole = reconstruct(
+        inspector.recording, model=inspector.model, start_us=inspector.loaded.span.start_us,
+        length_us=inspector.loaded.span.length_us,
+    ).log[20:80, 30:110]  # fmt: skip
+    assert np.corrcoef(found.after.ravel(), whole.ravel())[0, 1] > 0.95
+    wrong = replace(inspector.knobs, phase=inspector.knobs.phase + math.pi)
+    both = make_images(inspector, ImageKind.LOG_INTENSITY, against=wrong)
+    np.testing.assert_array_equal(both.after, found.after)
+    assert both.before is not None
+    assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
+
+
+def test_the_smoothness_of_a_log_intensity_is_chosen_again_if_the_residual_changes(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    (first,) = inspector.loaded.chosen
+    truth = inspector.knobs
+    inspector.set(replace(truth, apex=1.01 * truth.apex))
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert inspector.loaded.chosen == [first]
+    inspector.set(replace(truth, phase=truth.phase + math.pi))
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    (other,) = inspector.loaded.chosen
+    assert other.residual > 2.0 * first.residual
+    inspector.set(truth)
+    make_images(inspector, ImageKind.LOG_INTENSITY)
+    (again,) = inspector.loaded.chosen
+    np.testing.assert_array_equal(again.log, first.log)
+
+
+def test_a_log_intensity_needs_a_prism_that_rotates(recording: Recording) -> None:
+    with pytest.raises(AmiwarpError, match="a prism that rotates"):
+        make_images(Inspector(replace(recording, encoder=None)), ImageKind.LOG_INTENSITY)
+
+
+def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
+    inspector: Inspector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inspector.open(*inspector.first_window())
+    whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
+    monkeypatch.setattr(log_intensity, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(selected_part, "MOST_EVENTS", 40_000)
+    found = make_images(inspector, ImageKind.LOG_INTENSITY)
+    assert found.after.shape == whole.shape
+    assert "25 % of the pixels" in found.note
+    assert "ms in the middle" in found.note
+    assert np.corrcoef(found.after.ravel(), whole.ravel())[0, 1] > 0.5
+
+
+def test_a_scale_gives_colours_and_marks() -> None:
+    scale = Scale("events", "per pixel", 0.0, 100.0, "gray", 0.5)
+    colours = scale.rgb(np.array([[0.0, 25.0, 100.0, 400.0, np.nan]]))
+    assert colours[0, :, 0].tolist() == [0, 127, 255, 255, 0]
+    assert scale.ticks() == ((0.0, "0"), (0.5, "25"), (pytest.approx(0.7071, abs=1e-3), "50"),
+                             (pytest.approx(0.866, abs=1e-3), "75"), (1.0, "100"))  # fmt: skip
+    two = Scale("events", "per pixel", 0.0, 10.0, "polarity").rgb(np.array([[[10.0, 0.0, 0.0]], [[0.0, 10.0, 0.0]]]))
+    assert two[0, 0, 2] > two[0, 0, 0]  # OFF is blue
+    assert two[0, 1, 0] > two[0, 1, 2]
+    assert not two[0, 2].any()
+
+
+# event rates
+
+
+def expected_rates(events: Events, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    on, off = (np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (1, 0))
+    return on / np.diff(edges) * 1e6, off / np.diff(edges) * 1e6
+
+
+def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_rates, "MOST_BINS", 4096)
+    events = random_events(50_000, 16, 16)
+    rates = EventRates(MemoryEvents(events, 16, 16))
+    assert rates.share == 0.0
+    assert rates.fill(60.0)
+    assert rates.share == 1.0
+    first, stop = int(events.t[0]), int(events.t[-1]) + 1
+    for start, end, bins in ((first, stop, 100), (first, stop, 7), (first - 5000, stop + 5000, 50),
+                             (40_000, 41_000, 200), (40_000, 40_010, 200), (0, 60_000, 4000)):  # fmt: skip
+        found = rates.curve(start, end, bins)
+        assert found.edges_us[0] == start
+        assert found.edges_us[-1] == end
+        assert len(found.on) <= bins
+        on, off = expected_rates(events, found.edges_us)
+        lengths = np.diff(found.edges_us)
+        # an edge between two edges of the recording's bins counts part of a bin in the next one
+        most = 3.0 * 25.0 / lengths.min() * 1e6 * 0.5
+        assert np.abs(found.on - on).max() <= most
+        assert (found.on * lengths).sum() == pytest.approx((on * lengths).sum(), rel=2e-3)
+        assert (found.off * lengths).sum() == pytest.approx((off * lengths).sum(), rel=2e-3)
+    exact = rates.curve(40_000, 41_000, 200)
+    assert len(exact.on) == 200
+    np.testing.assert_array_equal(exact.on, expected_rates(events, exact.edges_us)[0])
+    monkeypatch.setattr(event_rates, "MOST_EXACT", 10)
+    coarse = rates.curve(40_000, 41_000, 200)
+    assert 30 < len(coarse.on) < 60
+    np.testing.assert_allclose(coarse.off[1:-1], expected_rates(events, coarse.edges_us)[1][1:-1])
+
+
+def test_rates_are_known_as_far_as_the_recording_is_read(tmp_path: Path) -> None:
+    events = random_events(3 * (1 << 20), 16, 16)
+    stretched = Events(events.x, events.y, events.t * 1000, events.p)
+    rates = EventRates(MemoryEvents(stretched, 16, 16))
+    first, stop = int(stretched.t[0]), int(stretched.t[-1]) + 1
+    assert np.isnan(rates.curve(first, stop, 100).on).all()
+    assert not rates.fill(0.0)
+    assert rates.share == pytest.approx(1 / 3, abs=0.01)
+    some = rates.curve(first, stop, 90)
+    assert np.isfinite(some.on[:29]).all()
+    assert np.isnan(some.on[31:]).all()
+    while not rates.fill(0.0):
+        pass
+    full = rates.curve(first, stop, 90)
+    np.testing.assert_array_equal(full.on[:29], some.on[:29])
+    assert (full.on * np.diff(full.edges_us)).sum() * 1e-6 == pytest.approx(stretched.p.sum())
+    text = tmp_path / "events.txt"
+    text.write_text("".join(f"{k * 1e-3:.6f} 1 2 {k % 2}\n" for k in range(1000)))
+    of_file = EventRates(open_recording(text).events)
+    assert of_file.fill(60.0)
+    np.testing.assert_allclose(of_file.curve(0, 999_000, 9).on, 500.0, rtol=0.02)
+
+
+# state
+
+
+def decode(query: str, default: ViewState, inspector: Inspector) -> tuple[ViewState, tuple[str, ...]]:
+    events = inspector.recording.events
+    return decode_state(query, default, size=events.size, duration_us=events.t_last - events.t_first + 1)
+
+
+def test_a_state_comes_back_from_its_address(inspector: Inspector, recording: Recording) -> None:
+    default = current_state(Inspector(recording))
+    assert encode_state(default, default) == ""
+    assert decode("", default, inspector) == (default, ())
+    state = replace(
+        default, start_us=12_345, length_us=40_001, selection=Selection(0, (3, 4, 90, 100), True, 1500),
+        knobs=replace(inspector.knobs, phase=-0.5, clock_offset=-120.5, model="circle"), image=ImageKind.TIME_SURFACE,
+        colour=Colour.RESIDUAL, axis=Axis.TIME, view=View.XY, overlaid=True, against=replace(inspector.knobs, apex=0.0),
+        sources=tuple(inspector.sources.items()),
+    )  # fmt: skip
+    query = encode_state(state, default)
+    assert len(query) < 600
+    found, wrong = decode("?" + query, default, inspector)
+    assert wrong == ()
+    for ours, given in ((found.knobs, state.knobs), (found.against, state.against)):
+        assert ours is not None
+        assert given is not None
+        assert ours.model == given.model
+        assert ours.phase == pytest.approx(given.phase, rel=1e-9)
+        assert ours.apex == pytest.approx(given.apex, rel=1e-9)
+        assert ours.clock_offset == given.clock_offset
+    assert replace(found, knobs=state.knobs, against=state.against) == state
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "apex=nan", "apex=inf", "apex=-1", "apex=1e400", "apex=", "apex", "phase=x", "model=sphere", "image=film",
+        "region=1,2,3", "region=5,5,5,9", "region=0,0,999,9", "region=-1,0,9,9", "region=1.5,0,9,9", "start_ms=-1",
+        "start_ms=1e99", "length_ms=0", "polarity=2", "hide_hot=yes", "noise_us=-5", "noise_us=\u0663", "sources=apex",
+        "sources=x:hand", "sources=apex:god", "unknown=1", "b_=1", "b_model=", "%ff=%ff", "<script>=1",
+        "focal_length=0",
+    ],
+)  # fmt: skip
+def test_a_wrong_address_is_explained_and_the_rest_is_taken(inspector: Inspector, query: str) -> None:
+    default = current_state(inspector)
+    found, wrong = decode(f"{query}&polarity=on", default, inspector)
+    assert found.selection == Selection(polarity=1)
+    assert replace(found, selection=default.selection) == default
+    assert len(wrong) == 1
+    assert wrong[0].startswith("the address gives")
+
+
+def test_a_long_address_is_refused(inspector: Inspector) -> None:
+    default = current_state(inspector)
+    found, wrong = decode("apex=1&" * 2000, default, inspector)
+    assert found == default
+    assert "14,000 characters" in wrong[0]
+
+
+def test_states_are_undone_and_redone(inspector: Inspector) -> None:
+    first = current_state(inspector)
+    history = History(first)
+    assert not history.can_undo
+    assert history.undo() == history.redo() == first
+    dragged = [replace(first, knobs=replace(first.knobs, apex=apex)) for apex in (0.01, 0.02, 0.03)]
+    for state in dragged:
+        history.add(state, "apex")
+    moved = replace(dragged[-1], start_us=5)
+    history.add(moved, "window")
+    assert history.undo() == dragged[-1]
+    assert history.can_redo
+    assert history.undo() == first
+    assert history.redo() == dragged[-1]
+    assert history.redo() == history.redo() == moved
+    history.undo()
+    history.add(first)
+    assert not history.can_redo
+    assert history.undo() == dragged[-1]
+    for k in range(1000):
+        history.add(replace(first, start_us=k))
+    undone = 0
+    while history.can_undo:
+        history.undo()
+        undone += 1
+    assert undone == 199
+
+
+def test_a_state_sets_the_inspector(inspector: Inspector, recording: Recording) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(10, 10, 80, 70)))
+    state, shown = current_state(inspector), inspector.show()
+    other = Inspector(recording)
+    apply_state(other, state)
+    assert current_state(other) == state
+    np.testing.assert_array_equal(other.show().after, shown.after)
+    empty = replace(state, selection=Selection(region=(0, 0, 1, 1)), length_us=1, knobs=Knobs())
+    with pytest.raises(AmiwarpError, match="another window"):
+        apply_state(other, empty)
+    assert current_state(other) == state
+
+
+# calibration
+
+
+@pytest.mark.parametrize("region", [None, (20, 10, 140, 110)])
+def test_a_calibration_uses_what_is_selected(
+    recording: Recording, inspector: Inspector, region: tuple[int, int, int, int] | None
+) -> None:
+    first, truth = recording.events.t_first, inspector.truth
+    assert truth is not None
+    inspector.open(first + 20_000, 180_000, Selection(region=region))
+    inspector.set(replace(truth, apex=0.5 * truth.apex))
+    said: list[str] = []
+    settings = Settings(model="exact", stages=("sharpness",))
+    found = calibrate_selected(inspector, settings, progress=lambda what, share: said.append(what))
+    assert said
+    assert found.calibration.camera == recording.camera
+    assert found.calibration.parameters["apex"] == pytest.approx(truth.apex, abs=math.radians(0.12))
+    assert found.before < found.current < found.after
+    assert found.after == pytest.approx(inspector.show(truth).sharpness_after, rel=0.1)
+    assert found.scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
+    assert ("x 20 to 139, y 10 to 109 px" in found.scope) is (region is not None)
+    assert scope_text(inspector) == found.scope
+    assert inspector.knobs.apex == 0.5 * truth.apex  # nothing is accepted yet
+    inspector.accept(found.calibration)
+    assert inspector.sources["apex"] is Source.CALIBRATED
+    shown = inspector.show()
+    assert (shown.sharpness_before, shown.sharpness_after) == pytest.approx((found.before, found.after), rel=0.03)
+
+
+def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) -> None:
+    start, length = inspector.first_window()
+    inspector.open(start, length // 10, Selection(1, (20, 10, 140, 110), noise_us=3000))
+    assert scope_text(inspector).count(",") >= 3
+    assert "ON events" in scope_text(inspector)
+    assert "without background activity (3 ms)" in scope_text(inspector)
+    with pytest.raises(AmiwarpError, match=r"quarter turn|too few"):
+        calibrate_selected(inspector)
+
+
+def test_the_cost_surface_has_its_top_at_the_truth(inspector: Inspector) -> None:
+    truth = inspector.knobs
+    inspector.set(replace(truth, apex=0.8 * truth.apex, phase=truth.phase + 0.6))
+    shares: list[float] = []
+    surface = cost_surface(inspector, points=(9, 13), progress=lambda what, share: shares.append(share))
+    assert surface.names == ("apex", "phase")
+    assert surface.sharpness.shape == (13, 9)
+    assert shares == pytest.approx(np.arange(13) / 13)
+    apex, phase = surface.best
+    assert apex == pytest.approx(truth.apex, abs=0.21 * truth.apex)
+    assert abs(math.remainder(phase - truth.phase, math.tau)) < math.radians(31.0)
+    still = np.ptp(surface.sharpness[:, 0])
+    assert still < 0.01 * np.ptp(surface.sharpness)  # without an apex, the phase does not matter
+
+
+def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording, inspector: Inspector) -> None:
+    without = Inspector(replace(recording, encoder=None))
+    encoder = recording.encoder
+    assert encoder is not None
+    zero = float(encoder.angle_at([without.zero_us])[0])
+    without.set(replace(inspector.knobs, rpm=718.0, phase=inspector.knobs.phase + zero))
+    surface = cost_surface(without, points=(5, 7))
+    assert surface.names == ("apex", "rpm")
+    assert surface.best[1] == pytest.approx(720.0, abs=2.1)
+
+
+# downloads
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("most_events", [4_000_000, 6400])
+def test_the_events_of_the_window_are_downloaded(
+    inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compensated: bool, most_events: int
+) -> None:
+    monkeypatch.setattr(viewer, "MOST_EVENTS", most_events)
+    monkeypatch.setattr(downloads, "BLOCK", 10_000)
+    region, (start, length) = (20, 10, 140, 110), inspector.first_window()
+    inspector.open(start, length, Selection(1, region))
+    path = tmp_path / "events.h5"
+    count = write_events(inspector, path, compensated=compensated)
+    events = inspector.recording.events.between(start, start + length)
+    inside = (events.x >= 20) & (events.x < 140) & (events.y >= 10) & (events.y < 110)
+    expected = events[(events.p == 1) & inside]
+    assert count == len(expected) > inspector.loaded.selected * (1 if most_events == 6400 else 0)
+    written = open_recording(path)
+    found = written.events.slice(0, count)
+    np.testing.assert_array_equal(found.t, expected.t)
+    xy = np.stack([found.x, found.y], axis=1).astype(np.float32)
+    moved = compensate_events(expected, inspector.model, inspector.encoder)
+    np.testing.assert_allclose(xy, moved if compensated else np.stack([expected.x, expected.y], axis=1), atol=1e-3)
+    assert written.encoder is not None
+    assert inspector.recording.encoder is not None
+    np.testing.assert_allclose(written.encoder.angle_at(found.t), inspector.encoder.angle_at(found.t))
+    assert len(written.encoder.t) < len(inspector.recording.encoder.t)
+    with pytest.raises(AmiwarpError, match="write to another file"):
+        write_events(inspector, path, compensated=compensated)
+
+
+def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
+    inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
+    for kind in (ImageKind.COUNT, ImageKind.POLARITY, ImageKind.TIME_SURFACE):
+        images = make_images(inspector, kind)
+        values = np.load(
+            io.BytesIO(as_bytes(".npy", lambda path, images=images: write_image(images, path, before=True)))
+        )
+        np.testing.assert_array_equal(values, images.before)
+        with Image.open(io.BytesIO(as_bytes(".png", lambda path, images=images: write_image(images, path)))) as picture:
+            np.testing.assert_array_equal(np.asarray(picture), images.scale.rgb(images.after))
+        with Image.open(io.BytesIO(as_bytes(".tif", lambda path, images=images: write_image(images, path)))) as picture:
+            assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
+            first = images.after[0] if kind is ImageKind.POLARITY else images.after
+            np.testing.assert_array_equal(np.asarray(picture), first)
+    with pytest.raises(AmiwarpError, match=r"\.png, \.tif, \.npy"):
+        write_image(images, tmp_path / "image.jpg")
+    with pytest.raises(AmiwarpError, match="no image of count before"):
+        write_image(replace(images, kind=ImageKind.COUNT, before=None), tmp_path / "image.png", before=True)
+    write_image(images, tmp_path / "image.png")
+    with pytest.raises(AmiwarpError, match="exists"):
+        write_image(images, tmp_path / "image.png")
+
+
+def test_a_calibration_is_downloaded(inspector: Inspector) -> None:
+    data = json.loads(as_bytes(".json", inspector.as_calibration().save))
+    assert data["parameters"]["apex"]["value"] == TRUE.apex
