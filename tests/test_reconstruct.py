@@ -102,6 +102,27 @@ def test_its_contrast_is_the_threshold(picture: Picture, truth: NDArray[np.float
     assert slope == pytest.approx(0.25, abs=0.03)
 
 
+def test_the_default_window_leaves_out_the_first_turn(recording: Recording, truth: NDArray[np.float32]) -> None:
+    """Shorter recordings: as late as possible."""
+    found = reconstruct(recording, model=MODEL)
+    first, last = recording.events.t_first, recording.events.t_last
+    assert found.start_us == pytest.approx(first + TURN_US, abs=5)
+    assert correlation(found.log, truth, everywhere(found)) >= 0.99
+    work = Reconstruction(recording, model=MODEL)
+    assert work.span(length_us=150_000) == (last + 1 - 150_000, 150_000)
+    assert work.span(turns=10.0)[0] == first
+    still = Reconstruction(recording, model=MODEL, encoder=Encoder.constant_speed(0.0, 0, last))
+    assert still.span(length_us=20_000) == (first + 100_000, 20_000)
+
+
+@pytest.mark.parametrize(("turns", "bar"), [(1.25, 0.05), (2.4, 0.01)])
+def test_references_at_the_start_do_not_bias_the_thresholds(recording: Recording, turns: float, bar: float) -> None:
+    """The simulated pixels stood still before the start, so two of three first events are ON."""
+    events = recording.events.between(0, round(turns * TURN_US))
+    work = Reconstruction(with_events(recording, events), model=MODEL)
+    assert abs(work.window(0, TURN_US).off_excess) < bar
+
+
 @pytest.mark.parametrize(("turns", "bar"), [(0.25, 0.90), (2.0, 0.96)])
 def test_other_lengths(recording: Recording, truth: NDArray[np.float32], turns: float, bar: float) -> None:
     found = reconstruct(recording, model=MODEL, start_us=START, turns=turns)

@@ -34,7 +34,11 @@ class WindowOptions:
 
     start: Annotated[
         float | None,
-        typer.Option(help="Start of the window (s from the first event). Default: 0.", rich_help_panel=_WINDOW),
+        typer.Option(
+            help="Start of the window (s from the first event). Default: one turn, less in short recordings; 0 for a "
+            "video.",
+            rich_help_panel=_WINDOW,
+        ),
     ] = None
     length: Annotated[
         float | None, typer.Option(min=1e-6, help="Length of the window (s).", rich_help_panel=_WINDOW)
@@ -63,9 +67,10 @@ class WindowOptions:
         ),
     ] = None
 
-    def span(self, work: Reconstruction) -> tuple[int, int]:
-        """Return the start and the length of the time window [us]."""
-        start = work.recording.events.t_first + round((self.start or 0.0) * 1e6)
+    def span(self, work: Reconstruction, *, video: bool) -> tuple[int, int]:
+        """Return the start and the length of the time window [us]. A video begins with the recording."""
+        after = 0.0 if self.start is None and video else self.start
+        start = None if after is None else work.recording.events.t_first + round(after * 1e6)
         return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
 
     def camera_rotation(self) -> CameraRotation | None:
@@ -147,7 +152,7 @@ def run(
         open_recording(recording), Calibration.load(calibration), camera_rotation=window.camera_rotation(),
         fill=picture.fill, device=device,
     )  # fmt: skip
-    start, length = window.span(work)
+    start, length = window.span(work, video=video)
     began = time.perf_counter()
     with progress("reconstructing") as advance:
         if video:

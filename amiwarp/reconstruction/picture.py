@@ -24,7 +24,7 @@ from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.known import dilated, known_nodes
 from amiwarp.reconstruction.result import Picture, upload_picture
-from amiwarp.reconstruction.window import busiest_square, map_tile, off_excess_by_counts
+from amiwarp.reconstruction.window import busiest_square, map_tile, off_excess_by_counts, settled_span
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
@@ -56,8 +56,6 @@ SPANS_PER_TURN = 8
 """Number of time spans per turn. A pixel that is silent in all spans of a turn adds one no-change equation per span."""
 NOISE_DISTANCE = 2
 """Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
-STILL_WINDOW_US = 100_000
-"""Default length of a time window if the prism does not turn [us]."""
 
 
 class Reconstruction:
@@ -134,7 +132,7 @@ class Reconstruction:
         Parameters
         ----------
         start_us : int, optional
-            Start [us]; by default the first event.
+            Start [us]; by default one turn (0.1 s without rotation) after the first event, or as late as possible.
         length_us : int, optional
             Length [us]; by default one turn, or 0.1 s if the prism does not turn.
         turns : float, optional
@@ -157,8 +155,8 @@ class Reconstruction:
             if self.turn_us is None:
                 raise AmiwarpError("turns is given, but the prism does not turn; give a length")
             length_us = round(turns * self.turn_us)
-        start = first if start_us is None else start_us
-        length = length_us or round(self.turn_us or STILL_WINDOW_US)
+        settled, length = settled_span(self.recording.events, self.turn_us, length_us)
+        start = settled if start_us is None else start_us
         if length < 1 or start > last or start + length <= first:
             where = f"{start} .. {start + length} us"
             raise AmiwarpError(
@@ -361,7 +359,8 @@ def reconstruct(
     encoder : Encoder, optional
         Encoder, if neither calibration nor recording provides one.
     start_us : int, optional
-        Start of the window [us]; by default the first event.
+        Start of the window [us]; by default one turn (0.1 s without rotation of the prism) after the first event, or as
+        late as possible.
     length_us : int, optional
         Length of the window [us]; by default one turn, or 0.1 s if the prism does not turn.
     turns : float, optional

@@ -1,4 +1,4 @@
-"""Properties of one time window: size of the map, busiest part of the image, ratio of the thresholds."""
+"""Properties of one time window: time, size of the map, busiest part of the image, ratio of the thresholds."""
 
 from __future__ import annotations
 
@@ -20,6 +20,20 @@ if TYPE_CHECKING:
 
 LARGEST_MARGIN = 0.5
 """Largest margin of the map on each side of the image, relative to the image's width."""
+STILL_WINDOW_US = 100_000
+"""Default length of a time window if the prism does not turn [us]."""
+
+
+def settled_span(source: EventSource, turn_us: float | None, length_us: int | None) -> tuple[int, int]:
+    """Return start and length [us] of a time window without the beginning of the recording, if it is long enough.
+
+    There, the reference of a pixel is unknown until its first event. ``turn_us``: duration of a turn [us], None if the
+    prism does not turn. ``length_us``: length of the window, by default a turn.
+    """
+    beginning = round(turn_us or STILL_WINDOW_US)
+    length = length_us or beginning
+    first, last = source.t_first, source.t_last
+    return max(first, min(first + beginning, last + 1 - length)), length
 
 
 def map_tile(model: Model, camera_rotation: CameraRotation, length_us: int) -> tuple[int, int, Tiles]:
@@ -57,14 +71,28 @@ def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: i
     """Return the ratio of the OFF to the ON threshold, minus 1, from event counts over whole turns near the window.
 
     After a whole turn, a pixel is back at its brightness. So the number of ON events times the ON threshold equals the
-    number of OFF events times the OFF threshold.
+    number of OFF events times the OFF threshold. This does not hold in the first turn of a recording: before a pixel
+    fires, its reference is not the brightness that an event left. So later turns are counted; in a recording of less
+    than two turns, the first event of each pixel is not counted.
     """
     first, last = source.t_first, source.t_last
     if turn_us is None or last - first < turn_us:
         return 0.0
-    length = max(1, math.floor(length_us / turn_us)) * turn_us
-    start = min(max(start_us, first), last - length)
-    p = read_between(source, round(start), round(start + length)).p
-    p = p if isinstance(p, np.ndarray) else p.numpy()
+    turns = (last - first) / turn_us
+    length = max(1, math.floor(min(length_us / turn_us, turns - 1.0))) * turn_us
+    start = min(max(start_us, first + turn_us), last - length)
+    settled = start >= first + turn_us
+    events = read_between(source, round(start if settled else first), round(start + length))
+    t, x, y, p = (v if isinstance(v, np.ndarray) else v.numpy() for v in (events.t, events.x, events.y, events.p))
+    if not settled:
+        counted = t >= start
+        counted[first_of_each_pixel(x, y, source.size[0])] = False
+        p = p[counted]
     on = int(p.sum())
     return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0
+
+
+def first_of_each_pixel(x: NDArray[np.uint16], y: NDArray[np.uint16], width: int) -> NDArray[np.int64]:
+    """Return the index of the first event of each pixel that fires, for events in time order, shape (pixels,)."""
+    index: NDArray[np.int64] = np.unique(y.astype(np.int64) * width + x, return_index=True)[1]
+    return index

@@ -39,16 +39,14 @@ print(
 # ------------------
 #
 # Here the true model is known, so no calibration is needed. For a recording of
-# yours give the result of :func:`amiwarp.calibrate` instead. The window starts
-# after 50 ms, because the first event of a pixel has no earlier one to be compared
-# with.
+# yours give the result of :func:`amiwarp.calibrate` instead. By default the window
+# starts after the first turn, because the first event of a pixel has no earlier one
+# to be compared with.
 
 model = amiwarp.truth_model(camera, recording.truth, prism.flat_side)
 pictures = {}
 for turns in (0.25, 0.5, 1.0):
-    pictures[turns] = amiwarp.reconstruct(
-        recording, model=model, start_us=50_000, turns=turns
-    )
+    pictures[turns] = amiwarp.reconstruct(recording, model=model, turns=turns)
 
 
 def fitted(picture):
