@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -92,7 +92,7 @@ def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: i
     return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0
 
 
-def first_of_each_pixel(x: NDArray[np.uint16], y: NDArray[np.uint16], width: int) -> NDArray[np.int64]:
+def first_of_each_pixel(x: NDArray[Any], y: NDArray[Any], width: int) -> NDArray[np.int64]:
     """Return the index of the first event of each pixel that fires, for events in time order, shape (pixels,)."""
     index: NDArray[np.int64] = np.unique(y.astype(np.int64) * width + x, return_index=True)[1]
     return index
