@@ -178,7 +178,7 @@ def test_pose_over_the_rate_of_pictures(streams: Streams, monkeypatch: pytest.Mo
     def detect(image: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
         shapes.append(image.shape)
         (window,) = pose.windows(streams, 100.0, 1)
-        return pose.image_joints(streams.frame(window.end_us), streams.camera)
+        return pose.image_joints(streams, window.end_us)
 
     values = pose.measure(streams, QUICK, {"perfect": detect})
     check_tables(pose, values)
@@ -208,15 +208,15 @@ def test_a_learned_reconstruction_is_judged_next_to_ours(streams: Streams, monke
 
 def test_pose_of_a_perfect_detector(streams: Streams) -> None:
     """The true joints of the instant score 1, and joints of another instant less."""
-    now, later = (pose.image_joints(streams.frame(t), streams.camera) for t in (10_000, 45_000))
-    assert pose.pose_scores(now, now) == (1.0, pytest.approx(1.0))
+    now, later = (pose.image_joints(streams, t) for t in (10_000, 20_000))
+    assert pose.pose_scores(now, now) == (dict.fromkeys(pose.FRACTIONS, 1.0), pytest.approx(1.0))
     pdj, iou = pose.pose_scores(later, now)
-    assert pdj is not None
+    assert pdj[pose.FRACTIONS[0]] < pdj[pose.FRACTIONS[-1]]
     assert iou is not None
     assert iou < 1.0
-    assert pose.pose_scores({}, now) == (0.0, 0.0)
+    assert pose.pose_scores({}, now) == (dict.fromkeys(pose.FRACTIONS, 0.0), 0.0)
     hidden = {**now, "left shoulder": np.full(2, np.nan)}
-    assert pose.pose_scores(now, hidden) == (None, None)
+    assert pose.pose_scores(now, hidden) == (dict.fromkeys(pose.FRACTIONS), None)
 
 
 def test_true_joints_project_to_their_pixels(streams: Streams) -> None:
@@ -225,7 +225,7 @@ def test_true_joints_project_to_their_pixels(streams: Streams) -> None:
     (turn,), (place,) = scene.trajectory.poses([0.02])
     local = (scene.world.joints["head"].poses([0.02])[1][0] - place) @ turn
     expected = [CAMERA.fx * local[0] / local[2] + CAMERA.cx, CAMERA.fy * local[1] / local[2] + CAMERA.cy]
-    found = pose.image_joints(streams.frame(20_000), streams.camera)["head"]
+    found = pose.image_joints(streams, 20_000)["head"]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)  # px
 
 

@@ -53,6 +53,25 @@ def test_the_nearest_track_is_chosen() -> None:
     assert found.index.tolist() == [0, 3, 1, 2]
 
 
+def test_random_corners_agree_with_a_search_through_all_tracks() -> None:
+    rng = np.random.default_rng(3)
+    t, xy = np.sort(rng.integers(0, 400_000, 600)), rng.uniform(-5.0, 40.0, (600, 2))
+    last: list[int] = []
+    expected = np.zeros(600, int)
+    for i in range(600):
+        away = [math.inf if t[i] - t[k] > measures.GAP_US else math.hypot(*(xy[k] - xy[i])) for k in last]
+        best = int(np.argmin(away)) if away else 0
+        if not away or away[best] > measures.RADIUS_PX:
+            best = len(last)
+            last.append(i)
+        last[best], expected[i] = i, best
+    kept = np.bincount(expected)[expected] >= 2
+    found = measures.link_corners(t, xy)
+    assert len(found.t) == kept.sum() > 300
+    numbers = np.unique(expected[kept])
+    np.testing.assert_array_equal(numbers[found.number], expected[found.index])
+
+
 def test_no_corners_give_no_tracks() -> None:
     found = measures.link_corners(np.zeros(0, np.int64), np.zeros((0, 2)))
     assert len(found.first) == 0

@@ -36,6 +36,14 @@ def load(kernel: Any, device: Any) -> None:
     kernel.module.load(device, block_dim=1 if device.is_cpu else None)
 
 
+def load_all(device: Any) -> None:
+    """Compile and load the kernels of all imported modules, several at a time.
+
+    Processes that start later find them in Warp's cache. Processes that start together would all compile them.
+    """
+    wp.force_load(device, max_workers=cpu_threads())
+
+
 def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:
     """Return at most ``parts`` contiguous (start, stop) ranges that cover ``range(n)``.
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ from typing import Any
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
+from amiwarp.kernels.cpu_threads import cpu_threads, limited_cpu_threads
+from amiwarp.kernels.launch import load_all
 from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, RecordedStreams, Streams
+from amiwarp.studies.evaluate.measures.libraries import library
 from amiwarp.studies.evaluate.registry import load
 from amiwarp.studies.evaluate.results import CellResult, Settings
 
@@ -30,6 +34,8 @@ class Job:
     """Names of the evaluations."""
     settings: Settings
     """Size of the run."""
+    threads: int | None = None
+    """Number of CPU threads; None for all."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +51,35 @@ class JobResult:
 def run_job(job: Job) -> JobResult:
     """Simulate the condition of a job once, or open its recording, and run its evaluations."""
     began = time.process_time()
-    try:
-        if isinstance(job.condition, Condition):
-            streams: RecordedStreams = Streams(job.condition, job.settings.device)
-        else:
-            streams = RecordedStreams.of(job.condition, job.settings.device)
-        cells = [_run(name, streams, job) for name in job.evaluations]
-    except AmiwarpError as error:
-        cells = [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
+    with limited_cpu_threads(job.threads), _limited_opencv(cpu_threads()):
+        try:
+            if isinstance(job.condition, Condition):
+                streams: RecordedStreams = Streams(job.condition, job.settings.device)
+            else:
+                streams = RecordedStreams.of(job.condition, job.settings.device)
+            cells = [_run(name, streams, job) for name in job.evaluations]
+        except AmiwarpError as error:
+            cells = [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
     return JobResult(cells, time.process_time() - began)
+
+
+@contextlib.contextmanager
+def _limited_opencv(threads: int) -> Iterator[None]:
+    """Let OpenCV use a number of threads within the block; by default it uses all cores."""
+    cv2 = library("cv2")
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def compile_kernels(names: Sequence[str], device: str) -> None:
+    """Compile the kernels of evaluations, before several processes would compile the same ones at once."""
+    for name in names:
+        load(name)
+    load_all(device)
 
 
 def _run(name: str, streams: RecordedStreams, job: Job) -> CellResult:
@@ -112,7 +138,7 @@ class Store:
             "processor_s": cell.processor_s,
         }
         path = self._path(cell.evaluation, cell.condition, settings)
-        write_text(path, json.dumps(data, indent=1, default=str) + "\n", overwrite=True)
+        write_text(path, json.dumps(data, default=str, separators=(",", ":")) + "\n", overwrite=True)
 
 
 def plan(names: Sequence[str], settings: Settings, recordings: Iterable[Path], *, worlds: bool = True) -> list[Job]:

@@ -59,6 +59,8 @@ LIMITS = {
     "mismatch and noise": ("mismatch", "leak_hz", "shot_noise_hz", "shot_noise_dark"),
 }
 """Limits of a sensor, by the fields of :class:`amiwarp.SensorModel` that describe them."""
+FRAMES_KEPT = 64
+"""Number of instants whose ground truth is kept; more than an evaluation uses for several streams."""
 ENOUGH = 0.95
 """Smallest number of events of the stream with the same count, relative to those of the AMI-EV."""
 
@@ -253,7 +255,7 @@ class Streams(RecordedStreams):
         self.simulation = condition.simulation(device)
         super().__init__(self.simulation.run(), device)
         self._places: dict[Stream, NDArray[np.float32] | None] = {}
-        self.frame = lru_cache(maxsize=8)(self._frame)
+        self.frame = lru_cache(maxsize=FRAMES_KEPT)(self._frame)
 
     @property
     def start_us(self) -> int:
@@ -328,7 +330,7 @@ class Streams(RecordedStreams):
         return TruthRenderer(self.simulation)
 
     def _frame(self, t_us: int) -> FrameTruth:
-        """Return the ground truth of all pixels at a time; :attr:`frame` keeps the last eight."""
+        """Return the ground truth of all pixels at a time; :attr:`frame` keeps the last ones."""
         return self._truth.at(t_us)
 
     def indexed_window(self, stream: Stream, start_us: int, end_us: int) -> tuple[Events, NDArray[np.int64]]:

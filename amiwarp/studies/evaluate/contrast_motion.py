@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
 
 from amiwarp.events.events import Events
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.studies.evaluate.measures.smoothing import smoothed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,24 +31,31 @@ LEAST_SHARE = 0.25
 """Number of events, relative to the median tile, below which a tile is left out."""
 MOST_EVENTS = 40_000
 """Largest number of events from which the camera's rotation is estimated; more are thinned evenly."""
+MOST_LOCAL = 100_000
+"""Largest number of events from which local motion is estimated; more are thinned evenly."""
+
+
+def thinned(events: Events, most: int) -> Events:
+    """Return at most ``most`` of the events, spread evenly."""
+    return events[:: max(1, -(-len(events) // most))]
 
 
 def rotated_back(events: Events, camera: Camera, rotation: CameraRotation) -> Events:
     """Return the events where the camera saw their scene points at ``rotation.middle_us``."""
-    from scipy.spatial.transform import Rotation
-
     rays = camera.pixels_to_rays(np.stack([events.x, events.y], axis=1).astype(np.float32))
     tau = ((events.t - rotation.middle_us) * 1e-6).astype(np.float64)
-    turned = Rotation.from_rotvec(rotation.rotation(tau)).apply(rays)
-    xy = camera.rays_to_pixels(turned.astype(np.float32))
+    xy = camera.rays_to_pixels(turned(rays, rotation.rotation(tau)).astype(np.float32))
     return Events(xy[:, 0].copy(), xy[:, 1].copy(), events.t, events.p)
 
 
-def moved_back(events: Events, velocity: tuple[float, float], middle_us: float) -> Events:
-    """Return the events where their points were at ``middle_us``, for a velocity in the image [px/s]."""
-    tau = (events.t - middle_us) * 1e-6
-    x, y = (at - v * tau for at, v in zip((events.x, events.y), velocity, strict=True))
-    return Events(x.astype(np.float32), y.astype(np.float32), events.t, events.p)
+def turned(rays: NDArray[np.floating], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rays turned by rotation vectors [rad], both of shape (n, 3), by the formula of Rodrigues."""
+    angle = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))[:, None]
+    axis = vectors / np.maximum(angle, 1e-300)
+    cos, (ax, ay, az), (x, y, z) = np.cos(angle), axis.T, rays.T
+    across = np.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x], axis=1)
+    along = np.einsum("ij,ij->i", axis, rays)[:, None]
+    return np.asarray(rays * cos + across * np.sin(angle) + axis * (along * (1.0 - cos)))
 
 
 def estimate_rotation(events: Events, camera: Camera) -> CameraRotation:
@@ -60,7 +67,7 @@ def estimate_rotation(events: Events, camera: Camera) -> CameraRotation:
     """
     if not len(events):
         return CameraRotation()
-    few = dithered(events[:: -(-len(events) // MOST_EVENTS)])
+    few = dithered(thinned(events, MOST_EVENTS))
     search = _RotationSearch(few, camera)
     found = []
     for k in range(len(SMOOTHING_PX)):
@@ -129,7 +136,7 @@ def tiles(image: NDArray[np.float32], side: int = TILE) -> NDArray[np.float32]:
 def smooth_image(events: Events, votes: Votes, sigma: float) -> NDArray[np.float32]:
     """Return the image of the events [events per pixel], smoothed; ``votes`` are its buffers."""
     votes.add_unmoved(events)
-    return np.asarray(ndimage.gaussian_filter(votes.take()[0], sigma), np.float32)
+    return smoothed(votes.take()[0], sigma)
 
 
 def velocity_grid(reach: float, step: float) -> NDArray[np.float64]:
@@ -141,7 +148,7 @@ def velocity_grid(reach: float, step: float) -> NDArray[np.float64]:
 
 def local_agreement(
     events: Events, size: tuple[int, int], velocities: NDArray[np.float64], pool: float
-) -> Iterator[NDArray[np.float64]]:
+) -> Iterator[NDArray[np.float32]]:
     """Yield how well events agree under each velocity [px/s] of shape (k, 2), as images of shape (height, width).
 
     It is the mean, over the events of a surrounding, of the density of events of their polarity less that of the other
@@ -152,38 +159,41 @@ def local_agreement(
     votes = Votes(CanvasShape(width, height, per_polarity=True), "cpu")
     place, sign = pixel_index(events, size), 2.0 * events.p - 1.0
     count = np.bincount(place, minlength=width * height).reshape(height, width).astype(np.float64)
-    around = np.maximum(ndimage.gaussian_filter(count, pool), 1e-9)
+    around = np.maximum(smoothed(count, pool), 1e-9)
     for moved in _moved(events, velocities):
         votes.add_unmoved(moved)
         off, on = votes.take()
-        density = sign * ndimage.gaussian_filter(on - off, DENSITY_PX).ravel()[pixel_index(moved, size)]
+        density = sign * smoothed(on - off, DENSITY_PX).ravel()[pixel_index(moved, size)]
         total = np.bincount(place, weights=density, minlength=width * height).reshape(height, width)
-        yield ndimage.gaussian_filter(total, pool) / around
+        yield smoothed(total, pool) / around
 
 
 def local_contrast(
     events: Events, size: tuple[int, int], velocities: NDArray[np.float64], pool: float
-) -> Iterator[NDArray[np.float64]]:
+) -> Iterator[NDArray[np.float32]]:
     """Yield variance over mean of the image of moved events around each pixel, arguments as in :func:`local_agreement`.
 
     Both polarities count, because an edge behind the prism has both within a turn.
     """
     votes = Votes(CanvasShape(*size), "cpu")
     for moved in _moved(events, velocities):
-        image = smooth_image(moved, votes, DENSITY_PX).astype(np.float64)
-        mean, square = (ndimage.gaussian_filter(values, pool) for values in (image, image * image))
+        image = smooth_image(moved, votes, DENSITY_PX)
+        mean, square = (smoothed(values, pool) for values in (image, image * image))
         yield (square - mean * mean) / np.maximum(mean, 1e-9)
 
 
 def _moved(events: Events, velocities: NDArray[np.float64]) -> Iterator[Events]:
     """Yield the events moved back to the middle of their time span, for each velocity [px/s]."""
     middle_us = (int(events.t[0]) + int(events.t[-1])) / 2.0
-    for vx, vy in velocities:
-        yield moved_back(events, (float(vx), float(vy)), middle_us)
+    tau = ((events.t - middle_us) * 1e-6).astype(np.float32)
+    x, y = events.x.astype(np.float32), events.y.astype(np.float32)
+    for vx, vy in velocities.astype(np.float32):
+        yield Events(x - vx * tau, y - vy * tau, events.t, events.p)
 
 
 def pixel_index(events: Events, size: tuple[int, int]) -> NDArray[np.int64]:
     """Return the index of each event's pixel, row by row; events outside have that of the nearest pixel."""
     width, height = size
-    x, y = (np.nan_to_num(np.rint(v.astype(np.float64))).astype(np.int64) for v in (events.x, events.y))
-    return np.asarray(np.clip(y, 0, height - 1) * width + np.clip(x, 0, width - 1))
+    x, y = (np.rint(np.clip(np.nan_to_num(v), 0, n - 1)).astype(np.int64)
+            for v, n in ((events.x, width), (events.y, height)))  # fmt: skip
+    return np.asarray(y * width + x)

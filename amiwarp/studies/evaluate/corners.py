@@ -41,7 +41,7 @@ DIFFERENCES = (
     "The paper's main text gives neither the tracker nor the limit at which a track ends. The ranking depends on the "
     "limit: see the curves. Scenes are simulated."
 )
-VERSION = 1
+VERSION = 2
 NEEDS_TRUTH = True
 
 APEX = math.radians(1.0)

@@ -65,7 +65,7 @@ DIFFERENCES = (
     "at a narrow tolerance says more. Matching the nearest first finds 90 to 99 % of the largest possible number of "
     "matches, which would take a hundred times as long for 99 thresholds."
 )
-VERSION = 2
+VERSION = 3
 NEEDS_TRUTH = True
 
 WINDOW_US = 33_000
@@ -77,7 +77,8 @@ USUAL, STRICT = 6.0, 1.5
 CANNY, GEOMETRY = "Canny", "geometry"
 """Kinds of true edges in the comparison."""
 SIGMAS = {1.0: "Canny, σ 1 px", CANNY_SIGMA: CANNY, 3.0: "Canny, σ 3 px"}
-"""Standard deviations of Canny's Gaussian in the sensitivity curve [px], and the kinds of edges that they give."""
+"""Standard deviations of Canny's Gaussian in the sensitivity curve [px], and the kinds of edges that they give. The
+curve is that at the strict tolerance."""
 SECTORS = 6
 """Number of classes of the angle between image motion and the normal of an edge."""
 SLOWEST = 5.0
@@ -119,24 +120,26 @@ class _Image:
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     """Return counts of matches over the thresholds, entropies, recall by direction, and example pictures."""
-    rows, sectors, pictures = [], [], {}
+    images, rows, sectors, pictures = [], [], [], {}
     middles = _middles(streams, settings)
     names: list[str] = [s.value for s in streams.names if _enough(streams, s, settings)]
     for name in (*names, CHANCE):
-        images = [_image(streams, name, t) for t in middles]
-        masks = [image.masks() for image in images]
-        counted = _count(name, images, masks)
+        windows = [_image(streams, name, t) for t in middles]
+        masks = [window.masks() for window in windows]
+        images.append(_summary(name, masks))
+        counted = _count(name, windows, masks)
         rows += counted
         if name != CHANCE:
-            best = _best(next(r for r in counted if (r["truth"], r["tolerance"]) == (CANNY, STRICT)))
-            sectors += _sectors(name, images, [mask[best][1] for mask in masks])
-        pictures[name] = _shown(images[0].image)
+            strict = next(r for r in counted if (r["truth"], r["tolerance"]) == (CANNY, STRICT))
+            best = best_f(_counts(strict, images[-1]))[0]
+            sectors += _sectors(name, windows, [mask[best][1] for mask in masks])
+        pictures[name] = _shown(windows[0].image)
     frame = streams.frame(middles[0])
     pictures["grey picture"] = _shown(grey_picture(frame.intensity))
     true = _true(frame)
     pictures |= {name: _shown(true[name]) for name in (CANNY, GEOMETRY)}
     first = streams.condition.seed == settings.first_seed
-    return {"rows": rows, "sectors": sectors, "pictures": pictures if first else {}}
+    return {"images": images, "rows": rows, "sectors": sectors, "pictures": pictures if first else {}}
 
 
 def _enough(streams: Streams, stream: Stream, settings: Settings) -> bool:
@@ -176,33 +179,39 @@ def _scattered(count: int, size: tuple[int, int], seed: int) -> Events:
     return Events(places[:, 0].copy(), places[:, 1].copy(), np.zeros(count, np.int64), np.zeros(count, np.uint8))
 
 
+def _summary(name: str, masks: Sequence[Sequence[Masks]]) -> dict[str, Any]:
+    """Return the number of thinned pixels and the entropy of a stream's images over the thresholds."""
+    entropy = np.mean([[binary_entropy(above) for above, _ in mask] for mask in masks], axis=0)
+    found = np.sum([[np.count_nonzero(thin) for _, thin in mask] for mask in masks], axis=0)
+    return {"stream": name, "found": found.tolist(), "entropy": entropy.round(4).tolist()}
+
+
 def _count(name: str, images: Sequence[_Image], masks: Sequence[Sequence[Masks]]) -> list[dict[str, Any]]:
-    """Return the counts of a stream for each kind of true edges and tolerance."""
-    entropy = np.mean([[binary_entropy(above) for above, _ in mask] for mask in masks], axis=0).tolist()
-    found = np.sum([[int(thin.sum()) for _, thin in mask] for mask in masks], axis=0).tolist()
+    """Return the number of matches over the thresholds for each kind of true edges and tolerance."""
     rows = []
     for truth in images[0].true:
-        matched = np.sum([_matched(m, image.true[truth]) for m, image in zip(masks, images, strict=True)], axis=0)
-        true = [sum(int(image.true[truth].sum()) for image in images)] * len(THRESHOLDS)
-        rows += [
-            {"stream": name, "truth": truth, "tolerance": tolerance, "matched": m, "found": found, "true": true,
-             "entropy": entropy}
-            for tolerance, m in zip(TOLERANCES, matched.T.tolist(), strict=True)
-        ]  # fmt: skip
+        tolerances = TOLERANCES if truth in (CANNY, GEOMETRY) else (STRICT,)
+        matched = np.sum([_matched(m, image.true[truth], tolerances) for m, image in zip(masks, images, strict=True)],
+                         axis=0)  # fmt: skip
+        true = sum(int(image.true[truth].sum()) for image in images)
+        rows += [{"stream": name, "truth": truth, "tolerance": tolerance, "matched": m, "true": true}
+                 for tolerance, m in zip(tolerances, matched.T.tolist(), strict=True)]  # fmt: skip
     return rows
 
 
-def _matched(masks: Sequence[Masks], true: NDArray[np.bool_]) -> list[list[int]]:
+def _matched(masks: Sequence[Masks], true: NDArray[np.bool_], tolerances: Sequence[float]) -> list[list[int]]:
     """Return the number of matches for each threshold and tolerance."""
     counts: list[list[int]] = []
     for k, (_, thin) in enumerate(masks):
         same = k > 0 and thin is masks[k - 1][1]
-        counts.append(counts[-1] if same else [int(m.sum()) for m in match(thin, true, TOLERANCES)])
+        counts.append(counts[-1] if same else [np.count_nonzero(m) for m in match(thin, true, tolerances)])
     return counts
 
 
-def _best(row: dict[str, Any]) -> int:
-    return best_f(Counts(*(np.array(row[name]) for name in ("matched", "found", "true"))))[0]
+def _counts(row: dict[str, Any], images: dict[str, Any]) -> Counts:
+    """Return the counts of a row of matches and of the summary of its images."""
+    matched, found = np.array(row["matched"]), np.array(images["found"])
+    return Counts(matched, found, np.full(len(found), row["true"]))
 
 
 def _sectors(name: str, images: Sequence[_Image], found: Sequence[NDArray[np.bool_]]) -> list[dict[str, Any]]:
@@ -240,24 +249,28 @@ def _shown(image: NDArray[Any]) -> str:
 
 def scores(results: Sequence[CellResult]) -> list[dict[str, Any]]:
     """Return the ODS-F of each world, motion, stream, kind of truth and tolerance, with its precision and recall."""
-    sums: dict[tuple[Any, ...], dict[str, Any]] = {}
+    images = {(_recording(r), r["stream"]): r for r in rows_of(results, "images")}
+    sets: dict[tuple[Any, ...], list[tuple[Counts, list[float]]]] = {}
     for row in rows_of(results, "rows"):
+        seen = images[_recording(row), row["stream"]]
         key = tuple(row[c] for c in ("scene", "camera", "stream", "truth", "tolerance"))
-        members = sums.setdefault(key, {"rows": []})
-        members["rows"].append(row)
+        sets.setdefault(key, []).append((_counts(row, seen), seen["entropy"]))
     out = []
-    for (scene, camera, stream, truth, tolerance), members in sums.items():
-        total = Counts(*(np.sum([r[n] for r in members["rows"]], axis=0) for n in ("matched", "found", "true")))
+    for (scene, camera, stream, truth, tolerance), members in sets.items():
+        total = Counts(*(np.sum([getattr(c, n) for c, _ in members], axis=0) for n in ("matched", "found", "true")))
         best, score = best_f(total)
-        each = [2 * r["matched"][best] / max(1, r["found"][best] + r["true"][best]) for r in members["rows"]]
         out.append({
             "scene": scene, "camera": camera, "stream": stream, "truth": truth, "tolerance": tolerance, "f": score,
-            "std": float(np.std(each)), "precision": float(total.precision[best]), "seeds": len(each),
-            "recall": float(total.recall[best]),
-            "entropy": float(np.mean([r["entropy"][best] for r in members["rows"]])),
+            "std": float(np.std([c.f_score[best] for c, _ in members])), "precision": float(total.precision[best]),
+            "seeds": len(members), "recall": float(total.recall[best]),
+            "entropy": float(np.mean([entropy[best] for _, entropy in members])),
         })  # fmt: skip
     chance = {_case(r): r["f"] for r in out if r["stream"] == CHANCE}
     return [r | {"chance": chance[_case(r)], "margin": r["f"] - chance[_case(r)]} for r in out]
+
+
+def _recording(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["scene"], row["camera"], row["seed"]
 
 
 def _case(row: dict[str, Any]) -> tuple[Any, ...]:

@@ -37,7 +37,7 @@ PROTOCOL = (
     "marks the tiles where the camera alone moves the image at 0.75 to 1.25 of δ·2πf; the film marks them in red."
 )
 DIFFERENCES = "The paper shows single moments of a film. Here the rate is measured over all tiles and moments."
-VERSION = 2
+VERSION = 3
 NEEDS_TRUTH = True
 
 PARTS = 12
@@ -85,9 +85,10 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
         if film:
             frames.append(_frame(events.x, events.y, streams.size, _marked(cameras[-1])))
     rows = _classes(np.array(counts), np.array(speeds))
-    tiles = _tile_rows(np.array(counts) / length, np.array(speeds), np.array(cameras), length, streams.size)
-    first = condition.seed == settings.first_seed
-    return {"rows": rows, "film": frames, "tiles": tiles if first else []}
+    tiles = {"part_ms": length * 1e-3, "columns": streams.size[0] // TILE}
+    tiles |= {name: np.round(values, 3).tolist() for name, values in
+              (("rate", 1e3 * np.array(counts) / length), ("speed", speeds), ("camera_speed", cameras))}  # fmt: skip
+    return {"rows": rows, "film": frames, "tiles": tiles if condition.seed == settings.first_seed else None}
 
 
 def _mean_speed(flow: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float64]:
@@ -102,16 +103,14 @@ def _marked(camera: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray((camera >= USUAL[0]) & (camera < USUAL[1]))
 
 
-def _tile_rows(
-    rate: NDArray[np.float64], speed: NDArray[np.float64], camera: NDArray[np.float64], length: int,
-    size: tuple[int, int],
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Return a row for each part of a turn and tile. Arrays of shape (parts, tiles); ``rate`` in Mev/s."""
-    columns = size[0] // TILE
+def _tile_rows(tiles: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for each part of a turn and tile, of the tiles that :func:`measure` returns."""
+    rate, speed, camera = (np.array(tiles[name]) for name in ("rate", "speed", "camera_speed"))
+    marked = _marked(camera)
     return [
-        {"time_ms": (part + 0.5) * length * 1e-3, "column": tile % columns, "row": tile // columns,
-         "rate": round(1e3 * float(rate[part, tile]), 3), "speed": round(float(speed[part, tile]), 3),
-         "camera_speed": round(float(camera[part, tile]), 3), "marked": bool(_marked(camera[part, tile]))}
+        {"time_ms": (part + 0.5) * tiles["part_ms"], "column": tile % tiles["columns"], "row": tile // tiles["columns"],
+         "rate": float(rate[part, tile]), "speed": float(speed[part, tile]),
+         "camera_speed": float(camera[part, tile]), "marked": bool(marked[part, tile])}
         for part in range(len(rate)) for tile in range(rate.shape[1])
     ]  # fmt: skip
 
@@ -157,6 +156,9 @@ def _frame(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int], marked: NDAr
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the relative event rate over the relative speed, and the rate of every tile over time."""
     rows = [{**r, "prism": f"{r['rpm']:g} rpm"} for r in rows_of(results, "rows")]
+    tiles = [{"camera": r.condition.trajectory, "rpm": r.condition.rpm, **row}
+             for r in results if isinstance(r.condition, Condition) and r.values.get("tiles")
+             for row in _tile_rows(r.values["tiles"])]  # fmt: skip
     x = "speed through the prism / δ·2πf"
     return [
         Table("fading", "Event rate where camera and prism cancel",
@@ -168,7 +170,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
         Table("fading_tiles", "Event rate of every tile over time",
               ("camera", "rpm", "time [ms]", "tile column", "tile row", "rate [kev/s]", x, "camera's speed / δ·2πf",
                "camera as fast as the prism"),
-              [tuple(r[k] for k in TILE_COLUMNS) for r in rows_of(results, "tiles")],
+              [tuple(r[k] for k in TILE_COLUMNS) for r in tiles],
               f"Tiles of {TILE} px, raw events, first seed.", long=True),
     ]  # fmt: skip
 

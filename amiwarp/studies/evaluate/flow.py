@@ -39,9 +39,11 @@ PROTOCOL = (
 )
 DIFFERENCES = (
     "The paper's main text names neither the algorithm nor the interval, which determines an error in pixels. Its "
-    "difference of +0.19 px is marked for a comparison of its sign and order only."
+    "difference of +0.19 px is marked for a comparison of its sign and order only. The settings of the contrast "
+    "maximisation were chosen on recordings of seed 0, whose textures and motions differ from those of the seeds that "
+    "are scored; it takes at most 100,000 events of a window, evenly thinned."
 )
-VERSION = 1
+VERSION = 2
 NEEDS_TRUTH = True
 
 TURNS = (0.25, 0.5, 1.0)

@@ -9,10 +9,12 @@ from scipy import ndimage
 
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.studies.evaluate.contrast_motion import (
+    MOST_LOCAL,
     dithered,
     estimate_rotation,
     local_contrast,
     rotated_back,
+    thinned,
     velocity_grid,
 )
 from amiwarp.studies.evaluate.measures.libraries import library
@@ -59,7 +61,7 @@ def flow_by_contrast(events: Events, camera: Camera) -> NDArray[np.float32]:
     rotation = estimate_rotation(events, camera)
     grid = velocity_grid(REACH_PX, 1.0)
     rows, columns = (np.arange(min(TILE // 2, n // 2), n, TILE) for n in size[::-1])
-    back = rotated_back(events, camera, rotation)
+    back = rotated_back(thinned(events, MOST_LOCAL), camera, rotation)
     maps = local_contrast(back, size, grid.reshape(-1, 2) / seconds, TILE / 2.0)
     scores = np.array([sharpness[np.ix_(rows, columns)] for sharpness in maps])
     motion = sharpest(scores.reshape(*grid.shape[:2], len(rows), len(columns)), grid)

@@ -14,11 +14,13 @@ import numpy as np
 
 from amiwarp.events.events import Events
 from amiwarp.studies.evaluate.contrast_motion import (
+    MOST_LOCAL,
     dithered,
     estimate_rotation,
     local_agreement,
     pixel_index,
     rotated_back,
+    thinned,
     velocity_grid,
 )
 from amiwarp.studies.evaluate.measures.libraries import library
@@ -83,7 +85,7 @@ def agreement_gain(events: Events, size: tuple[int, int], s: SegmentationSetting
     grid = velocity_grid(s.reach_px * scale, max(s.step_px * scale, 1.0)).reshape(-1, 2)
     fast = np.hypot(*grid.T) >= s.least_px * scale
     slow_best, fast_best = (np.zeros(size[::-1]) for _ in range(2))
-    found = local_agreement(events, size, grid / seconds, s.pool_px * scale)
+    found = local_agreement(thinned(events, MOST_LOCAL), size, grid / seconds, s.pool_px * scale)
     for is_fast, agreement in zip(fast, found, strict=True):
         best = fast_best if is_fast else slow_best
         np.maximum(best, agreement, out=best)

@@ -39,7 +39,7 @@ DIFFERENCES = (
     "The paper uses the network E2VID, which is not part of amiwarp, and reports NIQE only, as curves, by statistics "
     "that its authors fitted to other pictures. Values of NIQE are therefore comparable between our streams only."
 )
-VERSION = 2
+VERSION = 3
 NEEDS_TRUTH = True
 
 STEP_US = 1000
@@ -48,6 +48,8 @@ STANDARD_TURNS = 0.25
 """Length of the windows of the pictures over time [turns]."""
 TURNS = (0.25, 0.5, 1.0)
 """Lengths in the sensitivity curve [turns]."""
+RATES_HZ, HOLD = (30.0, 100.0, 1000.0), (0.0, 0.5, 1.0)
+"""Rates of the pictures in the sensitivity curve [1/s], and times of comparison as shares of the interval."""
 QUICK_PICTURES, FULL_PICTURES = 6, 12
 """Number of pictures over time."""
 DARK = 0.02
@@ -68,7 +70,7 @@ def measure(
     ``reconstructors``: learned or other reconstructions by name, which are judged next to our own.
     """
     methods: dict[str, Reconstructor | None] = {"own": None, **(reconstructors or {})}
-    over_time, over_length = [], []
+    over_time, over_length, over_rate = [], [], []
     for method, reconstructor in methods.items():
         for stream in reconstructed_streams(streams):
             maker = PictureMaker(streams, stream, reconstructor)
@@ -78,7 +80,8 @@ def measure(
             for turns in TURNS:
                 chosen = windows(streams, turns, 1)
                 over_length += [{**known, "turns": turns, **row} for row in _scores(maker, chosen)]
-    return {"time": over_time, "length": over_length}
+            over_rate += [{**known, **row} for row in _held(maker)]
+    return {"time": over_time, "length": over_length, "rate": over_rate}
 
 
 def windows(streams: Streams, turns: float, count: int) -> list[Window]:
@@ -94,11 +97,29 @@ def _scores(maker: PictureMaker, chosen: Sequence[Window]) -> list[dict[str, Any
     """Return time and scores of the picture of each window."""
     rows = []
     for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
-        truth = np.log(maker.streams.frame(window.middle_us).intensity.astype(np.float64) + DARK)
+        truth = log_truth(maker.streams, window.middle_us)
         found = similarity(*fitted(picture, truth))
         rows.append({"time_ms": (window.middle_us - chosen[0].middle_us) * 1e-3, "psnr": found.psnr_db,
                      "ssim": found.ssim, "niqe": naturalness(picture), "niqe_truth": naturalness(truth)})  # fmt: skip
     return rows
+
+
+def _held(maker: PictureMaker) -> list[dict[str, Any]]:
+    """Return the scores of a picture that is shown until the next one, for several rates of the pictures."""
+    chosen = windows(maker.streams, STANDARD_TURNS, 1)
+    rows = []
+    for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
+        for rate in RATES_HZ:
+            for share in HOLD:
+                t_us = min(window.middle_us + round(share * 1e6 / rate), maker.streams.end_us)
+                found = similarity(*fitted(picture, log_truth(maker.streams, t_us)))
+                rows.append({"rate": rate, "psnr": found.psnr_db, "ssim": found.ssim})
+    return rows
+
+
+def log_truth(streams: Streams, t_us: int) -> NDArray[np.float64]:
+    """Return the logarithm of the true luminance without the prism at a time."""
+    return np.asarray(np.log(streams.frame(t_us).intensity.astype(np.float64) + DARK))
 
 
 def naturalness(picture: NDArray[Any]) -> float | None:
@@ -108,8 +129,8 @@ def naturalness(picture: NDArray[Any]) -> float | None:
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
-    """Return the mean scores, the scores over time, and those over the length of the window."""
-    over_time, over_length = rows_of(results, "time"), rows_of(results, "length")
+    """Return the mean scores, and the scores over time, over the length of the window, and over the pictures' rate."""
+    over_time, over_length, over_rate = (rows_of(results, name) for name in ("time", "length", "rate"))
     names = ("scene", "camera", "method", "stream")
     columns = ("seeds x pictures", "PSNR [dB]", "std of PSNR", "SSIM", "std of SSIM", "NIQE", "std of NIQE")
     scores = ["psnr", "ssim", "niqe"]
@@ -123,6 +144,10 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
         Table("pictures_window", "Quality over the length of the window", (*names, "window [turns]", *columns),
               grouped(over_length, (*names, "turns"), scores), "A long window has more events and more motion.",
               Chart("window [turns]", "SSIM", "stream", "std of SSIM", panels=("scene", "camera"), log_x=True)),
+        Table("pictures_rate", "Quality over the rate of the pictures", (*names, "rate [1/s]", *columns[:5]),
+              grouped(over_rate, (*names, "rate"), scores[:2]), "A picture is shown until the next one, and compared "
+              "with the truth at three times in between.",
+              Chart("rate [1/s]", "SSIM", "stream", "std of SSIM", panels=("scene", "camera"), log_x=True)),
     ]  # fmt: skip
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.studies.evaluate.blob_detector import blob_keypoints
 from amiwarp.studies.evaluate.conditions import Condition, Streams
 from amiwarp.studies.evaluate.measures.keypoints import detected_joints
@@ -27,10 +28,6 @@ from amiwarp.studies.evaluate.results import (
 )
 from amiwarp.studies.evaluate.stream_pictures import PictureMaker, Window, reconstructed_streams
 
-if TYPE_CHECKING:
-    from amiwarp.events.truth import FrameTruth
-    from amiwarp.optics.camera import Camera
-
 Detector = Callable[[NDArray[Any]], Mapping[str, NDArray[Any]]]
 """Function that returns the joints (x, y) [px] by name in a grey picture with values from 0 to 255; missing ones are
 left out. The names are those of the world's joints."""
@@ -48,11 +45,15 @@ DIFFERENCES = (
     "The paper uses a pose network on pictures of people. No weights are part of amiwarp: give a detector to "
     "`amiwarp.studies.evaluate.pose.measure`."
 )
-VERSION = 1
+VERSION = 2
 NEEDS_TRUTH = True
 
 RATES_HZ = (10.0, 30.0, 100.0, 300.0, 1000.0)
 """Rates of the pictures [1/s]."""
+FRACTION, FRACTIONS = 0.2, (0.05, 0.1, 0.2, 0.3, 0.5)
+"""Distance at which a joint counts as detected [torso diameters], and the values of the sensitivity curve."""
+FRACTION_HZ = 100.0
+"""Rate of the pictures in that curve [1/s]."""
 LEAST_TURNS = 0.25
 """Shortest window [turns]."""
 HOLD = (0.0, 0.5, 1.0)
@@ -75,13 +76,13 @@ def measure(streams: Streams, settings: Settings, detectors: Mapping[str, Detect
     """
     found: dict[str, Detector] = {"blob": blob_keypoints, **(detectors or {})}
     rows: list[dict[str, Any]] = []
+    makers = {stream: PictureMaker(streams, stream) for stream in reconstructed_streams(streams)}
     for rate in RATES_HZ:
         chosen = windows(streams, rate, QUICK_PICTURES if settings.quick else FULL_PICTURES)
         for window in chosen:
-            now = image_joints(streams.frame(window.middle_us), streams.camera)
+            now = image_joints(streams, window.middle_us)
             rows += _rows(streams, window, rate, now, {"stream": "truth", "detector": "true joints"})
-        for stream in reconstructed_streams(streams):
-            maker = PictureMaker(streams, stream)
+        for stream, maker in makers.items():
             for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
                 for name, detect in found.items():
                     joints = detect(displayed(picture))
@@ -100,15 +101,18 @@ def windows(streams: Streams, rate_hz: float, count: int) -> list[Window]:
     return [Window(int(ends[k]) - length, int(ends[k])) for k in chosen]
 
 
-def image_joints(truth: FrameTruth, camera: Camera) -> dict[str, NDArray[np.float64]]:
-    """Return the true joints [px] by name; NaN outside the view."""
-    if not truth.joints:
+def image_joints(streams: Streams, t_us: int) -> dict[str, NDArray[np.float64]]:
+    """Return the true joints [px] at a time by name; NaN outside the view."""
+    scene, camera = streams.simulation.scene, streams.camera
+    if not isinstance(scene, WorldScene) or not scene.world.joints:
         raise AmiwarpError("the world has no joints, so a pose cannot be judged; use the world 'person'")
-    places = np.stack([(at - truth.position) @ truth.rotation for at in truth.joints.values()])
-    xy = np.asarray(camera.rays_to_pixels(places), np.float64)
+    t = [t_us * 1e-6]
+    (rotation,), (position,) = scene.trajectory.poses(t)
+    places = np.stack([path.poses(t)[1][0] for path in scene.world.joints.values()])
+    xy = np.asarray(camera.rays_to_pixels((places - position) @ rotation), np.float64)
     size = np.array([camera.width, camera.height])
     xy[~((xy > -0.5) & (xy < size - 0.5)).all(axis=1)] = np.nan
-    return dict(zip(truth.joints, xy, strict=True))
+    return dict(zip(scene.world.joints, xy, strict=True))
 
 
 def _rows(
@@ -118,34 +122,45 @@ def _rows(
     rows = []
     for share in HOLD:
         t_us = min(window.end_us + round(share * 1e6 / rate), streams.end_us)
-        truth = image_joints(streams.frame(t_us), streams.camera)
+        truth = image_joints(streams, t_us)
         pdj, iou = pose_scores(joints, truth)
-        rows.append({**known, "rate": rate, "pdj": pdj, "iou": iou})
+        rows.append({**known, "rate": rate, "pdj": pdj[FRACTION], "iou": iou,
+                     "pdj_over_fraction": [pdj[f] for f in FRACTIONS]})  # fmt: skip
     return rows
 
 
 def pose_scores(
     found: Mapping[str, NDArray[Any]], truth: Mapping[str, NDArray[Any]]
-) -> tuple[float | None, float | None]:
-    """Return PDJ and IoU of joints by name; None if the torso is not in view."""
+) -> tuple[dict[float, float | None], float | None]:
+    """Return the PDJ for each of :data:`FRACTIONS`, and the IoU; None if the torso is not in view."""
     torso = float(np.hypot(*(truth[TORSO[0]] - truth[TORSO[1]])))
     if not np.isfinite(torso):
-        return None, None
+        return dict.fromkeys(FRACTIONS), None
     nowhere = np.full(2, np.nan)
     places = np.stack([np.asarray(found.get(name, nowhere), np.float64) for name in truth])
     true = np.stack(list(truth.values()))
-    return detected_joints(places, true, torso), box_overlap(places, true)
+    return {f: detected_joints(places, true, torso, fraction=f) for f in FRACTIONS}, box_overlap(places, true)
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
-    """Return PDJ and IoU over the rate of the pictures."""
-    names = ("scene", "camera", "detector", "stream", "rate")
-    columns = ("scene", "camera", "detector", "stream", "rate [1/s]", "comparisons", "PDJ", "std of PDJ", "IoU",
-               "std of IoU")  # fmt: skip
+    """Return PDJ and IoU over the rate of the pictures, and the PDJ over its threshold."""
+    names = ("scene", "camera", "detector", "stream")
     caption = "'blob' checks the plumbing only. 'true joints' show the effect of window and rate alone."
-    rows = grouped(rows_of(results, "rows"), names, ["pdj", "iou"])
-    chart = Chart("rate [1/s]", "PDJ", "stream", "std of PDJ", panels=("scene", "camera", "detector"), log_x=True)
-    return [Table("pose", "Detected joints over the rate of the pictures", columns, rows, caption, chart)]
+    rows = rows_of(results, "rows")
+    spread = [{**r, "fraction": f, "pdj": pdj} for r in rows if r["rate"] == FRACTION_HZ
+              for f, pdj in zip(FRACTIONS, r["pdj_over_fraction"], strict=True)]  # fmt: skip
+
+    def chart(x: str) -> Chart:
+        return Chart(x, "PDJ", "stream", "std of PDJ", panels=("scene", "camera", "detector"), log_x=x[0] == "r")
+
+    return [
+        Table("pose", "Detected joints over the rate of the pictures",
+              (*names, "rate [1/s]", "comparisons", "PDJ", "std of PDJ", "IoU", "std of IoU"),
+              grouped(rows, (*names, "rate"), ["pdj", "iou"]), caption, chart("rate [1/s]")),
+        Table("pose_threshold", f"Detected joints over the threshold, {FRACTION_HZ:g} pictures/s",
+              (*names, "threshold [torso diameters]", "comparisons", "PDJ", "std of PDJ"),
+              grouped(spread, (*names, "fraction"), ["pdj"]), caption, chart("threshold [torso diameters]")),
+    ]  # fmt: skip
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:

@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from amiwarp.io.atomic_output import check_output, make_folder, own_folder
+from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import Workers, run_jobs, single_worker, start_workers
 from amiwarp.studies.dataset.run import worker_count
-from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
+from amiwarp.studies.evaluate.cells import Job, Store, compile_kernels, plan, run_job
 from amiwarp.studies.evaluate.registry import EVALUATIONS, SHORT
 from amiwarp.studies.evaluate.report import REPORT_FILES, section, write
 from amiwarp.studies.evaluate.results import FULL, QUICK, CellResult
@@ -117,7 +118,10 @@ def evaluate(
         check_output(folder / name)
     chosen = only or (EVALUATIONS if full else SHORT)
     jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
-    with _workers(scheduler, workers, device) as there:
+    count = worker_count(workers, device)
+    if scheduler is None:
+        jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
+    with _workers(scheduler, count, device) as there:
         results, new, processor_s = _run(jobs, Store(folder / "cells"), there, progress or silent)
     names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
     sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
@@ -132,9 +136,8 @@ def evaluate(
     )  # fmt: skip
 
 
-def _workers(scheduler: str | None, count: int | None, device: str) -> AbstractContextManager[Workers]:
+def _workers(scheduler: str | None, count: int, device: str) -> AbstractContextManager[Workers]:
     """Return the workers: those of the scheduler, this process, or local processes."""
-    count = worker_count(count, device)
     if scheduler is None and count == 1:
         return single_worker()
     return start_workers("amiwarp evaluate", "cluster", scheduler, count, device)
@@ -151,6 +154,10 @@ def _run(
         results += [cell for cell in known.values() if cell is not None]
         if missing := tuple(name for name, cell in known.items() if cell is None):
             todo.append(replace(job, evaluations=missing))
+    if len(todo) > 1 and workers.count() > 1:
+        progress("compiling kernels", 0.0)
+        names = dict.fromkeys(name for job in todo for name in job.evaluations)
+        workers.executor.submit(compile_kernels, tuple(names), todo[0].settings.device).result()
     processor_s, done, new = 0.0, 0, 0
     with contextlib.closing(run_jobs(workers, run_job, todo)) as running:
         for job, future in running:

@@ -2,57 +2,60 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
+
+from amiwarp.studies.evaluate.measures.smoothing import smoothed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+FINENESS = 2
+"""Cells of the grid per pixel, along each axis. Pixel centres are centres of cells, so those of plain events are exact.
+
+Other places are rounded to the cell, as if the Gaussian's variance were larger by 1 / (6 FINENESS²) px²: by 4 % for a
+standard deviation of 1 px, by 0.5 % for 3 px.
+"""
 TRUNCATE = 5.0
 """Radius at which the Gaussian kernel ends [standard deviations]."""
 
 
-def event_density(xy: NDArray[np.floating], size: tuple[int, int], h_px: float) -> NDArray[np.float64]:
-    """Return the kernel density at the place of each event [events/px²], shape (n,).
+def event_counts(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the number of events in each cell of a grid over the image, whose outermost cells are half outside.
 
-    ``xy``: places [px], shape (n, 2), within half a pixel around the image. ``size``: width and height [px]. ``h_px``:
-    standard deviation of the Gaussian kernel. Each event contributes to its own density, as usual for kernel density
-    estimates. Near the border the density is divided by the part of the kernel that lies in the image.
+    ``x``, ``y``: places [px], shape (n,); those outside the image are left out. ``size``: width and height [px].
     """
-    width, height = size
-    counts = _vote(xy, size)
-    ones = np.ones((height, width))
-    mass, share = (ndimage.gaussian_filter(a, h_px, mode="constant", truncate=TRUNCATE) for a in (counts, ones))
-    return np.asarray(ndimage.map_coordinates(mass / share, [xy[:, 1], xy[:, 0]], order=1, mode="nearest"))
+    columns, rows = (FINENESS * n + 1 for n in size)
+    half = FINENESS // 2
+    column, row = (np.rint(FINENESS * v.astype(np.float32)).astype(np.int32) + half for v in (x, y))
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    cell = (row * columns + column)[inside]
+    return np.asarray(np.bincount(cell, minlength=rows * columns).reshape(rows, columns), np.float32)
 
 
-def _vote(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the number of events at each pixel, with bilinear votes; those at the border go to the last pixel."""
-    width, height = size
-    x, y = np.clip(xy[:, 0], 0.0, width - 1.0), np.clip(xy[:, 1], 0.0, height - 1.0)
-    left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
-    u, v = x - left, y - top
-    counts = np.zeros(width * height)
-    for dx, dy, weight in ((0, 0, (1 - u) * (1 - v)), (1, 0, u * (1 - v)), (0, 1, (1 - u) * v), (1, 1, u * v)):
-        counts += np.bincount((top + dy) * width + left + dx, weight, width * height)
-    return counts.reshape(height, width)
-
-
-def density_variance(xy: NDArray[np.floating], size: tuple[int, int], h_px: float) -> float:
+def density_variance(counts: NDArray[np.float32], h_px: float) -> float:
     """Return the variance of ρ / mean ρ, where ρ is the kernel density at each event: 0 for an even distribution.
 
-    NaN without events. For a Poisson process of λ events/px² it is about λ / (4πh²) / (λ + 1 / (2πh²))².
+    ``counts``: events in the cells of a grid, see :func:`event_counts`. ``h_px``: standard deviation of the Gaussian
+    kernel. Each event contributes to its own density, as usual for kernel density estimates. Near the border the
+    density is divided by the part of the kernel that lies in the image. NaN without events. For a Poisson process of λ
+    events/px² the variance is about λ / (4πh²) / (λ + 1 / (2πh²))².
     """
-    xy = inside(xy, size)
-    if not len(xy):
+    number = float(counts.sum(dtype=np.float64))
+    if not number:
         return float("nan")
-    density = event_density(xy, size, h_px)
-    return float(np.var(density / density.mean()))
+    mass = smoothed(counts, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)
+    density = mass / _inside_share(counts.shape, h_px)
+    mean = float(np.sum(counts * density, dtype=np.float64)) / number
+    return float(np.sum(counts * (density / mean - 1.0) ** 2, dtype=np.float64)) / number
 
 
-def inside(xy: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the places within the image: those whose nearest pixel belongs to it."""
-    pixel = np.rint(xy)
-    return np.asarray(xy[((pixel >= 0) & (pixel < size)).all(axis=1)], np.float64)
+@lru_cache(maxsize=16)
+def _inside_share(shape: tuple[int, int], h_px: float) -> NDArray[np.float32]:
+    """Return the part of the kernel around each cell that lies in the image."""
+    cells = np.ones(shape, np.float32)
+    for edge in (cells[0], cells[-1], cells[:, 0], cells[:, -1]):
+        edge *= 0.5
+    return smoothed(cells, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import corner_tracks, launch
 from amiwarp.studies.evaluate.measures.libraries import library
 
 if TYPE_CHECKING:
@@ -71,27 +73,27 @@ def link_corners(
     ``t``: rising times [us]. ``xy``: places [px], shape (n, 2); NaN for corners without a place, which are left out.
     A track takes corners up to ``radius_px`` from its last point and ``gap_us`` after it.
     """
-    cells: dict[tuple[int, int], dict[int, int]] = {}  # by cell of `radius_px`: tracks, and their last points
-    number = np.full(len(t), -1)
-    tracks = 0
-    for i in np.flatnonzero(np.isfinite(xy).all(axis=1)).tolist():
-        column, row = (int(v // radius_px) for v in xy[i])
-        best, nearest, home = -1, radius_px, (column, row)
-        for cell in ((column + dx, row + dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
-            near = cells.get(cell, {})
-            for track, last in list(near.items()):
-                if t[i] - t[last] > gap_us:
-                    del near[track]
-                elif (distance := float(np.hypot(*(xy[last] - xy[i])))) <= nearest:
-                    best, nearest, home = track, distance, cell
-        if best < 0:
-            best, tracks = tracks, tracks + 1
-        else:
-            del cells[home][best]
-        cells.setdefault((column, row), {})[best] = i
-        number[i] = best
-    kept = np.flatnonzero(number >= 0)
-    return sorted_tracks(number[kept], np.asarray(t)[kept], np.asarray(xy)[kept], kept)
+    kept = np.flatnonzero(np.isfinite(xy).all(axis=1))
+    number = wp.empty(len(kept), dtype=int, device="cpu")
+    chains = _chains(np.asarray(t, np.int64)[kept], np.asarray(xy, np.float64)[kept], radius_px, gap_us)
+    launch.load(corner_tracks.link_events, number.device)
+    wp.launch(corner_tracks.link_events, 1, [chains], [number], device="cpu")
+    return sorted_tracks(number.numpy(), np.asarray(t)[kept], np.asarray(xy)[kept], kept)
+
+
+def _chains(t: NDArray[np.int64], xy: NDArray[np.float64], radius_px: float, gap_us: int) -> Any:
+    """Return corner events and empty lists of tracks as the struct that the kernel takes."""
+    column, row = np.floor(xy / radius_px).astype(np.int64).T
+    if len(t):
+        column, row = column - column.min() + 1, row - row.min() + 1  # a border of empty cells
+    columns, rows = (int(v.max(initial=0)) + 2 for v in (column, row))
+    chains = corner_tracks.CornerChains()
+    chains.x, chains.y = (wp.array(v, dtype=wp.float64, device="cpu") for v in xy.T)
+    chains.t, chains.cell = wp.array(t, device="cpu"), wp.array((row * columns + column).astype(np.int32), device="cpu")
+    chains.columns, chains.radius, chains.gap = columns, radius_px, gap_us
+    chains.head = wp.full(columns * rows, -1, dtype=int, device="cpu")
+    chains.after, chains.last = (wp.zeros(len(t), dtype=int, device="cpu") for _ in range(2))
+    return chains
 
 
 def follow_images(images: Sequence[NDArray[Any]], t: ArrayLike) -> Tracks:
