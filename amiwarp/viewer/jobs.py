@@ -153,13 +153,13 @@ def summary(found: FoundCalibration) -> str:
 
 def live_state(f: LiveFigures) -> dict[str, Any]:
     """Return the figures of a stream for the page: rows of name, value and whether it is bad, and what is wrong."""
-    rows = [
-        ["connection", "receiving" if f.connected else "interrupted", not f.connected],
-        ["rate", f"{f.rate_mev_s:.2f} million events/s", False],
-        ["latency", f"{f.latency_ms:.0f} ms", f.latency_ms > 1e3],
-        ["turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0],
-        ["speed of the prism", "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm", f.rpm is None],
-        ["lost events", f"{f.dropped:,}", f.dropped > 0], ["out of order", f"{f.late:,}", f.late > 0],
+    rows: list[tuple[str, str, bool]] = [
+        ("connection", "receiving" if f.connected else "interrupted", not f.connected),
+        ("rate", f"{f.rate_mev_s:.2f} million events/s", False),
+        ("latency", f"{f.latency_ms:.0f} ms", f.latency_ms > 1e3),
+        ("turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0),
+        ("speed of the prism", "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm", f.rpm is None),
+        ("lost events", f"{f.dropped:,}", f.dropped > 0), ("out of order", f"{f.late:,}", f.late > 0),
     ]  # fmt: skip
     message = "" if f.message == f.problem else f.message
     note = f"The stream is interrupted: {f.problem}. The last events are shown. {message}".strip()

@@ -148,7 +148,7 @@ def velocity_grid(reach: float, step: float) -> NDArray[np.float64]:
 
 def local_agreement(
     events: Events, size: tuple[int, int], velocities: NDArray[np.float64], pool: float
-) -> Iterator[NDArray[np.float32]]:
+) -> Iterator[NDArray[np.floating[Any]]]:
     """Yield how well events agree under each velocity [px/s] of shape (k, 2), as images of shape (height, width).
 
     It is the mean, over the events of a surrounding, of the density of events of their polarity less that of the other
@@ -170,7 +170,7 @@ def local_agreement(
 
 def local_contrast(
     events: Events, size: tuple[int, int], velocities: NDArray[np.float64], pool: float
-) -> Iterator[NDArray[np.float32]]:
+) -> Iterator[NDArray[np.floating[Any]]]:
     """Yield variance over mean of the image of moved events around each pixel, arguments as in :func:`local_agreement`.
 
     Both polarities count, because an edge behind the prism has both within a turn.
