@@ -433,6 +433,7 @@ def test_bad_values_are_said_and_good_ones_make_the_page_go_on(page: Any, record
         ("start_ms", "-1e300", "50", "no events from"),
         ("apex", "-1", "0.8", "apex"),
     ):
+        ready(page)
         events = page.locator("#events").inner_text()
         enter(page, name, bad)
         message(page, words)
