@@ -204,7 +204,7 @@ def _matched(masks: Sequence[Masks], true: NDArray[np.bool_], tolerances: Sequen
     counts: list[list[int]] = []
     for k, (_, thin) in enumerate(masks):
         same = k > 0 and thin is masks[k - 1][1]
-        counts.append(counts[-1] if same else [np.count_nonzero(m) for m in match(thin, true, tolerances)])
+        counts.append(counts[-1] if same else [int(np.count_nonzero(m)) for m in match(thin, true, tolerances)])
     return counts
 
 
