@@ -189,7 +189,7 @@ def test_pose_over_the_rate_of_pictures(streams: Streams, monkeypatch: pytest.Mo
 
 
 def test_a_learned_reconstruction_is_judged_next_to_ours(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "QUICK_PICTURES", 1)
+    monkeypatch.setattr(pictures, "PICTURES", 1)
     monkeypatch.setattr(pictures, "TURNS", (pictures.STANDARD_TURNS,))
     given: list[Events] = []
 

@@ -75,11 +75,13 @@ def _limited_opencv(threads: int) -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def compile_kernels(names: Sequence[str], device: str) -> None:
-    """Compile the kernels of evaluations, before several processes would compile the same ones at once."""
+def compile_kernels(names: Sequence[str], device: str) -> float:
+    """Compile the kernels of evaluations, which else each worker would compile. Return the processor time [s]."""
+    began = time.process_time()
     for name in names:
         load(name)
     load_all(device)
+    return time.process_time() - began
 
 
 def _run(name: str, streams: RecordedStreams, job: Job) -> CellResult:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib import calibrate
+from amiwarp.calib import Settings, calibrate
+from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
@@ -59,6 +60,15 @@ LIMITS = {
     "mismatch and noise": ("mismatch", "leak_hz", "shot_noise_hz", "shot_noise_dark"),
 }
 """Limits of a sensor, by the fields of :class:`amiwarp.SensorModel` that describe them."""
+FAST_CALIBRATION = Settings(
+    model="exact", global_evaluations=40, events=60_000, tolerance_px=0.01,
+    photometric=PhotometricSettings(steps=6, tolerance_px=0.005),
+)  # fmt: skip
+"""Settings of the calibration of simulated recordings, whose optics are known to be exact.
+
+They take two fifths of the time of the default ones. On a recording of the room with a handheld camera, the result is
+0.011 px (rms) from theirs.
+"""
 FRAMES_KEPT = 64
 """Number of instants whose ground truth is kept; more than an evaluation uses for several streams."""
 ENOUGH = 0.95
@@ -198,10 +208,14 @@ class RecordedStreams:
         """Calibration from the recording, or None if that fails; then :attr:`refusal` says why."""
         self.refusal = ""
         try:
-            return calibrate(self.recording, device=self.device)
+            return calibrate(self.recording, self._calibration_settings(), device=self.device)
         except AmiwarpError as error:
             self.refusal = str(error)
             return None
+
+    def _calibration_settings(self) -> Settings:
+        """Return the settings of the calibration: the defaults."""
+        return Settings()
 
     def window(self, stream: Stream, start_us: int, end_us: int) -> Events:
         """Return the events of a stream with ``start_us <= t < end_us``. Compensated coordinates are float32.
@@ -271,6 +285,12 @@ class Streams(RecordedStreams):
     def camera(self) -> Camera:
         """Camera of all streams."""
         return self.simulation.camera
+
+    def _calibration_settings(self) -> Settings:
+        """Return the fast settings. For a camera that is known to rest, they leave out a rotation of the camera."""
+        scene = self.simulation.scene
+        moves = isinstance(scene, WorldScene) and scene.trajectory.moves
+        return replace(FAST_CALIBRATION, free=None if moves else ("apex", "phase"))
 
     @cached_property
     def plain(self) -> Recording:

@@ -165,7 +165,7 @@ def local_agreement(
         off, on = votes.take()
         density = sign * smoothed(on - off, DENSITY_PX).ravel()[pixel_index(moved, size)]
         total = np.bincount(place, weights=density, minlength=width * height).reshape(height, width)
-        yield smoothed(total, pool) / around
+        yield np.asarray(smoothed(total, pool) / around, np.float32)
 
 
 def local_contrast(
@@ -179,7 +179,7 @@ def local_contrast(
     for moved in _moved(events, velocities):
         image = smooth_image(moved, votes, DENSITY_PX)
         mean, square = (smoothed(values, pool) for values in (image, image * image))
-        yield (square - mean * mean) / np.maximum(mean, 1e-9)
+        yield np.asarray((square - mean * mean) / np.maximum(mean, 1e-9), np.float32)
 
 
 def _moved(events: Events, velocities: NDArray[np.float64]) -> Iterator[Events]:

@@ -74,14 +74,17 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     gaps: list[dict[str, Any]] = []
     for source, members in SOURCES.items():
-        raw, indices = streams.indexed_window(source, streams.start_us, streams.end_us)
+        span = streams.start_us, streams.end_us
+        raw, indices = streams.indexed_window(source, *span)
+        place = streams.event_truth(source, *span).place
+        assert place is not None
         for detector in CornerMethod:
             found = detect_corners(raw, streams.size, detector=detector)
             for stream in (s for s in members if s in streams.names):
                 known = {"detector": detector.value, "stream": stream.value}
-                t, xy, place = _corners(streams, stream, found, indices)
+                t, xy, which = _corners(streams, stream, found, indices)
                 for gap_us in GAPS_US:
-                    curve = [known | row for row in _quality(streams, t, xy, place, frames, gap_us)]
+                    curve = [known | row for row in _quality(streams, t, xy, place[which], frames, gap_us)]
                     rows += curve if gap_us == GAP_US else []
                     gaps += [row for row in curve if row["limit"] == LIMIT_PX]
     return {"rows": rows, "gaps": gaps}
@@ -89,18 +92,16 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
 
 def _corners(
     streams: Streams, stream: Stream, found: NDArray[np.bool_], indices: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
-    """Return times, places [px] and points of the world [m] of a stream's corners.
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+    """Return times and places [px] of a stream's corners, and their positions in ``found``.
 
     ``found``: which events of the recording that the stream belongs to are corners; ``indices``: those events' indices.
     """
-    span = streams.start_us, streams.end_us
-    events, rows = streams.indexed_window(stream, *span)
-    place = streams.event_truth(stream, *span).place
-    assert place is not None
-    corners = found[rows - indices[0]] if len(rows) else np.zeros(0, bool)
+    events, rows = streams.indexed_window(stream, streams.start_us, streams.end_us)
+    which = rows - indices[0] if len(rows) else rows
+    corners = found[which]
     xy = np.stack([events.x[corners], events.y[corners]], axis=1).astype(np.float64)
-    return events.t[corners], xy, place[corners]
+    return events.t[corners], xy, which[corners]
 
 
 def _quality(

@@ -31,17 +31,18 @@ TITLE = "Perceptual fading"
 PROTOCOL = (
     "The image moves behind the prism at the speed δ·2πf, where δ is the radius of the orbit in pixels and f the "
     "turns per second, in a direction that turns with the prism. Where the camera moves the image at the same speed "
-    "in the opposite direction, both cancel. The image is divided into tiles, and time into 12 parts of a turn. The "
-    "event rate of a tile, relative to its mean, is set against the speed of the image through the prism, which the "
-    "ground truth states, relative to δ·2πf. A table of the first seed holds the rate of every tile over time, and "
-    "marks the tiles where the camera alone moves the image at 0.75 to 1.25 of δ·2πf; the film marks them in red."
+    "in the opposite direction, both cancel. The image is divided into tiles, and the first two turns into 12 parts "
+    "each. The event rate of a tile, relative to its mean, is set against the speed of the image through the prism, "
+    "which the ground truth states, relative to δ·2πf. A table of the first seed holds the rate of every tile over "
+    "time, and marks the tiles where the camera alone moves the image at 0.75 to 1.25 of δ·2πf; the film marks them "
+    "in red."
 )
 DIFFERENCES = "The paper shows single moments of a film. Here the rate is measured over all tiles and moments."
 VERSION = 3
 NEEDS_TRUTH = True
 
-PARTS = 12
-"""Parts of a turn."""
+PARTS, MOST_TURNS = 12, 2
+"""Parts of a turn, and largest number of turns from the start of the recording."""
 TILE = 30
 """Size of a tile [px]."""
 EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0)
@@ -72,7 +73,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     """Return the relative event rate by class of relative speed, and tiles and film of the first seed."""
     condition = streams.condition
     length = round(60e6 / condition.rpm / PARTS)
-    starts = range(0, streams.end_us - length + 1, length)
+    starts = range(0, min(streams.end_us - length + 1, MOST_TURNS * PARTS * length), length)
     orbit = orbit_speed(condition)
     counts, speeds, cameras, frames = [], [], [], []
     film = (condition.seed, condition.trajectory, condition.rpm) == (settings.first_seed, "fast", 720.0)

@@ -50,7 +50,7 @@ TURNS = (0.25, 0.5, 1.0)
 """Lengths in the sensitivity curve [turns]."""
 RATES_HZ, HOLD = (30.0, 100.0, 1000.0), (0.0, 0.5, 1.0)
 """Rates of the pictures in the sensitivity curve [1/s], and times of comparison as shares of the interval."""
-QUICK_PICTURES, FULL_PICTURES = 6, 12
+PICTURES = 6
 """Number of pictures over time."""
 DARK = 0.02
 """Luminance that is added before the logarithm, as in the simulated sensor."""
@@ -75,12 +75,12 @@ def measure(
         for stream in reconstructed_streams(streams):
             maker = PictureMaker(streams, stream, reconstructor)
             known = {"stream": stream.value, "method": method}
-            count = QUICK_PICTURES if settings.quick else FULL_PICTURES
-            over_time += [{**known, **row} for row in _scores(maker, windows(streams, STANDARD_TURNS, count))]
+            over_time += [{**known, **row} for row in _scores(streams, _made(maker, STANDARD_TURNS, PICTURES))]
             for turns in TURNS:
-                chosen = windows(streams, turns, 1)
-                over_length += [{**known, "turns": turns, **row} for row in _scores(maker, chosen)]
-            over_rate += [{**known, **row} for row in _held(maker)]
+                made = _made(maker, turns, 1)
+                over_length += [{**known, "turns": turns, **row} for row in _scores(streams, made)]
+                if turns == STANDARD_TURNS:
+                    over_rate += [{**known, **row} for row in _held(streams, made)]
     return {"time": over_time, "length": over_length, "rate": over_rate}
 
 
@@ -93,26 +93,35 @@ def windows(streams: Streams, turns: float, count: int) -> list[Window]:
     return [Window(first + k * STEP_US, first + k * STEP_US + length) for k in range(max(count, 0))]
 
 
-def _scores(maker: PictureMaker, chosen: Sequence[Window]) -> list[dict[str, Any]]:
-    """Return time and scores of the picture of each window."""
+Made = list[tuple[Window, "NDArray[np.float64]"]]
+"""Windows with their pictures."""
+
+
+def _made(maker: PictureMaker, turns: float, count: int) -> Made:
+    """Return windows of a length, see :func:`windows`, with their pictures."""
+    chosen = windows(maker.streams, turns, count)
+    return list(zip(chosen, maker.pictures(chosen), strict=True))
+
+
+def _scores(streams: Streams, made: Made) -> list[dict[str, Any]]:
+    """Return time and scores of each picture."""
     rows = []
-    for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
-        truth = log_truth(maker.streams, window.middle_us)
+    for window, picture in made:
+        truth = log_truth(streams, window.middle_us)
         found = similarity(*fitted(picture, truth))
-        rows.append({"time_ms": (window.middle_us - chosen[0].middle_us) * 1e-3, "psnr": found.psnr_db,
+        rows.append({"time_ms": (window.middle_us - made[0][0].middle_us) * 1e-3, "psnr": found.psnr_db,
                      "ssim": found.ssim, "niqe": naturalness(picture), "niqe_truth": naturalness(truth)})  # fmt: skip
     return rows
 
 
-def _held(maker: PictureMaker) -> list[dict[str, Any]]:
-    """Return the scores of a picture that is shown until the next one, for several rates of the pictures."""
-    chosen = windows(maker.streams, STANDARD_TURNS, 1)
+def _held(streams: Streams, made: Made) -> list[dict[str, Any]]:
+    """Return the scores of pictures that are shown until the next one, for several rates of the pictures."""
     rows = []
-    for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
+    for window, picture in made:
         for rate in RATES_HZ:
             for share in HOLD:
-                t_us = min(window.middle_us + round(share * 1e6 / rate), maker.streams.end_us)
-                found = similarity(*fitted(picture, log_truth(maker.streams, t_us)))
+                t_us = min(window.middle_us + round(share * 1e6 / rate), streams.end_us)
+                found = similarity(*fitted(picture, log_truth(streams, t_us)))
                 rows.append({"rate": rate, "psnr": found.psnr_db, "ssim": found.ssim})
     return rows
 

@@ -58,7 +58,7 @@ LEAST_TURNS = 0.25
 """Shortest window [turns]."""
 HOLD = (0.0, 0.5, 1.0)
 """Times at which a picture's joints are compared, from its completion, as shares of the interval."""
-QUICK_PICTURES, FULL_PICTURES = 1, 4
+QUICK_PICTURES, FULL_PICTURES = 1, 2
 """Number of pictures at each rate."""
 TORSO = ("left shoulder", "right hip")
 """Joints whose distance is the torso's diameter."""

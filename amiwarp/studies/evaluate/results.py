@@ -53,7 +53,7 @@ class Settings:
 
 
 QUICK = Settings()
-FULL = Settings(quick=False, seeds=10, width=320, height=240, duration_s=0.3)
+FULL = Settings(quick=False, seeds=10, width=320, height=240)
 
 
 def wide_focal(settings: Settings) -> float:

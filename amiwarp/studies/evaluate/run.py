@@ -154,11 +154,12 @@ def _run(
         results += [cell for cell in known.values() if cell is not None]
         if missing := tuple(name for name, cell in known.items() if cell is None):
             todo.append(replace(job, evaluations=missing))
+    processor_s, done, new = 0.0, 0, 0
     if len(todo) > 1 and workers.count() > 1:
         progress("compiling kernels", 0.0)
         names = dict.fromkeys(name for job in todo for name in job.evaluations)
-        workers.executor.submit(compile_kernels, tuple(names), todo[0].settings.device).result()
-    processor_s, done, new = 0.0, 0, 0
+        compiling = workers.executor.submit(compile_kernels, tuple(names), todo[0].settings.device)
+        processor_s = compiling.result()
     with contextlib.closing(run_jobs(workers, run_job, todo)) as running:
         for job, future in running:
             result = future.result()

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 TITLE = "Texture stability"
 PROTOCOL = (
     "The events of a window are a sample of points in the image. A Gaussian kernel of standard deviation h estimates "
-    "their density ρ at the place of each event. The measure is the variance of ρ / mean ρ over the events, averaged "
-    "over up to four windows of a recording. Lower is more even. The paper's values are marked at h = 3 px and "
-    "windows of 33 ms, our choice."
+    "their density ρ at the place of each event; places are rounded to half pixels. The measure is "
+    "the variance of ρ / mean ρ over the events, averaged over up to four windows of a recording. Lower "
+    "is more even. The paper's values are marked at h = 3 px and windows of 33 ms, our choice."
 )
 DIFFERENCES = (
     "The paper's main text gives neither kernel width nor window nor normalisation, and its scenes are real. Absolute"
