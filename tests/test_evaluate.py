@@ -23,8 +23,18 @@ from amiwarp.studies.evaluate.measures.density import density_variance, event_co
 from amiwarp.studies.evaluate.measures.edge_match import Counts, best_f, binary_entropy, match
 from amiwarp.studies.evaluate.measures.true_edges import geometric_edges
 from amiwarp.studies.evaluate.registry import EVALUATIONS, load
-from amiwarp.studies.evaluate.report import section, write
-from amiwarp.studies.evaluate.results import QUICK, CellResult, Claim, Table, Verdict, grouped
+from amiwarp.studies.evaluate.report import refused, section, write
+from amiwarp.studies.evaluate.results import (
+    QUICK,
+    CellResult,
+    Claim,
+    Table,
+    Verdict,
+    by_case,
+    compared,
+    grouped,
+    where_calibrated,
+)
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
 
@@ -195,6 +205,34 @@ def test_grouped_rows() -> None:
 def test_verdicts() -> None:
     verdicts = [Claim.judge("", "", "", holds, "").verdict for holds in (True, False, None)]
     assert verdicts == [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.NOT_TESTABLE]
+
+
+def stream_rows(scene: str, **scores: list[float | None]) -> list[dict[str, object]]:
+    """Return rows of streams, by the names of their members, with a score for each seed; None where there is no row."""
+    return [{"scene": scene, "camera": "fast", "seed": seed, "stream": Stream[name].value, "score": value}
+            for name, values in scores.items() for seed, value in enumerate(values) if value is not None]  # fmt: skip
+
+
+def test_a_comparison_needs_most_recordings_to_be_calibrated() -> None:
+    good = stream_rows("desk", PLAIN=[1.0, 1.2, 1.4, 1.2], TRUE=[2.0] * 4, CALIBRATED=[1.9, 2.0, None, None])
+    bad = stream_rows("room", PLAIN=[1.0, 1.2, 1.4, 1.2], TRUE=[2.0] * 4, CALIBRATED=[9.0, None, None, None])
+    one = compared(by_case(good, ("scene",), "score"), Stream.PLAIN, "higher", larger=True)
+    assert one == (True, "AMI-EV 1.950 ± 0.050, S-EV 1.200 ± 0.141")
+    both = compared(by_case(good + bad, ("scene",), "score"), Stream.PLAIN, "higher", larger=True)
+    assert both == (False, "higher in 1 of 2 cases, with the true model in 2; calibration mostly refused in 1")
+    assert compared(by_case(good, ("scene",), "score"), Stream.RAW, "higher", larger=True) == (None, "no result")
+    assert {r["seed"] for r in where_calibrated(good)} == {0, 1}
+
+
+def test_the_report_tells_what_the_calibration_refused() -> None:
+    conditions = [Condition("room", "fast", seed=seed) for seed in range(3)]
+    streams = ([Stream.PLAIN, Stream.RAW, Stream.CALIBRATED], [Stream.PLAIN, Stream.RAW], [Stream.PLAIN, Stream.RAW])
+    cells = [
+        CellResult("texture", condition, {"rows": [{"stream": s.value} for s in names]})
+        for condition, names in zip(conditions, streams, strict=True)
+    ]
+    assert refused(cells) == {"room, fast": "2 of 3"}
+    assert refused(cells[:1]) == {}
 
 
 def test_corners_of_uncompensated_events_leave_the_truth() -> None:

@@ -128,23 +128,26 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     names = ("seeds", "tracks", "std of tracks", "lifetime [ms]", "std", "error [px]", "std of error",
              "updates [1/s]", "std of updates")  # fmt: skip
     standard = [r for r in rows if r["limit"] == LIMIT_PX]
-    curve = ("seeds", "value", "std")
+    panels = ("scene", "camera", "detector")
 
-    def over_limit(name: str, value: str, title: str) -> Table:
-        return Table(name, title, (*by, "limit [px]", *curve), grouped(rows, (*by, "limit"), [value]),
+    def over_limit(name: str, value: str, shown: str) -> Table:
+        return Table(name, f"{shown.partition(' ')[0].capitalize()} over the limit",
+                     (*by, "limit [px]", "seeds", shown, "std"), grouped(rows, (*by, "limit"), [value]),
                      "A lenient limit hides errors; a strict one ends tracks early.",
-                     Chart("limit [px]", "value", "stream", "std", panels=("camera", "detector")))  # fmt: skip
+                     Chart("limit [px]", shown, "stream", "std", panels=panels))  # fmt: skip
 
     return [
         Table("corners", f"Tracks of corners that end {LIMIT_PX:g} px from the truth", (*by, *names),
-              grouped(standard, by, VALUES), "Longer lifetimes and smaller errors are better.",
-              Chart("camera", "lifetime [ms]", "stream", "std", panels=("detector",), kind=ChartKind.BARS)),
-        over_limit("corners_lifetime", "lifetime_ms", "Lifetime [ms] over the limit"),
-        over_limit("corners_error", "error_px", "Error [px] over the limit"),
-        Table("corners_gap", "Lifetime [ms] over the largest time between two corner events of a track",
-              (*by, "gap [ms]", *curve), grouped(rows_of(results, "gaps"), (*by, "gap"), ["lifetime_ms"]),
+              grouped(standard, by, VALUES), "Longer lifetimes and smaller errors are better. "
+              "A plain camera at rest has no tracks.",
+              Chart("camera", "lifetime [ms]", "stream", "std", panels=("scene", "detector"), kind=ChartKind.BARS)),
+        over_limit("corners_lifetime", "lifetime_ms", "lifetime [ms]"),
+        over_limit("corners_error", "error_px", "error [px]"),
+        Table("corners_gap", "Lifetime over the largest time between two corner events of a track",
+              (*by, "gap [ms]", "seeds", "lifetime [ms]", "std"),
+              grouped(rows_of(results, "gaps"), (*by, "gap"), ["lifetime_ms"]),
               "A quarter turn at 720 rpm takes 21 ms.",
-              Chart("gap [ms]", "value", "stream", "std", panels=("camera", "detector"))),
+              Chart("gap [ms]", "lifetime [ms]", "stream", "std", panels=panels)),
     ]  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT, COLUMNS = 7.2, 2.5, 3
 """Width of a figure and height of a row of panels [inch], and largest number of panels of a row."""
+TITLE_LENGTH = 26
+"""Largest number of characters of a panel's title in one line."""
 STYLE = {
     "font.size": 8.5, "axes.titlesize": 8.5, "axes.labelsize": 8.5, "legend.fontsize": 8.0, "axes.linewidth": 0.6,
     "axes.spines.top": False, "axes.spines.right": False, "lines.linewidth": 1.3, "lines.markersize": 3.5,
@@ -34,11 +37,13 @@ STREAM_COLOURS = {
     Stream.RAW: ORANGE,
 }
 """Colours of the streams, the same in all charts."""
-OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK)
+OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK, "0.55")
 """Colours of other series, in their order."""
-CHANCE, GREY = "chance", "0.55"
-"""Name and colour of the level of chance."""
-MARKERS = "osD^vPX"
+CHANCE = "chance"
+"""Name of the level of chance."""
+REFERENCE_COLOURS = {CHANCE: "0.55", "truth": BLACK}
+"""Colours of the level of chance and of the truth, next to the streams."""
+MARKERS = "osD^vPX*"
 """Markers that distinguish the series without colour."""
 
 
@@ -64,7 +69,7 @@ def draw(table: Table) -> Figure | None:
         for ax, panel in zip(axes, panels, strict=False):
             chosen = [row for row in rows if tuple(row[c] for c in chart.panels) == panel]
             _panel(ax, chart, chosen, series)
-            ax.set_title(", ".join(map(str, panel)))
+            ax.set_title(_title(panel))
         if not chart.log_y and min(float(row[chart.y]) for row in rows) >= 0:  # type: ignore[arg-type]
             axes[0].set_ylim(bottom=0)  # after all panels are drawn, as they share the axis
         for ax in axes[len(panels) :]:
@@ -74,6 +79,12 @@ def draw(table: Table) -> Figure | None:
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=min(4, len(labels)))
         return figure
+
+
+def _title(panel: Sequence[Value]) -> str:
+    """Return the title of a panel, in two lines if it is long."""
+    text = ", ".join(map(str, panel))
+    return text if len(text) <= TITLE_LENGTH else ", ".join(map(str, panel[:-1])) + f",\n{panel[-1]}"
 
 
 def _panel(ax: Axes, chart: Chart, rows: list[dict[str, Value]], series: list[Value]) -> None:
@@ -129,8 +140,8 @@ def _bars(ax: Axes, chart: Chart, by: dict[Value, list[dict[str, Value]]]) -> No
 
 def _colour(name: Value, k: int) -> str:
     """Return the colour of a stream, or of the k-th other series."""
-    if name == CHANCE:
-        return GREY
+    if name in REFERENCE_COLOURS:
+        return REFERENCE_COLOURS[str(name)]
     return STREAM_COLOURS[Stream(name)] if name in set(Stream) else OTHERS[k % len(OTHERS)]
 
 

@@ -33,6 +33,7 @@ from amiwarp.studies.evaluate.results import (
     ChartKind,
     Claim,
     Picture,
+    Score,
     Settings,
     Table,
     compared,
@@ -40,6 +41,7 @@ from amiwarp.studies.evaluate.results import (
     encode_picture,
     grouped,
     rows_of,
+    where_calibrated,
 )
 
 if TYPE_CHECKING:
@@ -356,15 +358,16 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
                  "not in the paper"),
         _ranking(of(still, *TOLERANCES), Stream.PLAIN, "At rest the AMI-EV sees edges and the S-EV does not.",
                  "curves"),
-        _fading(rows_of(results, "sectors")),
+        _fading(where_calibrated(rows_of(results, "sectors"))),
     ]  # fmt: skip
 
 
 def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: str) -> Claim:
     """Judge whether the calibrated AMI-EV has the larger margin over chance in each case."""
-    by: dict[tuple[Any, ...], dict[str, tuple[float, float]]] = {}
+    by: dict[tuple[Any, ...], dict[str, Score]] = {}
     for r in rows:
-        by.setdefault((r["scene"], r["camera"], r["tolerance"]), {})[r["stream"]] = (max(r["margin"], 0.0), r["std"])
+        score = Score(max(r["margin"], 0.0), r["std"], r["seeds"])
+        by.setdefault((r["scene"], r["camera"], r["tolerance"]), {})[r["stream"]] = score
     holds, ours = compared(by, other, "larger margin", larger=True)
     rule = (
         f"the margin of the ODS-F over chance, at least 0, of '{Stream.CALIBRATED}' is above that of '{other}' by more "

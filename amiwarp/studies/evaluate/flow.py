@@ -21,6 +21,7 @@ from amiwarp.studies.evaluate.results import (
     grouped,
     mean_of,
     rows_of,
+    where_calibrated,
     wide_focal,
 )
 
@@ -142,7 +143,8 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdict on the small increase of the error by the prism, for each method."""
-    rows = [r for r in rows_of(results, "rows") if r["turns"] == STANDARD_TURNS and r["pixels"] == "edges"]
+    rows = where_calibrated(rows_of(results, "rows"))
+    rows = [r for r in rows if r["turns"] == STANDARD_TURNS and r["pixels"] == "edges"]
     return [_claim([r for r in rows if r["method"] == method], method) for method in ("DIS", "contrast maximisation")]
 
 
@@ -153,6 +155,7 @@ def _claim(rows: Sequence[dict[str, Any]], method: str) -> Claim:
     )
     text = f"With the prism, compensated, the endpoint error is only slightly larger ({method})."
     rule = f"the mean of '{Stream.CALIBRATED}' is at most twice {PAPER_PX} px above that of '{Stream.PLAIN}', at edges"
+    rule += ", over the recordings that could be calibrated"
     if ours is None or plain is None:
         return Claim.judge(text, f"+{PAPER_PX} px", "no result", None, rule)
     shown = f"{ours - plain:+.2f} px ({plain:.2f} to {ours:.2f} px)"

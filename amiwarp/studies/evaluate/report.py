@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import NewFile, make_folder, write_text
+from amiwarp.studies.evaluate.conditions import Stream
 from amiwarp.studies.evaluate.drawing import draw, save, to_svg
 from amiwarp.studies.evaluate.registry import load, pictures
-from amiwarp.studies.evaluate.results import CellResult, Chart, Claim, Picture, Settings, Table, Value
+from amiwarp.studies.evaluate.results import CellResult, Chart, Claim, Picture, Settings, Table, Value, rows_of
 from amiwarp.studies.machine_info import machine, versions
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ class Section:
     """Number of cells."""
     errors: list[str]
     """Messages of cells that failed."""
+    not_calibrated: dict[str, str]
+    """Share of the recordings that the calibration refused, by scene and motion of the camera."""
     processor_s: float
     """Processor time of the measures [s]."""
 
@@ -64,8 +67,21 @@ def section(name: str, results: Sequence[CellResult]) -> Section:
     shown = evaluation.tables(good) if good else []
     return Section(
         name, evaluation.TITLE, evaluation.PROTOCOL, evaluation.DIFFERENCES, evaluation.claims(good), shown,
-        pictures(evaluation, good), len(results), errors, sum(r.processor_s for r in results),
+        pictures(evaluation, good), len(results), errors, refused(good), sum(r.processor_s for r in results),
     )  # fmt: skip
+
+
+def refused(results: Sequence[CellResult]) -> dict[str, str]:
+    """Return the share of recordings without a calibrated stream, by scene and motion of the camera."""
+    counts: dict[str, list[bool]] = {}
+    for result in results:
+        lists = (name for name, value in result.values.items() if isinstance(value, list) and value)
+        tables = [name for name in lists if "stream" in result.values[name][0]]
+        rows = rows_of([result], tables[0]) if tables else []
+        streams = {row["stream"] for row in rows}
+        if Stream.RAW in streams:
+            counts.setdefault(f"{rows[0]['scene']}, {rows[0]['camera']}", []).append(Stream.CALIBRATED not in streams)
+    return {case: f"{sum(missing)} of {len(missing)}" for case, missing in counts.items() if any(missing)}
 
 
 def write(out: Path, sections: Sequence[Section], settings: Settings, processor_s: float) -> dict[str, Path]:

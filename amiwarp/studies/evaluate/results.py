@@ -172,23 +172,54 @@ class Claim:
         return cls(text, paper, ours, verdict, rule)
 
 
+@dataclass(frozen=True)
+class Score:
+    """Score of a stream in a case, over the seeds."""
+
+    mean: float
+    """Mean."""
+    std: float
+    """Standard deviation."""
+    seeds: int
+    """Number of seeds that have a score."""
+
+
 def compared(
-    cases: Mapping[Any, Mapping[str, tuple[float, float]]], other: Stream, word: str, *, larger: bool
+    cases: Mapping[Any, Mapping[str, Score]], other: Stream, word: str, *, larger: bool
 ) -> tuple[bool | None, str]:
     """Compare the calibrated AMI-EV with another stream, and return whether it is better in each case, and a text.
 
-    ``cases``: mean and standard deviation of the streams in each case. Better means ``larger`` or smaller by more than
-    either standard deviation. ``word``: comparative for the text. Without cases that have both streams, the first
-    value is None.
+    Better means ``larger`` or smaller by more than either standard deviation. A case in which fewer than half of the
+    recordings could be calibrated counts as not better; the text also says in how many cases the true model is better.
+    ``word``: comparative for the text. Without cases that have the other stream, the first value is None.
     """
-    both = {Stream.CALIBRATED, other}
-    pairs = [(*case[Stream.CALIBRATED], *case[other]) for case in cases.values() if both <= case.keys()]
+    given = [case for case in cases.values() if other in case]
+    if not given:
+        return None, "no result"
     sign = 1.0 if larger else -1.0
-    better = sum(sign * (ours - theirs) > max(std, their_std) for ours, std, theirs, their_std in pairs)
-    text = f"{word} in {better} of {len(pairs)} cases" if pairs else "no result"
-    if len(pairs) == 1:
-        text = f"AMI-EV {pairs[0][0]:.3f} ± {pairs[0][1]:.3f}, {other} {pairs[0][2]:.3f} ± {pairs[0][3]:.3f}"
-    return better == len(pairs) if pairs else None, text
+
+    def better(stream: Stream) -> int:
+        pairs = [(case[stream], case[other]) for case in given if _most_have(stream, case, other)]
+        return sum(sign * (ours.mean - theirs.mean) > max(ours.std, theirs.std) for ours, theirs in pairs)
+
+    wins, refused = better(Stream.CALIBRATED), sum(not _most_have(Stream.CALIBRATED, case, other) for case in given)
+    text = f"{word} in {wins} of {len(given)} cases, with the true model in {better(Stream.TRUE)}"
+    if len(given) == 1 and not refused:
+        ours, theirs = given[0][Stream.CALIBRATED], given[0][other]
+        text = f"AMI-EV {ours.mean:.3f} ± {ours.std:.3f}, {other} {theirs.mean:.3f} ± {theirs.std:.3f}"
+    return wins == len(given), text + (f"; calibration mostly refused in {refused}" if refused else "")
+
+
+def _most_have(stream: Stream, case: Mapping[str, Score], other: Stream) -> bool:
+    """Return whether a stream exists in at least half of the recordings of a case that have the other one."""
+    return stream in case and 2 * case[stream].seeds >= case[other].seeds
+
+
+def where_calibrated(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of the recordings that have a calibrated stream, so that all streams are of the same ones."""
+    names = ("scene", "camera", "seed")
+    there = {tuple(row[n] for n in names) for row in rows if row["stream"] == Stream.CALIBRATED}
+    return [row for row in rows if tuple(row[n] for n in names) in there]
 
 
 def rows_of(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:
@@ -227,14 +258,15 @@ def grouped(rows: Sequence[dict[str, Any]], by: Sequence[str], values: Sequence[
     return out
 
 
-def by_case(
-    rows: Sequence[dict[str, Any]], by: Sequence[str], value: str
-) -> dict[tuple[Value, ...], dict[str, tuple[float, float]]]:
-    """Return mean and standard deviation of a column by case, the columns ``by``, and stream, for :func:`compared`."""
-    cases: dict[tuple[Value, ...], dict[str, tuple[float, float]]] = {}
+def by_case(rows: Sequence[dict[str, Any]], by: Sequence[str], value: str) -> dict[tuple[Value, ...], dict[str, Score]]:
+    """Return the score of a column by case, the columns ``by``, and stream, for :func:`compared`."""
+    rows = [r for r in rows if r.get(value) is not None]
+    cases: dict[tuple[Value, ...], dict[str, Score]] = {}
     for *case, stream, _, mean, std in grouped(rows, (*by, "stream"), [value]):
         if isinstance(mean, float) and isinstance(std, float):
-            cases.setdefault(tuple(case), {})[str(stream)] = (mean, std)
+            key = (*case, stream)
+            seeds = {r["seed"] for r in rows if tuple(r[name] for name in (*by, "stream")) == key}
+            cases.setdefault(tuple(case), {})[str(stream)] = Score(mean, std, len(seeds))
     return cases
 
 

@@ -50,6 +50,9 @@ STANDARD = SegmentationSettings()
 """Settings of the comparison."""
 VARIED = {"gain": (1.25, 2.0), "least_share": (0.08, 0.3), "density": (1.0, 4.0), "radius_px": (5.0, 12.0)}
 """Further values of the settings in the sensitivity curves."""
+NAMES = {"gain": "least gain", "least_share": "least share of a cluster", "density": "least density of a cluster",
+         "radius_px": "radius of the clustering [px]"}  # fmt: skip
+"""What the settings are called in the report."""
 
 
 def conditions(settings: Settings) -> list[Condition]:
@@ -87,7 +90,7 @@ def _curves(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the rows of each setting's curve: those in which all other settings are standard."""
     usual = _values(STANDARD)
     return [
-        row | {"setting": name, "value": row[name]}
+        row | {"setting": NAMES[name], "value of the setting": row[name]}
         for name in VARIED for row in rows if all(row[other] == usual[other] for other in VARIED if other != name)
     ]  # fmt: skip
 
@@ -106,10 +109,11 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
         Table("segmentation", "Segmentation of a thrown ball, per event",
               (*names, *columns, "events of the ball", "std of share"), grouped(standard, names, [*scores, "share"]),
               "Precision is undefined for a window in which no body is found; its IoU is 0."),
-        Table("segmentation_settings", "Segmentation over its settings", ("setting", *names, "value", *columns),
-              grouped(_curves(rows), ("setting", *names, "value"), scores), "gain: least gain in agreement of what "
-              "stays blurred; least_share, density and radius_px: clustering, see `SegmentationSettings`.",
-              Chart("value", "IoU", "stream", "std of IoU", panels=("setting",))),
+        Table("segmentation_settings", "Segmentation over its settings",
+              ("setting", *names, "value of the setting", *columns),
+              grouped(_curves(rows), ("setting", *names, "value of the setting"), scores),
+              "Gain: that in agreement of what stays blurred. The other settings are those of the clustering.",
+              Chart("value of the setting", "IoU", "stream", "std of IoU", panels=("setting",))),
     ]  # fmt: skip
 
 
