@@ -20,6 +20,7 @@ for sharpness, global_algorithm, local_algorithm in (
 ):
     found = amiwarp.calibrate(
         recording,
+        stages=("sharpness",),
         sharpness=sharpness,
         global_algorithm=global_algorithm,
         local_algorithm=local_algorithm,

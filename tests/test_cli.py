@@ -431,8 +431,12 @@ def test_a_turning_camera_without_a_prism(place: Path, data_dir: Path) -> None:
     assert picture["residual"] < 0.3
 
 
-INTERRUPTIBLE = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
-"""Code that restores Ctrl-C in a child process. Background jobs of a shell and their children ignore it."""
+INTERRUPTIBLE = (
+    "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "signal.signal(signal.SIGHUP, signal.SIG_DFL)"
+)
+"""Code that restores Ctrl-C and SIGHUP in a child process. A shell's background jobs ignore the one, what nohup runs
+the other, and so do their children."""
 
 
 @pytest.mark.parametrize(

@@ -35,8 +35,8 @@ from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
-KNOWN = PhotometricSettings(sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
-ALL = replace(KNOWN, pairs=600_000)
+KNOWN = PhotometricSettings(pairs=150_000, sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
+MORE, ALL = replace(KNOWN, pairs=300_000), replace(KNOWN, pairs=600_000)
 FREE = ("apex", "phase", "motion")
 
 
@@ -58,11 +58,11 @@ def rates_of(c: Calibration) -> NDArray[np.float64]:
     return np.array([c.parameters[n] for n in RATES])
 
 
-@pytest.mark.parametrize(("axis", "speed"), [(0, 60.0), (1, 10.0), (2, 30.0)])
+@pytest.mark.parametrize(("axis", "speed"), [(1, 10.0), (2, 60.0)])
 def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -> None:
     rate = np.eye(3)[axis] * math.radians(speed)
     recording = turned(texture, tuple(rate))
-    c = calibrate(recording, free=FREE, photometric=KNOWN, events=200_000)
+    c = calibrate(recording, free=FREE, photometric=KNOWN, events=100_000)
     assert c.photometric is not None
     assert c.photometric.accepted
     assert np.linalg.norm(rates_of(c) - rate) <= 0.02 * np.linalg.norm(rate)
@@ -77,7 +77,7 @@ def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8]
         camera_motion=CameraMotion([[0.0, 0.0, 0.2, 0.0], [0.2, 0.0, 1.2, 0.0]]),
     )  # fmt: skip
     recording = simulation.run()
-    c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN, events=200_000)
+    c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN, events=100_000)
     assert c.parameters["change_y"] == pytest.approx(5.0, rel=0.05)
     assert c.camera_rotation is not None
     assert c.camera_rotation.about(0).angular_velocity[1] == pytest.approx(0.2, abs=0.02)
@@ -103,7 +103,7 @@ def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording
     """At constant speed a clock offset equals a phase. This encoder has no counting steps that would separate them."""
     even = Encoder.constant_speed(720.0, recording.events.t_first, recording.events.t_last)
     recording = replace(recording, encoder=even)
-    c = calibrate(recording, free=("apex", "phase", "clock_offset"), photometric=KNOWN, events=200_000)
+    c = calibrate(recording, free=("apex", "phase", "clock_offset"), photometric=MORE, events=200_000)
     assert c.photometric is not None
     assert c.photometric.held == ("clock_offset",)
     assert "clock_offset" not in c.photometric.uncertainty
@@ -113,7 +113,7 @@ def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording
 
 def test_index_and_focal_length(recording: Recording) -> None:
     """Index, focal length and apex make nearly the same motion."""
-    c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN, events=200_000)
+    c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN, events=100_000)
     assert c.photometric is not None
     assert c.photometric.accepted
     assert error_px(c, recording) < 0.02
@@ -129,7 +129,7 @@ def test_linear_unknowns(texture: NDArray[np.uint8]) -> None:
     recording = simulate(texture, CAMERA, TRUE_PRISM, duration_s=0.25, sensor=sensor, seed=5)
     for free in (("leak",), ("off_ratio", "leak")):
         # a leak shows where events are few, so all pairs are used
-        c = calibrate(recording, free=("apex", "phase", *free), photometric=ALL, events=200_000)
+        c = calibrate(recording, free=("apex", "phase", *free), photometric=ALL, events=100_000)
         assert c.photometric is not None
         assert c.photometric.accepted
         assert c.photometric.leak == pytest.approx(20.0, abs=5.0)
@@ -196,7 +196,7 @@ class Film:
 def outcome(film: Film) -> tuple[Recording, Calibration | None]:
     recording = Simulation(Scene(film), CAMERA, TRUE_PRISM, film.seconds, seed=6).run()
     try:
-        return recording, calibrate(recording, photometric=KNOWN, events=200_000)
+        return recording, calibrate(recording, photometric=KNOWN, events=100_000)
     except AmiwarpError:
         return recording, None
 
