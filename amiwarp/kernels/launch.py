@@ -90,21 +90,15 @@ def launch_slices(
     inputs: Sequence[Any],
     outputs: Sequence[Any],
     *,
-    device: Any,
     first: int = 0,
     smallest: int = SMALLEST_SLICE,
 ) -> None:
-    """Run a kernel as :func:`launch` does, but let slice k write into ``outputs[k]`` only.
+    """Run a kernel on a CPU as :func:`launch` does, but let slice k write into ``outputs[k]`` only.
 
-    For kernels whose threads add to the same elements. The range is ``range(first, first + n)``. On CUDA there is one
-    launch, which adds into ``outputs[0]`` with atomics.
+    For kernels whose threads add to the same elements. The range is ``range(first, first + n)``.
     """
-    device = wp.get_device(device)
-    if n == 0:
-        return
-    ranges = slices(n, len(outputs), smallest) if device.is_cpu else [(0, n)]
-    if device.is_cpu:
-        load(kernel, device)
+    device, ranges = wp.get_device("cpu"), slices(n, len(outputs), smallest)
+    load(kernel, device)
 
     def run(job: tuple[tuple[int, int], Any]) -> None:
         (start, stop), out = job
@@ -139,5 +133,5 @@ class RecordedLaunch:
 
 
 def slice_count(device: Any) -> int:
-    """Return the number of output arrays that :func:`launch_slices` can use on ``device``."""
+    """Return the number of slices of a launch on ``device``."""
     return cpu_threads() if wp.get_device(device).is_cpu else 1

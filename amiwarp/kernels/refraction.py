@@ -177,12 +177,11 @@ def refract_in_prism_frame(m: ExactParams, x: float, y: float, z: float, w0: flo
     sign. z^2 is computed from its change, because computing it from x^2 + y^2 would cancel in float32 far from the
     axis.
     """
-    inside = float(entering)
     length2 = x * x + y * y + z * z
     bent = (m.index2 - 1.0) * length2
     d = w0 * x + w1 * y
-    q = m.sin_apex * d + m.cos_apex * wp.sqrt(z * z + (1.0 - inside) * bent)
-    shift = (wp.sqrt(q * q + (2.0 * inside - 1.0) * bent) - q) * m.sin_apex
+    q = m.sin_apex * d + m.cos_apex * wp.where(entering == 1, z, wp.sqrt(z * z + bent))
+    shift = (wp.sqrt(q * q + wp.where(entering == 1, bent, -bent)) - q) * m.sin_apex
     z2 = z * z - shift * (2.0 * d + shift)
     passes = wp.min(wp.min(z, q), z2) > 0.0  # z2 may be NaN and comes last: min(a, NaN) is NaN here
     return x + shift * w0, y + shift * w1, wp.where(passes, wp.sqrt(z2), NAN)
