@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from amiwarp.kernels.iwe import add_totals, empty_words, read_votes
-from amiwarp.kernels.launch import RecordedLaunch, launch
+from amiwarp.kernels.launch import RecordedLaunch, launch, specialised
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
 
 if TYPE_CHECKING:
@@ -115,7 +115,8 @@ class WordVotes:
                 self._recorded = inputs, vote
                 return vote
         given = [*inputs, self._trash, 0]
-        vote = wp.launch(vote_quickly, 1, given, [self._fast], device=self.device, record_cmd=True)
+        kernel = specialised(vote_quickly, given)
+        vote = wp.launch(kernel, 1, given, [self._fast], device=self.device, record_cmd=True)
         self._recorded = inputs, vote
         return vote
 

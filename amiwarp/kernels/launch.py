@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
+from threading import Lock
 from typing import Any
 
 import warp as wp
 
 from amiwarp.kernels.cpu_threads import cpu_threads
 
+_specialising = Lock()
 SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
 
 
@@ -26,6 +28,27 @@ def pool() -> ThreadPoolExecutor:
 def background_worker() -> ThreadPoolExecutor:
     """Return the shared background worker: a pool of one thread, which keeps the order of its jobs."""
     return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-background-worker")
+
+
+def specialised(kernel: Any, inputs: Sequence[Any]) -> Any:
+    """Return a generic kernel for the structs among its inputs, alone in a module; return any other kernel as it is.
+
+    So only the optical models that are used are compiled, and a new one does not compile the others again.
+    """
+    generic = [k for k, argument in enumerate(kernel.adj.args) if argument.type is Any]
+    if not generic:
+        return kernel
+    with _specialising:
+        return _specialised(kernel, tuple(inputs[k]._cls for k in generic))
+
+
+@cache
+def _specialised(kernel: Any, structs: tuple[Any, ...]) -> Any:
+    """Return a generic kernel for the structs in the order of its generic arguments."""
+    module = wp.get_module(".".join([kernel.module.name, kernel.key, *(struct.key for struct in structs)]))
+    module.options.update(kernel.module.options)
+    generic = [argument.label for argument in kernel.adj.args if argument.type is Any]
+    return wp.overload(wp.kernel(kernel.func, module=module), dict(zip(generic, structs, strict=True)))
 
 
 def load(kernel: Any, device: Any) -> None:
@@ -71,6 +94,7 @@ def launch(
     device = wp.get_device(device)
     if n == 0:
         return
+    kernel = specialised(kernel, inputs)
     if not device.is_cpu:
         wp.launch(kernel, dim=n, inputs=[*inputs, first], outputs=list(outputs), device=device)
         return
@@ -98,6 +122,7 @@ def launch_slices(
     For kernels whose threads add to the same elements. The range is ``range(first, first + n)``.
     """
     device, ranges = wp.get_device("cpu"), slices(n, len(outputs), smallest)
+    kernel = specialised(kernel, inputs)
     load(kernel, device)
 
     def run(job: tuple[tuple[int, int], Any]) -> None:
@@ -116,7 +141,7 @@ class RecordedLaunch:
 
     def __init__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
         """Record the launch without running it. Each repeat uses the same input and output arrays."""
-        device = wp.get_device(device)
+        device, kernel = wp.get_device(device), specialised(kernel, inputs)
         load(kernel, device)
         self._start = len(inputs)
         self._command = wp.launch(kernel, 1, [*inputs, 0], list(outputs), device=device, record_cmd=True)

@@ -12,9 +12,9 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
 from amiwarp.kernels.plain_models import is_plain, plain
-from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
+from amiwarp.kernels.refraction import displace
 from amiwarp.kernels.vector_code import (
     add_word_pairs,
     copy_bytes,
@@ -161,9 +161,3 @@ def vote_point_blocks(
     copy_bytes(layer, layers, first, n)
     share_block(canvas, u, v, layer, 0, places, shares)
     add_word_pairs(sums, places, shares, canvas.columns, n)
-
-
-for _struct in MODEL_STRUCTS:
-    wp.overload(vote_rotating_camera_blocks, {"model": _struct})
-    for _camera in (PinholeParams, CameraParams):
-        wp.overload(vote_event_blocks, {"model": _struct, "camera": _camera})

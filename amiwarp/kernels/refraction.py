@@ -366,11 +366,3 @@ def fit_harmonics(
         table[row, col, k] = mean[k] / n
         table[row, col, 2 + k] = c[k] * (2.0 / n)
         table[row, col, 4 + k] = s[k] * (2.0 / n)
-
-
-MODEL_STRUCTS = (CircleParams, RadialCircleParams, EllipseParams, ExactParams)
-for _struct in MODEL_STRUCTS:
-    wp.overload(compensate_points, {"model": _struct})
-    wp.overload(deflect_points, {"model": _struct})
-    if _struct is not EllipseParams:
-        wp.overload(fit_harmonics, {"model": _struct})

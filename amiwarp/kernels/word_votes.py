@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
+from amiwarp.kernels.refraction import displace
 from amiwarp.kernels.vector_code import load_float, load_uint8, load_uint16
 from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, rotate_azimuth
 
@@ -164,10 +164,3 @@ def vote_points(
     layer = int(layers[i]) * canvas.layer
     _inside, cell, word = vote_at(canvas, x[i], y[i], layer)
     add_vote_atomically(cells, cell, canvas.columns, word)
-
-
-for _struct in MODEL_STRUCTS:
-    wp.overload(vote_rotating_camera, {"model": _struct})
-    for _camera in (PinholeParams, CameraParams):
-        wp.overload(vote_events, {"model": _struct, "camera": _camera})
-        wp.overload(vote_quickly, {"model": _struct, "camera": _camera})
