@@ -13,7 +13,8 @@ from amiwarp.kernels.vector_code import load_float, load_int, load_word, store_f
 from amiwarp.kernels.votes import Canvas
 from amiwarp.kernels.word_votes import Cells
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(OPTIONS)
 
 VARIANCE = wp.constant(0)  # numbers of the sharpness measures
 GRADIENT = wp.constant(1)
@@ -166,7 +167,7 @@ def add_sums(sums: wp.array2d(dtype=int), start: int, totals: wp.array(dtype=wp.
 def smooth(width: int) -> Any:
     """Return the kernel that smooths ``width`` pixels per thread along one axis; the weights begin at the centre."""
 
-    @wp.kernel
+    @wp.kernel(module="unique", module_options=OPTIONS)  # so that a new one does not compile the others again
     def smooth(
         image: wp.array(dtype=float),
         weights: wp.array(dtype=float),
@@ -231,7 +232,7 @@ def sum_terms(width: int, kind: int) -> Any:
             return laplacian2(image, i, stride)
         return other_term(kind, h, eta)
 
-    @wp.kernel
+    @wp.kernel(module="unique", module_options=OPTIONS)  # so that a new one does not compile the others again
     def sum_terms(image: wp.array(dtype=float), frame: Frame, eta: float, start: int, sums: wp.array(dtype=wp.vec2d)):
         block = start + wp.tid()
         at = block_start(frame, block, width, STRIP)

@@ -3,11 +3,12 @@
 Warp itself runs each CPU launch on one thread.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import pairwise
-from threading import Lock
+from itertools import pairwise, takewhile
+from threading import Lock, Thread, main_thread
 from typing import Any
 
 import warp as wp
@@ -15,6 +16,7 @@ import warp as wp
 from amiwarp.kernels.cpu_threads import cpu_threads
 
 _specialising = Lock()
+_loading: defaultdict[str, Lock] = defaultdict(Lock)
 SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
 
 
@@ -54,13 +56,29 @@ def _specialised(kernel: Any, structs: tuple[Any, ...]) -> Any:
 def load(kernel: Any, device: Any) -> None:
     """Compile and load a kernel's module with the block size that launches here use.
 
-    Call it before several threads launch the kernel, or each of them would try to compile it.
+    Call it before several threads launch the kernel, or each of them would try to compile it. A call waits for a
+    running one for the same module.
     """
-    kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+    with _loading[kernel.module.name]:
+        kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+
+
+def load_kernels(kernels: Iterable[tuple[Any, ...]], device: Any) -> None:
+    """Compile and load kernels. Each is followed by the structs of its generic arguments."""
+    for kernel, *structs in kernels:
+        with _specialising:
+            one = _specialised(kernel, tuple(structs)) if structs else kernel
+        load(one, wp.get_device(device))
+
+
+def load_ahead(kernels: Iterable[tuple[Any, ...]], device: Any) -> None:
+    """Compile and load kernels as :func:`load_kernels` does, in the background, until the program ends."""
+    wanted = takewhile(lambda _: main_thread().is_alive(), kernels)
+    Thread(target=load_kernels, args=(wanted, device), name="amiwarp-compiler").start()
 
 
 def load_all(device: Any) -> None:
-    """Compile and load the kernels of all imported modules, several at a time.
+    """Compile and load the kernels of all imported modules, several at a time, except those for one optical model.
 
     Processes that start later find them in Warp's cache. Processes that start together would all compile them.
     """

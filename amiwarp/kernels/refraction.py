@@ -354,7 +354,8 @@ def fit_harmonics(
     mean = wp.vec2(0.0, 0.0)
     c = wp.vec2(0.0, 0.0)
     s = wp.vec2(0.0, 0.0)
-    for k in range(HARMONIC_ANGLES):
+    angles = int(HARMONIC_ANGLES)  # a variable, so that Warp does not unroll the loop, which is slow to compile
+    for k in range(angles):
         phi = 6.283185307179586 * float(k) / float(HARMONIC_ANGLES)
         w = wp.vec2(wp.cos(phi), wp.sin(phi))
         d = compensate(model, camera, xy, w) - xy
