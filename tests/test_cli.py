@@ -1,5 +1,7 @@
 """Command line: help, examples, JSON output and failures of the commands."""
 
+import importlib
+import inspect
 import json
 import os
 import re
@@ -39,7 +41,7 @@ from amiwarp.cli import (
     truth,
     view,
 )
-from amiwarp.cli.app import app
+from amiwarp.cli.app import SUMMARIES, app
 from amiwarp.cli.inputs import number
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
@@ -68,6 +70,22 @@ COMMANDS = {
         evaluate,
     )
 }  # fmt: skip
+
+
+def test_help_and_info_load_only_what_they_need() -> None:
+    """The list of commands repeats what the commands say of themselves, without loading them."""
+    for name, summary in SUMMARIES.items():
+        first = inspect.getdoc(importlib.import_module(f"amiwarp.cli.{name}").run).split("\n\n")[0]
+        assert first.replace("\n", " ") == summary, name
+    code = (
+        "import sys; from amiwarp.cli.app import SUMMARIES, app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: print({m.split('.')[0] for m in sys.modules} & {'numpy', 'warp', 'scipy'})\n"
+        "import amiwarp.cli.info\n"
+        "print({m.split('.')[0] for m in sys.modules} & {'warp', 'scipy', 'matplotlib'})"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-2:] == ["set()", "set()"]
 
 
 def run(*args: str | Path) -> Result:

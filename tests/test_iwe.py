@@ -9,10 +9,12 @@ import warp as wp
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
+from amiwarp.imaging import pixel_votes
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import upload_events
 from amiwarp.imaging.device_image import Image
-from amiwarp.imaging.warped_image import FIRST_BATCH, CanvasShape, Votes, iwe
+from amiwarp.imaging.warped_image import CanvasShape, Votes, iwe
+from amiwarp.imaging.word_votes import FIRST_BATCH
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
@@ -108,6 +110,23 @@ def fixed_point(xy: np.ndarray, height: int, width: int) -> np.ndarray:
     for dx, dy, weight in ((0, 0, 256 - fx - fy + b), (1, 0, fx - b), (0, 1, fy - b), (1, 1, b)):
         np.add.at(image, (low[:, 1] + dy + 1, low[:, 0] + dx + 1), weight)
     return image[1:-1, 1:-1]
+
+
+@pytest.mark.parametrize("fold", [0, 64])
+def test_sums_move_to_totals_before_they_overflow(fold: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    events, encoder = random_events(70_000, 32, 24), Encoder.constant_speed(720.0, 0, 250_000)
+    model, canvas = ExactModel(Camera.from_fov(32, 24, math.radians(60)), Prism(math.radians(1))), CanvasShape(32, 24)
+
+    def image(times: int) -> np.ndarray:
+        votes = Votes(canvas, "cpu")
+        for _ in range(times):
+            votes.add_events(model, upload_events(events, encoder, "cpu", fold=fold))
+        return votes.take()
+
+    once, thrice = image(1), image(3)
+    np.testing.assert_array_equal(thrice, 3.0 * once)
+    monkeypatch.setattr(pixel_votes, "CAPACITY", 10_000)
+    np.testing.assert_array_equal(image(3), thrice)
 
 
 @pytest.mark.parametrize("n", [1023, 1024, 1025, 5_000_000])

@@ -3,39 +3,18 @@
 from __future__ import annotations
 
 import _thread
+import importlib
 import signal
 import sys
 import threading
+from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
-from amiwarp.cli import (
-    INTERRUPTED,
-    STOPPED,
-    calibrate,
-    chart,
-    compensate,
-    convert,
-    dataset,
-    demo,
-    design,
-    emulate,
-    evaluate,
-    fail,
-    info,
-    live,
-    motor,
-    reconstruct,
-    record,
-    simulate,
-    stability,
-    translate,
-    truth,
-    view,
-)
-from amiwarp.cli.options import command
+from amiwarp.cli import INTERRUPTED, STOPPED, fail
 from amiwarp.errors import AmiwarpError
 
 BAD_INPUT, USAGE = 1, 2
@@ -44,8 +23,88 @@ _UsageError: Any = typer.BadParameter.__base__
 """Class ``UsageError`` of click, taken from Typer, because newer versions of Typer contain their own copy of click."""
 
 
+SUMMARIES = {
+    "demo": "Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.",
+    "info": "Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth and repairs.",
+    "view": "Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand.",
+    "convert": "Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.",
+    "simulate": (
+        "Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth."
+    ),
+    "translate": (
+        "Simulate the recording of an event camera behind the prism from a video, pictures, or a plain event recording."
+    ),
+    "dataset": "Make thousands of simulated recordings from a specification, with labels, splits and a manifest.",
+    "calibrate": (
+        "Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest."
+    ),
+    "compensate": "Compensate the prism's motion: move every event to its position without the prism.",
+    "reconstruct": "Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.",
+    "chart": "Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.",
+    "design": "Compare prisms and speeds for a camera, and recommend one with the reasons.",
+    "stability": (
+        "Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails."
+    ),
+    "evaluate": (
+        "Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report."
+    ),
+    "truth": (
+        "Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files."
+    ),
+    "motor": "Set the speed of the prism's motor, stop it, or print the controller's status.",
+    "record": "Record events and prism angles until the source ends, --seconds have passed, or Ctrl-C.",
+    "live": "Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.",
+    "emulate": "Emulate a prism controller with motor, encoder and index pulse, and inject faults on request.",
+}
+"""First sentence of each command's help, in the order of the list of commands.
+
+They are written here too, so that ``amiwarp --help`` need not load the commands.
+"""
+
+
+class _Commands(Mapping[str, Any]):
+    """All commands by name. The module of a command is loaded when the command is taken from here."""
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in SUMMARIES:
+            raise KeyError(name)
+        return _loaded(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(SUMMARIES)
+
+    def __len__(self) -> int:
+        return len(SUMMARIES)
+
+
+@cache
+def _loaded(name: str) -> Any:
+    """Load the module of a command and return the command."""
+    from amiwarp.cli.options import command  # NumPy is loaded with it
+
+    module = importlib.import_module(f"amiwarp.cli.{name}")
+    one = typer.Typer(rich_markup_mode="rich", add_completion=False)
+    command(one, module.run, name=name, example=module.EXAMPLE)
+    return typer.main.get_command(one)
+
+
 class _Group(TyperGroup):
-    """Command group that reports every failure as one line on stderr and an exit code."""
+    """Command group that loads only the command that runs, and reports every failure as one line and an exit code."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands: Any = _Commands()
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(SUMMARIES)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help with the summaries, without loading the commands."""
+        self.commands = {name: TyperCommand(name, help=text) for name, text in SUMMARIES.items()}
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self.commands = _Commands()
 
     def main(self, *args: Any, **extra: Any) -> Any:
         extra["standalone_mode"] = False
@@ -85,13 +144,6 @@ def _version(
         print(amiwarp.__version__)
     elif ctx.invoked_subcommand is None:
         print(ctx.get_help())
-
-
-for module in (
-    demo, info, view, convert, simulate, translate, dataset, calibrate, compensate, reconstruct, chart, design,
-    stability, evaluate, truth, motor, record, live, emulate,
-):  # fmt: skip
-    command(app, module.run, name=module.__name__.rpartition(".")[2], example=module.EXAMPLE)
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ import warp as wp
 
 from amiwarp.events.device_encoder import azimuths
 from amiwarp.kernels import compensation as kernels
-from amiwarp.kernels.launch import launch, load
+from amiwarp.kernels.launch import launch, load, specialised
 from amiwarp.optics.device_camera import camera_params, pinhole_params
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class LaunchPlan:
         self._camera = camera_params(model.camera, name)
         self._pinhole = pinhole_params(model.camera) or self._camera
         self._model, self._limits, self._azimuths = model.params(name), wp.vec2(*self.size), azimuths(name)
-        load(self.kernel, device)
+        load(specialised(self.kernel, [self._model, self._pinhole]), device)
 
     def padded(self, n: int) -> int:
         """Return the padded length of a column of ``n`` events."""
@@ -63,7 +63,7 @@ class LaunchPlan:
         if all_cores:
             launch(self.kernel, blocks, inputs, [], device=device, smallest=512)
         else:
-            wp.launch(self.kernel, dim=blocks, inputs=[*inputs, 0], device=device)
+            wp.launch(specialised(self.kernel, inputs), dim=blocks, inputs=[*inputs, 0], device=device)
         return c
 
     def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:

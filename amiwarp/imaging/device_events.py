@@ -13,8 +13,8 @@ from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import azimuths, encoder_params
 from amiwarp.events.device_events import DeviceEvents, time_span
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.pixel_votes import BLOCK
 from amiwarp.kernels.votes import (
-    BLOCK,
     EventArrays,
     drift_turns,
     fold_keys,
@@ -52,7 +52,9 @@ class UploadedEvents:
     only one.
     """
     count: int
-    """Number of events, without padding."""
+    """Number of entries, without padding."""
+    total: int
+    """Number of events that the entries stand for: ``count``, if they are not folded."""
     base: Any
     """Prism angles at drift 0 [1/65536 turn]; None if the angles do not depend on a drifting parameter."""
     slope: Any
@@ -138,8 +140,8 @@ def upload_events(
     if fold:
         return _folded(e, n, fold)
     if slope is None:
-        return UploadedEvents(e, n, None, None)
-    return UploadedEvents(e, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
+        return UploadedEvents(e, n, n, None, None)
+    return UploadedEvents(e, n, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
 
 
 def _padded(n: int, device: Any) -> int:
@@ -181,4 +183,4 @@ def _folded(e: Any, n: int, bins: int) -> UploadedEvents:
     out.layer = wp.zeros(_padded(m, device), dtype=wp.uint8, device=device)
     out.weight, out.azimuths, out.time = _put(weight, wp.uint8, device), e.azimuths, e.time
     launch(unfold_keys, m, [wp.array(key, dtype=wp.int64, device=device), bins], [out], device=device)
-    return UploadedEvents(out, m, None, None)
+    return UploadedEvents(out, m, n, None, None)

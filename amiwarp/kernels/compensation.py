@@ -4,9 +4,8 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, PinholeParams
 from amiwarp.kernels.encoder_angle import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
-from amiwarp.kernels.refraction import MODEL_STRUCTS, displace
+from amiwarp.kernels.refraction import displace
 from amiwarp.kernels.vector_code import (
     load_float,
     load_int64,
@@ -125,9 +124,3 @@ def compensate_events(
     i = start + wp.tid()
     x, y = displace_event(model, camera, azimuths, columns, theta_u32_at(encoder, columns.t[i]), i)
     store_position(size, columns, i, x, y)
-
-
-for _model in MODEL_STRUCTS:
-    for _camera in (PinholeParams, CameraParams):
-        wp.overload(compensate_blocks, {"model": _model, "camera": _camera})
-        wp.overload(compensate_events, {"model": _model, "camera": _camera})

@@ -9,10 +9,12 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.vector_code import load_float, load_word, store_float, store_int
-from amiwarp.kernels.votes import Canvas, Cells
+from amiwarp.kernels.vector_code import load_float, load_int, load_word, store_float, store_int
+from amiwarp.kernels.votes import Canvas
+from amiwarp.kernels.word_votes import Cells
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(OPTIONS)
 
 VARIANCE = wp.constant(0)  # numbers of the sharpness measures
 GRADIENT = wp.constant(1)
@@ -20,7 +22,7 @@ LAPLACIAN = wp.constant(2)
 PAPER_J = wp.constant(3)
 ENTROPY = wp.constant(4)
 STRIP = wp.constant(16)  # number of rows that one thread sums
-CPU_WIDTH = 64  # number of pixels per CPU thread
+CPU_WIDTH = wp.constant(64)  # number of pixels per CPU thread
 
 
 @wp.struct
@@ -115,38 +117,47 @@ def add_totals(more: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64),
         counts[i] = wp.int64(0)
 
 
-@cache
-def read_votes(width: int) -> Any:
-    """Return the kernel that computes ``width`` pixels [events] from all slices of votes, which are kept."""
+@wp.kernel
+def read_votes(cells: Cells, canvas: Canvas, frame: Frame, start: int, image: wp.array(dtype=float)):
+    """Compute one pixel [events] per thread from words and totals, which are kept. For CUDA."""
+    block = start + wp.tid()
+    cell = cell_of(canvas, frame, block, 1)
+    total = cells.totals[cell] + wp.int64(votes_of_pixel(cells.words, cell, canvas.columns))
+    image[block_start(frame, block, 1, 1)] = float(wp.float64(total) / wp.float64(256.0))
 
-    @wp.kernel
-    def read_votes(
-        words: wp.array2d(dtype=wp.uint64),
-        totals: wp.array2d(dtype=wp.int64),
-        spilled: int,
-        canvas: Canvas,
-        frame: Frame,
-        start: int,
-        image: wp.array(dtype=float),
-    ):
-        block = start + wp.tid()
-        cell = cell_of(canvas, frame, block, width)
-        at = block_start(frame, block, width, 1)
-        column = block_column(frame, block, width)
-        votes = wp.zeros(shape=(width,), dtype=int)
-        for s in range(words.shape[0]):
-            for k in range(width):
-                store_int(votes, k, votes[k] + votes_of_pixel(words[s], cell + k, canvas.columns))
-        for k in range(width):
-            store_float(image, at + k, wp.where(column + k < frame.columns, float(votes[k]) / 256.0, 0.0))
-        if spilled != 0:
-            for k in range(wp.min(width, frame.columns - column)):
-                total = wp.int64(votes[k])
-                for s in range(words.shape[0]):
-                    total += totals[s, cell + k]
-                image[at + k] = float(wp.float64(total) / wp.float64(256.0))
 
-    return read_votes
+@wp.kernel
+def read_sums(
+    sums: wp.array2d(dtype=int),
+    totals: wp.array(dtype=wp.int64),
+    canvas: Canvas,
+    frame: Frame,
+    start: int,
+    image: wp.array(dtype=float),
+):
+    """Compute 64 pixels [events] per thread from all slices of sums, which are kept, and totals, if any. For CPUs."""
+    block = start + wp.tid()
+    cell = cell_of(canvas, frame, block, CPU_WIDTH)
+    at = block_start(frame, block, CPU_WIDTH, 1)
+    column = block_column(frame, block, CPU_WIDTH)
+    votes = wp.zeros(shape=(64,), dtype=int)
+    for s in range(sums.shape[0]):
+        for k in range(CPU_WIDTH):
+            store_int(votes, k, votes[k] + load_int(sums[s], cell + k))
+    for k in range(CPU_WIDTH):
+        store_float(image, at + k, wp.where(column + k < frame.columns, float(votes[k]) / 256.0, 0.0))
+    if totals.shape[0] != 0:
+        for k in range(wp.min(CPU_WIDTH, frame.columns - column)):
+            total = totals[cell + k] + wp.int64(votes[k])
+            image[at + k] = float(wp.float64(total) / wp.float64(256.0))
+
+
+@wp.kernel
+def add_sums(sums: wp.array2d(dtype=int), start: int, totals: wp.array(dtype=wp.int64)):
+    """Add the sums of all slices to the totals, one pixel per thread."""
+    i = start + wp.tid()
+    for s in range(sums.shape[0]):
+        totals[i] = totals[i] + wp.int64(sums[s, i])
 
 
 # -- smoothing and sums
@@ -156,7 +167,7 @@ def read_votes(width: int) -> Any:
 def smooth(width: int) -> Any:
     """Return the kernel that smooths ``width`` pixels per thread along one axis; the weights begin at the centre."""
 
-    @wp.kernel
+    @wp.kernel(module="unique", module_options=OPTIONS)  # so that a new one does not compile the others again
     def smooth(
         image: wp.array(dtype=float),
         weights: wp.array(dtype=float),
@@ -221,7 +232,7 @@ def sum_terms(width: int, kind: int) -> Any:
             return laplacian2(image, i, stride)
         return other_term(kind, h, eta)
 
-    @wp.kernel
+    @wp.kernel(module="unique", module_options=OPTIONS)  # so that a new one does not compile the others again
     def sum_terms(image: wp.array(dtype=float), frame: Frame, eta: float, start: int, sums: wp.array(dtype=wp.vec2d)):
         block = start + wp.tid()
         at = block_start(frame, block, width, STRIP)

@@ -3,16 +3,20 @@
 Warp itself runs each CPU launch on one thread.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, takewhile
+from threading import Lock, Thread, main_thread
 from typing import Any
 
 import warp as wp
 
 from amiwarp.kernels.cpu_threads import cpu_threads
 
+_specialising = Lock()
+_loading: defaultdict[str, Lock] = defaultdict(Lock)
 SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
 
 
@@ -28,16 +32,53 @@ def background_worker() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-background-worker")
 
 
+def specialised(kernel: Any, inputs: Sequence[Any]) -> Any:
+    """Return a generic kernel for the structs among its inputs, alone in a module; return any other kernel as it is.
+
+    So only the optical models that are used are compiled, and a new one does not compile the others again.
+    """
+    generic = [k for k, argument in enumerate(kernel.adj.args) if argument.type is Any]
+    if not generic:
+        return kernel
+    with _specialising:
+        return _specialised(kernel, tuple(inputs[k]._cls for k in generic))
+
+
+@cache
+def _specialised(kernel: Any, structs: tuple[Any, ...]) -> Any:
+    """Return a generic kernel for the structs in the order of its generic arguments."""
+    module = wp.get_module(".".join([kernel.module.name, kernel.key, *(struct.key for struct in structs)]))
+    module.options.update(kernel.module.options)
+    generic = [argument.label for argument in kernel.adj.args if argument.type is Any]
+    return wp.overload(wp.kernel(kernel.func, module=module), dict(zip(generic, structs, strict=True)))
+
+
 def load(kernel: Any, device: Any) -> None:
     """Compile and load a kernel's module with the block size that launches here use.
 
-    Call it before several threads launch the kernel, or each of them would try to compile it.
+    Call it before several threads launch the kernel, or each of them would try to compile it. A call waits for a
+    running one for the same module.
     """
-    kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+    with _loading[kernel.module.name]:
+        kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+
+
+def load_kernels(kernels: Iterable[tuple[Any, ...]], device: Any) -> None:
+    """Compile and load kernels. Each is followed by the structs of its generic arguments."""
+    for kernel, *structs in kernels:
+        with _specialising:
+            one = _specialised(kernel, tuple(structs)) if structs else kernel
+        load(one, wp.get_device(device))
+
+
+def load_ahead(kernels: Iterable[tuple[Any, ...]], device: Any) -> None:
+    """Compile and load kernels as :func:`load_kernels` does, in the background, until the program ends."""
+    wanted = takewhile(lambda _: main_thread().is_alive(), kernels)
+    Thread(target=load_kernels, args=(wanted, device), name="amiwarp-compiler").start()
 
 
 def load_all(device: Any) -> None:
-    """Compile and load the kernels of all imported modules, several at a time.
+    """Compile and load the kernels of all imported modules, several at a time, except those for one optical model.
 
     Processes that start later find them in Warp's cache. Processes that start together would all compile them.
     """
@@ -71,6 +112,7 @@ def launch(
     device = wp.get_device(device)
     if n == 0:
         return
+    kernel = specialised(kernel, inputs)
     if not device.is_cpu:
         wp.launch(kernel, dim=n, inputs=[*inputs, first], outputs=list(outputs), device=device)
         return
@@ -90,21 +132,16 @@ def launch_slices(
     inputs: Sequence[Any],
     outputs: Sequence[Any],
     *,
-    device: Any,
     first: int = 0,
     smallest: int = SMALLEST_SLICE,
 ) -> None:
-    """Run a kernel as :func:`launch` does, but let slice k write into ``outputs[k]`` only.
+    """Run a kernel on a CPU as :func:`launch` does, but let slice k write into ``outputs[k]`` only.
 
-    For kernels whose threads add to the same elements. The range is ``range(first, first + n)``. On CUDA there is one
-    launch, which adds into ``outputs[0]`` with atomics.
+    For kernels whose threads add to the same elements. The range is ``range(first, first + n)``.
     """
-    device = wp.get_device(device)
-    if n == 0:
-        return
-    ranges = slices(n, len(outputs), smallest) if device.is_cpu else [(0, n)]
-    if device.is_cpu:
-        load(kernel, device)
+    device, ranges = wp.get_device("cpu"), slices(n, len(outputs), smallest)
+    kernel = specialised(kernel, inputs)
+    load(kernel, device)
 
     def run(job: tuple[tuple[int, int], Any]) -> None:
         (start, stop), out = job
@@ -122,7 +159,7 @@ class RecordedLaunch:
 
     def __init__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
         """Record the launch without running it. Each repeat uses the same input and output arrays."""
-        device = wp.get_device(device)
+        device, kernel = wp.get_device(device), specialised(kernel, inputs)
         load(kernel, device)
         self._start = len(inputs)
         self._command = wp.launch(kernel, 1, [*inputs, 0], list(outputs), device=device, record_cmd=True)
@@ -139,5 +176,5 @@ class RecordedLaunch:
 
 
 def slice_count(device: Any) -> int:
-    """Return the number of output arrays that :func:`launch_slices` can use on ``device``."""
+    """Return the number of slices of a launch on ``device``."""
     return cpu_threads() if wp.get_device(device).is_cpu else 1

@@ -6,7 +6,7 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
 from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs
-from amiwarp.kernels.refraction import MODEL_STRUCTS, compensate, displace
+from amiwarp.kernels.refraction import compensate, displace
 from amiwarp.kernels.vector_code import load_float, load_int, load_uint16, store_float, store_int
 
 wp.set_module_options({"enable_backward": False})
@@ -140,10 +140,3 @@ def place_blocks(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, 
         store_geometry(
             geometry, first + k, cells[k], parts[k], parts[64 + k], cells[64 + k], parts[128 + k], parts[192 + k]
         )
-
-
-for _struct in MODEL_STRUCTS:
-    wp.overload(place_pairs, {"model": _struct})
-    wp.overload(place_still, {"model": _struct})
-    wp.overload(place_blocks, {"model": _struct})
-    wp.overload(find_places, {"model": _struct})

@@ -177,12 +177,11 @@ def refract_in_prism_frame(m: ExactParams, x: float, y: float, z: float, w0: flo
     sign. z^2 is computed from its change, because computing it from x^2 + y^2 would cancel in float32 far from the
     axis.
     """
-    inside = float(entering)
     length2 = x * x + y * y + z * z
     bent = (m.index2 - 1.0) * length2
     d = w0 * x + w1 * y
-    q = m.sin_apex * d + m.cos_apex * wp.sqrt(z * z + (1.0 - inside) * bent)
-    shift = (wp.sqrt(q * q + (2.0 * inside - 1.0) * bent) - q) * m.sin_apex
+    q = m.sin_apex * d + m.cos_apex * wp.where(entering == 1, z, wp.sqrt(z * z + bent))
+    shift = (wp.sqrt(q * q + wp.where(entering == 1, bent, -bent)) - q) * m.sin_apex
     z2 = z * z - shift * (2.0 * d + shift)
     passes = wp.min(wp.min(z, q), z2) > 0.0  # z2 may be NaN and comes last: min(a, NaN) is NaN here
     return x + shift * w0, y + shift * w1, wp.where(passes, wp.sqrt(z2), NAN)
@@ -355,7 +354,8 @@ def fit_harmonics(
     mean = wp.vec2(0.0, 0.0)
     c = wp.vec2(0.0, 0.0)
     s = wp.vec2(0.0, 0.0)
-    for k in range(HARMONIC_ANGLES):
+    angles = int(HARMONIC_ANGLES)  # a variable, so that Warp does not unroll the loop, which is slow to compile
+    for k in range(angles):
         phi = 6.283185307179586 * float(k) / float(HARMONIC_ANGLES)
         w = wp.vec2(wp.cos(phi), wp.sin(phi))
         d = compensate(model, camera, xy, w) - xy
@@ -367,11 +367,3 @@ def fit_harmonics(
         table[row, col, k] = mean[k] / n
         table[row, col, 2 + k] = c[k] * (2.0 / n)
         table[row, col, 4 + k] = s[k] * (2.0 / n)
-
-
-MODEL_STRUCTS = (CircleParams, RadialCircleParams, EllipseParams, ExactParams)
-for _struct in MODEL_STRUCTS:
-    wp.overload(compensate_points, {"model": _struct})
-    wp.overload(deflect_points, {"model": _struct})
-    if _struct is not EllipseParams:
-        wp.overload(fit_harmonics, {"model": _struct})

@@ -1,4 +1,4 @@
-"""Unstrided loads and stores, and an addition that reports carries. With them, CPU compilers vectorise a loop."""
+"""Unstrided loads and stores, and additions to pairs of elements. With them, CPU compilers vectorise a loop."""
 
 import warp as wp
 
@@ -65,14 +65,49 @@ def store_word(values: wp.array(dtype=wp.uint64), i: int, value: wp.uint64):
     """Store ``value`` as element ``i`` of a contiguous array of uint64."""
 
 
-@wp.func_native("""
-    uint64_t* word = (uint64_t*)values.data + i;
-    const uint64_t old = *word, now = old + value;
-    *word = now;
-    return (old & value) | ((old | value) & ~now);
-""")
-def add_word(values: wp.array(dtype=wp.uint64), i: int, value: wp.uint64) -> wp.uint64:
-    """Add ``value`` to element ``i`` and return the carries: bit k is set if the addition carried out of bit k.
+@wp.func_native("for (int k = 0; k < n; ++k) ((float*)out.data)[k] = ((const float*)values.data)[first + k];")
+def copy_floats(out: wp.array(dtype=float), values: wp.array(dtype=float), first: int, n: int):
+    """Copy ``values[first : first + n]`` of contiguous arrays of float32."""
 
-    Only for CPU code in which no other thread writes to the array.
+
+@wp.func_native("for (int k = 0; k < n; ++k) ((uint8_t*)out.data)[k] = ((const uint8_t*)values.data)[first + k];")
+def copy_bytes(out: wp.array(dtype=wp.uint8), values: wp.array(dtype=wp.uint8), first: int, n: int):
+    """Copy ``values[first : first + n]`` of contiguous arrays of uint8."""
+
+
+@wp.func_native("""
+    const uint64_t* table = (const uint64_t*)pairs.data;
+    const uint16_t* index = (const uint16_t*)indices.data + first;
+    uint64_t* to = (uint64_t*)out.data;
+    for (int k = 0; k < n; ++k) to[k] = table[index[k]];
+""")
+def load_pairs(
+    out: wp.array(dtype=float), pairs: wp.array(dtype=float), indices: wp.array(dtype=wp.uint16), first: int, n: int
+):
+    """Copy the pairs of floats at ``indices[first : first + n]`` of a table of pairs, one load each."""
+
+
+@wp.func_native("""
+    const int* place = (const int*)places.data;
+    const uint64_t* share = (const uint64_t*)shares.data;
+    uint32_t* sum = (uint32_t*)sums.data;
+    for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k] + columns, 1);
+    for (int k = 0; k < n; ++k) {
+        uint64_t above, below;
+        uint32_t* at = sum + place[k];
+        memcpy(&above, at, 8);
+        memcpy(&below, at + columns, 8);
+        above += share[2 * k];
+        below += share[2 * k + 1];
+        memcpy(at, &above, 8);
+        memcpy(at + columns, &below, 8);
+    }
+""")
+def add_word_pairs(
+    sums: wp.array(dtype=int), places: wp.array(dtype=int), shares: wp.array(dtype=int), columns: int, n: int
+):
+    """Add four shares to the 2 x 2 elements at each of ``n`` places of an image, two in one 64-bit addition.
+
+    Only for little-endian CPUs, if no sum overflows 32 bits and no other thread writes to the image. The elements are
+    prefetched, because an image is larger than a core's cache.
     """

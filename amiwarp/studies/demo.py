@@ -21,6 +21,7 @@ from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.imaging import metrics
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output, make_folder
+from amiwarp.kernels.launch import load_ahead
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import Reconstructed, draw_demo
@@ -32,6 +33,7 @@ from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.studies.cpu_kernels import EXACT_KERNELS, OTHER_MODELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -122,6 +124,8 @@ def run_demo(demo: Demo, progress: Progress | None = None) -> DemoResult:
     for path in files.values():
         check_output(path)
     began = time.perf_counter()
+    if demo.device == "cpu":
+        load_ahead((*EXACT_KERNELS, *OTHER_MODELS), demo.device)
     simulated = simulation(demo)
     simulated.write(files["recording"], progress=report)
     simulated_s = time.perf_counter() - began

@@ -1,0 +1,93 @@
+"""Buffers of votes on a CPU: one image of 32-bit sums per slice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from amiwarp.imaging.device_events import LARGEST_WEIGHT
+from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.kernels.iwe import CPU_WIDTH, add_sums, read_sums
+from amiwarp.kernels.launch import RecordedLaunch, launch, launch_slices
+from amiwarp.kernels.pixel_votes import (
+    BLOCK,
+    CAPACITY,
+    vote_event_blocks,
+    vote_point_blocks,
+    vote_rotating_camera_blocks,
+)
+
+if TYPE_CHECKING:
+    from amiwarp.imaging.device_events import UploadedEvents
+    from amiwarp.imaging.device_image import Image
+
+SMALLEST = 512
+"""Fewest blocks of a slice."""
+
+
+class PixelVotes:
+    """Sums of the votes of each pixel on a CPU, allocated once. Before they overflow, they move to 64-bit totals."""
+
+    def __init__(self, canvas: Any, layers: int) -> None:
+        """Allocate the sums. ``canvas``: Warp struct ``amiwarp.kernels.votes.Canvas``."""
+        self._canvas, self._cells = canvas, layers * canvas.rows * canvas.columns
+        # votes and blocks of pixels may reach beyond the last row, with zeros
+        size = self._cells + canvas.columns + 2 + CPU_WIDTH
+        self._sums = wp.zeros((cpu_threads(), size), dtype=int, device="cpu")
+        self._slices = [self._sums[k] for k in range(self._sums.shape[0])]
+        self._totals = wp.empty(0, dtype=wp.int64, device="cpu")
+        self._room = CAPACITY  # number of events that the sums can still take
+
+    def clear(self) -> None:
+        """Discard all votes."""
+        self._sums.zero_()
+        self._totals = wp.empty(0, dtype=wp.int64, device="cpu")
+        self._room = CAPACITY
+
+    def add_events(self, inputs: list[Any], events: UploadedEvents, camera_rotation: Any | None) -> None:
+        """Vote events. ``inputs``: model, camera, columns of the events and canvas, as the kernels take them."""
+        kernel = vote_event_blocks
+        if camera_rotation is not None:
+            kernel, inputs = vote_rotating_camera_blocks, [*inputs, camera_rotation]
+        self._vote(kernel, inputs, events.count, events.total)
+
+    def add_points(self, x: Any, y: Any, layer: Any, count: int) -> None:
+        """Vote the first ``count`` points."""
+        self._vote(vote_point_blocks, [x, y, layer, self._canvas], count, count)
+
+    def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
+        """Return a function that votes a range of blocks of points in the calling thread."""
+        vote = RecordedLaunch(vote_point_blocks, [x, y, layer, self._canvas, len(x)], [self._slices[0]], device="cpu")
+
+        def vote_range(first: int, blocks: int) -> None:
+            self._reserve(blocks * int(BLOCK))
+            vote(first, blocks)
+
+        return vote_range
+
+    def _vote(self, kernel: Any, inputs: list[Any], count: int, total: int) -> None:
+        """Vote ``count`` entries that stand for ``total`` events, in pieces that fit into the sums."""
+        blocks, piece = -(-count // int(BLOCK)), CAPACITY // (int(BLOCK) * (1 if total == count else LARGEST_WEIGHT))
+        if total <= CAPACITY:
+            piece = max(blocks, 1)
+        for first in range(0, blocks, piece):
+            n = min(piece, blocks - first)
+            self._reserve(total if n == blocks else CAPACITY)
+            launch_slices(kernel, n, [*inputs, count], self._slices, first=first, smallest=SMALLEST)
+
+    def _reserve(self, events: int) -> None:
+        """Make room for the votes of a number of events."""
+        if events > self._room:
+            if not len(self._totals):
+                self._totals = wp.zeros(self._cells, dtype=wp.int64, device="cpu")
+            launch(add_sums, self._cells, [self._sums], [self._totals], device="cpu")
+            self._sums.zero_()
+            self._room = CAPACITY
+        self._room -= events
+
+    def read(self, image: Image) -> None:
+        """Write the current image [events] to ``image``; the votes are kept."""
+        inputs = [self._sums, self._totals, self._canvas, image.frame]
+        launch(read_sums, image.blocks, inputs, [image.pixels], device="cpu", smallest=SMALLEST)

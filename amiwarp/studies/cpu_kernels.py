@@ -1,0 +1,48 @@
+"""Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.
+
+Each is followed by the structs of its generic arguments. The other kernels of its module are compiled with it.
+"""
+
+from amiwarp.kernels.camera import PinholeParams
+from amiwarp.kernels.compensation import compensate_blocks
+from amiwarp.kernels.conjugate_gradients import descend
+from amiwarp.kernels.iwe import read_sums
+from amiwarp.kernels.map_positions import find_places, place_blocks
+from amiwarp.kernels.map_prior import link
+from amiwarp.kernels.multilevel import prolong
+from amiwarp.kernels.pairs import mark_spans
+from amiwarp.kernels.photometric import apply_normal_blocks
+from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
+from amiwarp.kernels.refraction import (
+    CircleParams,
+    EllipseParams,
+    ExactParams,
+    RadialCircleParams,
+    compensate_points,
+    fit_harmonics,
+)
+from amiwarp.kernels.residual_slopes import sum_costs
+from amiwarp.kernels.votes import turn_events
+
+EXACT_KERNELS = (
+    (turn_events,),
+    (vote_event_blocks, ExactParams, PinholeParams),
+    (read_sums,),
+    (mark_spans,),
+    (find_places, ExactParams),
+    (place_blocks, ExactParams),
+    (apply_normal_blocks,),
+    (descend,),
+    (sum_costs,),
+    (compensate_blocks, ExactParams, PinholeParams),
+    (link,),
+    (prolong,),
+)
+"""Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
+OTHER_MODELS = (
+    (fit_harmonics, ExactParams),
+    *((vote_event_blocks, struct, PinholeParams) for struct in (CircleParams, RadialCircleParams, EllipseParams)),
+    *((compensate_points, struct) for struct in (CircleParams, RadialCircleParams, EllipseParams)),
+    (vote_point_blocks,),
+)
+"""Kernels of a comparison of the optical models."""
