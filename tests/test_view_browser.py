@@ -83,8 +83,8 @@ class Tabs:
         return page
 
     def _console(self, message: Any) -> None:
-        if message.type in ("error", "warning") and not message.location["url"].endswith("/paraview/"):
-            self.failures.append(message.text)  # the page first tries ParaView's launcher, which does not exist
+        if message.type in ("error", "warning"):
+            self.failures.append(message.text)
 
     def __call__(self, server: Any) -> Callable[[], None]:
         from amiwarp.viewer.panel import Panel

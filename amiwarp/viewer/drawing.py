@@ -40,10 +40,12 @@ def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: boo
     else:
         third = (shown.events.t - zero_us) * 1e-3
         frame = {"low": start_ms, "high": start_ms + shown.span.length_us * 1e-3, "title": "time (ms)"}
+    colours = _pixels(colours_of(shown, look, after=True))
+    differ = colour in (Colour.DENSITY, Colour.RESIDUAL)  # depend on the places of the points
     return {
         "cloud_before": _bytes(shown.before), "cloud_after": _bytes(shown.after), "cloud_third": _bytes(third),
-        "colours_before": _pixels(colours_of(shown, look, after=False)),
-        "colours_after": _pixels(colours_of(shown, look, after=True)),
+        "colours_before": _pixels(colours_of(shown, look, after=False)) if differ else colours,
+        "colours_after": colours,
         "third_axis": frame, "region": list(shown.region),
         "legend": legend(shown, colour, dark=dark, start_ms=start_ms),
     }  # fmt: skip
