@@ -353,7 +353,7 @@ def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
 ) -> None:
     inspector.open(*inspector.first_window())
     whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
-    monkeypatch.setattr(log_intensity, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(log_intensity, "MOST_WORK", 20_000)
     monkeypatch.setattr(selected_part, "MOST_EVENTS", 40_000)
     found = make_images(inspector, ImageKind.LOG_INTENSITY)
     assert found.after.shape == whole.shape
