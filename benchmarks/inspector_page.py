@@ -26,7 +26,7 @@ from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.page_values import SETTABLE
 from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.serve import serve
-from benchmarks.view import made, recorded
+from benchmarks.inspector import made, recorded
 
 CHANGES = 15
 TURN = """async (seconds) => {
