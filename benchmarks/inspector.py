@@ -3,7 +3,9 @@
     python -m benchmarks.inspector [--device cuda:0] [--events 100_000_000] [--out FILE.json]
 
 It needs no browser; ``benchmarks.inspector_page`` measures the page. An update includes what the server makes of it for
-the page: bytes of points and colours, and encoded images. Wall times are medians. CPU times of all threads stand next to them, because other programs lengthen the wall times on
+the page: bytes of points and colours, and encoded images.
+
+Wall times are medians. CPU times of all threads stand next to them, because other programs lengthen the wall times on
 a shared machine. Each figure is checked in the same run: positions are those of ``compensate_events``, counts are those
 of the recording.
 """

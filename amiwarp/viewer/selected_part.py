@@ -74,13 +74,13 @@ def select_part(
     columns, rows = (np.zeros(size, np.bool_) for size in inspector.recording.events.size)
     columns[left:right:step] = rows[top:bottom:step] = True
     kept = np.flatnonzero(columns[events.x] & rows[events.y])
-    x, y = ((each[kept] - least) // step for each, least in ((events.x, left), (events.y, top)))
+    x, y = (((each[kept] - least) // step).astype(np.uint16) for each, least in ((events.x, left), (events.y, top)))
     width, height = -(-(right - left) // step), -(-(bottom - top) // step)
     c = inspector.camera
     camera = replace(
         c, width=width, height=height, fx=c.fx / step, fy=c.fy / step, cx=(c.cx - left) / step, cy=(c.cy - top) / step
     )
-    source = MemoryEvents(Events(x.astype(np.uint16), y.astype(np.uint16), events.t[kept], events.p[kept]), width, height)
+    source = MemoryEvents(Events(x, y, events.t[kept], events.p[kept]), width, height)
     whole = inspector.recording
     recording = Recording(source, camera, whole.encoder, whole.prism, name=whole.name)
     return SelectedPart(recording, start_us, length_us, step)
