@@ -119,7 +119,7 @@ def update(device: str, region: tuple[int, int, int, int] | None) -> dict[str, A
     def change(k: int) -> None:
         inspector.set(replace(inspector.knobs, apex=0.01 + 0.0005 * k))
         shown = inspector.show()
-        cloud_state(shown, Colour.POLARITY, Axis.ANGLE, dark=False, zero_us=0)
+        cloud_state(shown, Colour.POLARITY, Axis.ANGLE, dark=False)
         images = count_images(shown)
         assert images.before is not None
         for image in (images.before, images.after):
