@@ -3,7 +3,7 @@
     python -m benchmarks.inspector_page [--device cuda:0] [--out FILE.json]
 
 The window holds 1 million events, of which each cloud draws 100,000. A change counts until the browser has drawn the
-new cloud; the sharpness on the page is compared with that of a second inspector.
+new cloud and the new image; the sharpness on the page is compared with that of a second inspector.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.page_values import SETTABLE
 from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.serve import serve
-from benchmarks.view import made, recorded
+from benchmarks.inspector import made, recorded
 
 CHANGES = 15
 TURN = """async (seconds) => {
@@ -44,13 +44,16 @@ TURN = """async (seconds) => {
 }"""
 """Program for the browser that turns the clouds, and returns the frames per second."""
 CHANGE = """async (apex) => {
-  const canvas = document.querySelector('.clouds canvas');
-  const [frames, begin] = [canvas.dataset.frames, performance.now()];
+  const shown = () => [
+    document.querySelector('.clouds canvas').dataset.frames, document.querySelector('#image-after').dataset.images,
+  ];
+  const [before, begin] = [shown(), performance.now()];
   trame.state.set('apex', apex);
-  while (canvas.dataset.frames === frames) await new Promise(requestAnimationFrame);
+  while (shown().some((each, k) => each === before[k])) await new Promise(requestAnimationFrame);
   return performance.now() - begin;
 }"""
-"""Program for the browser that changes the apex angle, and returns the time until the cloud is drawn [ms]."""
+"""Program for the browser that changes the apex angle. It returns the time until cloud and image are drawn [ms].
+The sharpness comes with them, in one message."""
 
 
 def measure(url: str) -> dict[str, Any]:

@@ -34,6 +34,7 @@ from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.page_values import events_text
 from amiwarp.viewer.parameters import Knobs, Selection, Source
+from amiwarp.viewer.phase_estimate import estimate_phase
 from amiwarp.viewer.selected_calibration import calibrate_selected, cost_surface, scope_text
 from amiwarp.viewer.suggestion import suggest_region
 from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
@@ -163,6 +164,46 @@ def test_compensation_sharpens_the_suggested_region(inspector: Inspector, record
     assert inspector.suggest_region() == found  # a region that is shown does not matter
     plain = Inspector(replace(recording, encoder=None, prism=None, camera=None, truth=None))
     assert not plain.suggest_region().gains
+
+
+def test_edges_that_come_from_outside_suggest_no_region() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.poisson(4.0, (300, 400)).astype(np.float32)
+    after = before.copy()
+    after[150:240, 230:340] = np.where(np.arange(110) % 10 < 2, 20.0, 0.0)
+    before[:90, :120] = 0.05
+    after[:90, :120] = np.where(np.arange(120) < 4, 40.0, 0.05)
+    left, top, _, _ = suggest_region(before, after).region
+    assert left > 120
+    assert top > 90
+
+
+# estimate of the phase
+
+
+@pytest.mark.parametrize("phase", [-2.6, 0.0, 1.3])
+def test_an_unknown_phase_is_estimated(recording: Recording, phase: float) -> None:
+    encoder = recording.encoder
+    assert encoder is not None
+    turned = replace(recording, encoder=Encoder(encoder.t, encoder.angle - phase), truth=None)
+    inspector = Inspector(turned)
+    assert estimate_phase(inspector)
+    assert math.remainder(inspector.knobs.phase - phase, math.tau) == pytest.approx(0.0, abs=math.radians(6.0))
+    assert inspector.sources["phase"] == "estimated"
+    shown = inspector.show()
+    assert shown.sharpness_after > 1.1 * shown.sharpness_before
+    assert not estimate_phase(inspector)  # it is no longer unknown
+
+
+def test_a_phase_is_kept_if_it_is_known_or_sharpens_nothing(recording: Recording) -> None:
+    by_hand = Inspector(recording)
+    by_hand.set(replace(by_hand.knobs, phase=1.0))
+    flat = MemoryEvents(random_events(50_000, 160, 120), 160, 120)
+    without = replace(recording, encoder=None, truth=None)
+    for inspector in (by_hand, Inspector(replace(recording, events=flat, truth=None)), Inspector(without)):
+        before = inspector.knobs, inspector.sources["phase"]
+        assert not estimate_phase(inspector)
+        assert (inspector.knobs, inspector.sources["phase"]) == before
 
 
 # background activity
@@ -353,7 +394,7 @@ def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
 ) -> None:
     inspector.open(*inspector.first_window())
     whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
-    monkeypatch.setattr(log_intensity, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(log_intensity, "MOST_WORK", 20_000)
     monkeypatch.setattr(selected_part, "MOST_EVENTS", 40_000)
     found = make_images(inspector, ImageKind.LOG_INTENSITY)
     assert found.after.shape == whole.shape

@@ -164,7 +164,7 @@ def test_a_clicked_event_is_described_with_its_truth(inspector: Inspector) -> No
     shown = inspector.show()
     k = int(np.flatnonzero(shown.events.t % 12 == 2)[0])
     expected = f"; cause leak; instance red ball; depth {shown.events.t[k] * 1e-3:.3f} m"
-    assert event_text(shown, k, 0).endswith(f" px{expected}")
+    assert event_text(shown, k).endswith(f" px{expected}")
 
 
 def test_the_legend_has_its_strip_next_to_the_clouds(scene: Scene, inspector: Inspector) -> None:

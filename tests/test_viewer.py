@@ -28,10 +28,11 @@ from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import window_loading
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.cloud_scene import Look, Scene
-from amiwarp.viewer.colouring import WIDEST_PX, colours_of, residual
+from amiwarp.viewer.colouring import WIDEST_PX, axis_range, colours_of, residual, third_axis
+from amiwarp.viewer.drawing import orbit_lines
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.parameters import Knobs, Selection
-from amiwarp.viewer.timeline import event_rate, read_span
+from amiwarp.viewer.timeline import read_span
 
 TRUE = Prism(math.radians(1.0))
 PICTURES = Path(__file__).parent / "pictures"
@@ -116,15 +117,6 @@ def test_a_long_window_is_thinned_evenly_and_its_true_count_is_told(million: Mem
     assert shares.max() < 1.3 * shares.min()
     whole = read_span(million, 200_000, 10_000, most_events=64_000)
     assert np.array_equal(whole.events.t, t[(t >= 200_000) & (t < 210_000)])
-
-
-def test_the_rate_is_that_of_the_events(million: MemoryEvents) -> None:
-    source = Counted(million)
-    times, rates = event_rate(source)  # type: ignore[arg-type]
-    assert source.read == 0
-    assert len(rates) == 128
-    assert np.sum(rates * np.diff(times)) * 1e-6 == pytest.approx(len(million), abs=2)
-    assert np.abs(rates - len(million) / 1.5).max() < 0.1 * len(million)
 
 
 def test_the_first_window_is_one_turn_in_the_middle(inspector: Inspector, recording: Recording) -> None:
@@ -339,6 +331,33 @@ def test_pictures_are_as_they_were(scene: Scene, inspector: Inspector, recording
     known = {n: np.asarray(Image.open(PICTURES / f"view_{n}.png").convert("RGB")) for n in LOOKS}
     assert away(picture, known[name]) < 1.0
     assert all(away(picture, known[n]) > 4.0 for n in LOOKS if n != name)
+
+
+def test_the_time_axis_counts_from_the_first_event(scene: Scene, inspector: Inspector, recording: Recording) -> None:
+    inspector.open(recording.events.t_first + 40_000, 20_000)
+    shown = inspector.show()
+    assert axis_range(shown, Axis.TIME) == (40.0, 60.0)
+    t_ms = third_axis(shown, Axis.TIME)
+    assert 40.0 <= t_ms.min() < t_ms.max() < 60.0
+    scene.show(shown, Look(axis=Axis.TIME))
+    z = scene.box.positions(shown.before, t_ms)[:, 2]
+    assert 0.0 <= z.min() < z.max() <= scene.box.axis_height
+    assert (scene.box.low, scene.box.high) == (40.0, 60.0)
+
+
+def test_the_orbit_is_drawn_in_both_clouds_until_it_is_left_out(scene: Scene, inspector: Inspector) -> None:
+    def green() -> list[int]:
+        near = np.abs(scene.picture().astype(int) - (0, 158, 115)).max(axis=2) < 30
+        return [int(half.sum()) for half in np.split(near, 2, axis=1)]
+
+    look, shown = Look(), inspector.show()
+    for overlaid in (True, False):
+        scene.show(shown, replace(look, overlaid=overlaid), orbit_lines(inspector, shown))
+        scene.look_from(View.FREE, replace(look, overlaid=overlaid))
+        assert sum(green()) >= 10
+    assert min(green()) > 0
+    scene.show(shown, look)
+    assert sum(green()) == 0
 
 
 def test_a_turntable_ends_where_it_began(scene: Scene, inspector: Inspector) -> None:

@@ -68,12 +68,14 @@ class ScreenshotOptions:
     ] = "1400x620"
 
     def write(self, inspector: Inspector, path: Path) -> dict[str, Any]:
-        """Write the picture; return a description of its content for ``--json``.
+        """Write the picture; return a description of its content for ``--json``. An unknown phase is estimated first.
 
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
         from amiwarp.viewer.app import save_screenshot
         from amiwarp.viewer.cloud_scene import Look
+        from amiwarp.viewer.page_values import notes
+        from amiwarp.viewer.phase_estimate import estimate_phase
 
         if path.suffix.lower() != ".png":
             raise AmiwarpError(f"{path}: pictures are written as .png; give a name that ends in .png")
@@ -81,13 +83,14 @@ class ScreenshotOptions:
         width, height = parse_size(self.size)
         if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
             raise AmiwarpError(f"--size {self.size!r}: width and height must be {LEAST_PX} to {MOST_PX} px")
+        estimate_phase(inspector)
         look = Look(self.colour, third, dark=self.dark, overlaid=self.overlaid)
         save_screenshot(inspector, path, view=self.view, look=look, size=(width, height))
         shown = inspector.show()
         return {
             "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
             "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
-            "notes": list(inspector.notes),
+            "notes": notes(inspector),
         }  # fmt: skip
 
 

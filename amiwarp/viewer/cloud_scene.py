@@ -16,11 +16,13 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import save_png
 from amiwarp.validation import choice
 from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.colouring import colours_of, third_axis
+from amiwarp.viewer.colouring import axis_range, colours_of, third_axis
 from amiwarp.viewer.legend import legend_actors, rows_in, strip_share
 from amiwarp.viewer.truth_colours import Legend, legend_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from amiwarp.viewer.window import DisplayedWindow
@@ -36,6 +38,8 @@ CAMERA_DIRECTIONS = {
     View.Y_AXIS: ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
 }
 """Direction from the clouds to the camera, and the upward direction, for each view."""
+ORBIT_COLOUR = "#009e73"
+"""Colour of the model's orbit, as on the page."""
 VIEW_ANGLE = 26.0
 """Vertical field of view of the camera [deg]."""
 MARGIN = 0.1
@@ -66,14 +70,16 @@ class Look:
 
 @dataclass(frozen=True)
 class Box:
-    """Frame of both clouds: a region of the image [px], and the third axis from 0 to ``depth``."""
+    """Frame of both clouds: a region of the image [px], and the range of the third axis."""
 
     left: int
     top: int
     right: int
     bottom: int
-    depth: float
-    """Length of the third axis [deg or ms]."""
+    low: float
+    """Start of the third axis [deg or ms]."""
+    high: float
+    """End of the third axis [deg or ms]."""
 
     @property
     def width(self) -> int:
@@ -88,11 +94,11 @@ class Box:
     @property
     def stretch(self) -> float:
         """Scale of the third axis [px per deg or ms]. The scale of x and y is 1."""
-        return self.axis_height / self.depth
+        return self.axis_height / (self.high - self.low)
 
     def positions(self, xy: NDArray[Any], third: NDArray[Any]) -> NDArray[np.float32]:
         """Return points in the scene, shape ``(n, 3)``; y is negated, because the scene's y axis points up."""
-        return np.stack([xy[:, 0], -xy[:, 1], third * self.stretch], axis=1).astype(np.float32)
+        return np.stack([xy[:, 0], -xy[:, 1], (third - self.low) * self.stretch], axis=1).astype(np.float32)
 
 
 def check_display() -> None:
@@ -130,15 +136,18 @@ class Scene:
         self.view = View.FREE
         self._clouds: list[Any] = []
         self._frame: list[tuple[int, Any]] = []
+        self._lines: list[tuple[int, Any]] = []
         self._explained: tuple[Legend, str] | None = None
         self._framed: tuple[Any, ...] | None = None
-        self.box = Box(0, 0, 1, 1, 1.0)
+        self.box = Box(0, 0, 1, 1, 0.0, 1.0)
 
-    def show(self, shown: DisplayedWindow, look: Look) -> None:
-        """Draw the events of a window. The camera moves only if the region of the image has changed."""
+    def show(self, shown: DisplayedWindow, look: Look, lines: Sequence[NDArray[Any]] = ()) -> None:
+        """Draw the events of a window. The camera moves only if the region of the image has changed.
+
+        ``lines``: a line for each cloud, points x, y [px] and on the third axis, shape ``(n, 3)``.
+        """
         before = self.box
-        depth = 360.0 if look.axis is Axis.ANGLE else shown.span.length_us * 1e-3
-        self.box = Box(*shown.region, depth)
+        self.box = Box(*shown.region, *axis_range(shown, look.axis))
         third = third_axis(shown, look.axis)
         for k, xy in enumerate((shown.before, shown.after)):
             points = self.box.positions(xy, third)
@@ -146,8 +155,9 @@ class Scene:
             valid = np.isfinite(points).all(axis=1)
             self._cloud(k, points[valid], colours[valid], look)
         self._draw_frame(look)
+        self._draw_lines(lines, look)
         self._draw_legend(legend_of(shown.truth, look.colour, rows_in(self.plotter.window_size[1])), look)
-        if replace(before, depth=depth) != self.box:  # the region has changed
+        if replace(before, low=self.box.low, high=self.box.high) != self.box:  # the region has changed
             self.look_from(self.view, look)
 
     def look_from(self, view: View, look: Look) -> None:
@@ -242,6 +252,18 @@ class Scene:
         for k, title in enumerate(titles):
             self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
 
+    def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
+        """Draw a line in each cloud, instead of those drawn before."""
+        import pyvista
+
+        for k, actor in self._lines:
+            self.plotter.renderers[k].remove_actor(actor, render=False)
+        self._lines = []
+        for number, line in enumerate(lines):
+            k = 0 if look.overlaid else number
+            curve = pyvista.lines_from_points(self.box.positions(line[:, :2], line[:, 2]))
+            self._lines.append((k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5)))
+
     def _draw_legend(self, legend: Legend, look: Look) -> None:
         """Draw the legend in a strip on the left, if it has changed. The clouds shrink to make room."""
         ink, home, camera = BACKGROUND_AND_INK[look.dark][1], self.plotter.renderers[2], self._views[0].camera
@@ -275,7 +297,7 @@ class Scene:
         b = self.box
         frame = pyvista.Box((b.left, b.right, -b.bottom, -b.top, 0, b.axis_height)).outline()
         actors = [self._add(k, frame, color=ink, line_width=1.0)]
-        unit, third = ("θ [°]", (0.0, 360.0)) if look.axis is Axis.ANGLE else ("t [ms]", (0.0, b.depth))
+        unit = "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"
         gap = 0.05 * b.width
         front, middle = -b.bottom - gap, ((b.left + b.right) / 2.0, -(b.top + b.bottom) / 2.0)
         labels: list[tuple[str, tuple[float, float, float]]] = []
@@ -288,7 +310,7 @@ class Scene:
             place = (b.right + gap, -b.top + 1.2 * gap, 0.0) if flat else (b.right + 2.5 * gap, middle[1], -2.5 * gap)
             labels.append(("y [px]", place))
         if self.view is not View.XY:
-            labels += [(f"{v:g}", (b.left - gap, front + gap, v * b.stretch)) for v in ticks(*third)]
+            labels += [(f"{v:g}", (b.left - gap, front + gap, (v - b.low) * b.stretch)) for v in ticks(b.low, b.high)]
             labels.append((unit, (b.left - gap, front + gap, b.axis_height + 1.5 * gap)))
         for text, place in labels:
             label = pyvista.Label(text, position=place, size=13)

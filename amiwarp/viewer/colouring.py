@@ -31,10 +31,17 @@ WIDE_EVENTS = 2.0
 
 
 def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
-    """Return each point's third coordinate, shape ``(n,)``: prism angle [deg], or time in the window [ms]."""
+    """Return each point's third coordinate, shape ``(n,)``: prism angle [deg], or time [ms]."""
     if axis is Axis.ANGLE:
         return np.asarray(np.degrees(shown.theta), np.float64)
-    return np.asarray((shown.events.t - shown.span.start_us) * 1e-3, np.float64)
+    return np.asarray((shown.events.t - shown.span.first_us) * 1e-3, np.float64)
+
+
+def axis_range(shown: DisplayedWindow, axis: Axis) -> tuple[float, float]:
+    """Return the ends of the third axis: prism angle [deg], or time after the recording's first event [ms]."""
+    if axis is Axis.ANGLE:
+        return 0.0, 360.0
+    return shown.span.start_ms, shown.span.start_ms + shown.span.length_us * 1e-3
 
 
 def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np.uint8]:
@@ -66,12 +73,13 @@ def colour_table(colour: Colour, *, dark: bool) -> NDArray[np.uint8]:
     return np.asarray(255.0 * table, np.uint8)
 
 
-def scale_of(shown: DisplayedWindow, colour: Colour, *, start_ms: float) -> tuple[str, str, str]:
-    """Return the texts at both ends of a colour scale, and its title. ``start_ms``: start of the window [ms]."""
+def scale_of(shown: DisplayedWindow, colour: Colour) -> tuple[str, str, str]:
+    """Return the texts at both ends of a colour scale, and its title."""
     if colour is Colour.ANGLE:
         return "0°", "360°", "prism angle θ"
     if colour is Colour.TIME:
-        return f"{start_ms:.6g}", f"{start_ms + shown.span.length_us * 1e-3:.6g} ms", "time"
+        low, high = axis_range(shown, Axis.TIME)
+        return f"{low:.6g}", f"{high:.6g} ms", "time"
     if colour is Colour.DENSITY:
         return "0", f"{density_top(shown):.3g}", "events per pixel (square root)"
     return "0", f"{WIDEST_PX:g} px", "residual: width of the edge near an event"

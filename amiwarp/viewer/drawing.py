@@ -12,7 +12,7 @@ import numpy as np
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.viewer.choices import Axis, Colour
 from amiwarp.viewer.cloud_scene import Look
-from amiwarp.viewer.colouring import colour_table, colours_of, scale_of
+from amiwarp.viewer.colouring import axis_range, colour_table, colours_of, scale_of, third_axis
 from amiwarp.viewer.truth_colours import legend_of
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from amiwarp.events.events import Events
     from amiwarp.viewer.image_kinds import Scale
+    from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.window import DisplayedWindow
 
 JPEG_QUALITY = 90
@@ -31,32 +32,30 @@ STOPS = 16
 """Number of colours from which the browser draws a colour scale."""
 
 
-def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: bool, zero_us: int) -> dict[str, Any]:
-    """Return the state variables of the event clouds. ``zero_us``: time of the recording's first event [us]."""
-    look = Look(colour, axis, dark=dark)
-    start_ms = (shown.span.start_us - zero_us) * 1e-3
-    if axis is Axis.ANGLE:
-        third, frame = np.degrees(shown.theta), {"low": 0.0, "high": 360.0, "title": "prism angle θ (°)"}
-    else:
-        third = (shown.events.t - zero_us) * 1e-3
-        frame = {"low": start_ms, "high": start_ms + shown.span.length_us * 1e-3, "title": "time (ms)"}
+def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: bool) -> dict[str, Any]:
+    """Return the state variables of the event clouds."""
+    look, (low, high) = Look(colour, axis, dark=dark), axis_range(shown, axis)
+    title = "prism angle θ (°)" if axis is Axis.ANGLE else "time (ms)"
+    colours = _pixels(colours_of(shown, look, after=True))
+    differ = colour in (Colour.DENSITY, Colour.RESIDUAL)  # depend on the places of the points
     return {
-        "cloud_before": _bytes(shown.before), "cloud_after": _bytes(shown.after), "cloud_third": _bytes(third),
-        "colours_before": _pixels(colours_of(shown, look, after=False)),
-        "colours_after": _pixels(colours_of(shown, look, after=True)),
-        "third_axis": frame, "region": list(shown.region),
-        "legend": legend(shown, colour, dark=dark, start_ms=start_ms),
+        "cloud_before": float_bytes(shown.before), "cloud_after": float_bytes(shown.after),
+        "cloud_third": float_bytes(third_axis(shown, axis)),
+        "colours_before": _pixels(colours_of(shown, look, after=False)) if differ else colours,
+        "colours_after": colours,
+        "third_axis": {"low": low, "high": high, "title": title}, "region": list(shown.region),
+        "legend": legend(shown, colour, dark=dark),
     }  # fmt: skip
 
 
-def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool, start_ms: float) -> dict[str, Any]:
+def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> dict[str, Any]:
     """Return the legend of a colour choice: title, rows of colour and text, or a scale with its ends."""
     if colour is Colour.POLARITY:
         rows = [[ON_COLOUR, "ON: brighter"], [OFF_COLOUR, "OFF: darker"]]
         return {"title": "polarity", "rows": rows, "bar": "", "low": "", "high": ""}
     if known := legend_of(shown.truth, colour, LEGEND_ROWS):
         return {"title": known[0][1], "rows": [list(row) for row in known[1:]], "bar": "", "low": "", "high": ""}
-    low, high, title = scale_of(shown, colour, start_ms=start_ms)
+    low, high, title = scale_of(shown, colour)
     return {"title": title, "rows": [], "bar": gradient(colour_table(colour, dark=dark)), "low": low, "high": high}
 
 
@@ -92,12 +91,17 @@ def difference_state(before: NDArray[Any], after: NDArray[Any]) -> dict[str, Any
     return {"after": jpeg(colours), "after_scale": scale}
 
 
-def orbit_state(theta: NDArray[Any], orbit: NDArray[Any], point: NDArray[Any]) -> dict[str, Any]:
-    """Return the state variables of an orbit, pixels of shape ``(n, 2)``, and of the column of its scene point."""
-    degrees = np.degrees(theta)
-    column = np.broadcast_to(point, orbit.shape)
-    lines = (np.column_stack([xy, degrees]) for xy in (orbit, column))
-    return dict(zip(("orbit", "column"), map(_bytes, lines), strict=True)) | {"has_orbit": True}
+def orbit_lines(inspector: Inspector, shown: DisplayedWindow, picked: int = -1) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the orbit of a scene point, and the column in which the model sees it without the prism.
+
+    The scene point is that of a drawn event, or of the middle of the region. Both lines have points x, y [px] and prism
+    angle [deg], shape ``(n, 3)``.
+    """
+    left, top, right, bottom = shown.region
+    point = np.array([left + right, top + bottom]) / 2.0 if picked < 0 else shown.after[picked]
+    theta, orbit = inspector.orbit(float(point[0]), float(point[1]))
+    lines = [np.column_stack([xy, np.degrees(theta)]) for xy in (orbit, np.broadcast_to(point, orbit.shape))]
+    return lines[0], lines[1]
 
 
 NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}
@@ -125,16 +129,18 @@ def jpeg(values: NDArray[Any]) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.getvalue()).decode()
 
 
-def event_text(shown: DisplayedWindow, k: int, zero_us: int) -> str:
+def event_text(shown: DisplayedWindow, k: int) -> str:
     """Return the description of point ``k``: pixel, time, angle, polarity, compensated position and ground truth."""
     e, (x, y), truth = shown.events, shown.after[k], shown.truth.text(k)
+    time_ms = (e.t[k] - shown.span.first_us) * 1e-3
     return (
-        f"x {e.x[k]}, y {e.y[k]} px; {(e.t[k] - zero_us) * 1e-3:.3f} ms; θ {math.degrees(shown.theta[k]):.2f}°; "
+        f"x {e.x[k]}, y {e.y[k]} px; {time_ms:.3f} ms; θ {math.degrees(shown.theta[k]):.2f}°; "
         f"{'ON' if e.p[k] else 'OFF'}; compensated {x:.2f}, {y:.2f} px{truth and f'; {truth}'}"
     )
 
 
-def _bytes(values: NDArray[Any]) -> bytes:
+def float_bytes(values: NDArray[Any]) -> bytes:
+    """Return numbers as the browser reads them: float32, little-endian."""
     return np.ascontiguousarray(values, np.float32).tobytes()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,15 +69,15 @@ class Scale:
 
         ``values``: shape ``(height, width)``, or ``(2, height, width)`` for OFF and ON.
         """
-        places = self.places(values)
+        steps = _steps(values, self.low, self.high)
         if self.colours == "polarity":
+            places = np.linspace(0.0, 1.0, STEPS)[steps] ** self.gamma
             both = places[0][..., None] * np.array(OFF_ON_BLACK) + places[1][..., None] * np.array(ON_ON_BLACK)
             return np.asarray(np.rint(255.0 * np.clip(both, 0.0, 1.0)), np.uint8)
-        from matplotlib import colormaps
-
-        table = np.rint(255.0 * colormaps[self.colours](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
-        known = np.isfinite(places)
-        return np.asarray(np.where(known[..., None], table[(255.0 * np.where(known, places, 0.0)).astype(np.uint8)], 0))
+        colours = np.take(_table(self.colours, self.gamma), steps, axis=0)
+        if self.colours != "gray":
+            colours[np.isnan(values)] = 0
+        return colours
 
     def ticks(self) -> tuple[tuple[float, str], ...]:
         """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
@@ -85,6 +86,25 @@ class Scale:
         values = np.asarray(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]).tick_values(self.low, self.high), np.float64)
         values = values[(values >= self.low) & (values <= self.high)]
         return tuple((float(place), f"{v:g}") for place, v in zip(self.places(values), values, strict=True))
+
+
+STEPS = 1 << 16
+"""Number of steps into which the range of a scale is divided for its colours."""
+
+
+def _steps(values: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint16]:
+    """Return the steps of values in a range; 0 for NaN."""
+    share = (np.asarray(values, np.float32) - np.float32(low)) * np.float32((STEPS - 1) / (high - low))
+    return np.asarray(np.fmin(np.fmax(share, 0.0), STEPS - 1.0), np.uint16)
+
+
+@cache
+def _table(colours: str, gamma: float) -> NDArray[np.uint8]:
+    """Return the colours of all steps, of a colour map of Matplotlib after a tone curve, shape ``(STEPS, 3)``."""
+    from matplotlib import colormaps
+
+    shares = np.linspace(0.0, 1.0, STEPS) ** gamma
+    return np.asarray(np.rint(255.0 * colormaps[colours](shares)[:, :3]), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from amiwarp.viewer import parameters
 from amiwarp.viewer.imager import MeasuredImage, WindowImager
 from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source
 from amiwarp.viewer.suggestion import Suggestion, suggest_region
-from amiwarp.viewer.timeline import Span, event_rate, read_span
+from amiwarp.viewer.timeline import Span, read_span
 from amiwarp.viewer.window import DisplayedWindow, LoadedWindow, WindowAngles
 from amiwarp.viewer.window_loading import load_window, margin, upload
 
@@ -144,11 +144,6 @@ class Inspector:
         return self.model_of(self.knobs)
 
     @cached_property
-    def rate(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Event rate over the recording; see :func:`event_rate`."""
-        return event_rate(self.recording.events)
-
-    @cached_property
     def hot(self) -> NDArray[np.bool_]:
         """Hot and flickering pixels of the recording, shape (height, width)."""
         source, encoder = self.recording.events, self.encoder
@@ -173,8 +168,7 @@ class Inspector:
             recording = self.latest()
             self.recording = replace(self.recording, events=recording.events, encoder=recording.encoder)
             self._span = None
-            for name in ("rate", "hot"):
-                self.__dict__.pop(name, None)
+            self.__dict__.pop("hot", None)
 
     def accept(self, calibration: Calibration) -> None:
         """Set the parameters to a calibration. Raises :class:`AmiwarpError` if its camera has another size."""

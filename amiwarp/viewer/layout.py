@@ -69,6 +69,6 @@ def _knob(name: str) -> str:
     return (
         f'<KnobField v-if="{where}" name="{name}" label="{label}" unit="{unit}" :value="{name}" :least="{least}" '
         f':most="{most}" :step="{step}" :truth="truths.{name}" :note="sources.{name}" @drag="{name} = $event" '
-        f"@release=\"trigger('released')\" @typed=\"trigger('typed', ['{name}', $event])\" "
+        f"@typed=\"trigger('typed', ['{name}', $event])\" "
         f"@chosen=\"trigger('choose', ['{name}'])\"></KnobField>"
     )

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from amiwarp.viewer.parameters import Knobs
     from amiwarp.viewer.window import LoadedWindow
 
-MOST_PIXELS = 30_000
-"""Largest number of pixels that are all reconstructed. Of a larger region, every second column and row is used."""
-
+MOST_WORK = 500_000
+"""Largest number of events and pixels together from which a picture is made, so that it takes about a second on two
+cores. Of a larger region, only every second (third, ...) column and row is used."""
 SAME_RESIDUAL = 0.25
 """Relative change of the residual up to which the weight of the smoothness prior is kept."""
 
@@ -49,8 +49,8 @@ def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs) -> L
     if not math.isfinite(turn_us):
         raise AmiwarpError("the log intensity needs a prism that rotates; set its speed (rpm), or calibrate")
     left, top, right, bottom = _wide(inspector, window)
-    step = 1 if (right - left) * (bottom - top) <= MOST_PIXELS else 2
-    part = select_part(inspector, window, (left, top, right, bottom), step=step, longest_us=turn_us)
+    part = select_part(inspector, window, (left, top, right, bottom), most=MOST_WORK, longest_us=turn_us)
+    step = part.step
     if knobs.focal_length is not None:
         knobs = replace(knobs, focal_length=knobs.focal_length / step)
     model, encoder = inspector.model_of(knobs, part.recording.camera), inspector.encoder_of(knobs)
@@ -58,7 +58,7 @@ def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs) -> L
     picture = _picture(work, part, window.chosen)
     rows, columns = (np.arange(window.region[k], window.region[k + 2]) for k in (1, 0))
     cut = np.ix_((rows - top) // step, (columns - left) // step)
-    limits = [f"{100 // step**2} % of the pixels"] if step > 1 else []
+    limits = [f"{100 / step**2:.2g} % of the pixels"] if step > 1 else []
     if part.length_us < window.span.length_us:
         limits.append(f"{part.length_us * 1e-3:.3g} ms in the middle")
     note = "; ".join([f"{picture.pairs:,} pairs, residual {picture.residual:.2f}", *limits])

@@ -15,6 +15,7 @@ from amiwarp.reconstruction.export import save_film
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.downloads import as_bytes, write_events, write_image
+from amiwarp.viewer.drawing import orbit_lines
 from amiwarp.viewer.image_kinds import ImageKind, make_images
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.jobs import JobCancelled
@@ -89,12 +90,17 @@ class Exports:
         look = Look(Colour(state.colour), Axis(state.axis), float(state.point_size), float(state.opacity),
                     dark=bool(state.dark), overlaid=bool(state.overlaid))  # fmt: skip
         view, loop = View(state.view[0]), asyncio.get_running_loop()
+        with_orbit = bool(state.orbit_shown) and look.axis is Axis.ANGLE and panel.compensates
         assert window is not None
+
+        def draw(scene: Scene) -> None:
+            shown = inspector.show()
+            scene.show(shown, look, orbit_lines(inspector, shown) if with_orbit else ())
 
         def pictures() -> Iterator[NDArray[np.uint8]]:
             inspector.open(*window, selection)
             with closing(Scene(FILM_SIZE)) as scene:
-                scene.show(inspector.show(), look)
+                draw(scene)
                 scene.look_from(view, look)
                 if what == "turntable":
                     yield from scene.turntable(FRAMES)
@@ -103,7 +109,7 @@ class Exports:
                 while (start_us := start_us + step_us) <= last_us:
                     yield scene.picture()
                     inspector.open(round(start_us), window[1], selection)
-                    scene.show(inspector.show(), look)
+                    draw(scene)
                 yield scene.picture()
 
         def counted() -> Iterator[NDArray[np.uint8]]:

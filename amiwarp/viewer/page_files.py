@@ -13,10 +13,14 @@ ROUTE = "__amiwarp"
 
 
 def first_page(path: Path) -> str:
-    """Return trame's first page: it can be enlarged by the reader, and shows a plain text until the page is ready."""
+    """Return trame's first page with the page's own socket. The reader can enlarge the page.
+
+    It shows a plain text until the page is ready.
+    """
     page = path.read_text(encoding="utf-8")
     page = re.sub(r'<meta\s+name="viewport"[^>]*>', '<meta name="viewport" content="width=device-width">', page)
     page = re.sub(r"<title>.*?</title>", "<title>amiwarp inspector</title>", page)
+    page = page.replace("<title>", f'<script src="{ROUTE}/socket.js"></script><title>')
     return re.sub(r'<div id="app"></div>\s*<script>.*?</script>', '<div id="app">opening the inspector …</div>', page,
                   flags=re.DOTALL)  # fmt: skip
 

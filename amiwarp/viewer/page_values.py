@@ -100,5 +100,9 @@ def events_text(shown: DisplayedWindow) -> str:
 
 def notes(inspector: Inspector) -> list[str]:
     """Return what the recording lacks or what is only assumed, for the place where it matters."""
-    assumed = inspector.sources.get("phase") is Source.ASSUMED and math.isfinite(inspector.turn_us)
-    return [*inspector.notes, *(["phase assumed, not known: calibrate, or set it"] if assumed else [])]
+    texts = {
+        Source.ASSUMED: "phase assumed, not known: calibrate, or set it",
+        Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
+    }
+    phase = texts.get(inspector.sources["phase"], "") if math.isfinite(inspector.turn_us) else ""
+    return [*inspector.notes, *filter(None, [phase])]

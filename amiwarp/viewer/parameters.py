@@ -21,6 +21,7 @@ class Source(enum.StrEnum):
     """Where the value of a parameter comes from. The value of a member is the text that the page shows."""
 
     ASSUMED = "assumed"
+    ESTIMATED = "estimated"
     FILE = "from the file"
     CALIBRATED = "calibrated"
     HAND = "set by hand"

@@ -11,6 +11,7 @@ import numpy as np
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.viewer.timeline import read_span
+from amiwarp.viewer.window_loading import inside
 
 if TYPE_CHECKING:
     from amiwarp.viewer.imager import Region
@@ -31,10 +32,12 @@ class SelectedPart:
     """Start of the time window [us]."""
     length_us: int
     """Length of the time window [us]."""
+    step: int
+    """Distance between the used columns, and between the used rows [px]."""
 
 
 def select_part(
-    inspector: Inspector, window: LoadedWindow, part: Region, *, step: int = 1, longest_us: float = math.inf
+    inspector: Inspector, window: LoadedWindow, part: Region, *, most: float = math.inf, longest_us: float = math.inf
 ) -> SelectedPart:
     """Return the selected events of a part of the image.
 
@@ -46,8 +49,9 @@ def select_part(
         Its window.
     part : tuple of int
         Left, top, right and bottom of the part [px]; right and bottom are exclusive.
-    step : int
-        Use every ``step``-th column and row.
+    most : float
+        Largest number of events and pixels together. For a larger part, every second (third, ...) column and row is
+        used.
     longest_us : float
         Longest duration [us]. Of a longer window, and of one with too many events, the middle is used.
 
@@ -65,9 +69,12 @@ def select_part(
     first, stop = np.searchsorted(events.t, (start_us, start_us + length_us))
     events = events[first:stop]
     left, top, right, bottom = part
-    x, y = events.x.astype(np.int64) - left, events.y.astype(np.int64) - top
-    kept = (x >= 0) & (x < right - left) & (y >= 0) & (y < bottom - top) & (x % step == 0) & (y % step == 0)
-    x, y = ((each[kept] // step).astype(np.uint16) for each in (x, y))
+    work = float(np.count_nonzero(inside(events, part))) + (right - left) * (bottom - top)
+    step = max(1, math.ceil(math.sqrt(work / most)))
+    columns, rows = (np.zeros(size, np.bool_) for size in inspector.recording.events.size)
+    columns[left:right:step] = rows[top:bottom:step] = True
+    kept = np.flatnonzero(columns[events.x] & rows[events.y])
+    x, y = (((each[kept] - least) // step).astype(np.uint16) for each, least in ((events.x, left), (events.y, top)))
     width, height = -(-(right - left) // step), -(-(bottom - top) // step)
     c = inspector.camera
     camera = replace(
@@ -75,6 +82,5 @@ def select_part(
     )
     source = MemoryEvents(Events(x, y, events.t[kept], events.p[kept]), width, height)
     whole = inspector.recording
-    return SelectedPart(
-        Recording(source, camera, whole.encoder, whole.prism, name=whole.name), start_us, length_us
-    )  # fmt: skip
+    recording = Recording(source, camera, whole.encoder, whole.prism, name=whole.name)
+    return SelectedPart(recording, start_us, length_us, step)

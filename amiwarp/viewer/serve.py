@@ -19,7 +19,7 @@ from weakref import WeakSet
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.host_names import ALL_INTERFACES, HostNames, address, cannot_serve, normalised
 from amiwarp.viewer.message_filter import MOST_BYTES, Check, MessageFilter
-from amiwarp.viewer.page_files import first_page
+from amiwarp.viewer.page_files import FOLDER, ROUTE, first_page
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -88,7 +88,7 @@ class Tabs:
     def __init__(self, build: Session, settable: Mapping[str, Check]) -> None:
         from trame_client.module import vue3
 
-        self.folders = {"/": Path(vue3.www).resolve()}
+        self.folders = {"/": Path(vue3.www).resolve(), f"/{ROUTE}/": FOLDER.resolve()}
         self._build, self._settable = build, settable
         self._sockets: set[web.WebSocketResponse] = set()
         self._servers: WeakSet[Any] = WeakSet()  # servers of open tabs, and of closed tabs still in use

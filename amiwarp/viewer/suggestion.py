@@ -27,6 +27,10 @@ sharpness is chosen.
 The variance grows with the square of the number of events, so that nearly empty regions are no candidates.
 """
 
+LEAST_SHARE = 0.8
+"""Smallest ratio of the number of recorded events to that of compensated events in a candidate: its edges do not come
+from outside."""
+
 
 @dataclass(frozen=True)
 class Suggestion:
@@ -53,6 +57,7 @@ def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32]) -> S
     noise = random_variance(SMOOTHING_PX)
     sharp, sharp_after = (over_mean - noise) / mean, (over_mean_after - noise) / mean_after
     variance, sharper = mean_after * over_mean_after - mean * over_mean, sharp_after - sharp
+    variance = np.where(mean >= LEAST_SHARE * mean_after, variance, 0.0)
     gains = bool((over_mean_after - over_mean).max() > LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5)
     if not gains:
         variance = sharper = mean * over_mean

@@ -1,8 +1,7 @@
-"""Events of a time window, and the event rate over a recording, read without loading the other events."""
+"""Events of a time window, read without loading the other events."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,16 +19,14 @@ if TYPE_CHECKING:
 
 RUNS = 64
 """Number of evenly spaced runs of events that are read from a window with too many events."""
-RATE_POINTS = 128
-"""Largest number of points at which the event rate is measured."""
-RATE_SECONDS = 0.5
-"""Approximate time to measure the event rate [s]. If reading is slow, the rate has fewer points."""
 
 
 @dataclass(frozen=True)
 class Span:
     """Events of a time window."""
 
+    first_us: int
+    """Time of the recording's first event, from which all shown times count [us]."""
     start_us: int
     """Start of the time window on the events' clock [us]."""
     length_us: int
@@ -40,6 +37,11 @@ class Span:
     """All events of the window, or evenly spaced runs of them."""
     runs: tuple[slice, ...]
     """Indices of these events in the recording."""
+
+    @property
+    def start_ms(self) -> float:
+        """Start of the time window after the recording's first event [ms]."""
+        return (self.start_us - self.first_us) * 1e-3
 
     def rows(self, values: EventValues) -> NDArray[Any]:
         """Return the rows of ``values`` for :attr:`events`; ``values`` has one row per event of the recording."""
@@ -54,10 +56,11 @@ def read_span(source: EventSource, start_us: int, length_us: int, *, most_events
     first, stop = (source.find(t) for t in (start_us, start_us + length_us))
     count = stop - first
     if count <= most_events:
-        return Span(start_us, length_us, count, source.slice(first, stop), (slice(first, stop),))
+        return Span(source.t_first, start_us, length_us, count, source.slice(first, stop), (slice(first, stop),))
     starts, length = (first + np.arange(RUNS) * count // RUNS).tolist(), most_events // RUNS
     runs = tuple(slice(k, k + length) for k in starts)
-    return Span(start_us, length_us, count, Events.concatenate(list(_runs(source, starts, length))), runs)
+    events = Events.concatenate(list(_runs(source, starts, length)))
+    return Span(source.t_first, start_us, length_us, count, events, runs)
 
 
 def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:
@@ -72,20 +75,3 @@ def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Event
         starts = [k for k in starts if k + length > seen]
         if not starts:
             return
-
-
-def event_rate(source: EventSource) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the event rate over the recording.
-
-    The result is evenly spaced times [us], shape ``(n + 1,)``, and the rate in each interval between them [1/s], shape
-    ``(n,)``.
-    """
-    start_s, n, (first, last) = time.perf_counter(), 1, (source.t_first, source.t_last + 1)
-    index = {0.0: 0, 1.0: len(source)}
-    while n < min(RATE_POINTS, last - first) and time.perf_counter() - start_s < RATE_SECONDS / 3:
-        n *= 2
-        for k in range(1, n, 2):
-            index[k / n] = source.find(first + (last - first) * k // n)
-    shares = sorted(index)
-    t = first + np.array([round((last - first) * share) for share in shares], np.int64)
-    return t, np.diff([index[share] for share in shares]) / np.maximum(np.diff(t), 1) * 1e6

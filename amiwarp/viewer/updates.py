@@ -13,14 +13,16 @@ from amiwarp.viewer.drawing import (
     cloud_state,
     difference_state,
     event_text,
+    float_bytes,
     jpeg,
-    orbit_state,
+    orbit_lines,
     scale_state,
     whole_image,
 )
 from amiwarp.viewer.image_kinds import ImageKind, ShownImages, count_images, make_images
 from amiwarp.viewer.layout import UNITS
 from amiwarp.viewer.page_values import events_text, sharpness_text, truths
+from amiwarp.viewer.phase_estimate import estimate_phase
 from amiwarp.viewer.selected_calibration import scope_text
 
 if TYPE_CHECKING:
@@ -88,6 +90,8 @@ class Updates:
         start_us, length_us = panel.zero_us + round(start * 1e3), max(1, round(length * 1e3))
         await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
         if suggest:
+            if await panel.in_thread(estimate_phase, panel.inspector):
+                panel.show_knobs()
             region = (await panel.in_thread(panel.inspector.suggest_region)).region
             s.update({"region_wanted": list(region), "region_kind": "suggested"})
             await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
@@ -98,14 +102,14 @@ class Updates:
         panel, s, inspector = self._panel, self._state, self._panel.inspector
         new = self.shown is None
         shown = inspector.show(against=panel.comparison.knobs)
-        values = cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark), zero_us=panel.zero_us)
+        values = cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
         values |= self._images(shown) | self._orbit(shown)
         if new or shown.span is not self.shown.span:  # type: ignore[union-attr]
             values["overview"] = whole_image(shown.span.events, inspector.recording.events.size)
         compensated = panel.compensates
         left = panel.comparison.title
         pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
-        text = "" if self._picked < 0 else event_text(shown, self._picked, panel.zero_us)
+        text = "" if self._picked < 0 else event_text(shown, self._picked)
         return shown, {
             **values, "titles": pair if compensated else [[0, "events as recorded"]], "events": events_text(shown),
             "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
@@ -140,11 +144,8 @@ class Updates:
         s, inspector = self._state, self._panel.inspector
         if not (s.orbit_shown and s.axis == Axis.ANGLE.value and self._panel.compensates):
             return NO_ORBIT
-        left, top, right, bottom = shown.region
-        middle = np.array([left + right, top + bottom]) / 2.0
-        point = middle if self._picked < 0 else shown.after[self._picked]
-        theta, xy = inspector.orbit(float(point[0]), float(point[1]))
-        return orbit_state(theta, xy, point)
+        lines = zip(("orbit", "column"), orbit_lines(inspector, shown, self._picked), strict=True)
+        return {name: float_bytes(line) for name, line in lines} | {"has_orbit": True}
 
     def _show_prism(self) -> None:
         """Show what depends on the rotation of the prism."""

@@ -14,6 +14,15 @@ const GREY = 0xff909090;
 const ORBIT = '#009e73';
 const KEYS = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, -12], ArrowDown: [0, 12] };
 
+// Return a function that returns what it made last, until something that it is made of changes.
+function memory() {
+  let [known, value] = [[], null];
+  return (make, ...of) => {
+    if (of.length !== known.length || of.some((each, k) => each !== known[k])) [known, value] = [of, make()];
+    return value;
+  };
+}
+
 export function floats(bytes) {
   if (!bytes || !bytes.byteLength) return new Float32Array(0);
   return new Float32Array(bytes.slice().buffer);
@@ -34,7 +43,8 @@ export const EventClouds = {
   setup(props, { emit }) {
     const canvas = ref(null);
     const camera = new Camera();
-    const raster = new Raster();
+    const rasters = [new Raster(), new Raster()];
+    const [pictures, places, colours] = [0, 1, 2].map(() => [memory(), memory()]);
     const scene = { places: [new Float32Array(0), new Float32Array(0)], colours: [], half: [1, 1, 1] };
     const label = window.Vue.computed(() => {
       const names = props.titles.map(([, title]) => title).join(' and ');
@@ -45,27 +55,16 @@ export const EventClouds = {
     let observer;
 
     function build() {
-      const [left, top, right, bottom] = props.box;
-      const { low, high } = props.axis;
-      const tall = HEIGHT * Math.max(right - left, bottom - top);
-      scene.half = [(right - left) / 2, (bottom - top) / 2, tall / 2];
-      const third = floats(props.third);
-      const stretch = tall / Math.max(high - low, 1e-9);
-      const centre = [(left + right) / 2, (top + bottom) / 2, (low + high) / 2];
-      scene.place = (xy, z) => {
-        const out = new Float32Array((3 * xy.length) / 2);
-        for (let i = 0; i < xy.length / 2; i++) {
-          out[3 * i] = xy[2 * i] - centre[0];
-          out[3 * i + 1] = centre[1] - xy[2 * i + 1];
-          out[3 * i + 2] = (z[i] - centre[2]) * stretch;
-        }
-        return out;
-      };
-      scene.places = [props.before, props.after].map((xy) => scene.place(floats(xy), third));
-      scene.colours = [props.coloursBefore, props.coloursAfter].map(words);
+      const frame = frameOf(props.box, props.axis);
+      const key = JSON.stringify([props.box, props.axis]);
+      scene.half = frame.half;
+      scene.places = [props.before, props.after].map(
+        (cloud, k) => places[k](() => place(frame, floats(cloud), floats(props.third)), cloud, props.third, key),
+      );
+      scene.colours = [props.coloursBefore, props.coloursAfter].map((bytes, k) => colours[k](() => words(bytes), bytes));
       const turns = floats(props.orbit).filter((_, k) => k % 3 === 2);
       const xy = (bytes) => floats(bytes).filter((_, k) => k % 3 !== 2);
-      scene.lines = [props.orbit, props.column].map((bytes) => scene.place(xy(bytes), turns));
+      scene.lines = [props.orbit, props.column].map((bytes) => place(frame, xy(bytes), turns));
       ask();
     }
 
@@ -102,19 +101,24 @@ export const EventClouds = {
       const ink = style.getPropertyValue('--ink').trim() || '#333';
       const paper = style.getPropertyValue('--paper').trim() || '#ffffff';
       const context = view.getContext('2d');
-      for (const pane of panes()) {
+      const dot = Math.max(1, Math.round(props.dot * ratio * Math.max(1, Math.min(2.5, H / 420))));
+      panes().forEach((pane, number) => {
         const projection = camera.project(scene.half, pane.width, pane.height);
-        pane.projection = projection;
-        const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
-        raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
-        raster.clear(packed(paper));
-        const dot = Math.max(1, Math.round(props.dot * ratio * Math.max(1, Math.min(2.5, H / 420))));
-        for (const k of pane.clouds) {
-          const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
-          raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, grey);
-        }
+        const raster = rasters[number];
+        const fill = () => {
+          const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
+          raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
+          raster.clear(packed(paper));
+          for (const k of pane.clouds) {
+            const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
+            raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, grey);
+          }
+          return raster.image;
+        };
+        const key = JSON.stringify([projection, pane.width, pane.height, ratio, paper, dot, props.opacity, pane.clouds]);
+        const image = pictures[number](fill, key, ...pane.clouds.flatMap((k) => [scene.places[k], scene.colours[k]]));
         context.setTransform(1, 0, 0, 1, 0, 0);
-        context.putImageData(raster.image, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
+        context.putImageData(image, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
         context.setTransform(ratio, 0, 0, ratio, pane.left * ratio, pane.top * ratio);
         context.save();
         context.beginPath();
@@ -122,7 +126,7 @@ export const EventClouds = {
         context.clip();
         drawContent(context, projection, pane, ink, font);
         context.restore();
-      }
+      });
       view.dataset.frames = Number(view.dataset.frames || 0) + 1;
     }
 
@@ -235,6 +239,28 @@ export const EventClouds = {
     return { canvas, label };
   },
 };
+
+// Return half the size of the box around the points, its centre, and the stretch of the third axis.
+function frameOf([left, top, right, bottom], { low, high }) {
+  const tall = HEIGHT * Math.max(right - left, bottom - top);
+  return {
+    half: [(right - left) / 2, (bottom - top) / 2, tall / 2],
+    centre: [(left + right) / 2, (top + bottom) / 2, (low + high) / 2],
+    stretch: tall / Math.max(high - low, 1e-9),
+  };
+}
+
+// Return places in the box (x, y, z interleaved) of pixels and values on the third axis.
+function place({ centre, stretch }, xy, third) {
+  const out = new Float32Array((3 * xy.length) / 2);
+  const [cx, cy, cz] = centre;
+  for (let i = 0, j = 0; i < third.length; i++, j += 3) {
+    out[j] = xy[2 * i] - cx;
+    out[j + 1] = cy - xy[2 * i + 1];
+    out[j + 2] = (third[i] - cz) * stretch;
+  }
+  return out;
+}
 
 // Return a colour such as #15181c as a pixel of an image.
 function packed(hex) {

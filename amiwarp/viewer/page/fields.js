@@ -24,17 +24,19 @@ export const NumberField = {
   },
 };
 
+// While the slider moves, its values are sent as the server takes them. The last one is sent as if it were typed, because
+// calls to the server overtake values that wait.
 export const KnobField = {
   components: { NumberField },
   props: { name: String, label: String, unit: String, value: Number, least: Number, most: Number, step: Number, truth: Number,
     note: String },
-  emits: ['drag', 'release', 'typed', 'chosen'],
+  emits: ['drag', 'typed', 'chosen'],
   template: `<div class="knob">
     <label :for="'slider-' + name">{{ label }} ({{ unit }})</label>
     <span class="note" v-if="note">{{ note }}</span>
     <div class="track">
       <input type="range" :id="'slider-' + name" :min="least" :max="most" :step="step" :value="value"
-        @input="$emit('drag', Number($event.target.value))" @change="$emit('release')" @focus="$emit('chosen')"/>
+        @input="$emit('drag', Number($event.target.value))" @change="$emit('typed', $event.target.value)" @focus="$emit('chosen')"/>
       <i v-if="truth !== null && truth !== undefined" class="truth" :title="'known truth: ' + truth"
         :style="{ left: 'calc(8px + (100% - 16px) * ' + (truth - least) / (most - least) + ')' }"></i>
     </div>

@@ -10,6 +10,7 @@ import { RateTimeline } from './timeline.js';
 const { inject, nextTick, onBeforeUnmount, onMounted, ref, watch } = window.Vue;
 const FIELDS = 'input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select';
 const RETRY_MS = 1500;
+const ADDRESS_MS = 300; // a change of the address costs the browser more than a drawn cloud: once, after a drag
 
 // Saves a file that the server sends, or that the page makes.
 function download(name, content, type) {
@@ -28,6 +29,7 @@ const PageFrame = {
     const trame = inject('trame');
     const root = ref(null);
     let timer = 0;
+    let changed = 0;
 
     function pressed(event) {
       if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches(FIELDS)) return;
@@ -60,7 +62,8 @@ const PageFrame = {
 
     trame.refs.page = { download, picture: (name, words) => savePicture(name, words, download) };
     watch(() => props.address, (address) => {
-      if (address) window.history.replaceState(null, '', `#${address}`);
+      window.clearTimeout(changed);
+      if (address) changed = window.setTimeout(() => window.history.replaceState(null, '', `#${address}`), ADDRESS_MS);
     });
     watch(() => props.lost, (lost) => {
       window.clearInterval(timer);
@@ -77,6 +80,7 @@ const PageFrame = {
       window.removeEventListener('keydown', pressed);
       window.removeEventListener('hashchange', restore);
       window.clearInterval(timer);
+      window.clearTimeout(changed);
     });
     return { root };
   },

@@ -155,7 +155,11 @@ export const EventPicture = {
     }
 
     onMounted(() => {
-      image.onload = draw;
+      image.onload = () => {
+        if (!canvas.value) return;
+        draw();
+        canvas.value.dataset.images = Number(canvas.value.dataset.images || 0) + 1;
+      };
       image.src = props.src || '';
       observer = new window.ResizeObserver(() => window.requestAnimationFrame(draw));
       observer.observe(canvas.value);
