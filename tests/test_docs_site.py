@@ -145,7 +145,7 @@ def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) 
     data = json.loads(write(tmp_path, [section], QUICK, 1.0)["data"].read_text())
     other = json.loads(json.dumps(data).replace("More is more.", "Less."))
     text = page.content({"cpu": data, "gpu": other}, tmp_path)
-    assert "| More is more. | 2 | 3 | **reproduced** | not run | – |" in text
+    assert "| More is more. *Rule: larger.* | 2 | 3 | **reproduced** | not run | – |" in text
     assert "![Curve](paper-results/curve.png)" in text
     assert "| one \\| two | 0.5 |" in text
     assert (tmp_path / "curve.png").stat().st_size > 1000

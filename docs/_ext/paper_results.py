@@ -40,12 +40,16 @@ def markdown_table(headings: list[str], rows: list[list[str]]) -> str:
 
 
 def verdicts(reports: dict[str, Any]) -> str:
-    """Return the claims with the results and the verdicts of each report, by evaluation."""
+    """Return the claims with their rules, and the results and the verdicts of each report, by evaluation."""
     first = next(iter(reports.values()))
     text = ""
     for section in first["evaluations"]:
         rows = [
-            [claim["text"], claim["paper"], *(cell for report in reports.values() for cell in judged(report, claim))]
+            [
+                f"{claim['text']} *Rule: {claim['rule']}.*",
+                claim["paper"],
+                *(cell for report in reports.values() for cell in judged(report, claim)),
+            ]
             for claim in section["claims"]
         ]
         names = [cell for name in reports for cell in (f"here ({name})", "verdict")]
