@@ -661,6 +661,8 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     latest = Stream()
     page = opened(of=latest(), latest=latest)
     page.locator("#live").filter(has_text="1.25 million events/s").wait_for()
+    assert page.locator("#do-suggested").get_attribute("aria-pressed") == "true"
+    assert page.locator(".knob:has(#slider-phase) .note").inner_text() == "estimated"
     latest.problem = "no events for 2 s"
     page.locator("#stream-note").filter(has_text="The stream is interrupted: no events for 2 s").wait_for()
     latest.problem = ""
