@@ -550,6 +550,33 @@ def test_the_timeline_is_clicked_dragged_and_zoomed(page: Any, recording: Record
     page.mouse.dblclick(x(150.0), y)
 
 
+def test_an_image_is_zoomed_and_moved_and_stays_in_its_frame(page: Any) -> None:
+    def under(dx: float = 0.0) -> list[int]:
+        """Return the pixel under the mouse, which is ``dx`` away from the middle of the whole image."""
+        page.mouse.move(x + dx + 1, y)
+        page.mouse.move(x + dx, y)
+        text = page.locator(".tile small").first.inner_text()
+        return [int(each) for each in re.findall(r"-?\d+", text)]
+
+    x, y = middle(page, "#image-overview")
+    first, image = under(30), drawn(page, "#image-overview")
+    page.mouse.wheel(0, -800)
+    seen_change(page, "#image-overview", image)
+    assert under(30) == pytest.approx(first, abs=1)  # the place under the mouse stays
+    page.keyboard.down("Shift")
+    page.mouse.down()
+    for dx in (20, 0, -20):
+        page.mouse.move(x + dx, y)
+        assert under(dx) == pytest.approx(first, abs=1)  # so it does while it is dragged
+    page.mouse.move(x + 5000, y)
+    page.mouse.up()
+    page.keyboard.up("Shift")
+    box = page.locator("#image-overview").bounding_box()
+    assert under(box["x"] + 3 - x)[0] in (0, 1)  # the image ends at the edge of its frame
+    page.mouse.dblclick(x, y)
+    until(lambda: np.abs(drawn(page, "#image-overview") - image).mean() < 1.0)
+
+
 def test_a_click_on_an_event_tells_all_about_it(page: Any, kept: Any, recording: Recording) -> None:
     encoder, panel = recording.encoder, kept[1]
     assert encoder is not None
@@ -661,6 +688,8 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     latest = Stream()
     page = opened(of=latest(), latest=latest)
     page.locator("#live").filter(has_text="1.25 million events/s").wait_for()
+    assert page.locator("#do-suggested").get_attribute("aria-pressed") == "true"
+    assert page.locator(".knob:has(#slider-phase) .note").inner_text() == "estimated"
     latest.problem = "no events for 2 s"
     page.locator("#stream-note").filter(has_text="The stream is interrupted: no events for 2 s").wait_for()
     latest.problem = ""

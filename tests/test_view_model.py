@@ -688,6 +688,21 @@ def test_the_events_of_the_window_are_downloaded(
         write_events(inspector, path, compensated=compensated)
 
 
+def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
+    inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window = inspector.first_window()
+    inspector.open(*window, Selection(noise_us=300))
+    expected = inspector.loaded.events
+    assert 0.2 * inspector.loaded.span.count < len(expected) < 0.95 * inspector.loaded.span.count
+    monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
+    monkeypatch.setattr(downloads, "BLOCK", 500)
+    thinned = Inspector(inspector.recording)
+    thinned.open(*window, Selection(noise_us=300))
+    assert write_events(thinned, tmp_path / "events.h5", compensated=False) == len(expected)
+    np.testing.assert_array_equal(open_recording(tmp_path / "events.h5").events.slice(0, len(expected)).t, expected.t)
+
+
 def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
     inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
     for kind in (ImageKind.COUNT, ImageKind.POLARITY, ImageKind.TIME_SURFACE):

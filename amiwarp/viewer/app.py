@@ -145,7 +145,7 @@ def view(
     device: Any = "cpu",
     height: int = 700,
 ) -> NotebookPage:
-    """Show the inspector below a notebook cell.
+    """Show the inspector below a notebook cell. Warp's messages are switched off, so that the cell shows only the page.
 
     Parameters
     ----------
@@ -174,6 +174,9 @@ def view(
     """
     from IPython.display import IFrame, display
 
+    from amiwarp.kernels.quiet_start import start_quietly
+
+    start_quietly()
     Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
     make_inspector = partial(Inspector, recording, calibration, device=device)
     serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))

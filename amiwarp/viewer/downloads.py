@@ -12,6 +12,7 @@ import numpy as np
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.imaging.export import encode_image, encode_png
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import NewFile
@@ -19,7 +20,6 @@ from amiwarp.io.file_scan import FileEvents
 from amiwarp.viewer.window_loading import kept
 
 if TYPE_CHECKING:
-    from amiwarp.events.events import Events
     from amiwarp.viewer.image_kinds import ShownImages
     from amiwarp.viewer.inspector import Inspector
 
@@ -90,11 +90,17 @@ def write_image(images: ShownImages, path: Path, *, before: bool = False) -> Non
 
 
 def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
-    """Yield all selected events of the window, in blocks."""
+    """Yield all selected events of the window, in blocks.
+
+    The noise filter of a block sees the last events of the block before it.
+    """
     window, hot = inspector.loaded, inspector.hot if inspector.selection.hide_hot else None
-    for block in _blocks(inspector):
-        chosen = kept(inspector.recording, block, inspector.selection, window.region, hot)
+    noise_us, last = inspector.selection.noise_us or 0, None
+    for block in filter(len, _blocks(inspector)):
+        events = block if last is None else Events.concatenate([last, block])
+        chosen = kept(inspector.recording, events, inspector.selection, window.region, hot)[-len(block) :]
         yield block if chosen.all() else block[chosen]
+        last = events[int(np.searchsorted(events.t, block.t[-1] - noise_us)) :] if noise_us else None
 
 
 def _blocks(inspector: Inspector) -> Iterator[Events]:

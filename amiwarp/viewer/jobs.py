@@ -154,15 +154,17 @@ def summary(found: FoundCalibration) -> str:
 def live_state(f: LiveFigures) -> dict[str, Any]:
     """Return the figures of a stream for the page: rows of name, value and whether it is bad, and what is wrong."""
     rows: list[tuple[str, str, bool]] = [
-        ("connection", "receiving" if f.connected else "interrupted", not f.connected),
+        ("connection", "receiving" if f.connected else "interrupted, last events shown", not f.connected),
         ("rate", f"{f.rate_mev_s:.2f} million events/s", False),
-        ("latency", f"{f.latency_ms:.0f} ms", f.latency_ms > 1e3),
+        ("latency", f"{f.latency_ms:.0f} ms" if f.connected else "–", f.connected and f.latency_ms > 1e3),
         ("turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0),
         ("speed of the prism", "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm", f.rpm is None),
         ("lost events", f"{f.dropped:,}", f.dropped > 0), ("out of order", f"{f.late:,}", f.late > 0),
     ]  # fmt: skip
+    if f.connected and f.message:
+        rows.append(("last message", f.message, False))
     message = "" if f.message == f.problem else f.message
-    note = f"The stream is interrupted: {f.problem}. The last events are shown. {message}".strip()
+    note = f"The stream is interrupted: {f.problem}. {message}".strip()
     return {
         "live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows],
         "stream_note": "" if f.connected else note,
@@ -232,6 +234,7 @@ class Playback:
 
     async def _follow(self) -> None:
         panel, state = self._panel, self._panel.state
+        await panel.wait_until_drawn()  # with the suggested region
         while state.playing:
             with state:
                 panel.renew()

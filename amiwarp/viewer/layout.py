@@ -17,8 +17,8 @@ NAMES = tuple(UNITS)
 _TILTED = "model === 'exact' || model === 'ellipse'"
 SLIDERS = {
     "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), "true"),
-    "phase": ("phase θ_b", "°", ("-180", "180", "0.25"), "true"),
-    "clock_offset": ("clock offset Δt", "µs", ("-20000", "20000", "10"), "has_encoder"),
+    "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),
+    "clock_offset": ("clock offset", "µs", ("-20000", "20000", "10"), "has_encoder"),
     "rpm": ("speed of the prism", "rpm", ("-3000", "3000", "0.5"), "!has_encoder"),
     "tilt_x": ("tilt in x", "°", ("-5", "5", "0.05"), _TILTED),
     "tilt_y": ("tilt in y", "°", ("-5", "5", "0.05"), _TILTED),

@@ -73,6 +73,7 @@ class Panel:
     def start(self, inspector: Inspector) -> None:
         """Show an inspector from its first state."""
         self.inspector, state = inspector, self.state
+        inspector.renew()  # a live stream may have gone on since the inspector was made
         files = [] if self.library is None else self.library.files()
         folder = "" if self.library is None else str(self.library.folder)
         state.update({**initial_state(inspector), "files": files, "folder": folder})

@@ -12,13 +12,16 @@ export function drawFrame(context, projection, half, axes, ink, size, [width, he
   context.strokeStyle = context.fillStyle = ink;
   context.font = `${size}px system-ui, sans-serif`;
   context.lineWidth = 1;
-  context.globalAlpha = 0.55;
-  context.beginPath();
-  for (const axis of [0, 1, 2]) for (const [a, b] of edges(axis)) {
-    context.moveTo(places[a][0], places[a][1]);
-    context.lineTo(places[b][0], places[b][1]);
+  const farthest = places.reduce((least, place, k) => (place[2] < places[least][2] ? k : least), 0);
+  for (const hidden of [false, true]) { // edges behind the points are pale, because they are drawn over them
+    context.globalAlpha = hidden ? 0.18 : 0.55;
+    context.beginPath();
+    for (const axis of [0, 1, 2]) for (const [a, b] of edges(axis).filter((edge) => edge.includes(farthest) === hidden)) {
+      context.moveTo(places[a][0], places[a][1]);
+      context.lineTo(places[b][0], places[b][1]);
+    }
+    context.stroke();
   }
-  context.stroke();
   context.globalAlpha = 1;
   const taken = [];
   const labels = [0, 1, 2].flatMap((axis) => axisLabels(places, middle, axis, axes[axis], size));
@@ -52,7 +55,7 @@ function axisLabels(places, middle, axis, { low, high, title, flipped }, size) {
   const labels = ticks(low, high, length(edge) / TICK_PX[Number(upright)]).map((value) => ({
     text: text(value), place: at((value - low) / (high - low), 6), out, from: at((value - low) / (high - low), 0),
   }));
-  return [{ text: title, place: at(0.5, upright ? 3.4 * size : 1.85 * size), out, title: true, upright }, ...labels];
+  return [{ text: title, place: at(0.5, upright ? 4.3 * size : 1.85 * size), out, title: true, upright }, ...labels];
 }
 
 // Write a label, unless it would cover another one or leave the picture.

@@ -89,12 +89,22 @@ export const EventPicture = {
       context.fillText(`${length} px`, x, y - 7);
     }
 
+    // Look at the place (x, y) [share of the area] as nearly as the picture stays filled with the image.
+    function look(x, y) {
+      const [left, top, right, bottom] = area();
+      const within = (at, pixels, length) => {
+        const half = Math.min(0.5, pixels / (2 * scale() * length));
+        return Math.max(half, Math.min(1 - half, at));
+      };
+      view.x = within(x, canvas.value.clientWidth, right - left);
+      view.y = within(y, canvas.value.clientHeight, bottom - top);
+    }
+
     function zoom(factor, x = 0.5, y = 0.5) {
-      const after = Math.max(1, Math.min(64, view.zoom * factor));
-      const kept = view.zoom / after;
-      if (after === 1) Object.assign(view, { x: 0.5, y: 0.5 });
-      else Object.assign(view, { x: x + (view.x - x) * kept, y: y + (view.y - y) * kept });
-      view.zoom = after;
+      const before = view.zoom;
+      view.zoom = Math.max(1, Math.min(64, before * factor));
+      const kept = before / view.zoom;
+      look(x + (view.x - x) * kept, y + (view.y - y) * kept);
     }
 
     function share([x, y]) {
@@ -103,14 +113,14 @@ export const EventPicture = {
     }
 
     function pressed(event) {
-      const [first, start] = [place(event), [view.x, view.y]];
+      const first = place(event);
       const panning = event.button > 0 || event.shiftKey || !['region', 'measure'].includes(props.tool);
       canvas.value.setPointerCapture(event.pointerId);
       canvas.value.onpointermove = (now) => {
         const at = place(now);
         if (panning) {
           const [a, b] = [share(first), share(at)];
-          Object.assign(view, { x: view.x - (b[0] - a[0]), y: view.y - (b[1] - a[1]) });
+          look(view.x - (b[0] - a[0]), view.y - (b[1] - a[1]));
           return;
         }
         drawn = [...first, ...at];
@@ -134,7 +144,6 @@ export const EventPicture = {
         draw();
         if (box[2] - box[0] > 3 && box[3] - box[1] > 3) emit('region', box);
       };
-      if (panning) Object.assign(view, { x: start[0], y: start[1] });
     }
 
     function hovered(event) {
@@ -148,7 +157,7 @@ export const EventPicture = {
       if (event.key === '+') zoom(1.5, view.x, view.y);
       else if (event.key === '-') zoom(1 / 1.5, view.x, view.y);
       else if (event.key === '0') zoom(0);
-      else if (step && view.zoom > 1) Object.assign(view, { x: view.x - (0.1 * step[0]) / view.zoom, y: view.y - (0.1 * step[1]) / view.zoom });
+      else if (step && view.zoom > 1) look(view.x - (0.1 * step[0]) / view.zoom, view.y - (0.1 * step[1]) / view.zoom);
       else return;
       event.preventDefault();
       event.stopPropagation();

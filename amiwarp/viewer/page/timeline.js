@@ -36,7 +36,7 @@ export const RateTimeline = {
       const colour = (name) => style.getPropertyValue(name).trim();
       const [W, H] = [width(), pad.clientHeight - BOTTOM];
       const [on, off] = [floats(props.on), floats(props.off)];
-      const top = Math.max(1e-9, ...on, ...off);
+      const top = Math.max(0, ...[...on, ...off].filter(Number.isFinite)); // parts that are not counted yet are NaN
       context.fillStyle = colour('--window');
       const left = Math.max(LEFT, seen(props.start));
       const right = Math.min(LEFT + W, Math.max(left + 2, seen(props.start + props.length)));
@@ -46,7 +46,7 @@ export const RateTimeline = {
         context.lineWidth = 1.4;
         context.beginPath();
         rates.forEach((rate, k) => {
-          const y = H - 2 - (rate / top) * (H - 6);
+          const y = H - 2 - (rate / (top || 1)) * (H - 6);
           context.lineTo(LEFT + (k / rates.length) * W, y);
           context.lineTo(LEFT + ((k + 1) / rates.length) * W, y);
         });
@@ -68,7 +68,7 @@ export const RateTimeline = {
       context.font = '11px system-ui, sans-serif';
       context.textAlign = 'right';
       context.textBaseline = 'top';
-      context.fillText(short(top), LEFT - 5, 1);
+      if (top > 0) context.fillText(short(top), LEFT - 5, 1);
       context.textBaseline = 'bottom';
       context.fillText('0', LEFT - 5, H + 3);
       context.textBaseline = 'middle';
