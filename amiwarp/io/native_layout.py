@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.camera_attributes import camera_attributes, prism_attributes
-from amiwarp.io.chunks import CHUNK, GZIP_LEVEL, Codec
+from amiwarp.io.chunks import CHUNK, GZIP_LEVEL, Codec, blosc_shuffle
 from amiwarp.optics.camera import Camera, check_size
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def make_dataset(
     """Create an empty dataset of the native layout, whose rows have the shape ``row``."""
     import hdf5plugin
 
-    blosc = {"compression": hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)}
+    blosc = {"compression": hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=blosc_shuffle(np.dtype(dtype)))}
     gzip = {"compression": "gzip", "compression_opts": GZIP_LEVEL, "shuffle": True}
     # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.
     return file.create_dataset(
