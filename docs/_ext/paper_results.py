@@ -44,14 +44,10 @@ def verdicts(reports: dict[str, Any]) -> str:
     first = next(iter(reports.values()))
     text = ""
     for section in first["evaluations"]:
-        rows = [
-            [
-                f"{claim['text']} *Rule: {claim['rule']}.*",
-                claim["paper"],
-                *(cell for report in reports.values() for cell in judged(report, claim)),
-            ]
-            for claim in section["claims"]
-        ]
+        rows = []
+        for claim in section["claims"]:
+            cells = (cell for report in reports.values() for cell in judged(report, claim))
+            rows.append([f"{claim['text']} *Rule: {claim['rule']}.*", claim["paper"], *cells])
         names = [cell for name in reports for cell in (f"here ({name})", "verdict")]
         text += f"### {section['title']}\n\n" + markdown_table(["claim", "paper", *names], rows)
     return text
