@@ -144,8 +144,9 @@ class Updates:
         s, inspector = self._state, self._panel.inspector
         if not (s.orbit_shown and s.axis == Axis.ANGLE.value and self._panel.compensates):
             return NO_ORBIT
-        lines = zip(("orbit", "column"), orbit_lines(inspector, shown, self._picked), strict=True)
-        return {name: float_bytes(line) for name, line in lines} | {"has_orbit": True}
+        orbit, column = map(float_bytes, orbit_lines(inspector, shown, self._picked))
+        recorded = self._panel.comparison.knobs is None  # otherwise, both clouds are compensated
+        return {"orbit": orbit if recorded else column, "column": column, "has_orbit": True}
 
     def _show_prism(self) -> None:
         """Show what depends on the rotation of the prism."""
