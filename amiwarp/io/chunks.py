@@ -58,7 +58,7 @@ class Codec(enum.StrEnum):
     """
 
     BLOSC = "blosc"
-    """Blosc (LZ4, shuffle of bits, for times of bytes): the fastest. Other programs need HDF5's Blosc filter to read it."""
+    """Blosc (LZ4, shuffle of bits; of bytes for times): fastest. Other programs need HDF5's Blosc filter to read it."""
     GZIP = "gzip"
     """Deflate with byte shuffle, which every HDF5 library reads."""
 

@@ -37,11 +37,11 @@ CAPACITY = (1 << 23) - 1  # number of events that the sums of all slices hold to
 
 @wp.func
 def displace_block(
-    model: Any, camera: Any, events: EventArrays, first: int, n: int, x: wp.array(dtype=float), y: wp.array(dtype=float)
+    model: Any, camera: Any, events: EventArrays, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float)
 ):
     """Compute the compensated positions of a block of events."""
     azimuths = wp.zeros(shape=(128,), dtype=float)
-    load_pairs(azimuths, events.azimuths, events.turn, first, n)
+    load_pairs(azimuths, events.azimuths, events.turn, first)
     for k in range(BLOCK):
         w0, w1 = rotate_azimuth(model, load_float(azimuths, 2 * k), load_float(azimuths, 2 * k + 1))
         i = first + k
@@ -101,9 +101,9 @@ def vote_event_blocks(
     places = wp.zeros(shape=(64,), dtype=int)
     shares = wp.zeros(shape=(256,), dtype=int)
     if is_plain(model) == 1:
-        displace_block(plain(model), camera, events, first, n, x, y)
+        displace_block(plain(model), camera, events, first, x, y)
     else:
-        displace_block(model, camera, events, first, n, x, y)
+        displace_block(model, camera, events, first, x, y)
     dither_block(canvas, first, x, y)
     share_block(canvas, x, y, events.layer, first, places, shares)
     weigh_block(events, first, shares)
@@ -128,7 +128,7 @@ def vote_rotating_camera_blocks(
     y = wp.zeros(shape=(64,), dtype=float)
     places = wp.zeros(shape=(64,), dtype=int)
     shares = wp.zeros(shape=(256,), dtype=int)
-    displace_block(model, camera, events, first, n, x, y)
+    displace_block(model, camera, events, first, x, y)
     for k in range(n):
         xy = undo_camera_rotation(camera, wp.vec2(x[k], y[k]), camera_rotation, events.time[first + k])
         store_float(x, k, xy[0])

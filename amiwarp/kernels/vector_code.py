@@ -76,22 +76,30 @@ def copy_bytes(out: wp.array(dtype=wp.uint8), values: wp.array(dtype=wp.uint8), 
 
 
 @wp.func_native("""
-    const uint64_t* table = (const uint64_t*)pairs.data;
-    const uint16_t* index = (const uint16_t*)indices.data + first;
-    uint64_t* to = (uint64_t*)out.data;
-    for (int k = 0; k < n; ++k) to[k] = table[index[k]];
+    typedef uint64_t eight __attribute__((vector_size(64)));
+    const uint64_t* t = (const uint64_t*)pairs.data;
+    const uint16_t* i = (const uint16_t*)indices.data + first;
+    for (int k = 0; k < 64; k += 8, i += 8) {
+        const eight some = {t[i[0]], t[i[1]], t[i[2]], t[i[3]], t[i[4]], t[i[5]], t[i[6]], t[i[7]]};
+        memcpy((uint64_t*)out.data + k, &some, 64);
+    }
 """)
 def load_pairs(
-    out: wp.array(dtype=float), pairs: wp.array(dtype=float), indices: wp.array(dtype=wp.uint16), first: int, n: int
+    out: wp.array(dtype=float), pairs: wp.array(dtype=float), indices: wp.array(dtype=wp.uint16), first: int
 ):
-    """Copy the pairs of floats at ``indices[first : first + n]`` of a table of pairs, one load each."""
+    """Copy the pairs of floats at ``indices[first : first + 64]`` of a table of pairs, one load each. For CPUs.
+
+    Eight are stored at once, because a vector load from several waiting stores would wait until they are in the cache.
+    """
 
 
 @wp.func_native("""
     const int* place = (const int*)places.data;
     const uint64_t* share = (const uint64_t*)shares.data;
     uint32_t* sum = (uint32_t*)sums.data;
+#ifndef __CUDACC__
     for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k] + columns, 1);
+#endif
     for (int k = 0; k < n; ++k) {
         uint64_t above, below;
         uint32_t* at = sum + place[k];
