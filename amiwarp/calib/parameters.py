@@ -19,6 +19,7 @@ from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.validation import instance, one_of, real, shown, vector
@@ -65,7 +66,10 @@ MOTION = (*RATES, *CHANGES)
 """Names of all parameters of the camera's rotation."""
 EXACT_PARAMETERS = ("apex", "index", "tilt_x", "tilt_y")
 """Parameters of the exact model that the circle models do not have."""
-DEGENERATE_WITH_APEX = ("index", "focal_length")
+LENS = ("focal_length", "center_x", "center_y", "k1")
+"""Parameters of the camera's lens. The principal point (px) and the first radial coefficient of distortion are freed by
+the photometric stage only, if the events contradict the given camera."""
+DEGENERATE_WITH_APEX = ("index", *LENS)
 """Parameters that the sharpness stage does not search if the photometric stage follows: in sharpness they are nearly
 degenerate with the apex."""
 
@@ -322,12 +326,20 @@ def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraR
     return CameraRotation((x, y, z), (a, b, c), middle_us)
 
 
+def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
+    """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
+    fx = values.get("focal_length", camera.fx)
+    lens = camera.distortion
+    if "k1" in values:
+        lens = replace(lens or RadialTangential(), k1=values["k1"])
+    cx, cy = values.get("center_x", camera.cx), values.get("center_y", camera.cy)
+    return replace(camera, fx=fx, fy=camera.fy * (fx / camera.fx), cx=cx, cy=cy, distortion=lens)
+
+
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
     """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
     one_of(model, MODELS, "model")
-    if "focal_length" in values:
-        scale = values["focal_length"] / camera.fx
-        camera = replace(camera, fx=values["focal_length"], fy=camera.fy * scale)
+    camera = with_lens(camera, values)
     if model == "circle":
         return CircleModel(camera, values["deflection"], values["phase"], prism.flat_side)
     if model == "radial":

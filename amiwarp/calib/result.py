@@ -65,9 +65,11 @@ class Calibration:
     model_name: str
     """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
     camera: Camera
-    """Nominal camera. If ``parameters`` contain a focal length, it replaces the camera's focal length."""
+    """Given camera, corrected where the events contradict it. If ``parameters`` contain a focal length, it replaces the
+    camera's focal length."""
     prism: Prism
-    """Nominal prism. It gives the flat side, and the index if that was not free."""
+    """Nominal prism. It gives the flat side, corrected if the events contradict it, and the index if that was not free.
+    """
     parameters: Mapping[str, float]
     """Parameter values by name: angles in rad, ``clock_offset`` in us, ``rpm`` in 1/min, ``focal_length`` in px,
     ``rate_*`` in rad/s, ``change_*`` in rad/s²."""

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib import checks
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
-from amiwarp.calib.parameters import MOTION, RATES, size_name
+from amiwarp.calib.parameters import LENS, MOTION, RATES, size_name, with_lens
+from amiwarp.calib.photometric.acceptance import LARGEST_COST_RATIO, LARGEST_STILL_COST
 from amiwarp.calib.photometric.stage import refine
 from amiwarp.calib.preparation import linear_unknowns, prepare, rotation_window, zero_time
 from amiwarp.calib.prism_speed import encoder_turns_per_period
@@ -28,16 +29,6 @@ if TYPE_CHECKING:
 
 LEAST_BAD_SHARE = 0.01
 """Share of the events on hot or flickering pixels above which these pixels are masked."""
-LEAST_SHARPNESS_KEPT = 0.7
-"""Smallest share of the gain in sharpness that the parameters of the photometric stage must keep.
-
-The true parameters keep 0.93 to 0.99 of the gain, 0.8 with many hot pixels (measured).
-"""
-LARGEST_STILL_COST = 0.2
-"""Largest cost of the photometric stage, relative to that without a brightness map, that a still camera and a correct
-encoder scale leave."""
-LARGEST_COST_RATIO = 0.75
-"""Ratio of the new to the previous cost up to which a camera rotation or a corrected encoder scale is accepted."""
 LEAST_SCALE_ERROR = 0.003
 """Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
 
@@ -249,19 +240,23 @@ def _photometric_stage(
 ) -> Calibration:
     """Return the photometric stage's result, or the sharpness stage's result with a warning that says why."""
     try:
-        found, summary = refine(recording, search, linear_unknowns(search.settings), progress=progress)
+        found, summary, space = refine(recording, search, linear_unknowns(search.settings), progress=progress)
     except AmiwarpError as error:
         return replace(result, warnings=(*result.warnings, f"the photometric stage failed: {error}"))
-    after = search.fine.values(dict(found.parameters))
-    kept = (after - result.sharpness_before) / max(result.sharpness_after - result.sharpness_before, 1e-12)
-    if found.accepted and kept < LEAST_SHARPNESS_KEPT:
-        much = f"keeps only {100 * kept:.0f} %" if kept > 0.005 else "keeps nothing"
-        verdict = f"{much} of the gain in sharpness: events are missing, or the scene moved"
-        found = replace(found, accepted=False, verdict=verdict)
     if found.held:
         undetermined = f"the events do not determine {', '.join(found.held)}: the photometric stage left it unchanged"
         result = replace(result, warnings=(*result.warnings, undetermined))
-    result = replace(result, stages=(*result.stages, summary), photometric=found)
+    warnings = (*result.warnings, *found.warnings)
+    result = replace(result, stages=(*result.stages, summary), photometric=found, warnings=warnings)
     if not found.accepted:
         return replace(result, warnings=(*result.warnings, f"photometric stage: {found.verdict}"))
-    return replace(result, parameters=found.parameters, uncertainty=found.uncertainty, sharpness_after=after)
+    lens = {n: x for n, x in found.parameters.items() if n in LENS and n not in search.full_space.names}
+    return replace(
+        result,
+        camera=with_lens(result.camera, lens),
+        prism=space.prism,
+        parameters={n: x for n, x in found.parameters.items() if n not in lens},
+        uncertainty={n: x for n, x in found.uncertainty.items() if n not in lens},
+        free=tuple(n for n in space.names if n not in lens),
+        sharpness_after=search.sharpness_in(space, found.parameters),
+    )

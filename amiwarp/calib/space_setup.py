@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -107,6 +108,27 @@ def make_space(
     )  # fmt: skip
 
 
+def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
+    """Return the space with more free parameters: of the lens (:data:`LENS`), or the tilt of the prism's axis.
+
+    They start at their present values. Raises :class:`AmiwarpError` if one of them moves no event.
+    """
+    camera, lens = space.camera, space.camera.distortion
+    given = {"focal_length": camera.fx, "center_x": camera.cx, "center_y": camera.cy, "k1": lens.k1 if lens else 0.0}
+    values = {**{n: given.get(n, 0.0) for n in names}, **space.start}
+    half = {"focal_length": 0.6 * values.get("focal_length", 0.0), "k1": 0.5}
+    half |= dict.fromkeys(("center_x", "center_y"), 0.2 * camera.width)
+    half |= {n: _DEFAULT_RANGE[n] for n in ("tilt_x", "tilt_y")}
+    shifts = _pixels_per_unit(
+        space.model, camera, space.prism, names=names, values=values, rad_per_us=0.0, duration_us=space.duration_us
+    )
+    return replace(
+        space, names=(*space.names, *names), start=values, pixels={**space.pixels, **shifts},
+        low={**space.low, **{n: values[n] - half[n] for n in names}},
+        high={**space.high, **{n: values[n] + half[n] for n in names}},
+    )  # fmt: skip
+
+
 def _ordered_names(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
     """Return the free parameters' names in the search vector's order; raise for unknown or conflicting names."""
     size = size_name(model)
@@ -191,7 +213,8 @@ def _pixels_per_unit(
         return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
     size = size_name(model)
-    steps = {size: 0.25 * nominal[size], "phase": 0.05, **dict.fromkeys(_EXACT_ONLY, 0.02)}
+    lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01}
+    steps = {size: 0.25 * nominal[size], "phase": 0.05, **dict.fromkeys(_EXACT_ONLY, 0.02), **lens}
     shifts = {name: rms(name, step) for name, step in steps.items() if name in names}
     if set(DRIFTS) & set(names):
         phase = rms("phase", 0.05)

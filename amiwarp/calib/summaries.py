@@ -89,6 +89,8 @@ class PhotometricSummary:
     """Drift of a pixel's reference level [thresholds/s]: estimated if it was free, else 0."""
     held: tuple[str, ...] = ()
     """Free parameters that the events do not determine. They keep the values of the sharpness stage."""
+    warnings: tuple[str, ...] = ()
+    """Corrections of the given camera and prism, and where the result does not hold, one sentence each."""
 
 
 @dataclass(frozen=True, kw_only=True)

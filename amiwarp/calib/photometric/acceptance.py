@@ -20,6 +20,25 @@ LARGEST_COST = 0.75
 """Largest accepted cost, relative to the cost without a brightness map. Above it the map explains too little of the
 events."""
 
+LARGEST_STILL_COST = 0.2
+"""Largest cost of the photometric stage, relative to that without a brightness map, that a still camera and a correct
+encoder scale leave."""
+LARGEST_COST_RATIO = 0.75
+"""Ratio of the new to the previous cost up to which another explanation is accepted if the previous cost was high: a
+camera rotation, a corrected encoder scale, or a corrected lens."""
+LARGEST_INCONSISTENCY_PX = 0.1
+"""Largest accepted error that the check of the answer's consistency leaves [px]."""
+
+
+def judge_consistency(error_px: float, cause: str) -> tuple[bool, str]:
+    """Return whether to accept an answer that differs over the image and over time by ``error_px``, and the reason.
+
+    ``cause`` is the likeliest cause, in words.
+    """
+    if error_px <= LARGEST_INCONSISTENCY_PX:
+        return True, ""
+    return False, f"the answer differs by {error_px:.2f} px between parts of the image or of the recording: {cause}"
+
 
 def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -> tuple[bool, str]:
     """Return whether to accept an optimum of the photometric stage, and the reason.

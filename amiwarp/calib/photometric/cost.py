@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.photometric.causes import place_arguments
 from amiwarp.calib.photometric.gauss_newton import Slopes
 
 if TYPE_CHECKING:
@@ -51,13 +52,7 @@ class Cost:
 
     def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
         """Return the keyword arguments of :meth:`BrightnessMap.place` for the search vector ``v``."""
-        values = self.space.to_values(v)
-        space = self.space
-        return {
-            "model": space.build(values),
-            "drift": space.drift(values),
-            "camera_rotation": space.camera_rotation(values),
-        }
+        return place_arguments(self.space, self.space.to_values(v))
 
     def residuals(self, v: NDArray[np.float64], *, rounds: int = 1, steps: int | None = None) -> None:
         """Solve the brightness map at the search vector ``v``. The residuals stay on the device."""

@@ -7,21 +7,17 @@ parameters minimise its robust residual.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
-from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS, SearchStage, check_algorithm, maximise
-from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION
-from amiwarp.calib.photometric.acceptance import LARGEST_MOVE_PX, judge_optimum
+from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS, check_algorithm
+from amiwarp.calib.parameters import DEGENERATE_WITH_APEX
+from amiwarp.calib.photometric.answer_search import AnswerSearch
+from amiwarp.calib.photometric.correction import checked
 from amiwarp.calib.photometric.cost import Cost
-from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined, iterate
-from amiwarp.calib.photometric.minimum_check import cost_around_optimum
+from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined
 from amiwarp.calib.photometric.pair_collection import (
     FINE_PAIRS_PER_NODE,
     check_pairs,
@@ -33,22 +29,11 @@ from amiwarp.calib.summaries import PhotometricSummary, StageSummary
 from amiwarp.validation import real, whole
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.brightness.solver import Tiles
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.recording import Recording
     from amiwarp.progress import Progress
-
-LARGEST_ROTATION_MOVE_PX = 4.0
-"""Largest distance from the sharpness optimum that is searched in the parameters of the camera's rotation [px]."""
-RESTARTS = 3
-"""Largest number of further searches, each from a point near the previous result that has a lower cost."""
-FIRST_STEP_PX = 0.2
-"""First step of an NLopt algorithm's first run [px]."""
-POLISH_STEP_PX = 0.05
-"""First step of an NLopt algorithm's second run, which starts at the result of the first run [px]."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +83,11 @@ class PhotometricSettings:
 
 def refine(
     recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
-) -> tuple[PhotometricSummary, StageSummary]:
-    """Run the photometric stage, which starts at the result of the sharpness stage, and return its result.
+) -> tuple[PhotometricSummary, StageSummary, ParameterSpace]:
+    """Run the photometric stage, which starts at the result of the sharpness stage.
 
-    ``linear`` names the free ones of ``off_ratio`` and ``leak``. Raises :class:`AmiwarpError` for too few pairs.
+    ``linear`` names the free ones of ``off_ratio`` and ``leak``. Return the result, the summary of the search, and the
+    space of the result, whose camera and prism are corrected. Raises :class:`AmiwarpError` for too few pairs.
     """
     settings: PhotometricSettings = search.settings.photometric
     pairs, tiles = collect_pairs(recording, search, settings)
@@ -142,130 +128,7 @@ def refine(
         if progress is not None:
             progress(*stage_share(search.settings, "photometric", share))
 
-    stage, result = _search_with_restarts(cost, v, left, settings, report)
-    found = replace(result, sharpness_parameters=dict(search.best), pairs=len(pairs), held=held)
-    return found, StageSummary.of("photometric", stage, space)
-
-
-def search_box(space: ParameterSpace, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of the box about the sharpness stage's result ``v`` in which this stage searches."""
-
-    def largest_move(name: str) -> float:
-        if name in DEGENERATE_WITH_APEX:
-            return math.inf
-        return LARGEST_ROTATION_MOVE_PX if name in MOTION else LARGEST_MOVE_PX
-
-    most = np.array([largest_move(n) for n in space.names])
-    low, high = space.bounds()
-    return np.clip(low, v - most, v + most), np.clip(high, v - most, v + most)
-
-
-def _search_with_restarts(
-    cost: Cost, v: NDArray[np.float64], left: float, settings: PhotometricSettings, report: Callable[[float], None]
-) -> tuple[SearchStage, PhotometricSummary]:
-    """Search from the sharpness stage's result, and again from any point near the new result with a lower cost.
-
-    If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost.
-    """
-    stage = _search(cost, v, v, settings, report)
-    result, around = _evaluate(cost, stage.x, v, left)
-    for _ in range(RESTARTS):
-        lower = [point for point, rise in around if rise < 0.0]
-        if not lower:
-            break
-        cost.renew(lower[0])
-        stage = join_runs(stage, _search(cost, v, lower[0], settings, report))
-        result, around = _evaluate(cost, stage.x, v, left)
-    return stage, result
-
-
-def _search(
-    cost: Cost,
-    v: NDArray[np.float64],
-    start: NDArray[np.float64],
-    settings: PhotometricSettings,
-    report: Callable[[float], None],
-) -> SearchStage:
-    """Run one search from ``start``, in the box about the sharpness stage's result ``v``."""
-    low, high = search_box(cost.space, v)
-
-    def report_steps(done: int, budget: int) -> None:
-        report(done / budget)
-
-    def score(at: NDArray[np.float64]) -> float:
-        report_steps(cost.evaluations, 2 * settings.evaluations)
-        return cost(at)
-
-    if settings.algorithm == GAUSS_NEWTON:
-        return iterate(
-            cost.settled, cost.slopes, start, low=low, high=high, tolerance=settings.tolerance_px, report=report_steps
-        )
-
-    def run(at: NDArray[np.float64], step: float) -> SearchStage:
-        return maximise(
-            score, settings.algorithm, low=low, high=high, start=at, evaluations=settings.evaluations,
-            tolerance=settings.tolerance_px, step=step,
-        )  # fmt: skip
-
-    stage = run(start, FIRST_STEP_PX)
-    # during long steps the map is not fully converged, so a second run starts nearby with a better map
-    cost.steps *= 2
-    return join_runs(stage, run(stage.x, POLISH_STEP_PX))
-
-
-def join_runs(first: SearchStage, second: SearchStage) -> SearchStage:
-    """Return two successive runs as one.
-
-    The result is that of the second run, whose brightness map was better converged.
-    """
-    return replace(
-        second,
-        evaluations=first.evaluations + second.evaluations,
-        seconds=first.seconds + second.seconds,
-        points=np.concatenate([first.points, second.points]),
-        scores=np.concatenate([first.scores, second.scores]),
-    )
-
-
-def _evaluate(
-    cost: Cost,
-    best: NDArray[np.float64],
-    v: NDArray[np.float64],
-    left: float,
-) -> tuple[PhotometricSummary, list[tuple[NDArray[np.float64], float]]]:
-    """Evaluate the optimum ``best``: final map, covariance and acceptance.
-
-    ``v`` is the answer of the sharpness stage, ``left`` the share of equations of :func:`check_pairs`. Return the
-    summary, and points near the optimum with their rise in cost, the lowest first.
-    """
-    space = cost.space
-    # the map is better converged now than at the start of the search, so the cost at the start is measured again
-    cost.residuals(v, rounds=2)
-    at_start = cost.mean()
-    cost.residuals(best, rounds=2)
-    final, residual = cost.mean(), cost.brightness.residuals.median()
-    slopes = cost.slopes(best, with_parts=True)
-    covariance = slopes.covariance() / left**2
-    of_sharpness = np.array([n not in DEGENERATE_WITH_APEX for n in space.names])
-    of_prism = np.array([n not in (*DEGENERATE_WITH_APEX, *MOTION) for n in space.names])
-    leak, excess = (float(x) for x in cost.brightness.extra)  # read before the map is solved at other points
-    around = cost_around_optimum(cost, best, final)
-    rise = around[0][1] if around else math.inf
-    next_step = float(np.linalg.norm(slopes.step()[of_prism]))
-    moved = float(np.linalg.norm((best - v)[of_prism]))
-    accepted, verdict = judge_optimum(final, rise=rise, moved=moved, next_step=next_step)
-    found = PhotometricSummary(
-        accepted=accepted,
-        verdict=verdict,
-        parameters=space.to_values(best),
-        uncertainty=space.deviations(best, covariance),
-        sharpness_parameters={},
-        moved_px=float(np.linalg.norm((best - v)[of_sharpness])),
-        cost=final,
-        cost_at_sharpness=at_start,
-        residual=residual,
-        pairs=0,
-        off_over_on=1.0 + excess,
-        leak=leak,
-    )
-    return found, around
+    answers = AnswerSearch(cost, dict(search.best), left, settings, report)
+    answer = checked(answers, answers.search(v))
+    found = replace(answer.result, sharpness_parameters=answers.sharpest, pairs=len(pairs), held=held)
+    return found, StageSummary.of("photometric", answer.stage, cost.space), cost.space

@@ -27,6 +27,7 @@ from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.model_error import predicted_error
 from amiwarp.optics.models import MODELS
+from amiwarp.optics.prism import UnsizedPrism
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def calibrate_auto(
     first = calibrate_model(recording, settings, device=device, progress=progress)
     if not first.parameters["apex"]:
         return first  # without a prism all models are the same
+    recording = _as_corrected(recording, first)
     trial, parameters = _free_parameters(
         recording, first, settings, device=device, progress=progress, budget_px=budget_px
     )
@@ -81,6 +83,12 @@ def calibrate_auto(
         *(f"prediction and held-out turns disagree on the {c.model} model: {c.verdict}" for c in disagreements),
     )
     return replace(chosen, ladder=choice, seconds=whole, warnings=(*chosen.warnings, *warnings))
+
+
+def _as_corrected(recording: Recording, found: Calibration) -> Recording:
+    """Return the recording with the camera and the flat side that its calibration found."""
+    prism = replace(recording.prism or UnsizedPrism(), flat_side=found.prism.flat_side)
+    return replace(recording, camera=found.camera, prism=prism)
 
 
 def _free_parameters(
@@ -107,7 +115,8 @@ def _free_parameters(
             return trial, free_parameters.hold_all(parameters, str(error))
         parameters = free_parameters.confirm_freed(trial, parameters, exact)
         if free_parameters.freed_names(parameters) == more:
-            exact = replace(exact, stages=(*first.stages, *exact.stages))
+            warnings = tuple(dict.fromkeys((*first.warnings, *exact.warnings)))
+            exact = replace(exact, stages=(*first.stages, *exact.stages), warnings=warnings)
             return make_trial(recording, exact, settings, (), device=device, budget_px=budget_px), parameters
     return trial, parameters
 

@@ -262,6 +262,11 @@ class Search:
         pad = (image.shape[1] - self.space.camera.width) // 2
         return np.asarray(image[pad:-pad, pad:-pad])
 
+    def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
+        """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
+        events, smoothing = self.calibration_events, self.settings.smoothing_px
+        return self._objective(events, scale=1.0, smoothing=smoothing, space=space).values(values)
+
     def _bound_warnings(self, best: dict[str, float]) -> tuple[str, ...]:
         """Return a warning for each parameter that ended on a bound."""
         s = self.space

@@ -1,0 +1,305 @@
+"""Check that the answer of the photometric stage holds everywhere in the image, over time, and for all kinds of pairs.
+
+A wrong answer can leave a small residual, because a wrong camera is mostly absorbed by the size of the orbit. But then
+the size that fits differs from place to place. The check linearises the problem at the answer and asks how much of the
+residual each of a few likely causes would remove, were it free.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amiwarp.calib.parameters import DRIFTS
+from amiwarp.calib.photometric.causes import (
+    CAUSES,
+    FLAT_SIDE,
+    SCREENED,
+    Cause,
+    other_side,
+    place_arguments,
+    turned,
+    with_cause,
+)
+from amiwarp.calib.photometric.linear_fit import Estimate, LinearFit, linear_fit, masked
+from amiwarp.calib.photometric.minimum_check import size_and_phase_directions
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics.model_error import predicted_error
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib.parameters import ParameterSpace
+    from amiwarp.calib.photometric.cost import Cost
+    from amiwarp.optics.models import Model
+
+    Vector = NDArray[np.float64]
+
+SLOPE_PX = 0.02
+"""Step of the finite differences that give the derivatives of the residuals [px]."""
+SIGNIFICANT = 5.0
+"""Number of standard deviations from which on a cause is significant."""
+LEAST_GAIN = 0.002
+"""Smallest share of the squared residuals that a cause must remove. Right answers leave 0.001 at most."""
+LEAST_MOVE_PX = 0.005
+"""Smallest change of the model for which a cause is reported [px rms over the image and a turn]."""
+NOTABLE_PX = 0.025
+"""Smallest drift, or spread over the image, of the orbit's size and phase that is reported [px]."""
+GAP_SHARE, LEAST_STD_PX = 0.5, 0.002
+"""Systematic standard deviation of the answer: a share of the difference between the answers of pairs with long and
+with short gaps, and a least value [px]. Measured on recordings with known truth."""
+REGIONS = (3, 2)
+"""Number of columns and rows of the parts of the image whose answers are compared."""
+FEWEST_SQUARES = 4
+"""Smallest number of squares of pixels with events for a part of the image to be compared."""
+TELLING = 3.0
+"""Number of standard deviations between the two sides of the prism from which on the events tell them apart."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A cause for which the answer does not hold everywhere."""
+
+    cause: Cause
+    moved_px: float
+    """Change of the model over the image and a turn if the cause is corrected, constant lag removed [px rms]."""
+    gain: float
+    """Share of the squared residuals that the correction removes."""
+    significance: float
+    """Distance of the correction from none [standard deviations]."""
+    start: Vector
+    """Corrected search vector in the space of :func:`with_cause` [px]."""
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Result of the check."""
+
+    step: Vector
+    """Remaining Gauss-Newton step of the free parameters [px], shape (n,)."""
+    systematic: Vector
+    """Covariance of the errors that do not scatter from place to place [px²], shape (n, n)."""
+    findings: tuple[Finding, ...]
+    """Causes that are significant, the likeliest first."""
+    drift: tuple[float, float]
+    """Change of the orbit's size and phase over the recording [px rms]; 0 if not significant."""
+    spread: tuple[float, float]
+    """Standard deviation of the orbit's size and phase between parts of the image, beyond their scatter [px]."""
+    untold_px: float
+    """Error if the other side of the prism is the flat one [px rms], if the events do not tell which it is; else 0."""
+
+    def inconsistent_px(self) -> float:
+        """Return the largest error that the check found [px].
+
+        A phase that drifts or differs from place to place blurs the image, but its mean is right.
+        """
+        return max([f.moved_px for f in self.findings[:1]] + [abs(self.drift[0]), self.spread[0]])
+
+    def likeliest(self) -> str:
+        """Return the likeliest cause of an inconsistency, in words."""
+        if self.findings:
+            return f"{self.findings[0].cause.words} is wrong"
+        if abs(self.drift[0]) >= max(self.spread):
+            return "the camera or the scene moved"
+        if self.spread[1] > self.spread[0]:
+            return "the pixels are slow where it is dark, or the clock or the encoder is wrong"
+        return "the lens is wrong, near things moved past the camera, or events were lost"
+
+    def warnings(self) -> list[str]:
+        """Return a sentence for each inconsistency that a user should know of."""
+        out = []
+        if self.findings:
+            f = self.findings[0]
+            out.append(
+                f"the answer does not hold everywhere in the image: {f.cause.words} seems to be wrong, which amounts "
+                f"to {f.moved_px:.2f} px rms"
+            )
+        elif max(self.spread) >= NOTABLE_PX:
+            what = "phase" if self.spread[1] > self.spread[0] else "size"
+            out.append(
+                f"the {what} of the orbit differs by {max(self.spread):.2f} px between parts of the image: "
+                f"{self.likeliest()}"
+            )
+        if max(abs(d) for d in self.drift) >= NOTABLE_PX:
+            what = "phase" if abs(self.drift[1]) > abs(self.drift[0]) else "size"
+            out.append(
+                f"the {what} of the orbit drifts over the recording by {max(abs(d) for d in self.drift):.2f} px rms: "
+                "the scale or the clock of the encoder is wrong, or the camera moved"
+            )
+        if self.untold_px:
+            out.append(
+                "the events do not tell which side of the prism is flat; if the given one is wrong, the error is "
+                f"{self.untold_px:.2f} px rms"
+            )
+        return out
+
+
+def check_consistency(cost: Cost, best: Vector) -> Consistency:
+    """Check the answer ``best`` [px]. The map must be solved there; it is not changed."""
+    space = cost.space
+    columns = _columns(cost, best)
+    causes = testable(space)
+    for cause in causes:
+        if cause in SCREENED:
+            columns |= _cause_columns(cost, best, cause)
+    fit = linear_fit(cost, columns)
+    findings = _findings(cost, best, fit, [c for c in causes if c in SCREENED])
+    if findings:
+        for cause in causes:
+            if cause not in SCREENED:
+                columns |= _cause_columns(cost, best, cause)
+        fit = linear_fit(cost, columns)
+        findings = _findings(cost, best, fit, causes)
+    return Consistency(
+        step=fit.fit(space.names).change, systematic=_systematic(space, fit), findings=tuple(findings),
+        drift=_drift(space, best, fit), spread=_spread(space, best, fit), untold_px=_untold(space, best, fit),
+    )  # fmt: skip
+
+
+def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by the free parameters, and those of some pairs by size and phase.
+
+    ``long …`` are the derivatives of pairs with long gaps only; ``late …`` grow with the time of the pair.
+    """
+    space, time = cost.space, cost.brightness.pairs.time
+    columns = {name: _slope(cost, space, best, k) for k, name in enumerate(space.names)}
+    middle, gap = time.mean(axis=0), time[1] - time[0]
+    late = ((middle - middle.mean()) / max(float(middle.std()), 1e-9)).astype(np.float32)
+    long = (gap > np.median(gap)).astype(np.float32)
+    for name in _orbit(space):
+        columns[f"long {name}"] = masked(columns[name], long)
+        if not (set(DRIFTS) & set(space.names) or space.moving):
+            columns[f"late {name}"] = masked(columns[name], late)
+    return columns
+
+
+def _orbit(space: ParameterSpace) -> list[str]:
+    """Return the names of the free ones of size and phase."""
+    return [n for n in space.names if n in (space.size_name, "phase")]
+
+
+def _systematic(space: ParameterSpace, fit: LinearFit) -> Vector:
+    """Return the covariance of errors that pairs with long and with short gaps do not share [px²]."""
+    names = _orbit(space)
+    which = [space.names.index(n) for n in names]
+    change = np.zeros(len(space.names))
+    change[which] = fit.fit((*space.names, *(f"long {n}" for n in names))).change[len(space.names) :]
+    least = np.zeros(len(change))
+    least[which] = LEAST_STD_PX**2
+    return np.asarray(GAP_SHARE**2 * np.outer(change, change) + np.diag(least))
+
+
+def _spread(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float]:
+    """Return the standard deviation of size and phase between the parts of the image, beyond their scatter [px].
+
+    The estimate of DerSimonian and Laird (Controlled Clinical Trials 1986) for the variance between groups.
+    """
+    names = tuple(_orbit(space))
+    along = np.array(size_and_phase_directions(space, best))[:, [space.names.index(n) for n in names]]
+    places = np.minimum(fit.xy * REGIONS / (space.camera.width, space.camera.height), np.array(REGIONS) - 0.5)
+    region = places.astype(int) @ (1, REGIONS[0])
+    found = [fit.fit(names, region == k) for k in np.unique(region) if np.count_nonzero(region == k) >= FEWEST_SQUARES]
+    if len(found) < 2:
+        return 0.0, 0.0
+    values = np.array([along @ e.change for e in found])
+    variances = np.array([np.diag(along @ e.covariance @ along.T) for e in found])
+    weights = 1.0 / np.maximum(variances, 1e-12)
+    total = weights.sum(axis=0)
+    mean = (weights * values).sum(axis=0) / total
+    excess = (weights * (values - mean) ** 2).sum(axis=0) - (len(found) - 1)
+    size, phase = np.sqrt(np.maximum(0.0, excess / (total - (weights**2).sum(axis=0) / total))).tolist()
+    return size, phase
+
+
+def _untold(space: ParameterSpace, best: Vector, fit: LinearFit) -> float:
+    """Return the error if the other side of the prism is flat [px rms], if the events do not tell; else 0."""
+    if FLAT_SIDE not in fit.names:
+        return 0.0
+    std = math.sqrt(float(fit.fit((*space.names, FLAT_SIDE)).covariance[-1, -1]))
+    if std * TELLING <= 1.0:
+        return 0.0
+    values = space.to_values(best)
+    away = _distance(other_side(space).build(turned(space, values)), space.build(values))
+    return away if away >= LEAST_MOVE_PX else 0.0
+
+
+def _distance(model: Model, other: Model) -> float:
+    """Return the distance of two models over the image and a turn, constant lag removed [px rms]."""
+    return predicted_error(model, other, remove_lag=True, grid=8).rms
+
+
+def _slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
+    """Return the derivative of the residuals by entry ``k`` of the search vector of ``space``, on the device."""
+    step = np.zeros(len(v))
+    step[k] = SLOPE_PX
+    up, down = (place_arguments(space, space.to_values(at)) for at in (v + step, v - step))
+    return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+
+
+def testable(space: ParameterSpace) -> list[Cause]:
+    """Return the causes that can be tested: those that are not free anyway, for the exact model of a still camera."""
+    if space.model != "exact" or space.moving or not space.cartesian:
+        return []
+    return [c for c in CAUSES if not set(c.names) & set(space.names)]
+
+
+def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
+    """Return the derivatives of the residuals by the parameters of a cause, by name."""
+    space = cost.space
+    values = space.to_values(best)
+    try:
+        if cause.names == (FLAT_SIDE,):
+            ends = place_arguments(other_side(space), turned(space, values)), place_arguments(space, values)
+            return {FLAT_SIDE: cost.brightness.find_slope(*ends, 1.0)}
+        wide, v = with_cause(space, cause, values)
+    except AmiwarpError:
+        return {}  # it moves no event
+    return {n: _slope(cost, wide, v, wide.names.index(n)) for n in cause.names}
+
+
+def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause]) -> list[Finding]:
+    """Return the significant causes, the one that removes most of the residual first."""
+    n, found = len(best), []
+    before = fit.fit(cost.space.names).gain
+    for cause in causes:
+        if not set(cause.names) <= set(fit.names):
+            continue
+        estimate = fit.fit((*cost.space.names, *cause.names))
+        significance = estimate.significance(n)
+        gain = estimate.gain - before
+        if significance < SIGNIFICANT or gain < LEAST_GAIN:
+            continue
+        moved, start = _corrected(cost, best, cause, estimate)
+        if moved >= LEAST_MOVE_PX:
+            found.append(Finding(cause, moved, gain, significance, start))
+    return sorted(found, key=lambda f: -f.gain)
+
+
+def _corrected(cost: Cost, best: Vector, cause: Cause, estimate: Estimate) -> tuple[float, Vector]:
+    """Return how far the correction of a cause changes the model [px rms], and the corrected search vector."""
+    space, n = cost.space, len(best)
+    here = space.build(space.to_values(best))
+    wide, v = with_cause(space, cause, space.to_values(best))
+    if cause.names == (FLAT_SIDE,):
+        return float(estimate.change[n]) * _distance(wide.build(wide.to_values(v)), here), v
+    low, high = wide.bounds()
+    v = np.clip(v + estimate.change, low, high)
+    return _distance(wide.build(wide.to_values(v)), here), v
+
+
+def _drift(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float]:
+    """Return the significant change of size and phase over the recording [px rms]."""
+    late = tuple(name for name in fit.names if name.startswith("late "))
+    if len(late) < 2:
+        return 0.0, 0.0
+    n = len(space.names)
+    estimate = fit.fit((*space.names, *late))
+    along = np.array([d[[space.names.index(name.removeprefix("late ")) for name in late]]
+                      for d in size_and_phase_directions(space, best)])  # fmt: skip
+    change = along @ estimate.change[n:]
+    std = np.sqrt(np.diag(along @ estimate.covariance[n:, n:] @ along.T))
+    size, phase = np.where(np.abs(change) > SIGNIFICANT * std, change, 0.0).tolist()
+    return size, phase

@@ -1,0 +1,125 @@
+"""The photometric answer must hold everywhere in the image and over time; a wrong camera or flat side is corrected."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.photometric.acceptance import judge_consistency
+from amiwarp.calib.photometric.causes import CAUSES
+from amiwarp.calib.photometric.consistency import Consistency, Finding
+from amiwarp.calib.photometric.linear_fit import LinearFit
+from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.simulation.simulator import simulate
+
+CAMERA = Camera.from_fov(160, 120, math.radians(90.0))
+PRISM = Prism(math.radians(2.0))
+
+
+@pytest.fixture(scope="module")
+def wide(texture: np.ndarray) -> Recording:
+    """Two turns through a wide lens."""
+    return simulate(texture, CAMERA, PRISM, duration_s=0.17, seed=6)
+
+
+def calibrated(recording: Recording) -> Calibration:
+    return calibrate(
+        recording, model="exact", events=60_000, global_evaluations=60, photometric=PhotometricSettings(pairs=60_000)
+    )
+
+
+def error_px(recording: Recording, found: Calibration, camera: Camera = CAMERA) -> float:
+    assert recording.truth is not None
+    return model_error(found.model, truth_model(camera, recording.truth, FlatSide.SCENE)).rms
+
+
+def test_a_right_camera_is_left_alone(wide: Recording) -> None:
+    found = calibrated(wide)
+    assert found.camera == CAMERA
+    assert found.warnings == ()
+    assert error_px(wide, found) < 0.02
+    assert abs(found.parameters["apex"] - PRISM.apex) < 3.0 * found.uncertainty["apex"]
+
+
+def test_a_distortion_that_was_not_given_is_found(texture: np.ndarray) -> None:
+    camera = replace(CAMERA, distortion=RadialTangential(k1=-0.1))
+    recording = simulate(texture, camera, PRISM, duration_s=0.17, seed=6)
+    found = calibrated(replace(recording, camera=CAMERA))
+    assert error_px(recording, found, camera) < 0.03
+    assert isinstance(found.camera.distortion, RadialTangential)
+    assert found.camera.distortion.k1 == pytest.approx(-0.1, abs=0.01)
+    assert any("contradict k1 = 0" in w for w in found.warnings)
+    assert set(found.parameters) == {*found.free} == {"apex", "phase"}
+    assert found.photometric is not None
+    assert "k1" in found.photometric.uncertainty
+
+
+def test_the_flat_side_is_found(wide: Recording) -> None:
+    found = calibrated(replace(wide, prism=replace(PRISM, flat_side=FlatSide.CAMERA)))
+    assert found.prism.flat_side is FlatSide.SCENE
+    assert error_px(wide, found) < 0.02
+    assert any("flat face of the prism points to the scene" in w for w in found.warnings)
+
+
+def test_a_drifting_phase_is_reported(wide: Recording) -> None:
+    assert wide.encoder is not None
+    slipping = replace(wide, encoder=Encoder(wide.encoder.t, wide.encoder.angle * 1.008))
+    assert any("drifts over the recording" in w and "encoder" in w for w in calibrated(slipping).warnings)
+
+
+def linear(truth: np.ndarray, noise: float, squares: int = 200) -> LinearFit:
+    """Random columns whose residuals are those of the change ``truth``, with noise, in squares of 30 pairs."""
+    rng = np.random.default_rng(1)
+    columns = rng.normal(size=(squares, 30, len(truth)))
+    residual = -columns @ truth + noise * rng.normal(size=(squares, 30))
+    hessian = np.einsum("spi,spj->sij", columns, columns)
+    gradient = np.einsum("spi,sp->si", columns, residual)
+    xy = rng.uniform(0, 100, (squares, 2))
+    return LinearFit(("size", "phase", "other"), hessian, gradient, xy, float(np.sum(residual**2)))
+
+
+def test_linear_fit() -> None:
+    truth = np.array([0.3, -0.2, 0.5])
+    fit = linear(truth, noise=0.1)
+    whole = fit.fit(("size", "phase", "other"))
+    std = np.sqrt(np.diag(whole.covariance))
+    np.testing.assert_allclose(std, 0.1 / math.sqrt(200 * 30), rtol=0.2)
+    np.testing.assert_array_less(np.abs(whole.change - truth), 4.0 * std)
+    assert whole.significance(2) == pytest.approx(0.5 / std[2], rel=0.05)
+    assert whole.gain == pytest.approx(1.0 - 0.01 / (0.01 + np.sum(truth**2)), abs=0.01)
+    assert fit.fit(("size",)).gain < whole.gain
+    half = fit.fit(("size", "phase", "other"), fit.xy[:, 0] < 50.0)
+    assert half.covariance[0, 0] == pytest.approx(2.0 * whole.covariance[0, 0], rel=0.4)
+
+
+def outcome(**values: Any) -> Consistency:
+    none: dict[str, Any] = {"findings": (), "drift": (0.0, 0.0), "spread": (0.0, 0.0), "untold_px": 0.0}
+    return Consistency(step=np.zeros(2), systematic=np.zeros((2, 2)), **{**none, **values})
+
+
+def test_what_is_said_and_refused() -> None:
+    lens = Finding(CAUSES[0], moved_px=0.2, gain=0.1, significance=20.0, start=np.zeros(3))
+    for found, words, error in (
+        (outcome(findings=(lens,)), "focal length seems to be wrong", 0.2),
+        (outcome(spread=(0.3, 0.0)), "size of the orbit differs by 0.30 px", 0.3),
+        (outcome(spread=(0.0, 0.3)), "slow where it is dark", 0.0),
+        (outcome(drift=(0.15, 0.0)), "size of the orbit drifts", 0.15),
+        (outcome(drift=(0.0, -0.15)), "scale or the clock of the encoder", 0.0),
+        (outcome(untold_px=0.04), "do not tell which side", 0.0),
+    ):
+        [warning] = found.warnings()
+        assert words in warning
+        assert found.inconsistent_px() == pytest.approx(error)
+        accepted, reason = judge_consistency(found.inconsistent_px(), found.likeliest())
+        assert accepted == (error == 0.0)
+        assert (found.likeliest() in reason) == (not accepted)
+    assert outcome().warnings() == []
