@@ -222,6 +222,9 @@ def test_a_comparison_needs_most_recordings_to_be_calibrated() -> None:
     assert both == (False, "higher in 1 of 2 cases, with the true model in 2; calibration mostly refused in 1")
     assert compared(by_case(good, ("scene",), "score"), Stream.RAW, "higher", larger=True) == (None, "no result")
     assert {r["seed"] for r in where_calibrated(good)} == {0, 1}
+    none = [r for r in good if r["stream"] != Stream.CALIBRATED]
+    refused_all = compared(by_case(none, ("scene",), "score"), Stream.PLAIN, "higher", larger=True)
+    assert refused_all == (None, "the calibration refused all recordings")
 
 
 def test_the_report_tells_what_the_calibration_refused() -> None:

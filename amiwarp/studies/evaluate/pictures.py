@@ -11,6 +11,7 @@ from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.measures.niqe import BLOCK, niqe
 from amiwarp.studies.evaluate.measures.pictures import displayed, fitted, similarity
 from amiwarp.studies.evaluate.results import (
+    NO_RESULT,
     CellResult,
     Chart,
     Claim,
@@ -170,7 +171,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 def _claim(rows: Sequence[dict[str, Any]], camera: str, score: str, larger: bool) -> Claim:
     direction = "higher" if larger else "lower"
     holds, ours = compared(by_case(rows, ("scene",), score), Stream.PLAIN, direction, larger=larger)
-    if holds is None and rows:
+    if ours == NO_RESULT and rows:
         ours = f"the pictures of '{Stream.PLAIN}' are uniform and have no {score.upper()}"
     rule = (
         f"the mean {score.upper()} of '{Stream.CALIBRATED}' is {direction} than that of '{Stream.PLAIN}' by more than "

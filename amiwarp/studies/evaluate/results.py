@@ -172,6 +172,10 @@ class Claim:
         return cls(text, paper, ours, verdict, rule)
 
 
+NO_RESULT = "no result"
+"""Text for a comparison without values."""
+
+
 @dataclass(frozen=True)
 class Score:
     """Score of a stream in a case, over the seeds."""
@@ -191,11 +195,14 @@ def compared(
 
     Better means ``larger`` or smaller by more than either standard deviation. A case in which fewer than half of the
     recordings could be calibrated counts as not better; the text also says in how many cases the true model is better.
-    ``word``: comparative for the text. Without cases that have the other stream, the first value is None.
+    ``word``: comparative for the text. The first value is None if no case has the other stream, or if no recording
+    could be calibrated.
     """
     given = [case for case in cases.values() if other in case]
     if not given:
-        return None, "no result"
+        return None, NO_RESULT
+    if not any(Stream.CALIBRATED in case for case in given):
+        return None, "the calibration refused all recordings"
     sign = 1.0 if larger else -1.0
 
     def better(stream: Stream) -> int:
