@@ -208,7 +208,7 @@ def test_verdicts() -> None:
 
 
 def stream_rows(scene: str, **scores: list[float | None]) -> list[dict[str, object]]:
-    """Return rows of streams, by the names of their members, with a score for each seed; None where there is no row."""
+    """Return one row per stream and seed with its score. None as a score leaves the row out."""
     return [{"scene": scene, "camera": "fast", "seed": seed, "stream": Stream[name].value, "score": value}
             for name, values in scores.items() for seed, value in enumerate(values) if value is not None]  # fmt: skip
 

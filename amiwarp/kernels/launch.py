@@ -37,7 +37,7 @@ def specialised(kernel: Any, inputs: Sequence[Any]) -> Any:
 
     So only the optical models that are used are compiled, and a new one does not compile the others again.
     """
-    generic = [k for k, argument in enumerate(kernel.adj.args) if argument.type is Any]
+    generic = _generic_arguments(kernel)
     if not generic:
         return kernel
     with _specialising:
@@ -45,12 +45,18 @@ def specialised(kernel: Any, inputs: Sequence[Any]) -> Any:
 
 
 @cache
+def _generic_arguments(kernel: Any) -> dict[int, str]:
+    """Return the names of a kernel's generic arguments by their positions."""
+    return {k: argument.label for k, argument in enumerate(kernel.adj.args) if argument.type is Any}
+
+
+@cache
 def _specialised(kernel: Any, structs: tuple[Any, ...]) -> Any:
     """Return a generic kernel for the structs in the order of its generic arguments."""
     module = wp.get_module(".".join([kernel.module.name, kernel.key, *(struct.key for struct in structs)]))
     module.options.update(kernel.module.options)
-    generic = [argument.label for argument in kernel.adj.args if argument.type is Any]
-    return wp.overload(wp.kernel(kernel.func, module=module), dict(zip(generic, structs, strict=True)))
+    names = _generic_arguments(kernel).values()
+    return wp.overload(wp.kernel(kernel.func, module=module), dict(zip(names, structs, strict=True)))
 
 
 def load(kernel: Any, device: Any) -> None:

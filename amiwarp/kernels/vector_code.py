@@ -60,11 +60,6 @@ def store_int(values: wp.array(dtype=int), i: int, value: int):
     """Store ``value`` as element ``i`` of a contiguous array of int32."""
 
 
-@wp.func_native("((uint64_t*)values.data)[i] = value;")
-def store_word(values: wp.array(dtype=wp.uint64), i: int, value: wp.uint64):
-    """Store ``value`` as element ``i`` of a contiguous array of uint64."""
-
-
 @wp.func_native("for (int k = 0; k < n; ++k) ((float*)out.data)[k] = ((const float*)values.data)[first + k];")
 def copy_floats(out: wp.array(dtype=float), values: wp.array(dtype=float), first: int, n: int):
     """Copy ``values[first : first + n]`` of contiguous arrays of float32."""

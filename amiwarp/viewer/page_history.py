@@ -55,7 +55,7 @@ class PageHistory:
         self._want(address)
 
     async def apply(self) -> None:
-        """Show the state that was asked for. Raises :class:`AmiwarpError` if no events meet it."""
+        """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
         panel, wanted = self._panel, self._wanted
         self._wanted = None
         if wanted is None or self._default is None:

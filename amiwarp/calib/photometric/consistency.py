@@ -261,7 +261,7 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
 
 
 def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause]) -> list[Finding]:
-    """Return the significant causes, the one that removes most of the residual first."""
+    """Return the significant causes, ordered by the share of the residual that their correction removes."""
     n, found = len(best), []
     before = fit.fit(cost.space.names).gain
     for cause in causes:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from amiwarp.calib.parameters import LENS
 from amiwarp.calib.photometric.acceptance import LARGEST_COST_RATIO, LARGEST_STILL_COST, judge_consistency
 from amiwarp.calib.photometric.answer_search import join_runs
 from amiwarp.calib.photometric.causes import FLAT_SIDE, turned, with_cause
@@ -27,7 +28,7 @@ RIVAL_SHARE = 0.75
 """A cause is tried if it removes at least this share of the residual that the likeliest one removes."""
 TIE_SHARE = 0.04
 """Of the tried causes, the first one counts whose cost is at most this share of the gain above the lowest cost."""
-LARGEST_COST = 0.5
+LARGEST_EXAMINED_COST = 0.5
 """Largest cost, relative to that without a map, of an answer that is examined. Above it the map explains too little."""
 LARGEST_LAST_STEP_PX = 0.01
 """Longest step that is added to the answer without a new search [px]."""
@@ -52,7 +53,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     A correction is kept if it lowers the cost. The search's space is the corrected one then. The answer's uncertainty
     includes its systematic part.
     """
-    if answer.result.cost > LARGEST_COST or not search.cost.space.sized:
+    if answer.result.cost > LARGEST_EXAMINED_COST or not search.cost.space.sized:
         return answer
     given, cost = search.cost.space, search.cost
     first = answer, search.sharpest
@@ -150,8 +151,9 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
             scale, unit = (math.degrees(1.0), "deg") if name.startswith("tilt") else (1.0, "px")
             unit = "" if name == "k1" else f" {unit}"
             was, now, by = (scale * x for x in (space.start[name], found[name], std[name]))
+            remedy = "; calibrate the lens" if name in LENS else ""
             out.append(
-                f"the events contradict {name} = {was:.5g}{unit}: it was corrected to {now:.5g} ± {by:.2g}{unit}; "
-                "calibrate the lens"
+                f"the events contradict {name} = {was:.5g}{unit}: it was corrected to {now:.5g} ± {by:.2g}{unit}"
+                f"{remedy}"
             )
     return out

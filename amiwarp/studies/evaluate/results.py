@@ -268,12 +268,13 @@ def grouped(rows: Sequence[dict[str, Any]], by: Sequence[str], values: Sequence[
 def by_case(rows: Sequence[dict[str, Any]], by: Sequence[str], value: str) -> dict[tuple[Value, ...], dict[str, Score]]:
     """Return the score of a column by case, the columns ``by``, and stream, for :func:`compared`."""
     rows = [r for r in rows if r.get(value) is not None]
+    seeds: dict[tuple[Value, ...], set[int]] = {}
+    for row in rows:
+        seeds.setdefault(tuple(row[name] for name in (*by, "stream")), set()).add(row["seed"])
     cases: dict[tuple[Value, ...], dict[str, Score]] = {}
     for *case, stream, _, mean, std in grouped(rows, (*by, "stream"), [value]):
         if isinstance(mean, float) and isinstance(std, float):
-            key = (*case, stream)
-            seeds = {r["seed"] for r in rows if tuple(r[name] for name in (*by, "stream")) == key}
-            cases.setdefault(tuple(case), {})[str(stream)] = Score(mean, std, len(seeds))
+            cases.setdefault(tuple(case), {})[str(stream)] = Score(mean, std, len(seeds[*case, stream]))
     return cases
 
 
