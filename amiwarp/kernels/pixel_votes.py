@@ -89,6 +89,25 @@ def weigh_block(events: EventArrays, first: int, shares: wp.array(dtype=int)):
             store_int(shares, k, load_int(shares, k) * int(events.weight[first + k / 4]))
 
 
+@wp.func
+def vote_block(
+    events: EventArrays,
+    canvas: Canvas,
+    first: int,
+    n: int,
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+    sums: wp.array(dtype=int),
+):
+    """Vote the first ``n`` compensated positions of a block of events."""
+    places = wp.zeros(shape=(64,), dtype=int)
+    shares = wp.zeros(shape=(256,), dtype=int)
+    dither_block(canvas, first, x, y)
+    share_block(canvas, x, y, events.layer, first, places, shares)
+    weigh_block(events, first, shares)
+    add_word_pairs(sums, places, shares, canvas.columns, n)
+
+
 @wp.kernel
 def vote_event_blocks(
     model: Any, camera: Any, events: EventArrays, canvas: Canvas, count: int, start: int, sums: wp.array(dtype=int)
@@ -98,16 +117,11 @@ def vote_event_blocks(
     n = wp.min(BLOCK, count - first)
     x = wp.zeros(shape=(64,), dtype=float)
     y = wp.zeros(shape=(64,), dtype=float)
-    places = wp.zeros(shape=(64,), dtype=int)
-    shares = wp.zeros(shape=(256,), dtype=int)
     if is_plain(model) == 1:
         displace_block(plain(model), camera, events, first, x, y)
     else:
         displace_block(model, camera, events, first, x, y)
-    dither_block(canvas, first, x, y)
-    share_block(canvas, x, y, events.layer, first, places, shares)
-    weigh_block(events, first, shares)
-    add_word_pairs(sums, places, shares, canvas.columns, n)
+    vote_block(events, canvas, first, n, x, y, sums)
 
 
 @wp.kernel
@@ -126,16 +140,12 @@ def vote_rotating_camera_blocks(
     n = wp.min(BLOCK, count - first)
     x = wp.zeros(shape=(64,), dtype=float)
     y = wp.zeros(shape=(64,), dtype=float)
-    places = wp.zeros(shape=(64,), dtype=int)
-    shares = wp.zeros(shape=(256,), dtype=int)
     displace_block(model, camera, events, first, x, y)
     for k in range(n):
         xy = undo_camera_rotation(camera, wp.vec2(x[k], y[k]), camera_rotation, events.time[first + k])
         store_float(x, k, xy[0])
         store_float(y, k, xy[1])
-    dither_block(canvas, first, x, y)
-    share_block(canvas, x, y, events.layer, first, places, shares)
-    add_word_pairs(sums, places, shares, canvas.columns, n)
+    vote_block(events, canvas, first, n, x, y, sums)
 
 
 @wp.kernel
