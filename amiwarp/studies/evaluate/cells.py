@@ -21,7 +21,7 @@ from amiwarp.studies.evaluate.measures.libraries import library
 from amiwarp.studies.evaluate.registry import load
 from amiwarp.studies.evaluate.results import CellResult, Settings
 
-FORMAT = 2
+FORMAT = 3
 """Version of the files of cells, and of the streams and measures that all evaluations share."""
 
 

@@ -29,6 +29,7 @@ STYLE = {
     "xtick.major.width": 0.6, "ytick.major.width": 0.6, "legend.frameon": False, "svg.hashsalt": "amiwarp",
 }  # fmt: skip
 """Settings of Matplotlib."""
+GREY = "0.55"
 STREAM_COLOURS = {
     Stream.PLAIN: BLUE,
     Stream.SAME_COUNT: SKY_BLUE,
@@ -37,11 +38,11 @@ STREAM_COLOURS = {
     Stream.RAW: ORANGE,
 }
 """Colours of the streams, the same in all charts."""
-OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK, "0.55")
+OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK, GREY)
 """Colours of other series, in their order."""
 CHANCE = "chance"
 """Name of the level of chance."""
-REFERENCE_COLOURS = {CHANCE: "0.55", "truth": BLACK}
+REFERENCE_COLOURS = {CHANCE: GREY, "truth": BLACK}
 """Colours of the level of chance and of the truth, next to the streams."""
 MARKERS = "osD^vPX*"
 """Markers that distinguish the series without colour."""

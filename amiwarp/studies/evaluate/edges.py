@@ -28,6 +28,7 @@ from amiwarp.studies.evaluate.measures.true_edges import (
     skimage,
 )
 from amiwarp.studies.evaluate.results import (
+    NO_RESULT,
     CellResult,
     Chart,
     ChartKind,
@@ -387,7 +388,7 @@ def _fading(rows: Sequence[dict[str, Any]]) -> Claim:
         )
         if along and across:
             ratio[stream] = float(np.mean(along) / max(np.mean(across), 1e-9))
-    ours = ", ".join(f"{s} {r:.2f}" for s, r in ratio.items()) or "no result"
+    ours = ", ".join(f"{s} {r:.2f}" for s, r in ratio.items()) or NO_RESULT
     holds = ratio[Stream.PLAIN] < ratio[Stream.CALIBRATED] if len(ratio) == 2 else None
     rule = "recall at more than 60° over recall below 30° is lower for the S-EV than for the calibrated AMI-EV"
     text = "Edges along the motion fade from the S-EV, and not from the AMI-EV."

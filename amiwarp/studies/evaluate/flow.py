@@ -13,6 +13,7 @@ from amiwarp.studies.evaluate.conditions import FOCAL_PX, Condition, Stream, Str
 from amiwarp.studies.evaluate.flow_estimation import flow_by_contrast, flow_by_dis
 from amiwarp.studies.evaluate.measures.flow_error import flow_error
 from amiwarp.studies.evaluate.results import (
+    NO_RESULT,
     CellResult,
     Chart,
     Claim,
@@ -157,6 +158,6 @@ def _claim(rows: Sequence[dict[str, Any]], method: str) -> Claim:
     rule = f"the mean of '{Stream.CALIBRATED}' is at most twice {PAPER_PX} px above that of '{Stream.PLAIN}', at edges"
     rule += ", over the recordings that could be calibrated"
     if ours is None or plain is None:
-        return Claim.judge(text, f"+{PAPER_PX} px", "no result", None, rule)
+        return Claim.judge(text, f"+{PAPER_PX} px", NO_RESULT, None, rule)
     shown = f"{ours - plain:+.2f} px ({plain:.2f} to {ours:.2f} px)"
     return Claim.judge(text, f"+{PAPER_PX} px", shown, ours - plain <= 2.0 * PAPER_PX, rule)
