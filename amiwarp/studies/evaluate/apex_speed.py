@@ -12,7 +12,17 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import edge_blur
 from amiwarp.studies.evaluate.conditions import BANDWIDTH, DISCS, IDEAL, LIMITS, Condition, Stream, Streams
 from amiwarp.studies.evaluate.disc_target import BACKGROUND, DiscTarget, robust_spread
-from amiwarp.studies.evaluate.results import CellResult, Chart, Claim, Settings, Table, Value, grouped, rows_of
+from amiwarp.studies.evaluate.results import (
+    NO_RESULT,
+    CellResult,
+    Chart,
+    Claim,
+    Settings,
+    Table,
+    Value,
+    grouped,
+    rows_of,
+)
 
 TITLE = "Apex angle and speed"
 PROTOCOL = (
@@ -183,7 +193,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     known = small is not None and large is not None
     found.append(Claim.judge(
         "A prism of 2° is impractical: it gives too many events.", "text",
-        f"{large:.2f} Mev/s at 2°, {small:.2f} at 0.5°" if known else "no result",
+        f"{large:.2f} Mev/s at 2°, {small:.2f} at 0.5°" if known else NO_RESULT,
         large > 2.0 * small if small is not None and large is not None else None,
         "the event rate at 2° is more than twice that at 0.5° (720 rpm, unlimited bandwidth)",
     ))  # fmt: skip
@@ -195,7 +205,7 @@ def _surge(rows: Sequence[dict[str, Any]], text: str, paper: str, measure: str =
     below, above = (_mean(rows, measure, rpm=rpm, degrees=0.5, **where) for rpm in (USUAL_RPM, 2 * USUAL_RPM))
     rule = f"the mean blur at 1440 rpm is more than {SURGE:g} times that at 720 rpm"
     if below is None or above is None:
-        return Claim.judge(text, paper, "no result", None, rule)
+        return Claim.judge(text, paper, NO_RESULT, None, rule)
     return Claim.judge(
         text, paper, f"{below:.2f} px at 720 rpm, {above:.2f} px at 1440 rpm", above > SURGE * below, rule
     )
