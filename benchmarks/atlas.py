@@ -19,8 +19,8 @@ from pathlib import Path
 
 import warp as wp
 
+from amiwarp.studies.stability.axes import AXES
 from amiwarp.studies.stability.cells import Cell, run_cell
-from amiwarp.studies.stability.conditions import AXES
 from amiwarp.studies.stability.run import QUICK_METHODS, chosen, quick_axes, run
 
 _started = multiprocessing.get_context("spawn").Value("i", 0)

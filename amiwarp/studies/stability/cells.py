@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from amiwarp._version import __version__
 from amiwarp.calib import Settings, calibrate
 from amiwarp.calib.paper_method import calibrate_as_paper
-from amiwarp.calib.parameters import build_model, size_name
+from amiwarp.calib.parameters import build_model
 from amiwarp.calib.presets import settings_to
 from amiwarp.calib.selection.smaller_models import Places
 from amiwarp.calib.sharpness.search import AUTO, STAGES
@@ -39,7 +39,7 @@ LIMIT_PX = 0.1
 itself."""
 BEST_FIT = 1.5
 """Multiple of the error of the model's best fit to the truth that a successful calibration may have."""
-FORMAT = 1
+FORMAT = 2
 """Version of the file format of a stored cell, which is part of the cell's identity."""
 
 
@@ -119,6 +119,9 @@ class Result:
     """Error message of a refusal, or warnings of the calibration."""
     machine: str = ""
     """Description of the machine that ran the calibration."""
+    deviation: float | None = None
+    """Distance of the apex angle from the true one, in standard deviations that the calibration states; None for a
+    circle and for a refused recording."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as JSON data."""
@@ -187,7 +190,17 @@ def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> 
     took = time.perf_counter() - began
     error_px = _error_px(found, sample, truth)
     outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
-    return Result(outcome, float(min(error_px, 1e3)), limit, took, "; ".join(found.warnings))
+    return Result(
+        outcome, float(min(error_px, 1e3)), limit, took, "; ".join(found.warnings),
+        deviation=_deviation(found, cell.condition) if method.model == "exact" else None,
+    )  # fmt: skip
+
+
+def _deviation(found: Calibration, condition: Condition) -> float | None:
+    """Return the distance of the apex angle from the true one [standard deviations]; None if none is stated."""
+    exact = found.exact
+    std = exact.uncertainty.get("apex", 0.0)
+    return abs(exact.parameters["apex"] - condition.prism.apex) / std if std > 0.0 else None
 
 
 def _error_px(found: Calibration, sample: SimulatedSample, truth: ExactModel) -> float:
@@ -216,23 +229,18 @@ def _truth(condition: Condition, sample: SimulatedSample) -> ExactModel:
 def best_fit(condition: Condition, model: str) -> float:
     """Return the error of the best fit of ``model`` to the true model [px rms].
 
-    The fit uses the camera and the flat side that the recording states.
+    It is 0 for the exact model: a wrong camera or prism that the recording states is no excuse.
     """
-    truth = ExactModel(condition.camera, condition.prism)
-    nominal = replace(condition.prism, flat_side=condition.stated_side)
-    if model != "circle" and (condition.stated_camera, nominal) == (condition.camera, condition.prism):
+    if model != "circle":
         return 0.0
-    size = size_name(model)
-    start = nominal.apex if size == "apex" else nominal.deflection
+    truth = ExactModel(condition.camera, condition.prism)
 
     def error(v: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-        values = {size: start * abs(float(v[0])), "phase": float(v[1])}
-        fitted = build_model(model, condition.stated_camera, nominal, values)
+        values = {"deflection": condition.prism.deflection * abs(float(v[0])), "phase": float(v[1])}
+        fitted = build_model(model, condition.camera, condition.prism, values)
         return predicted_error(fitted, truth, grid=8).rms
 
-    turned = 0.0 if nominal == condition.prism else math.pi
-    runs = [minimize(error, [1.0, at], method="Nelder-Mead", options={"maxfev": 80}) for at in {0.0, turned}]
-    return float(min(run.fun for run in runs))
+    return float(minimize(error, [1.0, 0.0], method="Nelder-Mead", options={"maxfev": 80}).fun)
 
 
 class Store:

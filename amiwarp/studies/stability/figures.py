@@ -14,8 +14,8 @@ import numpy as np
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.plotting.figures import save
+from amiwarp.studies.stability.axes import Axis
 from amiwarp.studies.stability.cells import LIMIT_PX, Outcome
-from amiwarp.studies.stability.conditions import Axis
 from amiwarp.studies.stability.points import AxisPoint, axis_label, value_label
 from amiwarp.studies.stability.report import DEFAULT, PAPER, Atlas
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from amiwarp.studies.stability.axes import Axis
 from amiwarp.studies.stability.cells import Outcome, Result
-from amiwarp.studies.stability.conditions import Axis
 
 QUANTILES = (5, 25, 50, 75, 95)
 """Quantiles of the model error that are reported [%]."""

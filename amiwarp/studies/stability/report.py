@@ -14,8 +14,9 @@ from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
+from amiwarp.studies.stability.axes import Axis
 from amiwarp.studies.stability.cells import Cell, Method, Outcome, Store, Stored, identity
-from amiwarp.studies.stability.conditions import Axis, Condition, sensible
+from amiwarp.studies.stability.conditions import Condition, sensible
 from amiwarp.studies.stability.points import AxisPoint, Rate, axis_label, percent, value_label
 
 DEFAULT, PAPER = "default", "paper"

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amiwarp.progress import Progress
+from amiwarp.studies.stability.axes import AXES, Axis
 from amiwarp.studies.stability.cells import METHODS, Cell, Method, Store, Stored, identity, run_cell
-from amiwarp.studies.stability.conditions import AXES, Axis, Condition
+from amiwarp.studies.stability.conditions import Condition
 
 if TYPE_CHECKING:
     from concurrent.futures import Future

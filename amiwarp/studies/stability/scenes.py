@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 DARK, BRIGHT = 0.2, 1.0
 """Smallest and largest luminance of the scenes, relative to white."""
@@ -28,6 +28,8 @@ class SceneKind(enum.StrEnum):
     EDGES = "sparse edges"
     ONE_DIRECTION = "one edge direction"
     REPEATING = "repeating texture"
+    PRINT = "print"
+    LINES = "few thin lines"
     BLANK = "blank wall"
 
 
@@ -41,6 +43,10 @@ def draw(kind: SceneKind, width: int, height: int, *, period: float, seed: int) 
         return leaves(rng, width, height)
     if kind is SceneKind.EDGES:
         return polygons(rng, width, height)
+    if kind is SceneKind.PRINT:
+        return printed(rng, width, height)
+    if kind is SceneKind.LINES:
+        return thin_lines(rng, width, height)
     if kind is SceneKind.BLANK:
         return np.full((height, width), 0.5, np.float32)
     rows, cols = np.mgrid[:height, :width].astype(np.float64)
@@ -89,6 +95,46 @@ def polygons(rng: np.random.Generator, width: int, height: int, count: int = 8) 
             inside &= (b[0] - a[0]) * (rows - a[1]) - (b[1] - a[1]) * (cols - a[0]) >= 0.0
         out[inside] = value
     return _levels(out)
+
+
+def printed(rng: np.random.Generator, width: int, height: int) -> NDArray[np.float32]:
+    """Return a page of print: lines of signs on white, each of two to four straight strokes."""
+    out = np.ones((height, width))
+    size = max(8, round(height / 30))
+    for top in range(size, height - size, 2 * size):
+        left = size
+        while left < width - 2 * size:
+            if rng.uniform() < 0.15:  # space between two words
+                left += size
+                continue
+            for x0, y0, x1, y1 in rng.uniform(0.0, size, (rng.integers(2, 5), 4)):
+                _line(out, (left + 0.6 * x0, top + y0), (left + 0.6 * x1, top + y1), 0.1 * size, 0.0)
+            left += round(0.8 * size)
+    return _levels(out)
+
+
+def thin_lines(rng: np.random.Generator, width: int, height: int, count: int = 10) -> NDArray[np.float32]:
+    """Return short thin lines, brighter or darker than their uniform background."""
+    out = np.full((height, width), 0.5)
+    for value in rng.choice([0.15, 0.85], count):
+        middle, angle = rng.uniform(0.1, 0.9, 2) * (width, height), rng.uniform(0.0, np.pi)
+        half = 0.5 * rng.uniform(0.1, 0.3) * height * np.array([math.cos(angle), math.sin(angle)])
+        _line(out, middle - half, middle + half, rng.uniform(1.0, 2.5), value)
+    return _levels(out)
+
+
+def _line(out: NDArray[np.float64], start: ArrayLike, end: ArrayLike, half_width: float, value: float) -> None:
+    """Draw a straight line of one luminance into the picture ``out``; ends are ``(x, y)`` [texels]."""
+    ends = np.array([start, end])
+    left, top = np.maximum(np.floor(ends.min(axis=0) - half_width).astype(int), 0)
+    right, bottom = np.ceil(ends.max(axis=0) + half_width).astype(int) + 1
+    part = out[top:bottom, left:right]
+    rows, cols = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
+    along = ends[1] - ends[0]
+    share = ((cols - ends[0, 0]) * along[0] + (rows - ends[0, 1]) * along[1]) / max(float(along @ along), 1e-9)
+    share = np.clip(share, 0.0, 1.0)
+    away = np.hypot(cols - ends[0, 0] - share * along[0], rows - ends[0, 1] - share * along[1])
+    part[away <= half_width] = value
 
 
 def _triangle(angle: float) -> NDArray[np.float64]:
