@@ -85,6 +85,17 @@ class PairSet:
         self.arrays.slope = wp.array(values.ravel(), dtype=float, device=self.device)
         return self
 
+    def clear_lags(self) -> None:
+        """Set the lags of slow pixels to none. The first call allocates them; maps must be made afterwards."""
+        arrays = self.arrays
+        if not len(arrays.lag):
+            arrays.lag = wp.zeros(4 * arrays.stride, dtype=float, device=self.device)
+            arrays.offset = wp.zeros(arrays.stride, dtype=float, device=self.device)
+        none = np.zeros((4, arrays.stride), np.float32)
+        none[0::2] = 1.0
+        arrays.lag.assign(none.ravel())
+        arrays.offset.zero_()
+
     @classmethod
     def concatenate(cls, parts: Sequence[PairSet]) -> PairSet:
         """Join pair sets, in which equations from silence must have the same weight."""
@@ -328,4 +339,5 @@ def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) 
     for name, columns in COLUMNS.items():
         n = columns * out.stride if drifts or name != "slope" else 0
         setattr(out, name, wp.zeros(n, dtype=dtypes.get(name, float), device=device))
+    out.lag, out.offset = (wp.zeros(0, dtype=float, device=device) for _ in "lo")
     return out

@@ -177,6 +177,7 @@ class BrightnessMap:
         if (
             pinhole is None
             or arrays.slope.shape[0]
+            or arrays.lag.shape[0]
             or any(camera_rotation.angular_velocity)
             or any(camera_rotation.angular_acceleration)
         ):
@@ -189,6 +190,11 @@ class BrightnessMap:
             launch(places.place_blocks, blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
         else:
             launch(places.place_still, arrays.stride, inputs, [out], device=self.device)
+
+    def path_arguments(self, model: Model) -> list[Any]:
+        """Return the kernel arguments that describe the map and the paths of the pairs' pixels over it."""
+        camera = model_camera(model, self.device)
+        return [model.params(self.device), camera, self.pairs.arrays, self._atlas, self._image]
 
     @cached_property
     def _sides(self) -> tuple[Any, Any]:

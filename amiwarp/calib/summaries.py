@@ -87,6 +87,13 @@ class PhotometricSummary:
     """Ratio of the OFF to the ON threshold: estimated if it was free, else taken from the numbers of events."""
     leak: float = 0.0
     """Drift of a pixel's reference level [thresholds/s]: estimated if it was free, else 0."""
+    refractory_us: float = 0.0
+    """Refractory period of the pixels [us]: the given or the estimated one; 0 if there is none."""
+    time_constant_us: float = 0.0
+    """Estimated time constant of slow photoreceptors at the median brightness [us]; 0 if they are not slow.
+
+    The events come late by it, and more so in the dark. The mean lag is part of the phase.
+    """
     held: tuple[str, ...] = ()
     """Free parameters that the events do not determine. They keep the values of the sharpness stage."""
     warnings: tuple[str, ...] = ()

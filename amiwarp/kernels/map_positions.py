@@ -46,8 +46,31 @@ def compensated_position(
         a = w0 * c - w1 * s
         w1 = w1 * c + w0 * s
         w0 = a
-    xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), wp.vec2(w0, w1))
+    pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
+    if pairs.lag.shape[0] > 0:
+        return contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
+    xy = compensate(model, camera, pixel, wp.vec2(w0, w1))
     return undo_camera_rotation(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
+
+
+@wp.func
+def lag_of(pairs: Pairs, k: int, i: int) -> wp.vec2:
+    """Return rotation and contraction of the orbit at the first (k = 0) or second event, as a complex factor."""
+    return wp.vec2(pairs.lag[2 * k * pairs.stride + i], pairs.lag[(2 * k + 1) * pairs.stride + i])
+
+
+@wp.func
+def contracted_position(
+    model: Any, camera: CameraParams, pixel: wp.vec2, w0: float, w1: float, lag: wp.vec2
+) -> wp.vec2:
+    """Return the compensated position [px] on an orbit that is rotated and contracted about its centre by ``lag``."""
+    size = wp.length(lag)
+    c = lag[0] / size
+    s = lag[1] / size
+    azimuth = wp.vec2(w0 * c - w1 * s, w1 * c + w0 * s)
+    there = compensate(model, camera, pixel, azimuth)
+    opposite = compensate(model, camera, pixel, -azimuth)
+    return 0.5 * (there + opposite) + 0.5 * size * (there - opposite)
 
 
 @wp.kernel

@@ -29,7 +29,8 @@ class Pairs:
 
     All arrays are flat. ``azimuth`` holds four parts: the cosines of the encoder's angle at the first events, the
     sines, and both at the second events. ``time`` [s] counts from the middle of the window; ``slope`` is the derivative
-    of the angle by the drifting parameter, or empty. Both hold the first events, then the second events.
+    of the angle by the drifting parameter, or empty. Both hold the first events, then the second events. ``lag`` and
+    ``offset`` describe slow pixels (:mod:`amiwarp.kernels.slow_pixels`), or are empty.
     """
 
     count: int
@@ -42,6 +43,8 @@ class Pairs:
     azimuth: wp.array(dtype=float)
     slope: wp.array(dtype=float)
     time: wp.array(dtype=float)
+    lag: wp.array(dtype=float)  # rotation and contraction of the orbit at each event, in parts as ``azimuth``
+    offset: wp.array(dtype=float)  # what the equation's left side lacks [thresholds]
 
 
 @wp.struct
@@ -283,6 +286,8 @@ def weigh(
     if i >= pairs.count:
         return
     r = right_side(pairs, i) - difference(image, atlas, pairs, geometry, i)
+    if pairs.offset.shape[0] > 0:
+        r -= pairs.offset[i]
     on_map = geometry.cell[i] >= 0
     residual[i] = wp.where(on_map, r, NAN)
     cauchy = 1.0 / (1.0 + (r / scale[0]) * (r / scale[0]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,6 +56,8 @@ class AnswerSearch:
     """Share of equations of :func:`check_pairs`."""
     settings: PhotometricSettings
     report: Callable[[float], None]
+    timing: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    """Change of the first answer by a correction of the sensor's timing [px]; empty for none."""
 
     @property
     def origin(self) -> NDArray[np.float64]:

@@ -165,7 +165,7 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
     ``long …`` are the derivatives of pairs with long gaps only; ``late …`` grow with the time of the pair.
     """
     space, time = cost.space, cost.brightness.pairs.time
-    columns = {name: _slope(cost, space, best, k) for k, name in enumerate(space.names)}
+    columns = {name: slope(cost, space, best, k) for k, name in enumerate(space.names)}
     middle, gap = time.mean(axis=0), time[1] - time[0]
     late = ((middle - middle.mean()) / max(float(middle.std()), 1e-9)).astype(np.float32)
     long = (gap > np.median(gap)).astype(np.float32)
@@ -231,7 +231,7 @@ def _distance(model: Model, other: Model) -> float:
     return predicted_error(model, other, remove_lag=True, grid=8).rms
 
 
-def _slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
+def slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
     """Return the derivative of the residuals by entry ``k`` of the search vector of ``space``, on the device."""
     step = np.zeros(len(v))
     step[k] = SLOPE_PX
@@ -257,7 +257,7 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
         wide, v = with_cause(space, cause, values)
     except AmiwarpError:
         return {}  # it moves no event
-    return {n: _slope(cost, wide, v, wide.names.index(n)) for n in cause.names}
+    return {n: slope(cost, wide, v, wide.names.index(n)) for n in cause.names}
 
 
 def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause]) -> list[Finding]:

@@ -13,6 +13,7 @@ from amiwarp.calib.photometric.acceptance import LARGEST_COST_RATIO, LARGEST_STI
 from amiwarp.calib.photometric.answer_search import join_runs
 from amiwarp.calib.photometric.causes import FLAT_SIDE, turned, with_cause
 from amiwarp.calib.photometric.consistency import SIGNIFICANT, Consistency, check_consistency
+from amiwarp.calib.photometric.sensor_timing import LARGEST_EXAMINED_COST
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,8 +29,9 @@ RIVAL_SHARE = 0.75
 """A cause is tried if it removes at least this share of the residual that the likeliest one removes."""
 TIE_SHARE = 0.04
 """Of the tried causes, the first one counts whose cost is at most this share of the gain above the lowest cost."""
-LARGEST_EXAMINED_COST = 0.5
-"""Largest cost, relative to that without a map, of an answer that is examined. Above it the map explains too little."""
+TIMING_SHARE = 0.3
+"""Systematic standard deviation of the answer if the sensor's timing was corrected: a share of the correction. The
+thresholds, which turn the map's brightness into light, are not known."""
 LARGEST_LAST_STEP_PX = 0.01
 """Longest step that is added to the answer without a new search [px]."""
 
@@ -74,7 +76,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         cost.residuals(answer.stage.x, rounds=2)
         check = check_consistency(cost, answer.stage.x)
     notes = (*_corrections(given, search.cost.space, answer), *check.warnings())
-    return _final(search.cost.space, answer, check, notes)
+    return _final(search, answer, check, notes)
 
 
 def _best_correction(search: AnswerSearch, answer: Answer, check: Consistency) -> _Corrected | None:
@@ -122,14 +124,17 @@ def _comparable_cost(search: AnswerSearch, v: NDArray[np.float64]) -> float:
     return mean
 
 
-def _final(space: ParameterSpace, answer: Answer, check: Consistency, notes: tuple[str, ...]) -> Answer:
+def _final(search: AnswerSearch, answer: Answer, check: Consistency, notes: tuple[str, ...]) -> Answer:
     """Return the answer with the last step added, its whole uncertainty and the judgement of its consistency."""
-    result, v = answer.result, answer.stage.x
+    result, v, space = answer.result, answer.stage.x, search.cost.space
+    timing = np.zeros(len(v))
+    timing[: len(search.timing)] = TIMING_SHARE * search.timing
+    systematic = check.systematic + np.outer(check.step, check.step) + np.outer(timing, timing)
     if np.linalg.norm(check.step) <= LARGEST_LAST_STEP_PX:
         v = v + check.step
     result = replace(
         result, parameters=space.to_values(v), warnings=notes,
-        uncertainty=space.deviations(v, answer.covariance + check.systematic + np.outer(check.step, check.step)),
+        uncertainty=space.deviations(v, answer.covariance + systematic),
     )  # fmt: skip
     accepted, reason = judge_consistency(check.inconsistent_px(), check.likeliest())
     if result.accepted and not accepted:

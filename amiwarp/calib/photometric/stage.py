@@ -7,6 +7,7 @@ parameters minimise its robust residual.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS, check_algorithm
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX
-from amiwarp.calib.photometric.answer_search import AnswerSearch
+from amiwarp.calib.photometric.answer_search import AnswerSearch, join_runs
 from amiwarp.calib.photometric.correction import checked
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined
@@ -24,13 +25,28 @@ from amiwarp.calib.photometric.pair_collection import (
     collect_pairs,
     pairs_per_node,
 )
+from amiwarp.calib.photometric.sensor_timing import (
+    find_refractory,
+    find_time_constant,
+    refractory_step,
+    slow_step,
+    timing_can_be_found,
+    timing_notes,
+)
 from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.summaries import PhotometricSummary, StageSummary
 from amiwarp.validation import real, whole
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from amiwarp.brightness.event_pairs import PairSet
     from amiwarp.brightness.solver import Tiles
     from amiwarp.calib.parameters import ParameterSpace
+    from amiwarp.calib.photometric.answer_search import Answer
     from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.recording import Recording
     from amiwarp.progress import Progress
@@ -81,6 +97,25 @@ class PhotometricSettings:
         real(self.density, "photometric density", 0.01, 100.0)
 
 
+@dataclass(frozen=True)
+class _Equations:
+    """Equations of the stage: pairs of events, a map, and the search on it."""
+
+    pairs: PairSet
+    cost_on: Callable[[Tiles, ParameterSpace], Cost]
+    """Function that returns a cost with a new map on tiles, solved at the sharpness stage's result."""
+    answers: AnswerSearch
+    start: NDArray[np.float64]
+    """Search vector of the sharpness stage's result."""
+    held: tuple[str, ...]
+    """Free parameters that the events do not determine."""
+
+    def coarse(self) -> AnswerSearch:
+        """Return the search on a new map with one node per pixel."""
+        cost = self.answers.cost
+        return replace(self.answers, cost=self.cost_on(cost.brightness.tiles.at_density(1.0), cost.space))
+
+
 def refine(
     recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
 ) -> tuple[PhotometricSummary, StageSummary, ParameterSpace]:
@@ -89,7 +124,59 @@ def refine(
     ``linear`` names the free ones of ``off_ratio`` and ``leak``. Return the result, the summary of the search, and the
     space of the result, whose camera and prism are corrected. Raises :class:`AmiwarpError` for too few pairs.
     """
-    settings: PhotometricSettings = search.settings.photometric
+
+    def report(share: float) -> None:
+        if progress is not None:
+            progress(*stage_share(search.settings, "photometric", share))
+
+    def equations(sensor: SensorTiming) -> _Equations:
+        return _equations(recording, search, linear, sensor, report)
+
+    given = search.settings.photometric.sensor
+    found = equations(given)
+    answer = found.answers.search(found.start)
+    rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
+    if timing_can_be_found(answer, found.answers.cost) and rpm:
+        rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
+        v = answer.stage.x
+        if not given.refractory_us and (first := refractory_step(found.answers.cost, v, direction)):
+            turn = find_refractory(found.coarse(), v, first, direction)
+            sensor = replace(given, refractory_us=turn / rad_per_us)
+            found = equations(sensor)
+            answer = found.answers.search(found.start)
+        if first := slow_step(found.answers.cost, answer.stage.x, direction):
+            answer, turn = _with_slow_pixels(found, answer, first, direction)
+            time_constant = turn / rad_per_us
+        if len(v) == len(answer.stage.x):
+            found.answers.timing = answer.stage.x - v
+    answers = found.answers
+    answer = checked(answers, answer)
+    notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
+    result = replace(
+        answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
+        refractory_us=sensor.refractory_us, time_constant_us=time_constant,
+    )  # fmt: skip
+    return result, StageSummary.of("photometric", answer.stage, answers.cost.space), answers.cost.space
+
+
+def _with_slow_pixels(found: _Equations, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
+    """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad]; 0 if it fails.
+
+    ``first`` is a first estimate of that angle. The search of ``found`` has a new map then.
+    """
+    answers, v = found.answers, answer.stage.x
+    found.pairs.clear_lags()
+    turn = find_time_constant(found.coarse(), v, first, direction)
+    answers.cost = found.cost_on(answers.cost.brightness.tiles, answers.cost.space)
+    again = answers.search(v)
+    return replace(again, stage=join_runs(answer.stage, again.stage)), turn
+
+
+def _equations(
+    recording: Recording, search: Search, linear: tuple[str, ...], sensor: SensorTiming, report: Callable[[float], None]
+) -> _Equations:
+    """Return the equations of a recording. Raises :class:`AmiwarpError` for too few pairs."""
+    settings: PhotometricSettings = replace(search.settings.photometric, sensor=sensor)
     pairs, tiles = collect_pairs(recording, search, settings)
     full = search.full_space
     space = full.holding({n: x for n, x in search.best.items() if n not in full.names})
@@ -98,13 +185,13 @@ def refine(
     whole_turn = abs(search.calibration_events.encoder.rpm) * duration_us >= 60e6
     excess = off_excess(pairs, with_leak="leak" in linear) if whole_turn else 0.0
 
-    def cost_on(tiles: Tiles) -> Cost:
+    def cost_on(tiles: Tiles, space: ParameterSpace = space) -> Cost:
         brightness = BrightnessMap(
             pairs, tiles, off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
             middle_us=space.middle_us,
         )  # fmt: skip
         cost = Cost(space, brightness, settings.steps)
-        cost.warm_up(v)
+        cost.warm_up(space.to_vector({**space.start, **search.best}))
         return cost
 
     v = space.to_vector({**space.start, **search.best})
@@ -123,12 +210,4 @@ def refine(
     v = space.to_vector({**space.start, **search.best})
     if held:
         cost.warm_up(v)
-
-    def report(share: float) -> None:
-        if progress is not None:
-            progress(*stage_share(search.settings, "photometric", share))
-
-    answers = AnswerSearch(cost, dict(search.best), left, settings, report)
-    answer = checked(answers, answers.search(v))
-    found = replace(answer.result, sharpness_parameters=answers.sharpest, pairs=len(pairs), held=held)
-    return found, StageSummary.of("photometric", answer.stage, cost.space), cost.space
+    return _Equations(pairs, cost_on, AnswerSearch(cost, dict(search.best), left, settings, report), v, held)

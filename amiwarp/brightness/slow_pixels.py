@@ -1,0 +1,86 @@
+"""Pixels with slow photoreceptors: their events come late and from a smaller orbit, the more so the darker they are.
+
+A photoreceptor is modelled as a first-order low-pass filter whose rate is proportional to the light (Delbruck and Mead,
+ISCAS 1994). At an angular speed ω, a filter with time constant τ sees a circular orbit rotated by atan(ω τ) and
+contracted by cos(atan(ω τ)), exactly so where the brightness is linear over the orbit. What the filter's output
+differs from that elsewhere is computed along the prism's path and moved to the right side of the equations.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.kernels import slow_pixels as kernels
+from amiwarp.kernels.launch import launch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.brightness.solver import BrightnessMap
+    from amiwarp.optics.models import Model
+
+THRESHOLD = 0.25
+"""Assumed ON threshold [log intensity], which turns the map's brightness into light. Data sheets state 0.1 to 0.4."""
+MOST_THRESHOLDS = 8.0
+"""Largest difference from the median brightness that is used [ON thresholds]."""
+
+
+def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> tuple[NDArray[np.float32], float]:
+    """Return the time constant at each event, relative to that at the median brightness of all, and that brightness.
+
+    Parameters
+    ----------
+    brightness : BrightnessMap
+        Solved map.
+    model : Model
+        Model with the phase at which the map was solved.
+    ahead : float, default 0.0
+        Angle by which the prism is ahead of that phase, because the events come late [rad].
+
+    Returns
+    -------
+    relative : numpy.ndarray
+        Relative time constants at the first and the second event of each pair, shape (2, n).
+    middle : float
+        Median brightness [ON thresholds].
+    """
+    pairs = brightness.pairs
+    out = wp.zeros(2 * pairs.arrays.stride, dtype=float, device=brightness.device)
+    launch(kernels.find_levels, len(pairs), [*brightness.path_arguments(model), ahead], [out], device=brightness.device)
+    levels = out.numpy().reshape(2, -1)[:, : len(pairs)]
+    middle = float(np.nanmedian(levels))
+    away = np.nan_to_num(np.clip(levels - middle, -MOST_THRESHOLDS, MOST_THRESHOLDS))
+    return np.exp(-THRESHOLD * away), middle
+
+
+def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offsets: bool) -> None:
+    """Give the pairs the lags of slow pixels, relative to the mean lag, which remains part of the phase.
+
+    Parameters
+    ----------
+    brightness : BrightnessMap
+        Solved map, whose pairs have lags (:meth:`PairSet.clear_lags`).
+    model : Model
+        Model with the phase at which the map was solved.
+    turn : float
+        Angle by which the prism turns within the time constant at median brightness [rad].
+    with_offsets : bool
+        Whether to compute what the filter's output differs from the brightness on the contracted orbit. The map must
+        have been solved with lags.
+    """
+    pairs, ahead = brightness.pairs, math.atan(turn)
+    relative, middle = darkness(brightness, model, ahead=ahead if with_offsets else 0.0)
+    lag = np.arctan(turn * relative)
+    factor = np.cos(lag) * np.exp(1j * (ahead - lag))
+    values = np.zeros((4, pairs.arrays.stride), np.float32)
+    values[0] = values[2] = 1.0
+    values[0::2, : len(pairs)], values[1::2, : len(pairs)] = factor.real, factor.imag
+    pairs.arrays.lag.assign(values.ravel())
+    pairs.arrays.offset.zero_()
+    if with_offsets:
+        inputs: list[Any] = [*brightness.path_arguments(model), middle, THRESHOLD, turn, ahead]
+        launch(kernels.find_offsets, len(pairs), inputs, [pairs.arrays.offset], device=brightness.device)

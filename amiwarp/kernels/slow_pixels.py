@@ -1,0 +1,99 @@
+"""Equations of slow pixels, for :mod:`amiwarp.brightness.slow_pixels`.
+
+A photoreceptor is a first-order low-pass filter whose rate is proportional to the light, as in
+:mod:`amiwarp.kernels.photoreceptor`. An event tells the filter's output, not the brightness at the event.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from amiwarp.kernels.camera import NAN, CameraParams
+from amiwarp.kernels.map_positions import contracted_position, event_azimuth, lag_of, node_at
+from amiwarp.kernels.photometric import Atlas, Pairs
+from amiwarp.kernels.photoreceptor import filter_level
+from amiwarp.kernels.refraction import compensate
+
+wp.set_module_options({"enable_backward": False})
+
+STEPS = wp.constant(16)  # number of steps in which the filter's equation is solved
+MEMORY = wp.constant(6.0)  # time before an event from which the filter is followed [time constants at median light]
+
+
+@wp.func
+def brightness_at_position(image: wp.array(dtype=float), atlas: Atlas, tile: int, xy: wp.vec2) -> float:
+    """Return the brightness of a tile's map at a position [px]; NaN off the tile."""
+    cell, fx, fy = node_at(atlas, tile, xy[0], xy[1])
+    if cell < 0:
+        return NAN
+    upper = image[cell] * (1.0 - fx) + image[cell + 1] * fx
+    lower = image[cell + atlas.columns] * (1.0 - fx) + image[cell + atlas.columns + 1] * fx
+    return upper * (1.0 - fy) + lower * fy
+
+
+@wp.func
+def brightness_before(
+    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), k: int, i: int,
+    angle: float,
+) -> float:  # fmt: skip
+    """Return the brightness at the pixel of an event when the prism's angle was smaller by ``angle`` [rad]."""
+    w0, w1 = event_azimuth(model, pairs, k, i)
+    c = wp.cos(angle)
+    s = wp.sin(angle)
+    azimuth = wp.vec2(w0 * c + w1 * s, w1 * c - w0 * s)
+    xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), azimuth)
+    return brightness_at_position(image, atlas, pairs.tile[i], xy)
+
+
+@wp.kernel
+def find_levels(
+    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), ahead: float,
+    start: int, levels: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute the brightness at each event, NaN off the map. The prism is ``ahead`` [rad] of the effective phase."""
+    i = start + wp.tid()
+    for k in range(2):
+        levels[k * pairs.stride + i] = brightness_before(model, camera, pairs, atlas, image, k, i, -ahead)
+
+
+@wp.func
+def filtered(
+    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), k: int, i: int,
+    middle: float, threshold: float, turn: float, ahead: float,
+) -> float:  # fmt: skip
+    """Return the output of the filter at an event; see :func:`find_offsets`."""
+    width = MEMORY / float(STEPS)  # step [time constants at median light]
+    before = brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - ahead)
+    level = before
+    for j in range(STEPS):
+        past = MEMORY - float(j + 1) * width
+        after = brightness_before(model, camera, pairs, atlas, image, k, i, past * turn - ahead)
+        if wp.isnan(after):
+            after = before
+        light = wp.exp(threshold * (0.5 * (before + after) - middle))
+        level = filter_level(level, before, after, width * light)
+        before = after
+    return level
+
+
+@wp.kernel
+def find_offsets(
+    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), middle: float,
+    threshold: float, turn: float, ahead: float, start: int, offset: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute the difference between the filter's output and the brightness on the contracted orbit, for a pair.
+
+    ``turn`` is the prism's angle per time constant at the brightness ``middle`` [rad], ``threshold`` the ON threshold
+    [log intensity].
+    """
+    i = start + wp.tid()
+    total = float(0.0)
+    sign = float(-1.0)
+    for k in range(2):
+        w0, w1 = event_azimuth(model, pairs, k, i)
+        pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
+        xy = contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
+        there = brightness_at_position(image, atlas, pairs.tile[i], xy)
+        total += sign * (filtered(model, camera, pairs, atlas, image, k, i, middle, threshold, turn, ahead) - there)
+        sign = 1.0
+    offset[i] = wp.where(wp.isnan(total), 0.0, total)
