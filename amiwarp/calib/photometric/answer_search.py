@@ -71,18 +71,18 @@ class AnswerSearch:
         If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost.
         """
         cost = self.cost
-        stage = self._search(start)
+        stage = self.descend(start)
         answer, around = _evaluate(cost, stage, self.origin, self.left)
         for _ in range(RESTARTS):
             lower = [point for point, rise in around if rise < 0.0]
             if not lower:
                 break
             cost.renew(lower[0])
-            stage = join_runs(stage, self._search(lower[0]))
+            stage = join_runs(stage, self.descend(lower[0]))
             answer, around = _evaluate(cost, stage, self.origin, self.left)
         return answer
 
-    def _search(self, start: NDArray[np.float64]) -> SearchStage:
+    def descend(self, start: NDArray[np.float64]) -> SearchStage:
         """Run one search from ``start``, in the box about the sharpness stage's result."""
         cost, settings = self.cost, self.settings
         low, high = search_box(cost.space, self.origin)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.parameters import DRIFTS
+from amiwarp.calib.parameters import DRIFTS, LENS
 from amiwarp.calib.photometric.causes import (
     CAUSES,
     FLAT_SIDE,
@@ -44,6 +44,8 @@ SIGNIFICANT = 5.0
 """Number of standard deviations from which on a cause is significant."""
 LEAST_GAIN = 0.002
 """Smallest share of the squared residuals that a cause must remove. Right answers leave 0.001 at most."""
+LEAST_FURTHER_GAIN = 0.0005
+"""Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
 """Smallest change of the model for which a cause is reported [px rms over the image and a turn]."""
 NOTABLE_PX = 0.025
@@ -142,19 +144,23 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     space = cost.space
     columns = _columns(cost, best)
     causes = testable(space)
-    for cause in causes:
-        if cause in SCREENED:
-            columns |= _cause_columns(cost, best, cause)
+    doubtful = bool(set(LENS) & set(space.names))
+    screened = causes if doubtful else [c for c in causes if c in SCREENED]
+    for cause in screened:
+        columns |= _cause_columns(cost, best, cause)
     fit = linear_fit(cost, columns)
-    findings = _findings(cost, best, fit, [c for c in causes if c in SCREENED])
-    if findings:
+    findings = _findings(cost, best, fit, screened, LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN)
+    if findings and not doubtful:
         for cause in causes:
             if cause not in SCREENED:
                 columns |= _cause_columns(cost, best, cause)
         fit = linear_fit(cost, columns)
-        findings = _findings(cost, best, fit, causes)
+        findings = _findings(cost, best, fit, causes, LEAST_GAIN)
+    systematic = _systematic(space, fit)
+    if doubtful:
+        systematic = systematic + _doubt(space, fit, causes)
     return Consistency(
-        step=fit.fit(space.names).change, systematic=_systematic(space, fit), findings=tuple(findings),
+        step=fit.fit(space.names).change, systematic=systematic, findings=tuple(findings),
         drift=_drift(space, best, fit), spread=_spread(space, best, fit), untold_px=_untold(space, best, fit),
     )  # fmt: skip
 
@@ -190,6 +196,14 @@ def _systematic(space: ParameterSpace, fit: LinearFit) -> Vector:
     least = np.zeros(len(change))
     least[which] = LEAST_STD_PX**2
     return np.asarray(GAP_SHARE**2 * np.outer(change, change) + np.diag(least))
+
+
+def _doubt(space: ParameterSpace, fit: LinearFit, causes: list[Cause]) -> Vector:
+    """Return the covariance of the answer [px²] if everything else about a lens that was given wrongly is doubtful."""
+    others = [n for cause in causes for n in cause.names if n in fit.names and n != FLAT_SIDE]
+    estimate = fit.fit((*space.names, *others))
+    n = len(space.names)
+    return np.asarray(estimate.covariance[:n, :n] + np.outer(estimate.change[:n], estimate.change[:n]))
 
 
 def _spread(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float]:
@@ -260,7 +274,7 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
     return {n: slope(cost, wide, v, wide.names.index(n)) for n in cause.names}
 
 
-def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause]) -> list[Finding]:
+def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause], least_gain: float) -> list[Finding]:
     """Return the significant causes, ordered by the share of the residual that their correction removes."""
     n, found = len(best), []
     before = fit.fit(cost.space.names).gain
@@ -270,7 +284,7 @@ def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause]) -> 
         estimate = fit.fit((*cost.space.names, *cause.names))
         significance = estimate.significance(n)
         gain = estimate.gain - before
-        if significance < SIGNIFICANT or gain < LEAST_GAIN:
+        if significance < SIGNIFICANT or gain < least_gain:
             continue
         moved, start = _corrected(cost, best, cause, estimate)
         if moved >= LEAST_MOVE_PX:

@@ -75,8 +75,9 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         cost.space, (answer, search.sharpest) = given, first
         cost.residuals(answer.stage.x, rounds=2)
         check = check_consistency(cost, answer.stage.x)
+    answer = _final(search, answer, check)
     notes = (*_corrections(given, search.cost.space, answer), *check.warnings())
-    return _final(search, answer, check, notes)
+    return replace(answer, result=replace(answer.result, warnings=notes))
 
 
 def _best_correction(search: AnswerSearch, answer: Answer, check: Consistency) -> _Corrected | None:
@@ -124,7 +125,7 @@ def _comparable_cost(search: AnswerSearch, v: NDArray[np.float64]) -> float:
     return mean
 
 
-def _final(search: AnswerSearch, answer: Answer, check: Consistency, notes: tuple[str, ...]) -> Answer:
+def _final(search: AnswerSearch, answer: Answer, check: Consistency) -> Answer:
     """Return the answer with the last step added, its whole uncertainty and the judgement of its consistency."""
     result, v, space = answer.result, answer.stage.x, search.cost.space
     timing = np.zeros(len(v))
@@ -133,7 +134,7 @@ def _final(search: AnswerSearch, answer: Answer, check: Consistency, notes: tupl
     if np.linalg.norm(check.step) <= LARGEST_LAST_STEP_PX:
         v = v + check.step
     result = replace(
-        result, parameters=space.to_values(v), warnings=notes,
+        result, parameters=space.to_values(v),
         uncertainty=space.deviations(v, answer.covariance + systematic),
     )  # fmt: skip
     accepted, reason = judge_consistency(check.inconsistent_px(), check.likeliest())

@@ -106,7 +106,7 @@ def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: fl
         turned[0], turned[1] = z.real, z.imag
         azimuth.assign(turned.ravel())
         cost.renew(v)
-        at = search.search(v).stage.x
+        at = search.descend(v).x
         cost.residuals(at, rounds=2, steps=2 * cost.steps)
         return cost.mean()
 
@@ -145,7 +145,7 @@ def find_time_constant(search: AnswerSearch, v: Vector, first: float, direction:
         at = v
         for with_offsets in (False, True) if turn else ():
             set_lags(cost.brightness, space.build(space.to_values(at)), direction * turn, with_offsets=with_offsets)
-            at = search.search(at).stage.x
+            at = search.descend(at).x
         cost.residuals(at, rounds=2, steps=2 * cost.steps)
         return cost.mean()
 
@@ -155,9 +155,9 @@ def find_time_constant(search: AnswerSearch, v: Vector, first: float, direction:
 def _lowest(cost_at: Callable[[float], float], first: float) -> float:
     """Return the angle of the lowest cost, evaluated last; 0 if no angle costs less than 0.
 
-    Angles in geometric progression from ``first`` on bracket the lowest one; parabolas then find it.
+    Angles in geometric progression from a little above ``first`` on bracket the lowest one; parabolas then find it.
     """
-    angles = [first, FACTOR * first]
+    angles = [FACTOR * first, FACTOR**2 * first]
     costs = [cost_at(angle) for angle in angles]
     while len(angles) < MOST_TRIALS and costs[-1] < costs[-2] and FACTOR * angles[-1] <= LARGEST_RAD:
         angles.append(FACTOR * angles[-1])
