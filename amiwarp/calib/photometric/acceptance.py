@@ -3,6 +3,8 @@
 Each limit was set by failures that it prevents; ``docs/explanation/stability.md`` describes them.
 """
 
+import math
+
 LARGEST_MOVE_PX = 1.5
 """Largest accepted distance between the optima of the photometric and the sharpness stage, in the prism's parameters
 [px]."""
@@ -34,6 +36,21 @@ LARGEST_COST_RATIO = 0.75
 camera rotation, a corrected encoder scale, or a corrected lens."""
 LARGEST_INCONSISTENCY_PX = 0.1
 """Largest accepted error that the check of the answer's consistency leaves [px]."""
+
+
+LARGEST_LAG_RAD = 0.35
+"""Largest angle by which the prism may turn within the time constant of slow photoreceptors [rad]. At 0.2 the size of the
+orbit is corrected to 0.02 px, at 0.4 to 0.14 px."""
+
+
+def judge_lag(turn: float) -> tuple[bool, str]:
+    """Return whether to accept an answer for pixels within whose time constant the prism turns by an angle [rad]."""
+    if turn <= LARGEST_LAG_RAD:
+        return True, ""
+    return False, (
+        f"the pixels are too slow for this speed of the prism, which turns by {math.degrees(turn):.0f} deg within their "
+        "time constant; use more light, a larger bandwidth or a slower prism"
+    )
 
 
 def judge_consistency(error_px: float, cause: str) -> tuple[bool, str]:

@@ -53,6 +53,11 @@ NOTABLE_PX = 0.025
 GAP_SHARE, LEAST_STD_PX = 0.5, 0.002
 """Systematic standard deviation of the answer: a share of the difference between the answers of pairs with long and
 with short gaps, and a least value [px]. Measured on recordings with known truth."""
+COARSE_STD_PX = 0.01
+"""The least value for a map with one node per pixel: bilinear look-ups do not follow the scene within an orbit of one or
+two pixels [px]."""
+DOUBT = 2.0
+"""Factor of the standard deviation that a doubtful lens adds: a linearised fit finds too small changes."""
 REGIONS = (3, 2)
 """Number of columns and rows of the parts of the image whose answers are compared."""
 FEWEST_SQUARES = 4
@@ -156,7 +161,7 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
                 columns |= _cause_columns(cost, best, cause)
         fit = linear_fit(cost, columns)
         findings = _findings(cost, best, fit, causes, LEAST_GAIN)
-    systematic = _systematic(space, fit)
+    systematic = _systematic(space, fit, COARSE_STD_PX if cost.brightness.tiles.density <= 1.0 else LEAST_STD_PX)
     if doubtful:
         systematic = systematic + _doubt(space, fit, causes)
     return Consistency(
@@ -187,14 +192,14 @@ def _orbit(space: ParameterSpace) -> list[str]:
     return [n for n in space.names if n in (space.size_name, "phase")]
 
 
-def _systematic(space: ParameterSpace, fit: LinearFit) -> Vector:
+def _systematic(space: ParameterSpace, fit: LinearFit, least_px: float) -> Vector:
     """Return the covariance of errors that pairs with long and with short gaps do not share [px²]."""
     names = _orbit(space)
     which = [space.names.index(n) for n in names]
     change = np.zeros(len(space.names))
     change[which] = fit.fit((*space.names, *(f"long {n}" for n in names))).change[len(space.names) :]
     least = np.zeros(len(change))
-    least[which] = LEAST_STD_PX**2
+    least[which] = least_px**2
     return np.asarray(GAP_SHARE**2 * np.outer(change, change) + np.diag(least))
 
 
@@ -203,7 +208,7 @@ def _doubt(space: ParameterSpace, fit: LinearFit, causes: list[Cause]) -> Vector
     others = [n for cause in causes for n in cause.names if n in fit.names and n != FLAT_SIDE]
     estimate = fit.fit((*space.names, *others))
     n = len(space.names)
-    return np.asarray(estimate.covariance[:n, :n] + np.outer(estimate.change[:n], estimate.change[:n]))
+    return np.asarray(DOUBT**2 * (estimate.covariance[:n, :n] + np.outer(estimate.change[:n], estimate.change[:n])))
 
 
 def _spread(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS, check_algorithm
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX
+from amiwarp.calib.photometric.acceptance import judge_lag
 from amiwarp.calib.photometric.answer_search import AnswerSearch, join_runs
 from amiwarp.calib.photometric.correction import checked
 from amiwarp.calib.photometric.cost import Cost
@@ -151,6 +152,9 @@ def refine(
             found.answers.timing = answer.stage.x - v
     answers = found.answers
     answer = checked(answers, answer)
+    accepted, reason = judge_lag(time_constant * abs(rpm) * math.tau / 60e6)
+    if answer.result.accepted and not accepted:
+        answer = replace(answer, result=replace(answer.result, accepted=False, verdict=reason))
     notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
     result = replace(
         answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
