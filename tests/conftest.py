@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from amiwarp.calib import Calibration, calibrate
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -81,3 +82,9 @@ def recording(texture: np.ndarray) -> Recording:
         texture, camera, TRUE_PRISM, duration_s=0.25, motion=PrismMotion(720.0, phase=TRUE_PHASE),
         nominal_prism=NOMINAL_PRISM, seed=3,
     )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def calibration(recording: Recording) -> Calibration:
+    """The recording calibrated with default settings, except for fewer events."""
+    return calibrate(recording, events=100_000)

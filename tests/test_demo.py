@@ -50,7 +50,7 @@ def test_demo_without_opengl_still_draws(tmp_path: Path, texture: np.ndarray, mo
     monkeypatch.setattr("sys.executable", "/bin/false")
     photo = tmp_path / "photo.png"
     Image.fromarray(texture).save(photo)
-    args = ["demo", "--out", str(tmp_path / "out"), "--picture", str(photo), "--size", "200x150", "--duration", "0.2"]
+    args = ["demo", "--out", str(tmp_path / "out"), "--picture", str(photo), "--size", "120x90", "--duration", "0.17"]
     result = CliRunner().invoke(app, [*args, "--seed", "3"])
     assert result.exit_code == 0, result.stderr
     assert clouds.MISSING in " ".join(result.stdout.split())

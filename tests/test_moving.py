@@ -34,9 +34,9 @@ from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 
-CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
-KNOWN = PhotometricSettings(pairs=150_000, sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
-MORE, ALL = replace(KNOWN, pairs=300_000), replace(KNOWN, pairs=600_000)
+CAMERA = Camera.from_fov(140, 105, math.radians(50.0))
+KNOWN = PhotometricSettings(pairs=75_000, sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
+MORE, ALL = replace(KNOWN, pairs=300_000), replace(KNOWN, pairs=600_000, density=1.0)
 FREE = ("apex", "phase", "motion")
 
 
