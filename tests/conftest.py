@@ -24,6 +24,25 @@ sys.path.append(str(Path(__file__).parents[1]))
 wp.config.log_level = wp.LOG_ERROR
 wp.init()
 
+LONGEST_FIRST = (
+    "test_moving", "test_stability", "test_photometric", "test_sparse", "test_session", "test_demo", "test_stream_cli",
+    "test_examples", "test_refusals", "test_named_worlds", "test_view_browser", "test_reconstruct", "test_cli",
+    "test_evaluate_motion", "test_design", "test_chart", "test_calibrate", "test_consistency", "test_stream_returning",
+)  # fmt: skip
+"""Files whose tests take longest. They are run first, so that no process works alone on one of them at the end."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let xdist keep the order of the files. By itself it begins with the files that have most tests."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files. The order within a file stays."""
+    rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
 
 @pytest.fixture(params=["cpu", "cuda:0"])
 def device(request: pytest.FixtureRequest) -> str:
