@@ -42,7 +42,8 @@ def scaled(recording: Recording, factor: float) -> Recording:
 def test_a_wrong_scale_is_found_in_the_events(texture: np.ndarray) -> None:
     """Not mistaken for a slowly rotating camera, and not confirmed."""
     factor = 1.024
-    recording = simulate(texture, CAMERA, TRUE_PRISM, duration_s=0.25, seed=3)
+    camera = Camera.from_fov(120, 90, math.radians(50.0))
+    recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.18, seed=3)
     with pytest.raises(AmiwarpError, match=r"a still camera explains the events.*counts_per_turn") as caught:
         calibrate(scaled(recording, factor), model="exact", events=100_000, photometric=COARSE)
     assert float(str(caught.value).rpartition(" times ")[2]) == pytest.approx(factor, abs=0.002)
