@@ -13,6 +13,7 @@ import pytest
 import warp as wp
 
 from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -88,6 +89,8 @@ def texture() -> np.ndarray:
     return picture
 
 
+COARSE = PhotometricSettings(pairs=100_000, density=1.0)
+"""A third of the default's pairs and a quarter of the brightness map's nodes, which is enough for small images."""
 TRUE_PRISM = Prism(math.radians(2.2), 1.52)
 NOMINAL_PRISM = Prism(math.radians(2.6), 1.52)
 TRUE_PHASE = 2.0
@@ -105,5 +108,5 @@ def recording(texture: np.ndarray) -> Recording:
 
 @pytest.fixture(scope="session")
 def calibration(recording: Recording) -> Calibration:
-    """The recording calibrated with default settings, except for fewer events."""
-    return calibrate(recording, events=100_000)
+    """The recording calibrated by both stages, with fewer events and a coarser brightness map than by default."""
+    return calibrate(recording, events=100_000, photometric=COARSE)

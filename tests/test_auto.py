@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import COARSE
 from scipy.optimize import minimize
 
 from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.selection import model_choice as auto
 from amiwarp.calib.selection.model_choice import calibrate_auto
 from amiwarp.calib.selection.smaller_models import Places, candidate_space, encoder_noise, fit
@@ -31,7 +31,7 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
 
-COARSE = Settings(events=120_000, photometric=PhotometricSettings(pairs=100_000, density=1.0))
+BOTH = Settings(events=120_000, photometric=COARSE)
 SHARPNESS = Settings(events=120_000, stages=("sharpness",))
 CONSTANT, DOUBLING = 720.0, np.array([[0.0, 500.0], [0.34, 1000.0]])
 
@@ -59,13 +59,13 @@ def wide(texture: np.ndarray) -> Recording:
 
 @pytest.fixture(scope="module")
 def found(wide: Recording) -> Calibration:
-    return calibrate_auto(wide, COARSE)
+    return calibrate_auto(wide, BOTH)
 
 
 @pytest.fixture(scope="module")
 def as_circle(wide: Recording) -> Calibration:
     """Calibrated with a budget that a circle keeps."""
-    return calibrate_auto(wide, COARSE, budget_px=5.0)
+    return calibrate_auto(wide, BOTH, budget_px=5.0)
 
 
 def places_of(recording: Recording) -> Places:

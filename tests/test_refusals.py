@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import TRUE_PRISM
+from conftest import COARSE, TRUE_PRISM
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.photometric.acceptance import judge_optimum
-from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.preparation import prepare
 from amiwarp.calib.prism_speed import encoder_turns_per_period
 from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, in_pixels
@@ -27,8 +26,6 @@ from amiwarp.simulation.simulator import simulate
 
 WIDTH, HEIGHT, LENGTH_US = 96, 72, 500_000
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(50.0))
-COARSE = PhotometricSettings(pairs=100_000, density=1.0)
-"""A third of the default's pairs and a quarter of its nodes, enough for small images."""
 
 
 def scaled(recording: Recording, factor: float) -> Recording:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import COARSE
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.paper_method import calibrate_as_paper
-from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
 from amiwarp.optics.exact_model import ExactModel
@@ -20,8 +20,6 @@ from amiwarp.studies.stability.run import conditions
 from amiwarp.studies.stability.scenes import SceneKind, draw
 
 SMALL = Condition(width=160, height=120, turns=3.0)
-COARSE = PhotometricSettings(pairs=100_000, density=1.0)
-"""A third of the default's pairs and a quarter of its nodes, enough for small images."""
 
 
 def error_px(condition: Condition, seed: int) -> tuple[float, str]:
@@ -139,7 +137,7 @@ def test_what_sharpness_alone_gets_wrong(changes: dict[str, float], says: str) -
         ({"cancelled": 0.6, "width": 320, "height": 240}, "nominal apex"),
         ({"lamp": 0.9, "width": 48, "height": 36}, "flicker"),
         ({"backwards": True, "width": 128, "height": 96}, "."),
-        ({"counts_per_turn": 4, "width": 96, "height": 72}, "--stages sharpness"),
+        ({"counts_per_turn": 4, "width": 80, "height": 60}, "--stages sharpness"),
         ({"contrast": 1.0}, "."),
     ],
     ids=lambda v: str(v)[:30],
