@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from amiwarp.events.events import Events
-from amiwarp.events.truth import EventTruth
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -72,15 +71,16 @@ def palette() -> list[int]:
     return [int(value) for colour in (*greys, *polarities, *shades) for value in colour]
 
 
-def simulate(name: str, frames: int, motion_px: float, device: str) -> list[tuple[Events, EventTruth]]:
-    """Simulate a world; return its events and ground truth without the prism and through it."""
+def simulate(name: str, frames: int, motion_px: float, device: str) -> list[tuple[Events, NDArray[np.float32]]]:
+    """Simulate a world; return its events and their depths [m] without the prism and through it."""
     seconds = frames * SPACING_S
     world, trajectory = named_world(name, "handheld", duration_s=seconds)
     simulation = Simulation(WorldScene(world, trajectory, motion_px=motion_px), CAMERA, PRISM, seconds, device=device)
     runs = []
     for each in (simulation.without_prism(), simulation):
         events, truth = zip(*each.blocks_with_truth(), strict=True)
-        runs.append((Events.concatenate(list(events)), EventTruth.concatenate(list(truth))))
+        depth = np.concatenate([block.depth for block in truth])
+        runs.append((Events.concatenate(list(events)), depth))
     return runs
 
 
@@ -117,13 +117,12 @@ def background(scale: DepthScale) -> NDArray[np.uint8]:
     return image
 
 
-def draw(runs: list[tuple[Events, EventTruth]], count: int) -> list[Image.Image]:
+def draw(runs: list[tuple[Events, NDArray[np.float32]]], count: int) -> list[Image.Image]:
     """Return the frames of a film."""
-    (bare, _), (events, truth) = runs
-    assert truth.depth is not None
-    scale = DepthScale.of_events(truth.depth)
+    (bare, _), (events, depth) = runs
+    scale = DepthScale.of_events(depth)
     layers = [(each, np.where(each.p == 1, GREYS + 1, GREYS).astype(np.uint8)) for each in (bare, events)]
-    layers.append((events, scale.colours(truth.depth)))
+    layers.append((events, scale.colours(depth)))
     still, colours = background(scale), palette()
     frames = []
     for number in range(count):

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -22,6 +24,25 @@ from amiwarp.simulation.simulator import simulate
 sys.path.append(str(Path(__file__).parents[1]))
 wp.config.log_level = wp.LOG_ERROR
 wp.init()
+
+LONGEST_FIRST = (
+    "test_moving", "test_stability", "test_photometric", "test_sparse", "test_session", "test_demo", "test_stream_cli",
+    "test_examples", "test_refusals", "test_named_worlds", "test_view_browser", "test_reconstruct", "test_cli",
+    "test_evaluate_motion", "test_design", "test_chart", "test_calibrate", "test_consistency", "test_stream_returning",
+)  # fmt: skip
+"""Files whose tests take longest. They are run first, so that no process works alone on one of them at the end."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let xdist keep the order of the files. By itself it begins with the files that have most tests."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files. The order within a file stays."""
+    rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(params=["cpu", "cuda:0"])
@@ -68,6 +89,8 @@ def texture() -> np.ndarray:
     return picture
 
 
+COARSE = PhotometricSettings(pairs=100_000, density=1.0)
+"""A third of the default's pairs and a quarter of the brightness map's nodes, which is enough for small images."""
 TRUE_PRISM = Prism(math.radians(2.2), 1.52)
 NOMINAL_PRISM = Prism(math.radians(2.6), 1.52)
 TRUE_PHASE = 2.0
@@ -81,3 +104,9 @@ def recording(texture: np.ndarray) -> Recording:
         texture, camera, TRUE_PRISM, duration_s=0.25, motion=PrismMotion(720.0, phase=TRUE_PHASE),
         nominal_prism=NOMINAL_PRISM, seed=3,
     )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def calibration(recording: Recording) -> Calibration:
+    """The recording calibrated by both stages, with fewer events and a coarser brightness map than by default."""
+    return calibrate(recording, events=100_000, photometric=COARSE)

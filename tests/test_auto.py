@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import COARSE
 from scipy.optimize import minimize
 
 from amiwarp.calib import Calibration, Settings
@@ -30,6 +31,7 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
 
+BOTH = Settings(events=120_000, photometric=COARSE)
 SHARPNESS = Settings(events=120_000, stages=("sharpness",))
 CONSTANT, DOUBLING = 720.0, np.array([[0.0, 500.0], [0.34, 1000.0]])
 
@@ -57,13 +59,13 @@ def wide(texture: np.ndarray) -> Recording:
 
 @pytest.fixture(scope="module")
 def found(wide: Recording) -> Calibration:
-    return calibrate_auto(wide, Settings(events=120_000))
+    return calibrate_auto(wide, BOTH)
 
 
 @pytest.fixture(scope="module")
 def as_circle(wide: Recording) -> Calibration:
     """Calibrated with a budget that a circle keeps."""
-    return calibrate_auto(wide, Settings(events=120_000), budget_px=5.0)
+    return calibrate_auto(wide, BOTH, budget_px=5.0)
 
 
 def places_of(recording: Recording) -> Places:

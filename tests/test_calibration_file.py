@@ -8,17 +8,11 @@ from typing import Any
 
 import pytest
 
-from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib import Calibration
 from amiwarp.calib.result import camera_from_json, camera_to_json
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye, RadialTangential
-
-
-@pytest.fixture(scope="module")
-def calibration(recording: Recording) -> Calibration:
-    return calibrate(recording, events=50_000, global_evaluations=60)
 
 
 def test_there_and_back(calibration: Calibration, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import reference
 import warp as wp
 from conftest import TRUE_PRISM
 
-from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib import Calibration
 from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks, inside_image
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_encoder import encoder_params
@@ -123,11 +123,6 @@ def test_events_outside_the_camera_do_not_leave_its_tables(device: str) -> None:
     moved = compensate_events(events, model, Encoder.constant_speed(600.0, 0, 1000), device=device)
     assert np.abs(moved[0] - 65_535).max() < 20.0
     assert len(compensate_events(Events.empty(), model, Encoder.constant_speed(600.0, 0, 1000), device=device)) == 0
-
-
-@pytest.fixture(scope="module")
-def calibration(recording: Recording) -> Calibration:
-    return calibrate(recording, events=200_000)
 
 
 def test_places_agree_with_the_stored_truth(recording: Recording, device: str) -> None:

@@ -1,7 +1,9 @@
 """The demo keeps its error limits, from the picture to the figure."""
 
 import json
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,10 +49,10 @@ def test_demo_at_its_default_size(tmp_path: Path) -> None:
 
 def test_demo_without_opengl_still_draws(tmp_path: Path, texture: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without OpenGL, VTK ends its process. Here every such process ends at once."""
-    monkeypatch.setattr("sys.executable", "/bin/false")
+    monkeypatch.setattr(clouds, "sys", SimpleNamespace(executable="/bin/false", platform=sys.platform))
     photo = tmp_path / "photo.png"
     Image.fromarray(texture).save(photo)
-    args = ["demo", "--out", str(tmp_path / "out"), "--picture", str(photo), "--size", "200x150", "--duration", "0.2"]
+    args = ["demo", "--out", str(tmp_path / "out"), "--picture", str(photo), "--size", "120x90", "--duration", "0.17"]
     result = CliRunner().invoke(app, [*args, "--seed", "3"])
     assert result.exit_code == 0, result.stderr
     assert clouds.MISSING in " ".join(result.stdout.split())

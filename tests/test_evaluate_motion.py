@@ -21,7 +21,7 @@ from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.scene import Body, Material, Mesh, World
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
 from amiwarp.simulation.worlds.world_scene import WorldScene
-from amiwarp.studies.evaluate import flow, pictures, pose, segmentation
+from amiwarp.studies.evaluate import contrast_motion, flow, pictures, pose, segmentation
 from amiwarp.studies.evaluate.blob_detector import PROPORTIONS
 from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation, rotated_back
@@ -173,6 +173,7 @@ def test_flow_of_still_objects(streams: Streams, monkeypatch: pytest.MonkeyPatch
 
 def test_pose_over_the_rate_of_pictures(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose, "RATES_HZ", (100.0,))
+    monkeypatch.setattr(contrast_motion, "MOST_EVENTS", 5_000)
     shapes: list[tuple[int, ...]] = []
 
     def detect(image: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
@@ -191,6 +192,7 @@ def test_pose_over_the_rate_of_pictures(streams: Streams, monkeypatch: pytest.Mo
 def test_a_learned_reconstruction_is_judged_next_to_ours(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "PICTURES", 1)
     monkeypatch.setattr(pictures, "TURNS", (pictures.STANDARD_TURNS,))
+    monkeypatch.setattr(contrast_motion, "MOST_EVENTS", 5_000)
     given: list[Events] = []
 
     def perfect(events: Events) -> NDArray[np.float64]:

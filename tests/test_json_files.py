@@ -10,11 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib import Calibration
 from amiwarp.calib.presets import Preset
 from amiwarp.cli.inputs import read_camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
 from amiwarp.io.json_files import MOST_BYTES, read_json
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.sequences import open_pictures
@@ -42,11 +41,6 @@ NO_JSON: dict[str, tuple[bytes, str]] = {
     "a number": (b"3", "holds 3; expected an object"),
     "null": (b"null", "holds None; expected an object"),
 }
-
-
-@pytest.fixture(scope="module")
-def calibration(recording: Recording) -> Calibration:
-    return calibrate(recording, events=50_000, global_evaluations=60)
 
 
 @pytest.mark.parametrize("reader", READERS)

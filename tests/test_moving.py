@@ -34,9 +34,10 @@ from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 
-CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
-KNOWN = PhotometricSettings(pairs=150_000, sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
-MORE, ALL = replace(KNOWN, pairs=300_000), replace(KNOWN, pairs=600_000)
+CAMERA = Camera.from_fov(140, 105, math.radians(50.0))
+SMALL = Camera.from_fov(100, 75, math.radians(50.0))
+KNOWN = PhotometricSettings(pairs=75_000, density=1.0, sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
+MORE, ALL = (replace(KNOWN, pairs=pairs) for pairs in (300_000, 600_000))
 FREE = ("apex", "phase", "motion")
 
 
@@ -239,9 +240,9 @@ def test_an_object_moves_through(texture: NDArray[np.uint8]) -> None:
 
 def test_blank_scene() -> None:
     grey = np.full((60, 80), 128, np.uint8)
-    recording = simulate(grey, CAMERA, TRUE_PRISM, duration_s=0.25, seed=6)
+    recording = simulate(grey, SMALL, TRUE_PRISM, duration_s=0.25, seed=6)
     with pytest.raises(AmiwarpError, match=r"events are too few|sharper than chance"):
         calibrate(recording)
-    noisy = simulate(grey, CAMERA, TRUE_PRISM, duration_s=0.25, seed=6, sensor=SensorModel(shot_noise_hz=50.0))
+    noisy = simulate(grey, SMALL, TRUE_PRISM, duration_s=0.25, seed=6, sensor=SensorModel(shot_noise_hz=50.0))
     with pytest.raises(AmiwarpError, match="sharper than chance"):
         calibrate(noisy)

@@ -161,9 +161,8 @@ def content(world: World) -> list[Any]:
 def test_equal_seeds_give_equal_worlds(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the trajectory; and without trimesh."""
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    one, same, other = (
-        content(named_world(name, kind, seed=seed)[0]) for kind, seed in (("still", 0), ("fast", 0), ("still", 1))
-    )
+    one = content(still(name)[0])
+    same, other = (content(named_world(name, kind, seed=seed)[0]) for kind, seed in (("fast", 0), ("still", 1)))
     assert len(one) == len(same)
     assert all(np.array_equal(a, b) for a, b in zip(one, same, strict=True))
     assert len(one) != len(other) or not all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))

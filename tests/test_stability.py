@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import COARSE
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.paper_method import calibrate_as_paper
@@ -24,7 +25,7 @@ SMALL = Condition(width=160, height=120, turns=3.0)
 def error_px(condition: Condition, seed: int) -> tuple[float, str]:
     """Return the model error of the exact model's answer, and the warnings."""
     sample = make(condition, seed)
-    found = calibrate(sample.recording)
+    found = calibrate(sample.recording, photometric=COARSE)
     assert sample.recording.truth is not None
     truth = ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
     return model_error(found.exact.model, truth).rms, "; ".join(found.warnings)
@@ -112,10 +113,10 @@ def test_best_fit_of_each_model() -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"noise": 0.5}, ""),
+        ({"noise": 0.5, "width": 112, "height": 84}, ""),
         ({"hot": 0.05}, "hot pixels left out"),
-        ({"lamp": 0.2, "turns": 4.0}, "flicker at 100 Hz"),
-        ({"camera_deg_s": 10.0}, "the camera turned at 10.0 deg/s"),
+        ({"lamp": 0.2, "turns": 4.0, "width": 128, "height": 96}, "flicker at 100 Hz"),
+        ({"camera_deg_s": 10.0, "width": 96, "height": 72}, "the camera turned at 10.0 deg/s"),  # like a wrong scale
         ({"turns": 0.5, "width": 320, "height": 240}, ""),
         ({"window_events": 20_000}, "over the whole image"),
         ({"readout_us": 500.0}, ""),
@@ -133,16 +134,16 @@ def test_what_sharpness_alone_gets_wrong(changes: dict[str, float], says: str) -
     [
         ({"lost": 0.9}, "--stages sharpness"),
         ({"cancelled": 0.6, "width": 320, "height": 240}, "nominal apex"),
-        ({"lamp": 0.9}, "flicker"),
-        ({"backwards": True}, "."),
-        ({"counts_per_turn": 4}, "--stages sharpness"),
+        ({"lamp": 0.9, "width": 48, "height": 36}, "flicker"),
+        ({"backwards": True, "width": 128, "height": 96}, "."),
+        ({"counts_per_turn": 4, "width": 80, "height": 60}, "--stages sharpness"),
         ({"contrast": 1.0}, "."),
     ],
     ids=lambda v: str(v)[:30],
 )
 def test_what_cannot_be_determined_is_refused(changes: dict[str, float], reason: str) -> None:
     with pytest.raises(AmiwarpError, match=reason):
-        calibrate(make(replace(SMALL, **changes), 1).recording)  # type: ignore[arg-type]
+        calibrate(make(replace(SMALL, **changes), 1).recording, photometric=COARSE)  # type: ignore[arg-type]
 
 
 def test_the_papers_method_on_sparse_edges() -> None:

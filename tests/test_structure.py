@@ -4,6 +4,7 @@ Which room may import which is a contract of import-linter in ``pyproject.toml``
 """
 
 import ast
+import functools
 import graphlib
 import importlib
 import inspect
@@ -60,15 +61,18 @@ def imports_of(path: Path) -> Iterator[str]:
         stack.extend(ast.iter_child_nodes(node))
 
 
-def device_code() -> Iterator[tuple[str, str, ast.FunctionDef]]:
-    """Yield the place, the decorator and the syntax tree of every Warp kernel and device function."""
+@functools.cache
+def device_code() -> list[tuple[str, str, ast.FunctionDef]]:
+    """Return the place, the decorator and the syntax tree of every Warp kernel and device function."""
+    found = []
     for path in MODULES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef):
                 for decorator in node.decorator_list:
                     text = ast.unparse(decorator)
                     if text.startswith(("wp.kernel", "wp.func")):
-                        yield f"{name_of(path)}.{node.name}:{node.lineno}", text.partition("(")[0], node
+                        found.append((f"{name_of(path)}.{node.name}:{node.lineno}", text.partition("(")[0], node))
+    return found
 
 
 def length(node: ast.FunctionDef) -> int:

@@ -53,26 +53,28 @@ def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> tuple[fl
     at, surfaces = correlations(events, bins, turn, camera)
     rays = np.asarray(camera.pixels_to_rays(at.astype(np.float32)), np.float64)
 
-    def displacement(rate: NDArray[np.float64]) -> NDArray[np.float64]:
-        # a static point moves against the camera's rotation
-        rotated = camera.rays_to_pixels(Rotation.from_rotvec(-rate * seconds).apply(rays).astype(np.float32))
-        return np.asarray(rotated, np.float64) - at
+    patch = np.arange(len(at))
 
-    def agreement(rate: NDArray[np.float64]) -> float:
-        cells = displacement(rate) / 2.0
-        if not np.isfinite(cells).all() or np.abs(cells).max() > max(surfaces.shape[1:]) / 2:
-            return 0.0
-        return sum(
-            float(map_coordinates(s, cells[k, ::-1, None], order=1, mode="grid-wrap")[0])
-            for k, s in enumerate(surfaces)
+    def agreement(rates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sum of the patches' correlations for each of the angular velocities (n, 3)."""
+        # a static point moves against the camera's rotation
+        turned_rays = Rotation.from_rotvec(-rates * seconds).as_matrix()[:, None] @ rays[:, :, None]
+        pixels = camera.rays_to_pixels(turned_rays.reshape(-1, 3).astype(np.float32))
+        cells = (np.asarray(pixels, np.float64).reshape(len(rates), len(at), 2) - at) / 2.0
+        inside = (np.abs(cells) <= max(surfaces.shape[1:]) / 2).all(axis=(1, 2))
+        where = np.where(inside[:, None, None], cells, 0.0)
+        values = map_coordinates(
+            surfaces, [np.broadcast_to(patch, where.shape[:2]), where[..., 1], where[..., 0]], order=1, mode="grid-wrap"
         )
+        return np.where(inside, values.sum(axis=1), 0.0)
 
     unit = 1.0 / (camera.fx * seconds)  # moves the image by about one pixel per turn
-    starts = sorted((np.array(r) for r in hypotheses(surfaces, unit)), key=agreement)[-STARTS:]
+    candidates = np.array(hypotheses(surfaces, unit))
+    starts = candidates[np.argsort(agreement(candidates), kind="stable")[-STARTS:]]
     simplex = 4.0 * unit * np.vstack([np.zeros(3), np.eye(3)])
 
     def cost(rate: NDArray[np.float64]) -> float:
-        return -agreement(rate)
+        return -float(agreement(rate[None])[0])
 
     runs = [minimize(cost, s, method="Nelder-Mead", options={"initial_simplex": s + simplex}) for s in starts]
     x, y, z = min(runs, key=lambda run: float(run.fun)).x.tolist()

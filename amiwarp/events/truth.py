@@ -75,27 +75,6 @@ class EventTruth:
     place: NDArray[np.float32] | None = None
     """Point that each event saw, in the world's frame [m], shape ``(n, 3)``; NaN for the sky."""
 
-    @classmethod
-    def concatenate(cls, blocks: Sequence[EventTruth]) -> EventTruth:
-        """Join the ground truth of successive blocks of events.
-
-        Parameters
-        ----------
-        blocks : sequence of EventTruth
-            At least one block. Arrays that are None in any block are None in the result.
-
-        Returns
-        -------
-        EventTruth
-            Ground truth of all events.
-        """
-        joined: dict[str, NDArray[Any]] = {}
-        for name in ("points", "cause", "instance", "depth", "place"):
-            parts = [getattr(block, name) for block in blocks]
-            if parts and all(part is not None for part in parts):
-                joined[name] = np.concatenate(parts)
-        return cls(**joined)
-
 
 @dataclass(frozen=True, slots=True)
 class WorldLabels:

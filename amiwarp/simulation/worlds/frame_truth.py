@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -84,7 +83,7 @@ class TruthRenderer:
         pixels = camera.rays_to_pixels(self._rays)
         theta = np.full(len(pixels), wrap_angle(motion.angle([t_us]))[0])
         bare = surfaces_at(self._world, self._rays, rotation, position)
-        places = moved_points(model.compensate_points, pixels, theta)
+        places = model.compensate_points(pixels, theta)
         through = surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
         speed = self._flow(through, places, t)
         size = (camera.height, camera.width)
@@ -149,8 +148,8 @@ class TruthRenderer:
         """
         size = np.linalg.norm(speed, axis=1, keepdims=True)
         aside = speed / np.maximum(size, 1e-9)
-        along = [moved_points(model.deflect_points, places + sign * aside, theta) for sign in (-1.0, 1.0)]
-        turned = [moved_points(model.deflect_points, places, theta + sign * ANGLE) for sign in (-10.0, 10.0)]
+        along = [model.deflect_points(places + sign * aside, theta) for sign in (-1.0, 1.0)]
+        turned = [model.deflect_points(places, theta + sign * ANGLE) for sign in (-10.0, 10.0)]
         (before, after) = self._simulation.motion.angle([t_us - 50.0, t_us + 50.0])
         rate = (after - before) / 1e-4
         return np.asarray((along[1] - along[0]) / 2.0 * size + (turned[1] - turned[0]) / (20.0 * ANGLE) * rate)
@@ -168,12 +167,3 @@ class TruthRenderer:
         steps = prism_view.Steps()
         steps.at = wp.array(table, dtype=prism_view.Step, device=device)
         return np.array(self._sight.light(steps, 0, 1).numpy()[0])
-
-
-def moved_points(move: Callable[..., Any], xy: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points (n, 2) [px] after a method of an optical model has displaced them at prism angles (n,) [rad].
-
-    ``move``: method ``compensate_points`` or ``deflect_points`` of the model.
-    """
-    points = wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu")
-    return np.asarray(move(points, wp.array(theta.astype(np.float32), dtype=float, device="cpu")).numpy(), np.float64)
