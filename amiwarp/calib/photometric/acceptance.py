@@ -39,8 +39,8 @@ LARGEST_INCONSISTENCY_PX = 0.1
 
 
 LARGEST_LAG_RAD = 0.35
-"""Largest angle by which the prism may turn within the time constant of slow photoreceptors [rad]. At 0.2 the size of the
-orbit is corrected to 0.02 px, at 0.4 to 0.14 px."""
+"""Largest angle by which the prism may turn within the time constant of slow photoreceptors [rad]. At 0.2 an error of
+0.02 px remains, at 0.4 one of 0.14 px."""
 
 
 def judge_lag(turn: float) -> tuple[bool, str]:
@@ -48,8 +48,8 @@ def judge_lag(turn: float) -> tuple[bool, str]:
     if turn <= LARGEST_LAG_RAD:
         return True, ""
     return False, (
-        f"the pixels are too slow for this speed of the prism, which turns by {math.degrees(turn):.0f} deg within their "
-        "time constant; use more light, a larger bandwidth or a slower prism"
+        f"the pixels are too slow: the prism turns by {math.degrees(turn):.0f} deg within their time constant; use more "
+        "light, a larger bandwidth or a slower prism"
     )
 
 

@@ -54,8 +54,8 @@ GAP_SHARE, LEAST_STD_PX = 0.5, 0.002
 """Systematic standard deviation of the answer: a share of the difference between the answers of pairs with long and
 with short gaps, and a least value [px]. Measured on recordings with known truth."""
 COARSE_STD_PX = 0.01
-"""The least value for a map with one node per pixel: bilinear look-ups do not follow the scene within an orbit of one or
-two pixels [px]."""
+"""The least value for a map with one node per pixel, where bilinear look-ups do not follow the scene within an orbit of
+one or two pixels [px]."""
 DOUBT = 2.0
 """Factor of the standard deviation that a doubtful lens adds: a linearised fit finds too small changes."""
 REGIONS = (3, 2)
