@@ -366,6 +366,16 @@ def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
     assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
 
 
+def test_preparing_a_log_intensity_does_not_change_it(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_intensity, "_prepared", set())
+    expected = make_images(inspector, ImageKind.LOG_INTENSITY).after
+    inspector.loaded.chosen.clear()
+    log_intensity.prepare(inspector)
+    assert log_intensity._prepared == {"cpu"}
+    assert inspector.loaded.chosen == []
+    np.testing.assert_array_equal(make_images(inspector, ImageKind.LOG_INTENSITY).after, expected)
+
+
 def test_the_smoothness_of_a_log_intensity_is_chosen_again_if_the_residual_changes(inspector: Inspector) -> None:
     inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
     make_images(inspector, ImageKind.LOG_INTENSITY)

@@ -335,11 +335,9 @@ class Inspector:
         given = self._unprismed if knobs is None else knobs
         return self.model_of(given), self._angles(w, given).on_device, self._drift_us(given)
 
-    def positions(self, events: Events, knobs: Knobs | None) -> NDArray[np.float32]:
-        """Return the compensated positions of events [px], shape ``(n, 2)``; those recorded if ``knobs`` is None."""
+    def positions(self, events: Events, knobs: Knobs) -> NDArray[np.float32]:
+        """Return the compensated positions of events [px], shape ``(n, 2)``."""
         xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
-        if knobs is None:
-            return xy
         theta = self.encoder_of(knobs).angle_at(events.t).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 

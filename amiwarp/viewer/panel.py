@@ -87,6 +87,7 @@ class Panel:
         self.rates.start()
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.slider_released()
+        self.request_slow("preparation")
         if inspector.latest is not None:
             self.playback.toggle()
 
@@ -153,7 +154,7 @@ class Panel:
             self._quick = self._task(self._work())
 
     def request_slow(self, *what: str) -> None:
-        """Request updates that run in a thread after all quick updates: "curve" or "picture"."""
+        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
         self._slow_requests.update(what)
         self._show_pending()
         if self._slow is None:
@@ -281,7 +282,7 @@ class Panel:
         try:
             while self._slow_requests:
                 await self.wait_until_drawn()
-                name = min(self._slow_requests)  # the curve comes before the picture
+                name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
                 self._slow_requests.discard(name)
                 async with self._done({name}), self.device_lock:
                     with self.errors_shown(name):

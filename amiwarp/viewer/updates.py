@@ -21,6 +21,7 @@ from amiwarp.viewer.drawing import (
 )
 from amiwarp.viewer.image_kinds import ImageKind, ShownImages, count_images, make_images
 from amiwarp.viewer.layout import UNITS
+from amiwarp.viewer.log_intensity import prepare
 from amiwarp.viewer.page_values import events_text, sharpness_text, truths
 from amiwarp.viewer.phase_estimate import estimate_phase
 from amiwarp.viewer.selected_calibration import scope_text
@@ -72,8 +73,11 @@ class Updates:
                 panel.history.remember("" if todo & {"suggestion", "state"} else panel.change)
 
     async def make_slow(self, name: str) -> None:
-        """Make a slow update: "curve" or "picture"."""
-        await (self._curve() if name == "curve" else self._picture())
+        """Make a slow update: "curve", "picture", or "preparation" of the first picture."""
+        if name == "preparation":
+            await self._panel.in_thread(prepare, self._panel.inspector)
+        else:
+            await (self._curve() if name == "curve" else self._picture())
 
     def pick(self, k: int) -> None:
         """Describe a drawn event, and show its orbit; -1 for none."""
