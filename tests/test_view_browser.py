@@ -676,7 +676,7 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     width, height = events.size
 
     class Stream(LiveSource):
-        problem = ""
+        problem = no_angles = ""
 
         def __init__(self) -> None: ...
 
@@ -686,7 +686,7 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
             return replace(recording, events=MemoryEvents(events.between(events.t_first, end), width, height))
 
         def figures(self) -> LiveFigures:
-            return LiveFigures(not self.problem, self.problem, 1.25, 12.0, 1.0, 3, 0, RPM, "")
+            return LiveFigures(not self.problem, self.problem, self.no_angles, 1.25, 12.0, 1.0, 3, 0, RPM, "")
 
     latest = Stream()
     page = opened(of=latest(), latest=latest)
@@ -695,7 +695,10 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     assert page.locator(".knob:has(#slider-phase) .note").inner_text() == "estimated"
     latest.problem = "no events for 2 s"
     page.locator("#stream-note").filter(has_text="The stream is interrupted: no events for 2 s").wait_for()
-    latest.problem = ""
+    latest.problem, latest.no_angles = "", "the port COM3 of the controller is gone"
+    page.locator("#stream-note").filter(has_text="No prism angles arrive: the port COM3").wait_for()
+    assert f"{RPM:.1f} rpm, last measured" in page.locator("#live dd.bad").all_inner_texts()
+    latest.no_angles = ""
     page.locator("#stream-note").wait_for(state="detached")
     assert page.locator("#live dd.bad").inner_text() == "3"
     assert page.locator("#do-play").inner_text() == "stop"
@@ -703,6 +706,10 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     until(lambda: field(page, "start_ms") > shown + 8.0)
     page.locator("#do-play").click()
     page.locator("#do-play").filter(has_text="follow").wait_for()
+    latest.problem = "no events for 2 s"  # it is said although the stream is not followed
+    page.locator("#stream-note").wait_for()
+    latest.problem = ""
+    page.locator("#stream-note").wait_for(state="detached")
     until(lambda: not tabs.panels[-1].playback.runs)
     times, start = len(asked), field(page, "start_ms")
     before = sharpness(page)

@@ -21,6 +21,7 @@ from amiwarp.viewer.comparison import Comparison
 from amiwarp.viewer.frames import wait_until_page_keeps_up
 from amiwarp.viewer.jobs import CalibrationJob, Playback
 from amiwarp.viewer.layout import NAMES, SLIDERS, UNITS, template
+from amiwarp.viewer.live_source import LiveSource
 from amiwarp.viewer.page_calls import PageCalls
 from amiwarp.viewer.page_exports import Exports
 from amiwarp.viewer.page_files import use_page
@@ -90,6 +91,8 @@ class Panel:
         self.request_slow("preparation")
         if inspector.latest is not None:
             self.playback.toggle()
+        if isinstance(inspector.latest, LiveSource):
+            self.start_job(self.playback.watch(inspector.latest))
 
     async def open_file(self, name: str) -> None:
         """Show another recording of the library."""
