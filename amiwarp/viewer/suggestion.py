@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from amiwarp.viewer.imager import Region
 
 WIDEST, NARROWEST = 120, 60
-"""Largest width of a suggested region, and its width on a small sensor [px]."""
+"""Largest width of a suggested region, and its width on a small sensor or if there are very many events [px]."""
+CLEAR_EVENTS = 50_000
+"""Number of events above which a narrower region is suggested, because so many points hide each other in the cloud."""
 LEAST_SIGMA = 5.0
 """Smallest gain of variance over mean, in standard deviations of that of random events, that shows an effect."""
 NEARLY_BEST = 0.5
@@ -52,7 +54,19 @@ def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, m
     """
     rows, columns = before.shape
     width = min(columns, WIDEST, max(columns // 3, NARROWEST))
-    height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
+    while True:
+        height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
+        left, top, gains = _best_box(before, after, width, height, margin)
+        events = float(before[top : top + height, left : left + width].sum())
+        if events <= CLEAR_EVENTS or width <= NARROWEST:
+            return Suggestion((left, top, left + width, top + height), gains)
+        width = max(NARROWEST, min(width - 1, int(width * (CLEAR_EVENTS / events) ** 0.5)))
+
+
+def _best_box(
+    before: NDArray[np.float32], after: NDArray[np.float32], width: int, height: int, margin: int
+) -> tuple[int, int, bool]:
+    """Return left and top of the best box of a size, and whether compensation sharpens it."""
     mean, over_mean = _of_boxes(before, width, height)
     mean_after, over_mean_after = _of_boxes(after, width, height)
     noise = random_variance(SMOOTHING_PX)
@@ -67,7 +81,7 @@ def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, m
     candidates = np.full(variance.shape, -np.inf)
     candidates[inner] = np.where(variance[inner] >= NEARLY_BEST * variance[inner].max(), factor[inner], -np.inf)
     top, left = np.unravel_index(int(np.argmax(candidates)), candidates.shape)
-    return Suggestion((int(left), int(top), int(left) + width, int(top) + height), gains)
+    return int(left), int(top), gains
 
 
 def _inner(shape: tuple[int, ...], margin: int) -> tuple[slice, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.choices import Axis, Colour
+from amiwarp.viewer.comparison import RECORDED
 from amiwarp.viewer.drawing import (
     NO_ORBIT,
     cloud_state,
@@ -115,7 +116,7 @@ class Updates:
         pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
         text = "" if self._picked < 0 else event_text(shown, self._picked)
         return shown, {
-            **values, "titles": pair if compensated else [[0, "events as recorded"]], "events": events_text(shown),
+            **values, "titles": pair if compensated else [[0, RECORDED]], "events": events_text(shown),
             "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
             "against_title": left, "against_choices": panel.comparison.choices,
         }  # fmt: skip

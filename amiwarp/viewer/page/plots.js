@@ -2,6 +2,8 @@
 
 import { text, ticks } from './ticks.js';
 
+const LEAST_SHARE = 0.18; // of a colour bar between two numbers
+
 const { computed, onMounted, ref, watch } = window.Vue;
 
 // Return the ticks of an axis with their places as shares of its length.
@@ -87,5 +89,10 @@ export const CostSurface = {
 export const ColourBar = {
   props: { scale: Object },
   template: `<small class="colour-bar"><span class="bar" :style="{ background: scale.bar }"></span>
-    <span v-for="t in scale.ticks" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
+    <span v-for="t in apart" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
+  setup(props) {
+    const close = ([at], [before] = [-1]) => at - before < LEAST_SHARE;
+    const apart = computed(() => props.scale.ticks.reduce((kept, tick) => (close(tick, kept.at(-1)) ? kept : [...kept, tick]), []));
+    return { apart };
+  },
 };
