@@ -3,7 +3,7 @@
 import { corners } from './camera.js';
 import { text, ticks } from './ticks.js';
 
-const TICK_PX = [52, 32]; // least distance between two ticks along a flat and an upright axis
+const TICK_PX = [40, 32]; // least distance between two ticks along a flat and an upright axis
 
 // Draw the frame of a box. `axes` holds low, high and title of x, y and the third axis; y points down in images.
 export function drawFrame(context, projection, half, axes, [ink, paper], size, [width, height]) {

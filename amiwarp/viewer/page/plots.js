@@ -89,7 +89,7 @@ export const CostSurface = {
 export const ColourBar = {
   props: { scale: Object },
   template: `<small class="colour-bar"><span class="bar" :style="{ background: scale.bar }"></span>
-    <span v-for="t in apart" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
+    <span v-for="t in apart" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title" :title="scale.title">{{ scale.title }}</span></small>`,
   setup(props) {
     const close = ([at], [before] = [-1]) => at - before < LEAST_SHARE;
     const apart = computed(() => props.scale.ticks.reduce((kept, tick) => (close(tick, kept.at(-1)) ? kept : [...kept, tick]), []));
