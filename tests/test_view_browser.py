@@ -304,6 +304,10 @@ def test_while_a_slider_moves_the_page_follows_and_the_curve_is_that_of_the_slid
     enter(page, "apex", 0.9)
     title.filter(has_text="sharpness over apex angle").wait_for()
     until(lambda: curve.get_attribute("points") != points)
+    assert page.locator("#curve line.truth").count() == 1
+    enter(page, "phase", 60.0)
+    page.locator("#curve-text").filter(has_text="peak at the edge 90, now 60").wait_for()
+    assert page.locator("#curve line.truth").count() == 0  # the true phase is not on the axis
 
 
 def test_undo_redo_reset_and_the_address_bring_a_state_back(page: Any, opened: Open) -> None:

@@ -169,8 +169,9 @@ class Updates:
         x = (values / UNITS[name]).tolist()
         if not x:
             return
-        best = x[int(np.argmax(scores))]
-        s.curve = {"name": label, "title": title, "text": f"highest at {best:.4g}; now {s[name]:.4g}", "x": x,
+        best = int(np.argmax(scores))
+        peak = f"{'at the edge ' if best in (0, len(x) - 1) else ''}{x[best]:.4g}"
+        s.curve = {"name": label, "title": title, "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
                    "y": scores.tolist(), "truth": truths(panel.inspector)[name]}  # fmt: skip
         s.curve_mark = float(s[name])
 
