@@ -227,6 +227,41 @@ def test_the_speed_is_that_of_the_first_turn() -> None:
     assert shown.turn_us == pytest.approx(60e6 / 720.0, rel=1e-3)
 
 
+def test_lost_angles_are_said_and_no_extrapolated_speed_is_shown() -> None:
+    """The controller's port is gone from 0.2 s on. At 0.5 s it is back, after a reset: its angles start at 0."""
+    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made"})()
+    ring, stream, speed = RecentEvents(source), EncoderStream(), 720.0 * math.tau / 60e6
+    ring.link = type("Link", (), {"connected": True, "name": "COM3"})()
+
+    def arrive(start: int, stop: int, zero: int | None) -> None:
+        t = np.arange(start, stop, 1000)
+        ring.append(Events.from_arrays(np.full(t.size, 5), np.full(t.size, 5), t, np.zeros(t.size)))
+        if zero is not None:
+            ring.append_encoder(*stream.append(t, (t - zero) * speed))
+
+    arrive(0, 200_000, 0)
+    live = LiveSource(ring, [])
+    before = live()
+    ring.link.connected = False
+    arrive(200_000, 500_000, None)
+    assert live().events.t_last <= 200_000
+    lost = live.figures()
+    assert lost.connected
+    assert lost.no_angles == "the port COM3 of the controller is gone"
+    assert lost.rpm == pytest.approx(720.0, rel=1e-3)
+    ring.link.connected = True
+    stream.restart()
+    arrive(500_000, 540_000, 500_000)
+    back = live.figures()
+    assert live().events.t_last <= before.events.t_last + 1000
+    assert (back.no_angles, live.figures().turn_share) == ("", pytest.approx(0.48, abs=0.02))
+    assert back.rpm == pytest.approx(720.0, rel=1e-3)
+    arrive(540_000, 600_000, 500_000)
+    assert live().events.t_first >= 499_000
+    assert live.figures().rpm == pytest.approx(720.0, rel=1e-3)
+    assert Inspector(live()).turn_us == pytest.approx(60e6 / 720.0, rel=1e-3)
+
+
 def test_a_stream_is_followed_while_one_looks(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ import sys
 import types
 import urllib.request
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 
 import amiwarp
 from amiwarp.cli.app import app
+from amiwarp.events.events import MemoryEvents
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -68,6 +70,17 @@ def test_window_model_and_axis(files: Path, tmp_path: Path) -> None:
     cut = json.loads(view(files / "recording.h5", "--screenshot", two, *options)[1])
     assert 0 < cut["events"] < 0.5 * wide["events"]
     assert one.read_bytes() != two.read_bytes()
+
+
+def test_a_picture_without_a_rotating_prism_shows_one_cloud(files: Path, tmp_path: Path) -> None:
+    recording, out = open_recording(files / "recording.h5"), tmp_path / "out.png"
+    events = MemoryEvents(recording.events.slice(0, 5_000), *recording.events.size)
+    save_recording(tmp_path / "plain.h5", replace(recording, events=events, encoder=None, truth=None))
+    code, said, _ = view(tmp_path / "plain.h5", "--screenshot", out, "--size", "400x200")
+    assert code == 0
+    assert "compensated" not in said.splitlines()[-1]
+    seen = np.asarray(Image.open(out).convert("RGB"))[:, 190:210].astype(int)
+    assert (seen.max(axis=2) - seen.min(axis=2) > 100).any()  # its points are in the middle of the picture
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,23 @@ def test_edges_that_come_from_outside_suggest_no_region() -> None:
     assert top > 90
 
 
+def test_neither_the_border_nor_an_empty_part_counts_as_a_gain() -> None:
+    """Compensation moves events away from the border, and both parts with edges get sharper, the full one by more."""
+    rng = np.random.default_rng(0)
+    before, columns = rng.poisson(4.0, (300, 400)).astype(np.float32), np.arange(130)
+    after = before.copy()
+    for image, full, empty in ((before, 5, 10), (after, 2, 6)):
+        image[150:250, 230:360] = np.where(columns % 10 < full, 60.0 / full, 0.0)
+        image[150:250, 60:190] = np.where(abs(columns - 65) < empty / 2, 300.0 / empty, 0.0)
+    after[:8], after[:, :8] = 0.0, 0.0
+    left, top, right, bottom = suggest_region(before, after, margin=10).region
+    assert left >= 220
+    assert right <= 370
+    before[20:], after[20:] = 4.0, 4.0
+    left, top, right, bottom = suggest_region(before, after, margin=10).region
+    assert min(left, top, 400 - right, 300 - bottom) >= 10
+
+
 # estimate of the phase
 
 
@@ -364,6 +381,16 @@ def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
     np.testing.assert_array_equal(both.after, found.after)
     assert both.before is not None
     assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
+
+
+def test_preparing_a_log_intensity_does_not_change_it(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_intensity, "_prepared", set())
+    expected = make_images(inspector, ImageKind.LOG_INTENSITY).after
+    inspector.loaded.chosen.clear()
+    log_intensity.prepare(inspector)
+    assert log_intensity._prepared == {"cpu"}
+    assert inspector.loaded.chosen == []
+    np.testing.assert_array_equal(make_images(inspector, ImageKind.LOG_INTENSITY).after, expected)
 
 
 def test_the_smoothness_of_a_log_intensity_is_chosen_again_if_the_residual_changes(inspector: Inspector) -> None:

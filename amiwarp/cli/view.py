@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,7 +90,8 @@ class ScreenshotOptions:
         shown = inspector.show()
         return {
             "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
-            "sharpness_before": shown.sharpness_before, "sharpness_after": shown.sharpness_after,
+            "sharpness_before": shown.sharpness_before,
+            "sharpness_after": shown.sharpness_after if math.isfinite(inspector.turn_us) else None,
             "notes": notes(inspector),
         }  # fmt: skip
 
@@ -263,5 +265,6 @@ def run(
 
 def _lines(d: dict[str, Any]) -> list[str]:
     """Return the lines that are printed about a written picture."""
-    gain = f"sharpness {d['sharpness_before']:.3f} as recorded, {d['sharpness_after']:.3f} compensated"
+    after = "" if d["sharpness_after"] is None else f", {d['sharpness_after']:.3f} compensated"
+    gain = f"sharpness {d['sharpness_before']:.3f} as recorded{after}"
     return [*d["notes"], f"{d['file']}: {d['events']:,} events, {d['drawn']:,} drawn; {gain}"]

@@ -12,6 +12,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import as_times
 from amiwarp.events.encoder import TWO_PI, Encoder
 
+RESTART_US = 1
+"""Time between the extrapolated sample that ends the samples before a restart and the first sample after it [us]."""
+
 
 class EncoderStream:
     """Buffer of the latest samples of a live encoder. Angles after the last sample are extrapolated.
@@ -119,9 +122,9 @@ class EncoderStream:
         gaps = [(int(t[i]), int(t[i + 1])) for i in inner]
         if len(self) and (self._restarted or int(t[0]) - before > self.GAP_US):
             gaps.insert(0, (before, int(t[0])))
-            if self._restarted and int(t[0]) - 1 > before:
-                last = self._extrapolate(int(t[0]) - 1)
-                t, angles = np.append(t[:1] - 1, t), np.append(last, angles)
+            if self._restarted and int(t[0]) - RESTART_US > before:
+                last = self._extrapolate(int(t[0]) - RESTART_US)
+                t, angles = np.append(t[:1] - RESTART_US, t), np.append(last, angles)
         self._restarted = False
         self._store(t, angles)
         self._gaps = [*self._gaps, *gaps][-self.MAX_GAPS :]
@@ -234,3 +237,14 @@ class EncoderStream:
             if low < t[-1] and t[0] < high:
                 out[int(np.searchsorted(t, low, side="right")) : int(np.searchsorted(t, high))] = True
         return out
+
+
+def start_of_last_run(t: NDArray[np.int64]) -> int:
+    """Return the index of the first sample after the last gap or restart in samples of an :class:`EncoderStream`.
+
+    A gap is longer than :attr:`EncoderStream.GAP_US`, and than three usual intervals. ``t``: times [us], shape (n,).
+    """
+    steps = np.diff(t)
+    longest = max(EncoderStream.GAP_US, 3.0 * float(np.median(steps))) if steps.size else 0.0
+    breaks = np.flatnonzero((steps > longest) | (steps <= RESTART_US))
+    return int(breaks[-1]) + 1 if breaks.size else 0

@@ -24,7 +24,14 @@ from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.known import dilated, known_nodes
 from amiwarp.reconstruction.result import Picture, upload_picture
-from amiwarp.reconstruction.window import busiest_square, map_tile, off_excess_by_counts, settled_span
+from amiwarp.reconstruction.window import (
+    SMOOTHNESS,
+    choice_square,
+    lowest_weight,
+    map_tile,
+    off_excess_by_counts,
+    settled_span,
+)
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
@@ -39,15 +46,11 @@ SCALES = (1.0, 0.5, 0.5)
 """Residual at which an equation gets half weight, in each round of Cauchy weights [thresholds]."""
 STEPS = 30
 """Number of conjugate-gradient steps in each round of Cauchy weights."""
-SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
-"""Candidate weights of the smoothness prior; held-out equations choose among them."""
 WEAK_WEIGHT = 0.03
 """Weight of the equations from silence and from the window's ends, relative to pairs of events. Held-out pairs are
 predicted best near this weight."""
 HOLD_OUT_EVERY = 8
 """Interval of held-out pairs: every eighth pair of events is held out to choose the smoothness."""
-CHOICE_SQUARE = 96
-"""Side of the square of pixels in which the smoothness is chosen [px]: the square with the most events."""
 EDGE_STEP = 0.5
 """Difference of neighbouring nodes above which ``Fill.EDGE`` treats them as separated by an edge [thresholds]."""
 MEAN_DAMPING = 1e-6
@@ -186,8 +189,7 @@ class Reconstruction:
         AmiwarpError
             If no pixel fires twice in the window.
         """
-        began = time.perf_counter()
-        recording = self.recording
+        recording, began = self.recording, time.perf_counter()
         width, height = recording.events.size
         table, count = self._table(start_us, length_us)
         pairs = self._pairs(table, start_us, length_us)
@@ -201,8 +203,7 @@ class Reconstruction:
         left, top, tiles = self._tile(start_us, length_us)
         solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
         residual, covered = _solve(solver, pair_count, last)
-        cut = np.s_[top : top + height, left : left + width]
-        unknowns = solver.unknowns
+        unknowns, cut = solver.unknowns, np.s_[top : top + height, left : left + width]
         log, known = unknowns[: tiles.nodes].reshape(tiles.rows, tiles.columns)[cut], covered[cut]
         log = log - np.median(log[known] if known.any() else log)
         if self.fill is Fill.NONE:
@@ -290,21 +291,21 @@ class Reconstruction:
 
     def _choose(self, count: NDArray[np.int32], pairs: PairSet, start_us: int, length_us: int, off: float) -> float:
         """Return the smoothness weight with the lowest cost of held-out pairs, in the busiest part of the image."""
-        x0, y0 = busiest_square(count, CHOICE_SQUARE)
-        part = pairs.of_square(x0, y0, CHOICE_SQUARE)
+        x0, y0, side = choice_square(count)
+        part = pairs.of_square(x0, y0, side)
         if part.hold_out(HOLD_OUT_EVERY) < 50:
             return SMOOTHNESS[-1]
         left, top, _ = self._tile(start_us, length_us)
-        shape = (CHOICE_SQUARE + 2 * top, CHOICE_SQUARE + 2 * left)
-        tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), *shape, 1.0)
+        tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), side + 2 * top, side + 2 * left, 1.0)
         solver = self._solver(part, tiles, off, start_us + length_us // 2)
-        scores = []
-        for weight in SMOOTHNESS:
+
+        def cost(weight: float) -> float:
             solver.restart(weight)
             for scale in SCALES[:2]:
                 solver.solve(scale, steps=STEPS)
-            scores.append(solver.residuals.mean_cost(SCALES[0], held=True))
-        return SMOOTHNESS[int(np.nanargmin(scores))]
+            return solver.residuals.mean_cost(SCALES[0], held=True)
+
+        return lowest_weight(cost)
 
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
         """Return the map's margin left of and above the image (columns, rows), and the map of a window."""

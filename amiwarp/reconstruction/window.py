@@ -1,4 +1,4 @@
-"""Properties of one time window: time, size of the map, busiest part of the image, ratio of the thresholds."""
+"""Properties of one time window: time, size of the map, smoothness, ratio of the thresholds."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from amiwarp.events.encoder import TWO_PI
 from amiwarp.optics.camera_rotation import CameraRotation, border
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from amiwarp.events.events import EventSource
@@ -20,6 +22,12 @@ if TYPE_CHECKING:
 
 LARGEST_MARGIN = 0.5
 """Largest margin of the map on each side of the image, relative to the image's width."""
+SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
+"""Candidate weights of the smoothness prior, ascending; held-out equations choose among them."""
+CHOICE_SQUARES = (64, 96)
+"""Sides of the square of pixels in which the smoothness is chosen [px]."""
+CHOICE_EVENTS = 24_000
+"""Number of events that suffices for the choice in the smaller square."""
 STILL_WINDOW_US = 100_000
 """Default length of a time window if the prism does not turn [us]."""
 
@@ -59,12 +67,30 @@ def border_displacements(model: Model) -> NDArray[np.float64]:
     return away[np.isfinite(away).all(axis=1)]
 
 
-def busiest_square(count: NDArray[np.int32], side: int) -> tuple[int, int]:
-    """Return first column and row of the square of ``side`` px with the most events; ``count``: events per pixel."""
-    rows = np.add.reduceat(count, np.arange(0, count.shape[0], side), axis=0)
-    cells = np.add.reduceat(rows, np.arange(0, count.shape[1], side), axis=1)
-    row, column = np.unravel_index(int(cells.argmax()), cells.shape)
-    return int(column) * side, int(row) * side
+def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
+    """Return first column, first row and side of the square of pixels in which the smoothness is chosen.
+
+    It is the square with the most events, of the smallest side with enough events. ``count``: events per pixel, shape
+    ``(height, width)``.
+    """
+    for side in CHOICE_SQUARES:
+        rows = np.add.reduceat(count, np.arange(0, count.shape[0], side), axis=0)
+        cells = np.add.reduceat(rows, np.arange(0, count.shape[1], side), axis=1)
+        row, column = np.unravel_index(int(cells.argmax()), cells.shape)
+        if cells.max() >= CHOICE_EVENTS:
+            break
+    return int(column) * side, int(row) * side, side
+
+
+def lowest_weight(cost: Callable[[float], float]) -> float:
+    """Return the weight of :data:`SMOOTHNESS` with the lowest cost.
+
+    The cost falls and then rises with the weight. So the two middle weights show on which side the lowest cost is.
+    """
+    weakest, weak, strong, strongest = SMOOTHNESS
+    weak_cost, strong_cost = cost(weak), cost(strong)
+    inner, outer = (weak, weakest) if weak_cost < strong_cost else (strong, strongest)
+    return outer if cost(outer) < min(weak_cost, strong_cost) else inner
 
 
 def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: int, length_us: int) -> float:

@@ -7,6 +7,7 @@ to maintain, nothing extra to install, and the inspector works in the same way o
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import secrets
 import shutil
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.io.atomic_output import check_output
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.cloud_scene import Look, Scene
+from amiwarp.viewer.comparison import RECORDED
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.library import Library
 from amiwarp.viewer.page_values import SETTABLE
@@ -190,6 +192,8 @@ def save_screenshot(
 
     check_output(path)
     look = look or Look()
+    if not math.isfinite(inspector.turn_us):
+        look = look.for_clouds([RECORDED])
     with closing(Scene(size)) as scene:
         scene.show(inspector.show(), look)
         scene.look_from(view, look)

@@ -35,7 +35,7 @@ CAMERA_DIRECTIONS = {
     View.FREE: ((1.0, -1.35, 0.75), (0.0, 0.0, 1.0)),
     View.XY: ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
     View.X_AXIS: ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
-    View.Y_AXIS: ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    View.Y_AXIS: ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
 }
 """Direction from the clouds to the camera, and the upward direction, for each view."""
 ORBIT_COLOUR = "#009e73"
@@ -61,11 +61,17 @@ class Look:
     dark: bool = False
     """Whether the background is dark."""
     overlaid: bool = False
-    """Whether both clouds are drawn in one frame, with the recorded cloud in grey."""
+    """Whether both clouds are drawn in one frame, with the first one in grey."""
+    titles: tuple[str, ...] = ("as recorded", "compensated")
+    """Titles of the clouds. With a single title, only the second cloud is drawn."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
         object.__setattr__(self, "axis", choice(Axis, self.axis, "axis"))
+
+    def for_clouds(self, titles: Sequence[str]) -> Look:
+        """Return the look for clouds with these titles. A single cloud gets the whole picture."""
+        return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
 
 
 @dataclass(frozen=True)
@@ -152,7 +158,7 @@ class Scene:
         for k, xy in enumerate((shown.before, shown.after)):
             points = self.box.positions(xy, third)
             colours = colours_of(shown, look, after=k == 1)
-            valid = np.isfinite(points).all(axis=1)
+            valid = np.isfinite(points).all(axis=1) & (k == 1 or len(look.titles) > 1)
             self._cloud(k, points[valid], colours[valid], look)
         self._draw_frame(look)
         self._draw_lines(lines, look)
@@ -232,7 +238,7 @@ class Scene:
 
     def _draw_frame(self, look: Look) -> None:
         """Draw the box, the ticks and the axis titles, if they have changed."""
-        wanted = (self.box, look.axis, look.dark, look.overlaid, self.view)
+        wanted = (self.box, look.axis, look.dark, look.overlaid, look.titles, self.view)
         if wanted == self._framed:
             return
         self._framed = wanted
@@ -248,7 +254,7 @@ class Scene:
         for k, actor in self._frame:
             self.plotter.renderers[k].remove_actor(actor, render=False)
         self._frame = []
-        titles = ("as recorded and compensated",) if look.overlaid else ("as recorded", "compensated")
+        titles = (" and ".join(look.titles),) if look.overlaid else look.titles
         for k, title in enumerate(titles):
             self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
 
@@ -310,8 +316,9 @@ class Scene:
             place = (b.right + gap, -b.top + 1.2 * gap, 0.0) if flat else (b.right + 2.5 * gap, middle[1], -2.5 * gap)
             labels.append(("y [px]", place))
         if self.view is not View.XY:
-            labels += [(f"{v:g}", (b.left - gap, front + gap, (v - b.low) * b.stretch)) for v in ticks(b.low, b.high)]
-            labels.append((unit, (b.left - gap, front + gap, b.axis_height + 1.5 * gap)))
+            y = -b.top + gap if self.view is View.Y_AXIS else front + gap  # on the left
+            labels += [(f"{v:g}", (b.left - gap, y, (v - b.low) * b.stretch)) for v in ticks(b.low, b.high)]
+            labels.append((unit, (b.left - gap, y, b.axis_height + 1.5 * gap)))
         for text, place in labels:
             label = pyvista.Label(text, position=place, size=13)
             label.prop.color, label.prop.justification_horizontal = ink, "center"

@@ -16,6 +16,10 @@ AGAINST = {
 """What the left cloud and image can show: name, and title."""
 
 
+RECORDED = "events as recorded"
+"""Title of the only cloud, if there is no motion to compensate."""
+
+
 class Comparison:
     """Comparison of the current parameters of a page (A) with others."""
 

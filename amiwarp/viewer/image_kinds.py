@@ -177,15 +177,17 @@ def _counts(
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
     events, (width, height) = window.events, inspector.recording.events.size
-    xy = inspector.positions(events, knobs)
-    with np.errstate(invalid="ignore"):
-        pixel = np.rint(xy)
-        inside = ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
-    column, row = pixel[inside].astype(np.int64).T
-    surface = np.full(width * height, np.nan, np.float32)
+    if knobs is None:
+        pixel = events.y.astype(np.int64) * width + events.x
+    else:
+        x, y = np.rint(inspector.positions(events, knobs)).T
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        with np.errstate(invalid="ignore"):
+            pixel = np.where(inside, y.astype(np.int64) * width + x.astype(np.int64), width * height)
+    surface = np.full(width * height + 1, np.nan, np.float32)  # the last element takes the events outside of the image
     # events are in order of time; of several values for one pixel, NumPy keeps the last
-    surface[row * width + column] = (events.t[inside] - window.span.start_us) * 1e-3
-    return surface.reshape(height, width)
+    surface[pixel] = (events.t - window.span.start_us) * 1e-3
+    return surface[:-1].reshape(height, width)
 
 
 def _log_images(inspector: Inspector, window: LoadedWindow, knobs: Knobs, against: Knobs | None) -> ShownImages:

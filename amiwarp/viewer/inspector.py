@@ -19,6 +19,7 @@ from amiwarp.events.encoder_speed import turn_between
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.camera import Camera
+from amiwarp.reconstruction.window import border_displacements
 from amiwarp.viewer import parameters
 from amiwarp.viewer.imager import MeasuredImage, WindowImager
 from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source
@@ -234,7 +235,9 @@ class Inspector:
         loaded = self.loaded
         if self.selection.region is not None:
             loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
-        return suggest_region(self._unmoved(loaded).image, self._measured(loaded, self.knobs).image)
+        before, after = self._unmoved(loaded).image, self._measured(loaded, self.knobs).image
+        orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
+        return suggest_region(before, after, margin=math.ceil(orbit_px))
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
         """Return the time window's images and points.
@@ -335,11 +338,9 @@ class Inspector:
         given = self._unprismed if knobs is None else knobs
         return self.model_of(given), self._angles(w, given).on_device, self._drift_us(given)
 
-    def positions(self, events: Events, knobs: Knobs | None) -> NDArray[np.float32]:
-        """Return the compensated positions of events [px], shape ``(n, 2)``; those recorded if ``knobs`` is None."""
+    def positions(self, events: Events, knobs: Knobs) -> NDArray[np.float32]:
+        """Return the compensated positions of events [px], shape ``(n, 2)``."""
         xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
-        if knobs is None:
-            return xy
         theta = self.encoder_of(knobs).angle_at(events.t).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 

@@ -153,22 +153,24 @@ def summary(found: FoundCalibration) -> str:
 
 def live_state(f: LiveFigures) -> dict[str, Any]:
     """Return the figures of a stream for the page: rows of name, value and whether it is bad, and what is wrong."""
+    angles, speed = f.connected and not f.no_angles, "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm"
+    fresh = angles and f.turn_share >= 1.0
     rows: list[tuple[str, str, bool]] = [
-        ("connection", "receiving" if f.connected else "interrupted, last events shown", not f.connected),
+        ("events", "receiving" if f.connected else "interrupted, last ones shown", not f.connected),
+        ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
         ("rate", f"{f.rate_mev_s:.2f} million events/s", False),
         ("latency", f"{f.latency_ms:.0f} ms" if f.connected else "–", f.connected and f.latency_ms > 1e3),
         ("turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0),
-        ("speed of the prism", "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm", f.rpm is None),
+        ("speed of the prism", speed if fresh else f"{speed}, last measured", f.rpm is None or not fresh),
         ("lost events", f"{f.dropped:,}", f.dropped > 0), ("out of order", f"{f.late:,}", f.late > 0),
     ]  # fmt: skip
     if f.connected and f.message:
         rows.append(("last message", f.message, False))
     message = "" if f.message == f.problem else f.message
-    note = f"The stream is interrupted: {f.problem}. {message}".strip()
-    return {
-        "live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows],
-        "stream_note": "" if f.connected else note,
-    }
+    note = "" if f.connected else f"The stream is interrupted: {f.problem}. {message}".strip()
+    if f.no_angles:
+        note = f"No prism angles arrive: {f.no_angles}. The last turn before it is shown, until they return."
+    return {"live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows], "stream_note": note}
 
 
 def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration | None) -> dict[str, Any]:
@@ -212,6 +214,13 @@ class Playback:
         self.runs = True
         self._panel.start_job(self._play())
 
+    async def watch(self, source: LiveSource) -> None:
+        """Show the figures of a live stream, also while it is not followed, until the page is closed."""
+        while True:
+            with self._panel.state as state:
+                state.update(live_state(source.figures()))
+            await asyncio.sleep(FOLLOW_S)
+
     async def _play(self) -> None:
         try:
             await (self._run() if self._panel.inspector.latest is None else self._follow())
@@ -238,9 +247,6 @@ class Playback:
         while state.playing:
             with state:
                 panel.renew()
-                latest = panel.inspector.latest
-                if isinstance(latest, LiveSource):
-                    state.update(live_state(latest.figures()))
             await panel.wait_until_drawn()
             await asyncio.sleep(FOLLOW_S)
         panel.slider_released()

@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
     from amiwarp.live.stream.recent_events import RecentEvents
 
-SILENT_S = 1.0
-"""Time without events after which a stream counts as interrupted [s]."""
-
 
 @dataclass(frozen=True)
 class LiveFigures:
@@ -25,6 +22,8 @@ class LiveFigures:
     """Whether events arrive."""
     problem: str
     """Why no events arrive; empty if they do."""
+    no_angles: str
+    """Why no angles of the prism arrive; empty if they do, or if no events arrive either."""
     rate_mev_s: float
     """Rate of the received events [million events/s]."""
     latency_ms: float
@@ -36,7 +35,7 @@ class LiveFigures:
     late: int
     """Number of events that arrived out of order and got a later time."""
     rpm: float | None
-    """Speed of the prism [turns/min]; None if it is unknown."""
+    """Measured speed of the prism in the last turn of the shown events [turns/min]; None if it is unknown."""
     message: str
     """Latest message of the source or of the controller; empty if there was none."""
 
@@ -61,12 +60,12 @@ class LiveSource:
 
     def figures(self) -> LiveFigures:
         """Return the figures of this moment."""
-        recent, status, age_s = self._recent, self._recent.status, self._recent.age_s
-        problem = recent.ended or (f"no events for {age_s:.0f} s" if age_s > SILENT_S else "")
+        recent, status, problem = self._recent, self._recent.status, self._recent.silence
         last, encoder = self._last.events.t_last, self._last.encoder
         turn_us = 2e6 if encoder is None else min(2e6, 60e6 / max(abs(encoder.rpm), 1.0))
         rpm = None if encoder is None else rpm_between(encoder, round(last - turn_us), last)
         return LiveFigures(
-            not problem, problem, 0.0 if problem else status.rate_mev_s, 1e3 * age_s, recent.turn_share, status.dropped,
-            status.late, rpm, self._messages[-1] if self._messages else "",
+            not problem, problem, "" if problem else recent.encoder_silence, 0.0 if problem else status.rate_mev_s,
+            1e3 * recent.age_s, recent.turn_share, status.dropped, status.late, rpm,
+            self._messages[-1] if self._messages else "",
         )  # fmt: skip

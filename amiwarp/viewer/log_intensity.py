@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 MOST_WORK = 500_000
 """Largest number of events and pixels together from which a picture is made, so that it takes about a second on two
 cores. Of a larger region, only every second (third, ...) column and row is used."""
+PREPARING_SHARE = 0.01
+"""Share of these events and pixels in the picture that is made only to compile and load its kernels."""
 SAME_RESIDUAL = 0.25
 """Relative change of the residual up to which the weight of the smoothness prior is kept."""
 
@@ -40,8 +43,24 @@ class LogIntensity:
     """Number of equations, their residual, and what limits the picture."""
 
 
-def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs) -> LogIntensity:
+_prepared: set[str] = set()
+"""Devices on which :func:`prepare` has run."""
+
+
+def prepare(inspector: Inspector) -> None:
+    """Compile and load what a log intensity needs, once per device, so that the first one takes no longer."""
+    if str(inspector.device) in _prepared:
+        return
+    with suppress(AmiwarpError):
+        window = replace(inspector.loaded, chosen=[])
+        log_intensity(inspector, window, inspector.knobs, share=PREPARING_SHARE)
+        _prepared.add(str(inspector.device))
+
+
+def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs, *, share: float = 1.0) -> LogIntensity:
     """Reconstruct the log intensity of a window's region with given parameters.
+
+    ``share``: share of :data:`MOST_WORK` that it may use.
 
     Raises :class:`AmiwarpError` if the prism does not rotate, or if no pixel fires twice.
     """
@@ -49,7 +68,7 @@ def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs) -> L
     if not math.isfinite(turn_us):
         raise AmiwarpError("the log intensity needs a prism that rotates; set its speed (rpm), or calibrate")
     left, top, right, bottom = _wide(inspector, window)
-    part = select_part(inspector, window, (left, top, right, bottom), most=MOST_WORK, longest_us=turn_us)
+    part = select_part(inspector, window, (left, top, right, bottom), most=share * MOST_WORK, longest_us=turn_us)
     step = part.step
     if knobs.focal_length is not None:
         knobs = replace(knobs, focal_length=knobs.focal_length / step)

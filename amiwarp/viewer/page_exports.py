@@ -89,13 +89,16 @@ class Exports:
         window, selection, step_us = panel.inspector.window, panel.inspector.selection, 1e6 / FPS * float(state.speed)
         look = Look(Colour(state.colour), Axis(state.axis), float(state.point_size), float(state.opacity),
                     dark=bool(state.dark), overlaid=bool(state.overlaid))  # fmt: skip
+        look, against = look.for_clouds([title for _, title in state.titles]), panel.comparison.knobs
         view, loop = View(state.view[0]), asyncio.get_running_loop()
         with_orbit = bool(state.orbit_shown) and look.axis is Axis.ANGLE and panel.compensates
         assert window is not None
 
         def draw(scene: Scene) -> None:
-            shown = inspector.show()
-            scene.show(shown, look, orbit_lines(inspector, shown) if with_orbit else ())
+            shown = inspector.show(against=against)
+            orbit, column = orbit_lines(inspector, shown)
+            lines = (orbit if against is None else column, column)
+            scene.show(shown, look, lines if with_orbit else ())
 
         def pictures() -> Iterator[NDArray[np.uint8]]:
             inspector.open(*window, selection)

@@ -21,6 +21,7 @@ from amiwarp.viewer.comparison import Comparison
 from amiwarp.viewer.frames import wait_until_page_keeps_up
 from amiwarp.viewer.jobs import CalibrationJob, Playback
 from amiwarp.viewer.layout import NAMES, SLIDERS, UNITS, template
+from amiwarp.viewer.live_source import LiveSource
 from amiwarp.viewer.page_calls import PageCalls
 from amiwarp.viewer.page_exports import Exports
 from amiwarp.viewer.page_files import use_page
@@ -87,8 +88,11 @@ class Panel:
         self.rates.start()
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.slider_released()
+        self.request_slow("preparation")
         if inspector.latest is not None:
             self.playback.toggle()
+        if isinstance(inspector.latest, LiveSource):
+            self.start_job(self.playback.watch(inspector.latest))
 
     async def open_file(self, name: str) -> None:
         """Show another recording of the library."""
@@ -153,7 +157,7 @@ class Panel:
             self._quick = self._task(self._work())
 
     def request_slow(self, *what: str) -> None:
-        """Request updates that run in a thread after all quick updates: "curve" or "picture"."""
+        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
         self._slow_requests.update(what)
         self._show_pending()
         if self._slow is None:
@@ -281,7 +285,7 @@ class Panel:
         try:
             while self._slow_requests:
                 await self.wait_until_drawn()
-                name = min(self._slow_requests)  # the curve comes before the picture
+                name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
                 self._slow_requests.discard(name)
                 async with self._done({name}), self.device_lock:
                     with self.errors_shown(name):

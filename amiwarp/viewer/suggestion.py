@@ -17,16 +17,17 @@ if TYPE_CHECKING:
     from amiwarp.viewer.imager import Region
 
 WIDEST, NARROWEST = 120, 60
-"""Largest width of a suggested region, and its width on a small sensor [px]."""
+"""Largest width of a suggested region, and its width on a small sensor or if there are very many events [px]."""
+CLEAR_EVENTS = 50_000
+"""Number of events above which a narrower region is suggested, because so many points hide each other in the cloud."""
 LEAST_SIGMA = 5.0
 """Smallest gain of variance over mean, in standard deviations of that of random events, that shows an effect."""
 NEARLY_BEST = 0.5
-"""Share of the largest gain of variance from which a region is a candidate. The candidate with the largest gain of
-sharpness is chosen.
+"""Share of the largest gain of variance from which a region is a candidate. The candidate whose sharpness gains the
+largest factor is chosen.
 
 The variance grows with the square of the number of events, so that nearly empty regions are no candidates.
 """
-
 LEAST_SHARE = 0.8
 """Smallest ratio of the number of recorded events to that of compensated events in a candidate: its edges do not come
 from outside."""
@@ -43,27 +44,50 @@ class Suggestion:
     """
 
 
-def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32]) -> Suggestion:
+def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, margin: int = 0) -> Suggestion:
     """Return the region in which compensation gains most sharpness.
 
     If it gains nothing anywhere, return the region of the recorded image that has most structure. ``before`` and
     ``after`` are images of the same events as recorded and compensated [events per pixel], shape ``(height, width)``.
+    ``margin``: distance that the region keeps from the border of the image if it can [px]. If it is the radius of the
+    orbit, no events of the region were outside of the image during a part of the turn.
     """
     rows, columns = before.shape
     width = min(columns, WIDEST, max(columns // 3, NARROWEST))
-    height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
+    while True:
+        height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
+        left, top, gains = _best_box(before, after, width, height, margin)
+        events = float(before[top : top + height, left : left + width].sum())
+        if events <= CLEAR_EVENTS or width <= NARROWEST:
+            return Suggestion((left, top, left + width, top + height), gains)
+        width = max(NARROWEST, min(width - 1, int(width * (CLEAR_EVENTS / events) ** 0.5)))
+
+
+def _best_box(
+    before: NDArray[np.float32], after: NDArray[np.float32], width: int, height: int, margin: int
+) -> tuple[int, int, bool]:
+    """Return left and top of the best box of a size, and whether compensation sharpens it."""
     mean, over_mean = _of_boxes(before, width, height)
     mean_after, over_mean_after = _of_boxes(after, width, height)
     noise = random_variance(SMOOTHING_PX)
-    sharp, sharp_after = (over_mean - noise) / mean, (over_mean_after - noise) / mean_after
-    variance, sharper = mean_after * over_mean_after - mean * over_mean, sharp_after - sharp
+    # the variance of random events stays in the divisor, so that a region without structure has no arbitrary factor
+    factor = (over_mean_after - noise) / mean_after / (np.maximum(over_mean, noise) / mean)
+    variance = mean_after * over_mean_after - mean * over_mean
     variance = np.where(mean >= LEAST_SHARE * mean_after, variance, 0.0)
-    gains = bool((over_mean_after - over_mean).max() > LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5)
+    inner = _inner(variance.shape, margin)
+    gains = bool((over_mean_after - over_mean)[inner].max() > LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5)
     if not gains:
-        variance = sharper = mean * over_mean
-    candidates = np.where(variance >= NEARLY_BEST * variance.max(), sharper, -np.inf)
+        variance = factor = mean * over_mean
+    candidates = np.full(variance.shape, -np.inf)
+    candidates[inner] = np.where(variance[inner] >= NEARLY_BEST * variance[inner].max(), factor[inner], -np.inf)
     top, left = np.unravel_index(int(np.argmax(candidates)), candidates.shape)
-    return Suggestion((int(left), int(top), int(left) + width, int(top) + height), gains)
+    return int(left), int(top), gains
+
+
+def _inner(shape: tuple[int, ...], margin: int) -> tuple[slice, ...]:
+    """Return the part of an array without a margin on each side, at least its middle."""
+    margins = (min(margin, (n - 1) // 2) for n in shape)
+    return tuple(slice(m, n - m) for m, n in zip(margins, shape, strict=True))
 
 
 def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

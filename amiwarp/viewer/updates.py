@@ -8,6 +8,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.viewer.choices import Axis, Colour
+from amiwarp.viewer.comparison import RECORDED
 from amiwarp.viewer.drawing import (
     NO_ORBIT,
     cloud_state,
@@ -21,6 +22,7 @@ from amiwarp.viewer.drawing import (
 )
 from amiwarp.viewer.image_kinds import ImageKind, ShownImages, count_images, make_images
 from amiwarp.viewer.layout import UNITS
+from amiwarp.viewer.log_intensity import prepare
 from amiwarp.viewer.page_values import events_text, sharpness_text, truths
 from amiwarp.viewer.phase_estimate import estimate_phase
 from amiwarp.viewer.selected_calibration import scope_text
@@ -72,8 +74,11 @@ class Updates:
                 panel.history.remember("" if todo & {"suggestion", "state"} else panel.change)
 
     async def make_slow(self, name: str) -> None:
-        """Make a slow update: "curve" or "picture"."""
-        await (self._curve() if name == "curve" else self._picture())
+        """Make a slow update: "curve", "picture", or "preparation" of the first picture."""
+        if name == "preparation":
+            await self._panel.in_thread(prepare, self._panel.inspector)
+        else:
+            await (self._curve() if name == "curve" else self._picture())
 
     def pick(self, k: int) -> None:
         """Describe a drawn event, and show its orbit; -1 for none."""
@@ -111,7 +116,7 @@ class Updates:
         pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
         text = "" if self._picked < 0 else event_text(shown, self._picked)
         return shown, {
-            **values, "titles": pair if compensated else [[0, "events as recorded"]], "events": events_text(shown),
+            **values, "titles": pair if compensated else [[0, RECORDED]], "events": events_text(shown),
             "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
             "against_title": left, "against_choices": panel.comparison.choices,
         }  # fmt: skip
@@ -164,8 +169,9 @@ class Updates:
         x = (values / UNITS[name]).tolist()
         if not x:
             return
-        best = x[int(np.argmax(scores))]
-        s.curve = {"name": label, "title": title, "text": f"highest at {best:.4g}; now {s[name]:.4g}", "x": x,
+        best = int(np.argmax(scores))
+        peak = f"{'at the edge ' if best in (0, len(x) - 1) else ''}{x[best]:.4g}"
+        s.curve = {"name": label, "title": title, "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
                    "y": scores.tolist(), "truth": truths(panel.inspector)[name]}  # fmt: skip
         s.curve_mark = float(s[name])
 

@@ -46,16 +46,18 @@ def load_window(
     region = selection.region or (0, 0, *recording.events.size)
     left, top, right, bottom = region
     wide = (left - margin_px, top - margin_px, right + margin_px, bottom + margin_px)
-    near = np.flatnonzero(kept(recording, span.events, selection, wide, hot))
-    events = span.events if len(near) == len(span.events) else span.events[near]
-    within = np.flatnonzero(inside(events, region)) if selection.region else np.arange(len(events))
-    n = len(within)
+    keep = kept(recording, span.events, selection, wide, hot)
+    near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
+    events = span.events if near is None else span.events[near]
+    within = np.flatnonzero(inside(events, region)) if selection.region else None
+    n = len(events) if within is None else len(within)
     if not n:
         what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
         raise AmiwarpError(f"{what} from {(span.start_us - recording.events.t_first) * 1e-3:.3f} ms on for "
                            f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
-    thin = within[np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)]
-    drawn, truth = events[thin], DrawnTruth(recording.truth, span, near[thin])
+    thin = np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)
+    thin = thin if within is None else within[thin]
+    drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
     xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
     curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
     return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)

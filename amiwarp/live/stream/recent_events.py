@@ -15,6 +15,7 @@ import numpy as np
 from amiwarp.compensation.streams import OVERHEAD, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.encoder_stream import start_of_last_run
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.live.stream.queue_policy import Policy
@@ -34,6 +35,8 @@ SECONDS, MOST_BYTES = 2.0, 1 << 27
 
 Encoder samples have a memory limit of the same size.
 """
+SILENT_S = 1.0
+"""Time without events or encoder samples after which they count as interrupted [s]."""
 FIRST_S = 15.0
 """Longest wait for the first turn of the prism when a stream starts [s]."""
 
@@ -54,7 +57,9 @@ class RecentEvents:
         """Rate, losses and speed of the stream, from its last report."""
         self.ended = ""
         """Why the stream has ended; empty while it runs."""
-        self._arrived_s = time.monotonic()
+        self.link: Link | None = None
+        """Link to the controller that sends the encoder samples; None if they come with the events."""
+        self._arrived_s = self._sampled_s = time.monotonic()
         self._lock = threading.Lock()
 
     def append(self, events: Events) -> None:
@@ -74,6 +79,7 @@ class RecentEvents:
         """
         if len(t_us):
             with self._lock:
+                self._sampled_s = time.monotonic()
                 self._samples.append((t_us, angle))
                 self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
                 since = int(t_us[-1]) - round(2e6 * SECONDS)
@@ -86,16 +92,33 @@ class RecentEvents:
         """Time since the latest events arrived [s]."""
         return time.monotonic() - self._arrived_s
 
+    @property
+    def silence(self) -> str:
+        """Why no events arrive; empty if they do."""
+        return self.ended or _silence("events", self.age_s)
+
+    @property
+    def encoder_silence(self) -> str:
+        """Why no encoder samples arrive; empty if they do."""
+        if self.link is not None and not self.link.connected:
+            return f"the port {self.link.name} of the controller is gone"
+        return _silence("encoder samples", time.monotonic() - self._sampled_s)
+
     def tick(self) -> None:
         """Do nothing, because no data wait to be written."""
 
     def recording(self) -> Recording | None:
-        """Return the kept events that the encoder covers, as a recording; None if they are shorter than one turn."""
+        """Return the kept events that the encoder covers, as a recording; None if they are shorter than one turn.
+
+        Events before a gap or a restart of the encoder samples are left out, because their angles do not continue.
+        """
         with self._lock:
             events, samples = list(self._events), list(self._samples)
         if not samples or not events:
             return None
         t, angle = (np.concatenate(column) for column in zip(*samples, strict=True))
+        run = start_of_last_run(t)
+        t, angle = t[run:], angle[run:]
         if len(t) < 2:
             return None
         joined = Events.concatenate(events)
@@ -111,6 +134,10 @@ class RecentEvents:
         return Recording(MemoryEvents(covered, *self._size), self._camera, encoder, self._prism, name=self._name)
 
 
+def _silence(what: str, seconds: float) -> str:
+    return f"no {what} for {seconds:.0f} s" if seconds > SILENT_S else ""
+
+
 @contextlib.contextmanager
 def followed(source: Source, link: Link | None, recent: RecentEvents, say: Callable[[str], None]) -> Iterator[None]:
     """Fill ``recent`` from a source, in a background thread, while the ``with`` block runs.
@@ -118,7 +145,7 @@ def followed(source: Source, link: Link | None, recent: RecentEvents, say: Calla
     Waits for the first turn of the prism. Raises :class:`AmiwarpError` if it does not come in time, or the error of the
     source.
     """
-    stop, failures = threading.Event(), []
+    stop, failures, recent.link = threading.Event(), [], link
 
     def report(status: SessionStatus) -> None:
         recent.status = replace(status)

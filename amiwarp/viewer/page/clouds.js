@@ -124,18 +124,18 @@ export const EventClouds = {
         context.beginPath();
         context.rect(0, 0, pane.width, pane.height);
         context.clip();
-        drawContent(context, projection, pane, ink, font);
+        drawContent(context, projection, pane, [ink, paper], font);
         context.restore();
       });
       view.dataset.frames = Number(view.dataset.frames || 0) + 1;
     }
 
-    function drawContent(context, projection, pane, ink, size) {
+    function drawContent(context, projection, pane, [ink, paper], size) {
       const [left, top, right, bottom] = props.box;
       const axes = [
         { low: left, high: right, title: 'x (px)' }, { low: top, high: bottom, title: 'y (px)', flipped: true }, props.axis,
       ];
-      drawFrame(context, projection, scene.half, axes, ink, size, [pane.width, pane.height]);
+      drawFrame(context, projection, scene.half, axes, [ink, paper], size, [pane.width, pane.height]);
       context.strokeStyle = ORBIT;
       context.lineWidth = 2.5;
       for (const k of pane.clouds) line(context, scene.lines[k], projection);

@@ -3,10 +3,10 @@
 import { corners } from './camera.js';
 import { text, ticks } from './ticks.js';
 
-const TICK_PX = [52, 32]; // least distance between two ticks along a flat and an upright axis
+const TICK_PX = [40, 32]; // least distance between two ticks along a flat and an upright axis
 
 // Draw the frame of a box. `axes` holds low, high and title of x, y and the third axis; y points down in images.
-export function drawFrame(context, projection, half, axes, ink, size, [width, height]) {
+export function drawFrame(context, projection, half, axes, [ink, paper], size, [width, height]) {
   const places = corners(half).map((corner) => projection.at(corner));
   const middle = projection.at([0, 0, 0]);
   context.strokeStyle = context.fillStyle = ink;
@@ -26,7 +26,7 @@ export function drawFrame(context, projection, half, axes, ink, size, [width, he
   const taken = [];
   const labels = [0, 1, 2].flatMap((axis) => axisLabels(places, middle, axis, axes[axis], size));
   for (const label of labels.filter((each) => each.title).concat(labels.filter((each) => !each.title))) {
-    write(context, label, taken, size + 2, [width, height]);
+    write(context, label, taken, size + 2, [width, height], paper);
   }
 }
 
@@ -55,11 +55,11 @@ function axisLabels(places, middle, axis, { low, high, title, flipped }, size) {
   const labels = ticks(low, high, length(edge) / TICK_PX[Number(upright)]).map((value) => ({
     text: text(value), place: at((value - low) / (high - low), 6), out, from: at((value - low) / (high - low), 0),
   }));
-  return [{ text: title, place: at(0.5, upright ? 4.3 * size : 1.85 * size), out, title: true, upright }, ...labels];
+  return [{ text: title, place: at(0.5, upright ? 4.3 * size : 2.9 * size), out, title: true, upright }, ...labels];
 }
 
 // Write a label, unless it would cover another one or leave the picture.
-function write(context, label, taken, tall, [W, H]) {
+function write(context, label, taken, tall, [W, H], paper) {
   const width = context.measureText(label.text).width;
   let [x, y] = label.place;
   const turned = label.title && label.upright;
@@ -80,6 +80,9 @@ function write(context, label, taken, tall, [W, H]) {
   if (turned) context.rotate(-Math.PI / 2);
   context.textAlign = 'center';
   context.textBaseline = 'middle';
+  context.strokeStyle = paper; // keeps the text readable on points
+  context.lineWidth = 3;
+  context.strokeText(label.text, 0, 0);
   context.fillText(label.text, 0, 0);
   context.restore();
   if (label.from) {

@@ -2,6 +2,8 @@
 
 import { text, ticks } from './ticks.js';
 
+const LEAST_SHARE = 0.18; // of a colour bar between two numbers
+
 const { computed, onMounted, ref, watch } = window.Vue;
 
 // Return the ticks of an axis with their places as shares of its length.
@@ -18,8 +20,8 @@ export const CurvePlot = {
       <svg viewBox="0 0 100 100" preserveAspectRatio="none" aria-hidden="true">
         <line v-for="t in across" :x1="100 * t.at" :x2="100 * t.at" y1="0" y2="100" class="grid"/>
         <line v-for="t in up" x1="0" x2="100" :y1="100 - 100 * t.at" :y2="100 - 100 * t.at" class="grid"/>
-        <line v-if="truth !== null && truth !== undefined" class="truth" :x1="share(truth)" :x2="share(truth)" y1="0" y2="100"/>
-        <line class="mark" :x1="share(mark)" :x2="share(mark)" y1="0" y2="100"/>
+        <line v-if="shown(truth)" class="truth" :x1="share(truth)" :x2="share(truth)" y1="0" y2="100"/>
+        <line v-if="shown(mark)" class="mark" :x1="share(mark)" :x2="share(mark)" y1="0" y2="100"/>
         <polyline :points="points"/>
       </svg>
       <span v-for="t in up" class="tick-y" :style="{ bottom: 100 * t.at + '%' }">{{ t.text }}</span>
@@ -34,7 +36,8 @@ export const CurvePlot = {
       const gap = 0.08 * (high - low) || 0.01;
       return [low - gap, high + gap];
     });
-    const share = (value) => 100 * Math.max(0, Math.min(1, (value - range.value[0]) / (range.value[1] - range.value[0])));
+    const share = (value) => (100 * (value - range.value[0])) / (range.value[1] - range.value[0]);
+    const shown = (value) => Number.isFinite(value) && Math.abs(share(value) - 50) <= 50.1; // nothing is moved to the end
     const points = computed(() => {
       const [low, high] = tall.value;
       return props.x.map((x, k) => `${share(x)},${100 - (100 * (props.y[k] - low)) / (high - low)}`).join(' ');
@@ -46,7 +49,7 @@ export const CurvePlot = {
       const at = (event.clientX - box.left) / box.width;
       emit('pick', range.value[0] + at * (range.value[1] - range.value[0]));
     }
-    return { share, points, across, up, clicked };
+    return { share, shown, points, across, up, clicked };
   },
 };
 
@@ -55,7 +58,7 @@ export const CostSurface = {
   template: `<div class="plot surface" role="img" :aria-label="label">
     <div class="plot-y">{{ yTitle }}</div>
     <div class="plot-box"><canvas ref="canvas"></canvas>
-      <span v-for="m in marks" class="cross" :class="m.kind" :style="{ left: share(m.x, x), bottom: share(m.y, y) }"
+      <span v-for="m in within" class="cross" :class="m.kind" :style="{ left: share(m.x, x), bottom: share(m.y, y) }"
         :title="m.title">{{ m.sign }}</span>
       <span v-for="t in placed(y[0], y[y.length - 1], 4)" class="tick-y" :style="{ bottom: 100 * t.at + '%' }">{{ t.text }}</span>
       <span v-for="t in placed(x[0], x[x.length - 1], 4)" class="tick-x" :style="{ left: 100 * t.at + '%' }">{{ t.text }}</span>
@@ -64,7 +67,9 @@ export const CostSurface = {
   </div>`,
   setup(props) {
     const canvas = ref(null);
-    const share = (value, axis) => `${100 * Math.max(0, Math.min(1, (value - axis[0]) / (axis[axis.length - 1] - axis[0])))}%`;
+    const share = (value, axis) => `${(100 * (value - axis[0])) / (axis[axis.length - 1] - axis[0])}%`;
+    const inside = (value, axis) => value >= axis[0] && value <= axis[axis.length - 1];
+    const within = computed(() => props.marks.filter((mark) => inside(mark.x, props.x) && inside(mark.y, props.y)));
     function draw() {
       const [width, height, flat] = [props.x.length, props.y.length, props.values.flat()];
       const [low, high] = [Math.min(...flat), Math.max(...flat)];
@@ -80,12 +85,17 @@ export const CostSurface = {
     }
     onMounted(draw);
     watch(() => props.values, draw);
-    return { canvas, share, placed };
+    return { canvas, share, within, placed };
   },
 };
 
 export const ColourBar = {
   props: { scale: Object },
   template: `<small class="colour-bar"><span class="bar" :style="{ background: scale.bar }"></span>
-    <span v-for="t in scale.ticks" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title">{{ scale.title }}</span></small>`,
+    <span v-for="t in apart" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title" :title="scale.title">{{ scale.title }}</span></small>`,
+  setup(props) {
+    const close = ([at], [before] = [-1]) => at - before < LEAST_SHARE;
+    const apart = computed(() => props.scale.ticks.reduce((kept, tick) => (close(tick, kept.at(-1)) ? kept : [...kept, tick]), []));
+    return { apart };
+  },
 };
