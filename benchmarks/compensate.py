@@ -183,8 +183,8 @@ def plain_copy(source: Path, result: Path, folder: Path) -> float:
         (folder / "copy").unlink()
 
 
-def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any]:
-    return Events(events.x, events.y, events.t + piece * int(events.t[-1] - events.t[0]), events.p), inside
+def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any, dict[str, list[bytes]]]:
+    return Events(events.x, events.y, events.t + piece * int(events.t[-1] - events.t[0]), events.p), inside, {}
 
 
 def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[str, float]:

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from amiwarp.calib import Calibration
-from amiwarp.calib.result import camera_from_json, camera_to_json
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.camera_json import camera_from_json, camera_to_json
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye, RadialTangential
 

@@ -17,7 +17,8 @@ from amiwarp.events.device_events import time_span
 from amiwarp.kernels import pairs as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
-from amiwarp.kernels.photometric import BLOCK, HELD, Pairs
+from amiwarp.kernels.pair_chains import BLOCK
+from amiwarp.kernels.photometric import HELD, Pairs
 from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:

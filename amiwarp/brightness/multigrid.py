@@ -14,8 +14,9 @@ from amiwarp.kernels.conjugate_gradients import gather
 
 COARSEST = 6
 """Smallest number of rows or columns of a grid; coarser grids are not made."""
-STRIDE = 8
-"""Every how many pairs of events one is used to estimate a coarse grid's diagonal, which need not be exact."""
+STRIDES = (3, 3, 7)
+"""Every how many pairs one is used to estimate the diagonal of the first grid, the second, and the further ones. They
+have no common divisor with the usual numbers of pairs per silent pixel. With fewer pairs, more steps are needed."""
 
 
 class GridHierarchy:
@@ -34,8 +35,9 @@ class GridHierarchy:
     def prepare(self, program: Any, equations: list[Any], count: int, sums: Any, slices: list[Any]) -> None:
         """Add to ``program`` the computation of the grids' diagonals for the current weights of the equations."""
         for level, diagonal in enumerate(self._diagonal, start=1):
-            inputs = [*equations, float(2**level), self.shapes[level][1], STRIDE]
-            program.add_slices(k.add_coarse_diagonal, count // STRIDE, inputs, slices)
+            stride = STRIDES[min(level, len(STRIDES)) - 1]
+            inputs = [*equations, float(2**level), self.shapes[level][1], stride]
+            program.add_slices(k.add_coarse_diagonal, count // stride, inputs, slices)
             program.add(gather, len(diagonal), [sums], [diagonal])
 
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:

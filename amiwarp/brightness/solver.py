@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.multigrid import GridHierarchy
+from amiwarp.brightness.pair_chains import FEW_BLOCKS, PairChains
 from amiwarp.brightness.residuals import CHUNKS, Residuals
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
@@ -25,7 +26,7 @@ from amiwarp.kernels.conjugate_gradients import dot, gather, gather_diagonal
 from amiwarp.kernels.launch import launch, slice_count
 from amiwarp.kernels.map_prior import EXTRA, Prior, link
 from amiwarp.kernels.pairs import keep_nodes
-from amiwarp.kernels.photometric import BLOCK, Geometry, add_diagonal, subtract, weigh
+from amiwarp.kernels.photometric import Geometry, add_diagonal, subtract, weigh
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
 from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
 
 DAMPING = 0.02
 """Weight of the squared map values relative to the equations. It determines unknowns that no equation does."""
-FEW_BLOCKS = 256
-"""Smallest number of blocks of pairs for which a second CPU thread is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +123,8 @@ class BrightnessMap:
             self._prior.held = tiles.nodes + 1  # of the sensor unknowns, the leak comes first
             self._image[-1:].fill_(off_excess)
         self.residuals = Residuals(pairs, len(tiles.origin))
-        self._scale = self._zeros(1)
-        self._geometry = self._new_geometry()
+        self._scale, self._solved = self._zeros(1), False
+        self._geometry, self._chains = self._new_geometry(), PairChains(pairs.arrays.stride, self.device)
 
     def _zeros(self, n: int) -> Any:
         return wp.zeros(n, dtype=float, device=self.device)
@@ -168,6 +167,7 @@ class BrightnessMap:
     def place(self, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
         """Compute the positions of the pairs on the map, for a model and a camera rotation about ``middle_us``."""
         self._place(model, drift, camera_rotation, self._geometry)
+        self._chains.join(self._geometry)
 
     def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
         """Compute the positions of the pairs into ``out``."""
@@ -186,8 +186,7 @@ class BrightnessMap:
             return
         inputs = [params, pinhole, arrays, self._atlas]
         if self.device.is_cpu:
-            blocks = arrays.stride // int(BLOCK)
-            launch(places.place_blocks, blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
+            launch(places.place_blocks, self._chains.blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
         else:
             launch(places.place_still, arrays.stride, inputs, [out], device=self.device)
 
@@ -222,6 +221,7 @@ class BrightnessMap:
         on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
         inputs = [on, self.pairs.arrays.on, self._geometry.stride]
         launch(keep_nodes, self.count, inputs, [self._geometry.cell], device=self.device)
+        self._chains.join(self._geometry)
 
     # -- solving
 
@@ -235,6 +235,9 @@ class BrightnessMap:
         for _ in range(rounds):
             self._weigh.run()
             self._prepare.run()
+            if not self._solved:  # the coarser grids need not follow the weights
+                self._prepare_grids.run()
+            self._solved = True
             self._descent.run(steps)
         self._weigh.run()
 
@@ -292,6 +295,13 @@ class BrightnessMap:
             program.add(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
         program.add_slices(add_diagonal, self.count, self._equations, self._slices)
         program.add(gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
+        self._chains.add_weights(program, self.residuals.weight)
+        return program
+
+    @cached_property
+    def _prepare_grids(self) -> Any:
+        """Program that computes the diagonals of the coarser grids for the current weights."""
+        program = Program(self.device)
         if self._grids is not None:
             self._grids.prepare(program, self._equations[1:], self.count, self._sums, self._slices)
         return program
@@ -374,12 +384,11 @@ class _ConjugateGradients:
             self._add(program, cg.update_search_direction, [], [of._u, of._dots])
         else:
             self._add(program, cg.update_search_direction_with, [of._z], [of._u, of._dots])
-        inputs = [*of._equations, of._u.direction]
         if of.device.is_cpu:
-            blocks = of.pairs.arrays.stride // int(kernels.BLOCK)
-            program.add_slices(kernels.apply_normal_blocks, blocks, inputs, of._slices, smallest=FEW_BLOCKS)
+            inputs = [of.pairs.arrays, of._atlas, of._chains.arrays, of._u.direction]
+            program.add_slices(kernels.apply_normal_blocks, of._chains.blocks, inputs, of._slices, smallest=FEW_BLOCKS)
         else:
-            program.add_slices(kernels.apply_normal, of.count, inputs, of._slices)
+            program.add_slices(kernels.apply_normal, of.count, [*of._equations, of._u.direction], of._slices)
         self._add(program, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
         self._add(program, cg.descend, [], [self.image, of._u, of._dots])
         self._correct(program)

@@ -18,11 +18,11 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.io.atomic_output import write_text
+from amiwarp.io.camera_json import camera_from_json, camera_to_json
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
-from amiwarp.optics.camera import CAMERA_NUMBERS, Camera
+from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.lens import DISTORTIONS
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import one_of, real, shown
@@ -312,30 +312,6 @@ def constant_speed(rpm: float, t_first: int, t_last: int, zero_us: int) -> Encod
     """Return an encoder of constant speed ``rpm`` [1/min] whose angle is 0 at ``zero_us``."""
     encoder = Encoder.constant_speed(rpm, t_first, t_last)
     return replace(encoder, angle=encoder.angle + (t_first - zero_us) * (rpm * 2.0 * math.pi / 60e6))
-
-
-def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Return a camera as a JSON object."""
-    out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
-    if camera.distortion is not None:
-        [kind] = (name for name, lens in DISTORTIONS.items() if isinstance(camera.distortion, lens))
-        out["distortion"] = {"kind": kind, **asdict(camera.distortion)}
-    return out
-
-
-def camera_from_json(data: Any, where: str = "") -> Camera:
-    """Return a camera from a JSON object.
-
-    ``where`` is the object's name in messages. Raises :class:`AmiwarpError` naming the field.
-    """
-    given = fields_of(data, where, *CAMERA_NUMBERS, optional=("distortion",))
-    prefix, lens = f"{where}." if where else "", given.get("distortion")
-    distortion = None
-    if lens is not None:
-        numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, f"{prefix}distortion")
-        kind = one_of(numbers.pop("kind", None), DISTORTIONS, f"field {prefix}distortion.kind")
-        distortion = build(DISTORTIONS[kind], numbers, f"{prefix}distortion")
-    return Camera(**{name: given[name] for name in CAMERA_NUMBERS}, distortion=distortion)
 
 
 def cost_surface(stages: tuple[StageSummary, ...], size: str) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.sensors import mean_rate
 from amiwarp.events.truth import Cause
 from amiwarp.io import open_recording
+from amiwarp.io.camera_json import camera_to_json
 from amiwarp.io.conversion import GAP_INTERVALS
 from amiwarp.io.file_scan import head_only
 from amiwarp.optics.prism import Prism
@@ -193,8 +194,6 @@ def _sensor_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _camera(recording: Recording) -> dict[str, Any]:
     """Return the camera's intrinsics and its field of view [deg]."""
-    from amiwarp.calib.result import camera_to_json
-
     camera = recording.camera
     assert camera is not None
     return {**camera_to_json(camera), "fov_deg": math.degrees(camera.fov)}

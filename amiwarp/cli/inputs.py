@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.camera_json import camera_from_json
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import read_json
 from amiwarp.io.text import read_calib
@@ -70,8 +71,6 @@ def read_camera(path: Path, width: int, height: int) -> Camera:
     ``width`` and ``height`` [px] are used for ``calib.txt`` only, which holds no size. Raises :class:`AmiwarpError`
     naming file and field.
     """
-    from amiwarp.calib.result import camera_from_json
-
     if path.suffix.lower() != ".json":
         return read_calib(path, width, height)
     data = read_json(path, "a camera")

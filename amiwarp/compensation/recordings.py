@@ -23,6 +23,7 @@ from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.native_reader import NativeEvents
+from amiwarp.io.native_writer import FlaggedEvents
 from amiwarp.kernels.event_arrays import join_columns
 from amiwarp.kernels.launch import launch
 from amiwarp.progress import Progress
@@ -279,23 +280,26 @@ def compensate(
     return CompensationSummary(done, outside, time.perf_counter() - began)
 
 
-def compensated_pieces(
-    source: EventSource, compensator: BlockCompensator
-) -> Iterator[Callable[[], tuple[Events, NDArray[np.uint8]]]]:
-    """Yield functions that each return one compensated piece of the recording.
+def compensated_pieces(source: EventSource, compensator: BlockCompensator) -> Iterator[Callable[[], FlaggedEvents]]:
+    """Yield functions that return the compensated events of each piece, as :meth:`RecordingWriter.fill` takes them.
 
-    Threads may call them in parallel; pieces of native files are then read in parallel too.
+    Threads may call them in parallel; pieces of native files are then read in parallel too, and their times and
+    polarities are not encoded again.
     """
     if isinstance(source, NativeEvents):
-        for read in source.pieces(PIECE):
-            yield partial(_read_and_compensate, read, compensator)
+        for start in range(0, len(source), PIECE):
+            yield partial(_compensate_stored, source, start, compensator)
     else:
         for events in source.blocks(count=PIECE):
-            yield partial(compensator, events)
+            yield partial(_compensate_piece, events, compensator)
 
 
-def _read_and_compensate(read: Callable[[], Events], compensator: BlockCompensator) -> tuple[Events, NDArray[np.uint8]]:
-    return compensator(read())
+def _compensate_stored(source: NativeEvents, start: int, compensator: BlockCompensator) -> FlaggedEvents:
+    return *compensator(source.slice(start, start + PIECE)), source.encoded_times_and_polarities(start, start + PIECE)
+
+
+def _compensate_piece(events: Events, compensator: BlockCompensator) -> FlaggedEvents:
+    return *compensator(events), {}
 
 
 def check_size(fitted: Calibration | Model, size: tuple[int, int], name: str, *, what: str = "calibration") -> None:

@@ -201,9 +201,13 @@ class StoredColumn:
         self._last = at, out
         return out
 
-    def _decode(self, at: int, out: NDArray[Any]) -> bool:
+    def encoded(self, at: int) -> bytes:
+        """Return the stored bytes of chunk ``at``."""
         offset, size = self._places[at]
-        return decode(os.pread(self._handle, size, offset), out)
+        return os.pread(self._handle, size, offset)
+
+    def _decode(self, at: int, out: NDArray[Any]) -> bool:
+        return decode(self.encoded(at), out)
 
 
 def append_chunk(dataset: Any, start: int, stored: bytes, count: int) -> None:

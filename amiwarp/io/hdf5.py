@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.chunks import StoredColumn
+from amiwarp.io.chunks import CHUNK, StoredColumn
 from amiwarp.io.reading_process import ReadingProcess, borrow, give_back
 
 PIECE = 1 << 20
@@ -108,6 +108,13 @@ class Column:
     def is_stored(self) -> bool:
         """Whether the dataset's chunks are read without HDF5."""
         return self._stored is not None
+
+    def encoded(self, start: int, stop: int) -> list[bytes] | None:
+        """Return the stored chunks of the elements with ``start <= index < stop``, which begin a chunk; None if HDF5
+        reads them."""
+        if self._stored is None:
+            return None
+        return [self._stored.encoded(at // CHUNK) for at in range(start, stop, CHUNK)]
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return the elements with ``start <= index < stop``. Raises :class:`AmiwarpError` for damaged data."""

@@ -149,6 +149,19 @@ class NativeEvents:
         for start in range(0, self._count, count):
             yield partial(self.slice, start, start + count)
 
+    def encoded_times_and_polarities(self, start: int, stop: int) -> dict[str, list[bytes]]:
+        """Return the stored chunks of times and polarities with ``start <= index < stop``, by name of the dataset.
+
+        A recording of the same events from the first one on holds the same chunks. ``start`` begins a chunk. Empty for
+        files of other formats, unfinished files, and times that do not start at the first event.
+        """
+        root = self._file.attributes("/") or {}
+        if root.get("format") != FORMAT or self._file.unfinished or self._offset != self.t_first:
+            return {}
+        chunks = {n: self._columns[n].encoded(start, min(stop, self._count)) for n in ("t", "p")}
+        dtypes = {"t": np.dtype(np.int64), "p": np.dtype(np.uint8)}
+        return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == dtypes[n]}
+
     def _pieces_in_order(self) -> Iterator[Events]:
         with contextlib.closing(in_order(self.pieces(CHUNK))) as pieces:
             yield from pieces

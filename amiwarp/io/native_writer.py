@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -43,8 +43,9 @@ from amiwarp.validation import choice
 if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
 
-FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8]]
-"""Compensated events with flags of shape ``(n,)``: 1 if the event lies inside the image."""
+FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8], Mapping[str, Sequence[bytes]]]
+"""Compensated events with flags of shape ``(n,)``: 1 if the event lies inside the image; and chunks of their columns
+that are encoded already, by the name of the dataset."""
 
 
 class RecordingWriter(RecordAppender):
@@ -221,8 +222,9 @@ class RecordingWriter(RecordAppender):
         Parameters
         ----------
         pieces : iterable of callable
-            Functions that return events and their ``inside`` flags, in order. Threads call them. Each piece except the
-            last must hold whole chunks.
+            Functions that return events, their ``inside`` flags, and encoded chunks of columns by name, in order.
+            Threads call them. Each piece except the last must hold whole chunks. Blosc's encoded chunks are stored as
+            they are; other columns are encoded.
         t_first : int
             Time of the first event [us].
         done : callable
@@ -251,10 +253,16 @@ class RecordingWriter(RecordAppender):
 
     def _compute(self, piece: Callable[[], FlaggedEvents]) -> tuple[Events, NDArray[np.uint8], Columns, list[bytes]]:
         """Compute and encode a piece. Runs in a thread."""
-        events, inside = piece()
-        columns = {"events/x": events.x, "events/y": events.y, "events/t": events.t - self._t_offset}
+        events, inside, known = piece()
+        known = known if self._codec is Codec.BLOSC else {}
+        t = events.t if "events/t" in known else events.t - self._t_offset  # of an encoded column, only the size counts
+        columns = {"events/x": events.x, "events/y": events.y, "events/t": t}
         columns |= {"events/p": events.p, "events/inside": inside}
-        return events, inside, columns, [encode(part, self._codec) for part in chunks_of(columns)]
+        encoded = (
+            known.get(name) or [encode(part, self._codec) for part in chunks_of({name: column})]
+            for name, column in columns.items()
+        )
+        return events, inside, columns, [chunk for chunks in encoded for chunk in chunks]
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder, which is written at the end.

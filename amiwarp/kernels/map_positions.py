@@ -5,7 +5,8 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.kernels.photometric import BLOCK, Atlas, Geometry, Pairs
+from amiwarp.kernels.pair_chains import BLOCK
+from amiwarp.kernels.photometric import Atlas, Geometry, Pairs
 from amiwarp.kernels.refraction import compensate, displace
 from amiwarp.kernels.vector_code import load_float, load_int, load_uint16, store_float, store_int
 

@@ -139,12 +139,12 @@ def mark_quiet(
         quiet = int(0)
         if k < spans:
             quiet = wp.where(tile_of[pixel] >= 0 and fired[k * pixels + pixel] == wp.uint8(0), 1, 0)
-            flag[base + k * pixels + pixel] = 0
+            flag[base + pixel * spans + k] = 0
         if quiet == 1:
             run += 1
         else:
             for j in range(k - wp.where(run >= at_least, run, 0), k):
-                flag[base + j * pixels + pixel] = 1
+                flag[base + pixel * spans + j] = 1
             run = 0
 
 
@@ -211,10 +211,10 @@ def write_quiet(
     candidate = start + wp.tid()
     if flag[base + candidate] == 0:
         return
-    pixels = tile_of.shape[0] * tile_of.shape[1]
-    span = candidate / pixels
-    row = (candidate % pixels) / tile_of.shape[1]
-    column = candidate % tile_of.shape[1]
+    spans = edges.shape[0] - 1
+    span = candidate % spans
+    row = (candidate / spans) / tile_of.shape[1]
+    column = (candidate / spans) % tile_of.shape[1]
     i = place[base + candidate] - 1
     pairs.x[i] = wp.uint16(column)
     pairs.y[i] = wp.uint16(row)

@@ -11,11 +11,11 @@ import warp as wp
 from amiwarp.kernels.camera import NAN
 from amiwarp.kernels.conjugate_gradients import add_fixed, add_two, to_fixed
 from amiwarp.kernels.map_prior import EXTRA
-from amiwarp.kernels.vector_code import load_float, load_int, load_uint8, store_float
+from amiwarp.kernels.pair_chains import BLOCK, Chains, add_differences, weighted_differences
+from amiwarp.kernels.vector_code import load_float, load_int, load_uint8
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = wp.constant(64)  # number of pairs per CPU thread; arrays are padded to whole blocks
 # Bits of a pair's ``on``: bit 0 is the polarity; bit 1, no event at the second time; bit 2, no event at the first time;
 # bit 3, held out, with weight 0.
 ON = wp.constant(wp.uint8(1))
@@ -110,13 +110,19 @@ def is_off(pairs: Pairs, i: int) -> float:
 
 
 @wp.func
+def sensor_terms(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, i: int) -> float:
+    """Return the terms of a pair's equation that do not depend on the map: [OFF] s + leak (t2 - t1)."""
+    extra = image.shape[0] - EXTRA
+    elapsed = load_float(pairs.time, pairs.stride + i) - load_float(pairs.time, i)
+    value = atlas.with_leak * load_float(image, extra) * elapsed
+    return value + is_off(pairs, i) * load_float(image, extra + 1)
+
+
+@wp.func
 def difference(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, g: Geometry, i: int) -> float:
     """Return the left side of a pair's equation: L(second) - L(first) + [OFF] s + leak (t2 - t1)."""
-    extra = image.shape[0] - EXTRA
     value = brightness_at(image, g, atlas.columns, 1, i) - brightness_at(image, g, atlas.columns, 0, i)
-    elapsed = load_float(pairs.time, pairs.stride + i) - load_float(pairs.time, i)
-    value += atlas.with_leak * load_float(image, extra) * elapsed
-    return value + is_off(pairs, i) * load_float(image, extra + 1)
+    return value + sensor_terms(image, atlas, pairs, i)
 
 
 @wp.func
@@ -197,19 +203,22 @@ def apply_normal(
 def apply_normal_blocks(
     pairs: Pairs,
     atlas: Atlas,
-    geometry: Geometry,
-    weight: wp.array(dtype=float),
+    chains: Chains,
     vector: wp.array(dtype=float),
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
     """Compute sums += Aᵀ W A vector for equations A with weights W, one block of pairs per thread. For CPUs."""
-    first = (start + wp.tid()) * BLOCK
-    values = wp.zeros(shape=(64,), dtype=float)
-    for k in range(BLOCK):
-        store_float(values, k, load_float(weight, first + k) * difference(vector, atlas, pairs, geometry, first + k))
-    for k in range(BLOCK):
-        transpose_add(sums, atlas, pairs, geometry, first + k, values[k])
+    block = start + wp.tid()
+    values = wp.zeros(shape=(144,), dtype=float)
+    weighted_differences(values, chains, vector, atlas.columns, block)
+    if atlas.with_leak > 0.0 or atlas.with_off != 0:
+        for k in range(BLOCK):
+            i = BLOCK * block + k
+            end = int(chains.end[i])
+            values[end] += chains.weight[2 * BLOCK * block + end] * sensor_terms(vector, atlas, pairs, i)
+            add_extra(sums, atlas, pairs, i, values[end])
+    add_differences(sums, values, chains, atlas.columns, block)
 
 
 @wp.kernel

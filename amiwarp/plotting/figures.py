@@ -147,24 +147,44 @@ class Reconstructed:
         return found, tones(original, Tone.MAPPED, contrast=1.0, between=between)
 
 
+@dataclass(frozen=True, eq=False)
+class EventViews:
+    """Parts of the demo's figure that show events: images, the enlarged region, and its point clouds."""
+
+    images: Images
+    """Images of the events before and after compensation."""
+    corner: tuple[int, int]
+    """Top left pixel (x, y) of the enlarged region."""
+    clouds: tuple[clouds.Cloud, clouds.Cloud]
+    """Events of one turn in the region, before and after compensation."""
+    drawn: list[NDArray[np.uint8]] | None
+    """Pictures of the clouds by VTK; None if it cannot draw here."""
+
+    @classmethod
+    def of(cls, recording: Recording, calibration: Calibration, device: Any) -> EventViews:
+        """Compute the images and draw the clouds."""
+        pair = images(thin(recording, EVENTS), recording, calibration, device=device)
+        corner = busiest(pair.after)
+        both = region_clouds(recording, calibration, corner, device)
+        return cls(pair, corner, both, clouds.render(both))
+
+
 def draw_demo(
     path: Path,
-    recording: Recording,
+    grid: Grid,
     calibration: Calibration,
+    views: EventViews,
     reconstructed: Reconstructed,
     *,
     headline: str,
     truth: tuple[float, float],
-    device: Any,
 ) -> tuple[str, ...]:
-    """Draw images, the enlarged region, point clouds and cost surface of the demo in one figure.
+    """Draw images, the enlarged region, point clouds and cost surface of the demo on the axes of ``grid``.
 
     Return notes on parts that were drawn by a fallback.
     """
-    pair = images(thin(recording, EVENTS), recording, calibration, device=device)
-    corner = busiest(pair.after)
+    pair, corner = views.images, views.corner
     found, original = reconstructed.tones()
-    grid = Grid.make(*recording.events.size)
     figure, ax = grid.figure, grid.axes
     figure.text(0.5, 1.0 - 0.34 / grid.height, headline, ha="center", va="center", fontsize=18)
     show(ax["raw"], pair.before, pair.top, "events before compensation")
@@ -177,7 +197,7 @@ def draw_demo(
     show(ax["part raw"], pair.before[part], pair.top, "marked region: before")
     show(ax["part compensated"], pair.after[part], pair.top, "after compensation")
     show_grey(ax["part picture"], found[part], "reconstructed")
-    notes = _draw_clouds(figure, (ax["cloud before"], ax["cloud after"]), recording, calibration, corner, device)
+    notes = _draw_clouds(figure, (ax["cloud before"], ax["cloud after"]), views)
     draw_cost(figure, ax["cost"], calibration, truth)
     enlarge(figure, ax["cost"])
     save(figure, path)
@@ -267,23 +287,19 @@ def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
     return max(0, int(column) + margin_x - width // 2), max(0, int(row) + margin_y - height // 2)
 
 
-def _draw_clouds(
-    figure: Any, axes: Any, recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
-) -> tuple[str, ...]:
+def _draw_clouds(figure: Any, axes: Any, views: EventViews) -> tuple[str, ...]:
     """Draw the event clouds before and after compensation; return notes if VTK could not draw them."""
-    pair = region_clouds(recording, calibration, corner, device)
-    pictures = clouds.render(pair)
     for k, (ax, title) in enumerate(zip(axes, ("before", "after"), strict=True)):
         ax.set_axis_off()
         ax.set_title(f"{title}: one turn of the marked region")
-        if pictures is not None:
-            ax.imshow(pictures[k])
+        if views.drawn is not None:
+            ax.imshow(views.drawn[k])
             continue
         ax.set_visible(False)
         plain = figure.add_axes(ax.get_position(), projection="3d")
         plain.set_title(ax.get_title())
-        clouds.draw_plain(plain, pair[k])
-    return () if pictures is not None else (clouds.MISSING,)
+        clouds.draw_plain(plain, views.clouds[k])
+    return () if views.drawn is not None else (clouds.MISSING,)
 
 
 def region_clouds(

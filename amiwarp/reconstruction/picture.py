@@ -22,8 +22,8 @@ from amiwarp.events.device_source import DeviceMemoryEvents, device_of, read_bet
 from amiwarp.events.encoder_speed import turn_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
-from amiwarp.reconstruction.known import dilated, known_nodes
 from amiwarp.reconstruction.result import Picture, upload_picture
+from amiwarp.reconstruction.rounds import SCALES, STEPS, solve_rounds
 from amiwarp.reconstruction.window import (
     SMOOTHNESS,
     choice_square,
@@ -42,10 +42,6 @@ if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
     from amiwarp.optics.models import Model
 
-SCALES = (1.0, 0.5, 0.5)
-"""Residual at which an equation gets half weight, in each round of Cauchy weights [thresholds]."""
-STEPS = 30
-"""Number of conjugate-gradient steps in each round of Cauchy weights."""
 WEAK_WEIGHT = 0.03
 """Weight of the equations from silence and from the window's ends, relative to pairs of events. Held-out pairs are
 predicted best near this weight."""
@@ -57,8 +53,6 @@ MEAN_DAMPING = 1e-6
 """Weight of the squared map values. It determines the mean of the map, which no equation does."""
 SPANS_PER_TURN = 8
 """Number of time spans per turn. A pixel that is silent in all spans of a turn adds one no-change equation per span."""
-NOISE_DISTANCE = 2
-"""Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
 
 
 class Reconstruction:
@@ -202,8 +196,9 @@ class Reconstruction:
             self.smoothness = self._choose(count, pairs, start_us, length_us, off)
         left, top, tiles = self._tile(start_us, length_us)
         solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
-        residual, covered = _solve(solver, pair_count, last)
-        unknowns, cut = solver.unknowns, np.s_[top : top + height, left : left + width]
+        residual, covered = solve_rounds(solver, pair_count, last)
+        cut = np.s_[top : top + height, left : left + width]
+        unknowns = solver.unknowns
         log, known = unknowns[: tiles.nodes].reshape(tiles.rows, tiles.columns)[cut], covered[cut]
         log = log - np.median(log[known] if known.any() else log)
         if self.fill is Fill.NONE:
@@ -310,26 +305,6 @@ class Reconstruction:
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
         """Return the map's margin left of and above the image (columns, rows), and the map of a window."""
         return map_tile(self.model, self.camera_rotation.about(start_us + length_us // 2), length_us)
-
-
-def _solve(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tuple[float, NDArray[np.bool_]]:
-    """Solve for the map; return the median residual and the known nodes.
-
-    ``last`` is the picture of the previous window, from which the solution starts.
-    """
-    nodes = solver.tiles.nodes
-    if last is not None:
-        unknowns = last.to_host().unknowns.copy()
-        unknowns[nodes:] = solver.unknowns[nodes:]
-        solver.unknowns = unknowns
-    for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
-        solver.solve(scale, steps=STEPS)
-    residual = solver.residuals.median(pair_count)
-    covered = known_nodes(solver)
-    if covered.any():
-        solver.keep(dilated(covered, NOISE_DISTANCE)[None])
-    solver.solve(SCALES[-1], steps=STEPS)
-    return residual, covered
 
 
 def reconstruct(

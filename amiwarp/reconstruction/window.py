@@ -24,6 +24,8 @@ LARGEST_MARGIN = 0.5
 """Largest margin of the map on each side of the image, relative to the image's width."""
 SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
 """Candidate weights of the smoothness prior, ascending; held-out equations choose among them."""
+TIE = 1.03
+"""Ratio of costs of held-out equations up to which the larger weight is chosen. Converged maps nearly tie."""
 CHOICE_SQUARES = (64, 96)
 """Sides of the square of pixels in which the smoothness is chosen [px]."""
 CHOICE_EVENTS = 24_000
@@ -83,14 +85,15 @@ def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
 
 
 def lowest_weight(cost: Callable[[float], float]) -> float:
-    """Return the weight of :data:`SMOOTHNESS` with the lowest cost.
+    """Return the largest weight of :data:`SMOOTHNESS` whose cost is nearly the lowest; see :data:`TIE`.
 
     The cost falls and then rises with the weight. So the two middle weights show on which side the lowest cost is.
     """
     weakest, weak, strong, strongest = SMOOTHNESS
     weak_cost, strong_cost = cost(weak), cost(strong)
-    inner, outer = (weak, weakest) if weak_cost < strong_cost else (strong, strongest)
-    return outer if cost(outer) < min(weak_cost, strong_cost) else inner
+    if strong_cost <= TIE * weak_cost:
+        return strongest if cost(strongest) <= TIE * min(weak_cost, strong_cost) else strong
+    return weak if weak_cost <= TIE * cost(weakest) else weakest
 
 
 def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: int, length_us: int) -> float:

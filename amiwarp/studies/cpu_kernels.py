@@ -10,6 +10,7 @@ from amiwarp.kernels.iwe import read_sums
 from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.map_prior import link
 from amiwarp.kernels.multilevel import prolong
+from amiwarp.kernels.pair_chains import make_chains
 from amiwarp.kernels.pairs import mark_spans
 from amiwarp.kernels.photometric import apply_normal_blocks
 from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
@@ -31,6 +32,7 @@ EXACT_KERNELS = (
     (mark_spans,),
     (find_places, ExactParams),
     (place_blocks, ExactParams),
+    (make_chains,),
     (apply_normal_blocks,),
     (descend,),
     (sum_costs,),

@@ -48,8 +48,8 @@ def judge_lag(turn: float) -> tuple[bool, str]:
     if turn <= LARGEST_LAG_RAD:
         return True, ""
     return False, (
-        f"the pixels are too slow: the prism turns by {math.degrees(turn):.0f} deg within their time constant; use more "
-        "light, a larger bandwidth or a slower prism"
+        f"the pixels are too slow: the prism turns by {math.degrees(turn):.0f} deg within their time constant; use "
+        "more light, a larger bandwidth or a slower prism"
     )
 
 

@@ -1,0 +1,152 @@
+"""Chains of event pairs on the brightness map, for CPUs.
+
+Most pairs of a pixel begin where the pair before them ends. Successive pairs with a common position form a chain. A
+block of pairs stores the positions of its chains one after the other, so that each is loaded once, and added to once.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+BLOCK = wp.constant(64)  # number of pairs per CPU thread; arrays are padded to whole blocks
+
+
+@wp.struct
+class Chains:
+    """Positions on the map, 128 places per block of pairs; empty on CUDA.
+
+    A pair's difference belongs to its second position, which follows the first. Pairs off the map get node 0, weight 0.
+    """
+
+    cell: wp.array(dtype=int)  # index of the map node up and left of each position
+    x: wp.array(dtype=float)  # fractions to the next node
+    y: wp.array(dtype=float)
+    weight: wp.array(dtype=float)  # weight of the pair that ends at each position; 0 at the start of a chain
+    count: wp.array(dtype=int)  # number of positions in each block
+    end: wp.array(dtype=wp.uint8)  # place of each pair's second position in its block
+
+
+@wp.func_native("""
+    const int* from = (const int*)cells.data;
+    const float* part = (const float*)parts.data;
+    int* cell = (int*)chains.cell.data + 128 * block;
+    float* x = (float*)chains.x.data + 128 * block;
+    float* y = (float*)chains.y.data + 128 * block;
+    int n = 0;
+    for (int k = 0; k < 64; ++k) {
+        const int i = 64 * block + k;
+        for (int end = 0; end < 2; ++end) {
+            const int at = from[end * stride + i] < 0 ? 0 : from[end * stride + i];
+            const float fx = part[2 * end * stride + i], fy = part[(2 * end + 1) * stride + i];
+            if (end == 0 && n > 0 && at == cell[n - 1] && fx == x[n - 1] && fy == y[n - 1]) continue;
+            cell[n] = at;
+            x[n] = fx;
+            y[n++] = fy;
+        }
+        ((uint8_t*)chains.end.data)[i] = (uint8_t)(n - 1);
+    }
+    ((int*)chains.count.data)[block] = n;
+    for (; n % 8 > 0; ++n) cell[n] = 0, x[n] = 0.0f, y[n] = 0.0f;
+""")
+def join_pairs(cells: wp.array(dtype=int), parts: wp.array(dtype=float), stride: int, chains: Chains, block: int):
+    """Store the positions of a block of pairs without those that a pair shares with the one before."""
+
+
+@wp.kernel
+def make_chains(
+    cells: wp.array(dtype=int), parts: wp.array(dtype=float), stride: int, start: int, chains: Chains
+):  # fmt: skip
+    """Store the positions of one block of pairs per thread, from the arrays of ``Geometry``."""
+    join_pairs(cells, parts, stride, chains, start + wp.tid())
+
+
+@wp.kernel
+def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
+    """Copy the weights of one block of pairs per thread to the positions at which the pairs end."""
+    block = start + wp.tid()
+    for j in range(128):
+        chains.weight[2 * BLOCK * block + j] = 0.0
+    for k in range(BLOCK):
+        i = BLOCK * block + k
+        chains.weight[2 * BLOCK * block + int(chains.end[i])] = weight[i]
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    typedef uint64_t Eight __attribute__((vector_size(64)));
+    const float* map = (const float*)vector.data;
+    const int n = (((const int*)chains.count.data)[block] + 7) & ~7;
+    const int* cell = (const int*)chains.cell.data + 128 * block;
+    const float* x = (const float*)chains.x.data + 128 * block;
+    const float* y = (const float*)chains.y.data + 128 * block;
+    const float* weight = (const float*)chains.weight.data + 128 * block;
+    alignas(64) float upper[256], lower[256], at[144];
+    for (int j = 0; j < n; j += 8) {
+        uint64_t a[8], b[8];
+        for (int i = 0; i < 8; ++i) {
+            memcpy(a + i, map + cell[j + i], 8);
+            memcpy(b + i, map + cell[j + i] + columns, 8);
+        }
+        const Eight above = {a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7]};
+        const Eight below = {b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]};
+        memcpy(upper + 2 * j, &above, 64);
+        memcpy(lower + 2 * j, &below, 64);
+    }
+    at[15] = 0.0f;
+    for (int j = 0; j < n; ++j) {
+        const float u = upper[2 * j] + (upper[2 * j + 1] - upper[2 * j]) * x[j];
+        const float v = lower[2 * j] + (lower[2 * j + 1] - lower[2 * j]) * x[j];
+        at[16 + j] = u + (v - u) * y[j];
+    }
+    float* out = (float*)values.data;
+    for (int j = 0; j < n; ++j) out[j] = weight[j] * (at[16 + j] - at[15 + j]);
+#endif
+""")
+def weighted_differences(
+    values: wp.array(dtype=float), chains: Chains, vector: wp.array(dtype=float), columns: int, block: int
+):
+    """Compute weight · (L(second) - L(first)) of each pair in a block, at the place of its second position."""
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    typedef long long Two __attribute__((vector_size(16), aligned(8)));
+    typedef long long Four __attribute__((vector_size(32)));
+    typedef double Real __attribute__((vector_size(32)));
+    typedef float Shares __attribute__((vector_size(16)));
+    const int n = ((const int*)chains.count.data)[block], padded = (n + 7) & ~7;
+    const int* cell = (const int*)chains.cell.data + 128 * block;
+    const float* x = (const float*)chains.x.data + 128 * block;
+    const float* y = (const float*)chains.y.data + 128 * block;
+    const float* value = (const float*)values.data;
+    alignas(64) float share[512];
+    for (int j = 0; j < padded; ++j) {
+        const float s = value[j] - value[j + 1], below = s * y[j], above = s - below;
+        share[4 * j + 1] = above * x[j];
+        share[4 * j + 3] = below * x[j];
+        share[4 * j] = above - share[4 * j + 1];
+        share[4 * j + 2] = below - share[4 * j + 3];
+    }
+    const Real origin = {1572864.0, 1572864.0, 1572864.0, 1572864.0};
+    for (int first = 0; first < 4; ++first)
+        for (int j = first; j < n; j += 4) {
+            Shares four;
+            memcpy(&four, share + 4 * j, 16);
+            const Real moved = __builtin_convertvector(four, Real) + origin;
+            const Four fixed = (Four)moved - (Four)origin;
+            int64_t* to = (int64_t*)sums.data + cell[j];
+            *(Two*)to += Two{fixed[0], fixed[1]};
+            *(Two*)(to + columns) += Two{fixed[2], fixed[3]};
+        }
+#endif
+""")
+def add_differences(
+    sums: wp.array(dtype=wp.int64), values: wp.array(dtype=float), chains: Chains, columns: int, block: int
+):
+    """Add the transpose of the differences times their values to the sums, if no other thread writes to them.
+
+    The element of ``values`` after the last one must be 0. The bits of a double between 2**20 and 2**21 are a number in
+    units of 2**-32, as :func:`amiwarp.kernels.conjugate_gradients.to_fixed` returns. So shares must be below 2**19.
+    Neighbouring positions are not added one right after the other, because a vector load waits for a store that
+    overlaps it in part.
+    """

@@ -1,0 +1,42 @@
+"""Rounds of robust weights that solve for the map of a picture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from amiwarp.reconstruction.known import dilated, known_nodes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.brightness.solver import BrightnessMap
+    from amiwarp.reconstruction.result import Picture
+
+SCALES = (1.0, 0.5, 0.5)
+"""Residual at which an equation gets half weight, in each round of Cauchy weights [thresholds]."""
+STEPS = 24
+"""Number of conjugate-gradient steps in each round of Cauchy weights."""
+NOISE_DISTANCE = 2
+"""Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
+
+
+def solve_rounds(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tuple[float, NDArray[np.bool_]]:
+    """Solve for the map; return the median residual and the known nodes.
+
+    ``last`` is the picture of the previous window, from which the solution starts.
+    """
+    nodes = solver.tiles.nodes
+    if last is not None:
+        unknowns = last.to_host().unknowns.copy()
+        unknowns[nodes:] = solver.unknowns[nodes:]
+        solver.unknowns = unknowns
+    for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
+        solver.solve(scale, steps=STEPS)
+    residual = solver.residuals.median(pair_count)
+    covered = known_nodes(solver)
+    if covered.any():
+        solver.keep(dilated(covered, NOISE_DISTANCE)[None])
+    solver.solve(SCALES[-1], steps=STEPS)
+    return residual, covered
