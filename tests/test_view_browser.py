@@ -450,10 +450,11 @@ def test_bad_values_are_said_and_good_ones_make_the_page_go_on(page: Any, record
         ("apex", "-1", "0.8", "apex"),
     ):
         ready(page)
-        events = page.locator("#events").inner_text()
+        events, value = page.locator("#events").inner_text(), field(page, name)
         enter(page, name, bad)
         message(page, words)
         assert page.locator("#events").inner_text() == events
+        until(lambda name=name, value=value: name == "apex" or field(page, name) == value)  # what is still shown
         enter(page, name, good)
         page.locator("#message").wait_for(state="detached")
     page.locator("#region-left").fill("5000")
@@ -677,6 +678,7 @@ def test_without_encoder_there_is_one_cloud_until_the_speed_is_set(opened: Open,
     until(lambda: field(page, "start_ms") == pytest.approx(start - length, abs=0.01))
     enter(page, "rpm", RPM)
     page.locator("#image-before").wait_for()
+    assert "no encoder" not in page.locator("#prism").inner_text()
     assert page.locator("#do-step").inner_text() == "turn ▶"
     page.locator("#curve-title").filter(has_text="speed of the prism").wait_for()
     page.locator("#name").click()

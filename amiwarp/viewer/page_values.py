@@ -11,6 +11,7 @@ from amiwarp.viewer.comparison import AGAINST
 from amiwarp.viewer.drawing import NO_ORBIT
 from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
 from amiwarp.viewer.image_kinds import ImageKind
+from amiwarp.viewer.inspector import NO_ENCODER
 from amiwarp.viewer.layout import KEYS, NAMES, SCOPES, SPEEDS, TOOLS, UNITS, VIEWS
 from amiwarp.viewer.message_filter import Check, flag, number, one_of
 from amiwarp.viewer.page_exports import export_state
@@ -105,4 +106,5 @@ def notes(inspector: Inspector) -> list[str]:
         Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
     }
     phase = texts.get(inspector.sources["phase"], "") if math.isfinite(inspector.turn_us) else ""
-    return [*inspector.notes, *filter(None, [phase])]
+    missing = [note for note in inspector.notes if not (note == NO_ENCODER and inspector.knobs.rpm)]
+    return [*missing, *filter(None, [phase])]

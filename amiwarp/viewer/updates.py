@@ -56,7 +56,11 @@ class Updates:
         panel, state = self._panel, self._state
         if todo & {"window", "suggestion"}:
             with panel.errors_shown("window"):
-                await self._open(suggest="suggestion" in todo)
+                try:
+                    await self._open(suggest="suggestion" in todo)
+                except AmiwarpError:
+                    self._return_to_open_window()
+                    raise
         with panel.errors_shown("knobs"):
             if "knobs" in todo:
                 panel.set_knobs()
@@ -101,6 +105,14 @@ class Updates:
             s.update({"region_wanted": list(region), "region_kind": "suggested"})
             await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
         self._picked = -1
+
+    def _return_to_open_window(self) -> None:
+        """Show time and region of the window that is still shown. Playback goes on through a time without events."""
+        inspector, s = self._panel.inspector, self._state
+        if inspector.window is not None and not s.playing:
+            start_us, length_us = inspector.window
+            s.start_ms, s.length_ms = round((start_us - self._panel.zero_us) * 1e-3, 3), round(length_us * 1e-3, 3)
+            s.region_wanted = list(inspector.loaded.region)
 
     def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
         """Return what is to be shown, and the state variables that show it."""

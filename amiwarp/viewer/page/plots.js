@@ -42,7 +42,10 @@ export const CurvePlot = {
       const [low, high] = tall.value;
       return props.x.map((x, k) => `${share(x)},${100 - (100 * (props.y[k] - low)) / (high - low)}`).join(' ');
     });
-    const across = computed(() => placed(...range.value, 5));
+    const across = computed(() => { // wide numbers would touch each other
+      const all = placed(...range.value, 5);
+      return all.some((tick) => tick.text.length > 4) ? placed(...range.value, 2) : all;
+    });
     const up = computed(() => placed(...tall.value, 4));
     function clicked(event) {
       const box = event.currentTarget.getBoundingClientRect();
