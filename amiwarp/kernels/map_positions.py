@@ -7,6 +7,7 @@ import warp as wp
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
 from amiwarp.kernels.pair_chains import BLOCK
 from amiwarp.kernels.photometric import Atlas, Geometry, Pairs
+from amiwarp.kernels.plain_models import is_plain, plain
 from amiwarp.kernels.refraction import compensate, displace
 from amiwarp.kernels.vector_code import load_float, load_int, load_uint16, store_float, store_int
 
@@ -144,23 +145,50 @@ def place_still(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, s
     store_geometry(geometry, i, a, ax, ay, b, bx, by)
 
 
+@wp.func
+def displace_block(
+    model: Any, camera: PinholeParams, pairs: Pairs, k: int, first: int, x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute the compensated positions of the first (k = 0) or second events of a block of pairs."""
+    for j in range(BLOCK):
+        i = first + j
+        w0, w1 = event_azimuth(model, pairs, k, i)
+        u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
+        store_float(x, j, u)
+        store_float(y, j, v)
+
+
+@wp.func
+def find_nodes(
+    atlas: Atlas, pairs: Pairs, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float),
+    cells: wp.array(dtype=int),
+):  # fmt: skip
+    """Replace the positions of a block by the fractions between map nodes, and compute the nodes."""
+    for j in range(BLOCK):
+        cell, u, v = node_at(atlas, load_int(pairs.tile, first + j), load_float(x, j), load_float(y, j))
+        store_int(cells, j, cell)
+        store_float(x, j, u)
+        store_float(y, j, v)
+
+
 @wp.kernel
 def place_blocks(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry):
     """Compute the positions as :func:`place_still` does, one block of pairs per thread. For CPUs."""
     first = (start + wp.tid()) * BLOCK
-    cells = wp.zeros(shape=(128,), dtype=int)
-    parts = wp.zeros(shape=(256,), dtype=float)
-    for k in range(BLOCK):
-        cell, x, y = event_node(model, camera, pairs, atlas, 0, first + k)
-        store_int(cells, k, cell)
-        store_float(parts, k, x)
-        store_float(parts, 64 + k, y)
-    for k in range(BLOCK):
-        cell, x, y = event_node(model, camera, pairs, atlas, 1, first + k)
-        store_int(cells, 64 + k, cell)
-        store_float(parts, 128 + k, x)
-        store_float(parts, 192 + k, y)
-    for k in range(BLOCK):
-        store_geometry(
-            geometry, first + k, cells[k], parts[k], parts[64 + k], cells[64 + k], parts[128 + k], parts[192 + k]
-        )
+    ax = wp.zeros(shape=(64,), dtype=float)
+    ay = wp.zeros(shape=(64,), dtype=float)
+    bx = wp.zeros(shape=(64,), dtype=float)
+    by = wp.zeros(shape=(64,), dtype=float)
+    a = wp.zeros(shape=(64,), dtype=int)
+    b = wp.zeros(shape=(64,), dtype=int)
+    if is_plain(model) == 1:
+        displace_block(plain(model), camera, pairs, 0, first, ax, ay)
+        displace_block(plain(model), camera, pairs, 1, first, bx, by)
+    else:
+        displace_block(model, camera, pairs, 0, first, ax, ay)
+        displace_block(model, camera, pairs, 1, first, bx, by)
+    find_nodes(atlas, pairs, first, ax, ay, a)
+    find_nodes(atlas, pairs, first, bx, by, b)
+    for j in range(BLOCK):
+        store_geometry(geometry, first + j, a[j], ax[j], ay[j], b[j], bx[j], by[j])
