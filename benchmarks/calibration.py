@@ -57,7 +57,7 @@ from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 
 APEXES_DEG = (0.5, 1.0, 2.0)
-NOMINAL = 1.3
+NOMINAL = 1.15
 """Ratio of the nominal to the true apex angle. It differs from 1 so that no search range is centred on the truth."""
 EVERY = 16
 """Interval of the kept events of a picture's recording: every 16th event. Calibration thins them further, to a million.

@@ -9,7 +9,7 @@ differs from that elsewhere is computed along the prism's path and moved to the 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -82,5 +82,7 @@ def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offse
     pairs.arrays.lag.assign(values.ravel())
     pairs.arrays.offset.zero_()
     if with_offsets:
-        inputs: list[Any] = [*brightness.path_arguments(model), middle, THRESHOLD, turn, ahead]
+        filtering = kernels.Photoreceptor()
+        filtering.threshold, filtering.middle, filtering.turn, filtering.ahead = THRESHOLD, middle, turn, ahead
+        inputs = [*brightness.path_arguments(model), filtering]
         launch(kernels.find_offsets, len(pairs), inputs, [pairs.arrays.offset], device=brightness.device)

@@ -174,13 +174,8 @@ class BrightnessMap:
         arrays, params = self.pairs.arrays, model.params(self.device)
         camera_rotation = (camera_rotation or CameraRotation()).about(self.middle_us)
         pinhole = pinhole_params(model.camera)
-        if (
-            pinhole is None
-            or arrays.slope.shape[0]
-            or arrays.lag.shape[0]
-            or any(camera_rotation.angular_velocity)
-            or any(camera_rotation.angular_acceleration)
-        ):
+        rotates = any((*camera_rotation.angular_velocity, *camera_rotation.angular_acceleration))
+        if pinhole is None or rotates or arrays.slope.shape[0] or arrays.lag.shape[0]:
             inputs = [params, model_camera(model, self.device), arrays, self._atlas, drift, camera_rotation.params()]
             launch(places.place_pairs, self.count, inputs, [out], device=self.device)
             return

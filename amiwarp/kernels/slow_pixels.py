@@ -20,6 +20,16 @@ STEPS = wp.constant(16)  # number of steps in which the filter's equation is sol
 MEMORY = wp.constant(6.0)  # time before an event from which the filter is followed [time constants at median light]
 
 
+@wp.struct
+class Photoreceptor:
+    """Photoreceptors of the pixels."""
+
+    threshold: float  # ON threshold [log intensity]
+    middle: float  # median brightness [ON thresholds]
+    turn: float  # angle of the prism per time constant at the median brightness [rad]
+    ahead: float  # angle by which the prism is ahead of the effective phase [rad]
+
+
 @wp.func
 def brightness_at_position(image: wp.array(dtype=float), atlas: Atlas, tile: int, xy: wp.vec2) -> float:
     """Return the brightness of a tile's map at a position [px]; NaN off the tile."""
@@ -59,18 +69,18 @@ def find_levels(
 @wp.func
 def filtered(
     model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), k: int, i: int,
-    middle: float, threshold: float, turn: float, ahead: float,
+    filter: Photoreceptor,
 ) -> float:  # fmt: skip
-    """Return the output of the filter at an event; see :func:`find_offsets`."""
+    """Return the output of the filter at an event."""
     width = MEMORY / float(STEPS)  # step [time constants at median light]
-    before = brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - ahead)
+    before = brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * filter.turn - filter.ahead)
     level = before
     for j in range(STEPS):
         past = MEMORY - float(j + 1) * width
-        after = brightness_before(model, camera, pairs, atlas, image, k, i, past * turn - ahead)
+        after = brightness_before(model, camera, pairs, atlas, image, k, i, past * filter.turn - filter.ahead)
         if wp.isnan(after):
             after = before
-        light = wp.exp(threshold * (0.5 * (before + after) - middle))
+        light = wp.exp(filter.threshold * (0.5 * (before + after) - filter.middle))
         level = filter_level(level, before, after, width * light)
         before = after
     return level
@@ -78,14 +88,10 @@ def filtered(
 
 @wp.kernel
 def find_offsets(
-    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), middle: float,
-    threshold: float, turn: float, ahead: float, start: int, offset: wp.array(dtype=float),
+    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float),
+    filter: Photoreceptor, start: int, offset: wp.array(dtype=float),
 ):  # fmt: skip
-    """Compute the difference between the filter's output and the brightness on the contracted orbit, for a pair.
-
-    ``turn`` is the prism's angle per time constant at the brightness ``middle`` [rad], ``threshold`` the ON threshold
-    [log intensity].
-    """
+    """Compute the difference between the filter's output and the brightness on the contracted orbit, for a pair."""
     i = start + wp.tid()
     total = float(0.0)
     sign = float(-1.0)
@@ -94,6 +100,6 @@ def find_offsets(
         pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
         xy = contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
         there = brightness_at_position(image, atlas, pairs.tile[i], xy)
-        total += sign * (filtered(model, camera, pairs, atlas, image, k, i, middle, threshold, turn, ahead) - there)
+        total += sign * (filtered(model, camera, pairs, atlas, image, k, i, filter) - there)
         sign = 1.0
     offset[i] = wp.where(wp.isnan(total), 0.0, total)

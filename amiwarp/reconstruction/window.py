@@ -24,7 +24,7 @@ LARGEST_MARGIN = 0.5
 """Largest margin of the map on each side of the image, relative to the image's width."""
 SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
 """Candidate weights of the smoothness prior, ascending; held-out equations choose among them."""
-TIE = 1.03
+TIE = 1.05
 """Ratio of costs of held-out equations up to which the larger weight is chosen. Converged maps nearly tie."""
 CHOICE_SQUARES = (64, 96)
 """Sides of the square of pixels in which the smoothness is chosen [px]."""

@@ -53,6 +53,11 @@ if TYPE_CHECKING:
     from amiwarp.progress import Progress
 
 
+LARGEST_FINE_COST = 0.3
+"""Largest cost, relative to that without a map, for which a map has more than one node per pixel along each axis. Where
+half of the events are noise, a finer map follows them, and orbits come out too small."""
+
+
 @dataclass(frozen=True)
 class PhotometricSettings:
     """Settings of the photometric stage of a calibration.
@@ -202,8 +207,9 @@ def _equations(
     cost = cost_on(tiles)
     coverage = cost.brightness.coverage(cost.scale)
     few = pairs_per_node(coverage, len(pairs)) < FINE_PAIRS_PER_NODE
+    noisy = cost.mean() > LARGEST_FINE_COST
     # a fine map converges too slowly for parameters that make nearly the same motion
-    if tiles.density > 1.0 and (few or any(n in DEGENERATE_WITH_APEX for n in space.names)):
+    if tiles.density > 1.0 and (few or noisy or any(n in DEGENERATE_WITH_APEX for n in space.names)):
         cost = cost_on(tiles.at_density(1.0))
         coverage = cost.brightness.coverage(cost.scale)
     left = check_pairs(recording.name, coverage, len(pairs))
