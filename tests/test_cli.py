@@ -73,7 +73,7 @@ COMMANDS = {
 }  # fmt: skip
 
 
-def test_help_and_info_load_only_what_they_need(folder: Path) -> None:
+def test_help_and_info_load_only_what_they_need(made: tuple[Path, str]) -> None:
     """The list of commands repeats what the commands say of themselves, without loading them."""
     for name, summary in SUMMARIES.items():
         first = inspect.getdoc(importlib.import_module(f"amiwarp.cli.{name}").run).split("\n\n")[0]
@@ -85,10 +85,10 @@ def test_help_and_info_load_only_what_they_need(folder: Path) -> None:
         "try: app(['info', sys.argv[1]])\n"
         "except SystemExit: print({m.split('.')[0] for m in sys.modules} & {'warp', 'scipy', 'matplotlib'})"
     )
-    command = [sys.executable, "-c", code, str(folder / "recording.h5")]
+    command = [sys.executable, "-c", code, str(made[0] / "recording.h5")]
     ran = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "fx" in ran.stdout
-    assert ran.stdout.splitlines()[-2:] == ["set()", "set()"]
+    assert ran.stdout.splitlines().count("set()") == 2
 
 
 def run(*args: str | Path) -> Result:

@@ -239,10 +239,13 @@ def simulation(demo: Demo) -> Simulation:
 
 
 def earth() -> Path:
-    """Return the path of the map of the earth that comes with PyVista, without loading PyVista."""
+    """Return the path of the map of the earth that comes with PyVista, without loading PyVista.
+
+    Raises :class:`ModuleNotFoundError` if it is not installed.
+    """
     found = importlib.util.find_spec("pyvista")
-    assert found is not None
-    assert found.origin is not None
+    if found is None or found.origin is None:
+        raise ModuleNotFoundError("PyVista is not installed", name="pyvista")
     return Path(found.origin).parent / "examples" / "2k_earth_daymap.jpg"
 
 

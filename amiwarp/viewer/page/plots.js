@@ -3,6 +3,7 @@
 import { text, ticks } from './ticks.js';
 
 const LEAST_SHARE = 0.18; // of a colour bar between two numbers
+const WIDE_SHARE = 0.45; // of an axis between two wide numbers
 
 const { computed, onMounted, ref, watch } = window.Vue;
 
@@ -44,7 +45,9 @@ export const CurvePlot = {
     });
     const across = computed(() => { // wide numbers would touch each other
       const all = placed(...range.value, 5);
-      return all.some((tick) => tick.text.length > 4) ? placed(...range.value, 2) : all;
+      if (!all.some((tick) => tick.text.length > 4)) return all;
+      const far = (tick, last) => !last || tick.at - last.at >= WIDE_SHARE;
+      return placed(...range.value, 2).reduce((kept, tick) => (far(tick, kept.at(-1)) ? [...kept, tick] : kept), []);
     });
     const up = computed(() => placed(...tall.value, 4));
     function clicked(event) {
