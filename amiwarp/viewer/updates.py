@@ -68,12 +68,12 @@ class Updates:
                 panel.history.remember("")
             if "state" in todo:
                 await panel.history.apply()
+            panel.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
             shown, values = await panel.in_thread(self._compute)
             self.shown = shown
             state.update(values)
             state.curve_mark = float(state[state.knob])
             self._show_prism()
-            panel.show_knobs()
             if not state.playing:
                 panel.history.remember("" if todo & {"suggestion", "state"} else panel.change)
 
