@@ -36,6 +36,12 @@ def event_azimuth(model: Any, pairs: Pairs, k: int, i: int):
 
 
 @wp.func
+def turned(w0: float, w1: float, c: float, s: float) -> wp.vec2:
+    """Return the direction (w0, w1) rotated by the angle with cosine ``c`` and sine ``s``."""
+    return wp.vec2(w0 * c - w1 * s, w1 * c + w0 * s)
+
+
+@wp.func
 def compensated_position(
     model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
@@ -43,11 +49,9 @@ def compensated_position(
     w0, w1 = event_azimuth(model, pairs, k, i)
     if pairs.slope.shape[0] > 0:
         angle = pairs.slope[k * pairs.stride + i] * drift
-        c = wp.cos(angle)
-        s = wp.sin(angle)
-        a = w0 * c - w1 * s
-        w1 = w1 * c + w0 * s
-        w0 = a
+        azimuth = turned(w0, w1, wp.cos(angle), wp.sin(angle))
+        w0 = azimuth[0]
+        w1 = azimuth[1]
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
     if pairs.lag.shape[0] > 0:
         return contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
@@ -67,9 +71,7 @@ def contracted_position(
 ) -> wp.vec2:
     """Return the compensated position [px] on an orbit that is rotated and contracted about its centre by ``lag``."""
     size = wp.length(lag)
-    c = lag[0] / size
-    s = lag[1] / size
-    azimuth = wp.vec2(w0 * c - w1 * s, w1 * c + w0 * s)
+    azimuth = turned(w0, w1, lag[0] / size, lag[1] / size)
     there = compensate(model, camera, pixel, azimuth)
     opposite = compensate(model, camera, pixel, -azimuth)
     return 0.5 * (there + opposite) + 0.5 * size * (there - opposite)

@@ -93,14 +93,20 @@ def bilinear(f: wp.vec2) -> wp.vec4:
 
 
 @wp.func
+def interpolated(image: wp.array(dtype=float), columns: int, cell: int, fx: float, fy: float) -> float:
+    """Return the brightness between four nodes, of which ``cell`` is the upper left one."""
+    upper = load_float(image, cell) * (1.0 - fx) + load_float(image, cell + 1) * fx
+    lower = load_float(image, cell + columns) * (1.0 - fx) + load_float(image, cell + columns + 1) * fx
+    return upper * (1.0 - fy) + lower * fy
+
+
+@wp.func
 def brightness_at(image: wp.array(dtype=float), g: Geometry, columns: int, k: int, i: int) -> float:
     """Return the brightness at the first (k = 0) or second event of a pair, or at node 0 for a pair off the map."""
     cell = wp.max(load_int(g.cell, k * g.stride + i), 0)
     fx = load_float(g.part, 2 * k * g.stride + i)
     fy = load_float(g.part, (2 * k + 1) * g.stride + i)
-    upper = load_float(image, cell) * (1.0 - fx) + load_float(image, cell + 1) * fx
-    lower = load_float(image, cell + columns) * (1.0 - fx) + load_float(image, cell + columns + 1) * fx
-    return upper * (1.0 - fy) + lower * fy
+    return interpolated(image, columns, cell, fx, fy)
 
 
 @wp.func

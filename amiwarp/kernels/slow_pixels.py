@@ -9,8 +9,8 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams
-from amiwarp.kernels.map_positions import contracted_position, event_azimuth, lag_of, node_at
-from amiwarp.kernels.photometric import Atlas, Pairs
+from amiwarp.kernels.map_positions import contracted_position, event_azimuth, lag_of, node_at, turned
+from amiwarp.kernels.photometric import Atlas, Pairs, interpolated
 from amiwarp.kernels.photoreceptor import filter_level
 from amiwarp.kernels.refraction import compensate
 
@@ -36,9 +36,7 @@ def brightness_at_position(image: wp.array(dtype=float), atlas: Atlas, tile: int
     cell, fx, fy = node_at(atlas, tile, xy[0], xy[1])
     if cell < 0:
         return NAN
-    upper = image[cell] * (1.0 - fx) + image[cell + 1] * fx
-    lower = image[cell + atlas.columns] * (1.0 - fx) + image[cell + atlas.columns + 1] * fx
-    return upper * (1.0 - fy) + lower * fy
+    return interpolated(image, atlas.columns, cell, fx, fy)
 
 
 @wp.func
@@ -48,9 +46,7 @@ def brightness_before(
 ) -> float:  # fmt: skip
     """Return the brightness at the pixel of an event when the prism's angle was smaller by ``angle`` [rad]."""
     w0, w1 = event_azimuth(model, pairs, k, i)
-    c = wp.cos(angle)
-    s = wp.sin(angle)
-    azimuth = wp.vec2(w0 * c + w1 * s, w1 * c - w0 * s)
+    azimuth = turned(w0, w1, wp.cos(angle), -wp.sin(angle))
     xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), azimuth)
     return brightness_at_position(image, atlas, pairs.tile[i], xy)
 

@@ -28,6 +28,8 @@ LARGEST_COST = 0.75
 """Largest accepted cost, relative to the cost without a brightness map. Above it the map explains too little of the
 events."""
 
+LARGEST_EXAMINED_COST = 0.5
+"""Largest cost, relative to that without a map, of an answer that is examined for causes of an error."""
 LARGEST_STILL_COST = 0.2
 """Largest cost of the photometric stage, relative to that without a brightness map, that a still camera and a correct
 encoder scale leave."""

@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.calib.parameters import LENS
-from amiwarp.calib.photometric.acceptance import LARGEST_COST_RATIO, LARGEST_STILL_COST, judge_consistency
+from amiwarp.calib.photometric.acceptance import (
+    LARGEST_COST_RATIO,
+    LARGEST_EXAMINED_COST,
+    LARGEST_STILL_COST,
+    judge_consistency,
+)
 from amiwarp.calib.photometric.answer_search import join_runs
 from amiwarp.calib.photometric.causes import FLAT_SIDE, turned, with_cause
 from amiwarp.calib.photometric.consistency import SIGNIFICANT, Consistency, check_consistency
-from amiwarp.calib.photometric.sensor_timing import LARGEST_EXAMINED_COST
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

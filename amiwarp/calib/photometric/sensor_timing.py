@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.slow_pixels import darkness, set_lags
+from amiwarp.calib.photometric.acceptance import LARGEST_EXAMINED_COST
 from amiwarp.calib.photometric.consistency import slope
 from amiwarp.calib.photometric.linear_fit import linear_fit
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
     Vector = NDArray[np.float64]
 
-LARGEST_EXAMINED_COST = 0.5
-"""Largest cost, relative to that without a map, of an answer that is examined. Above it the map explains too little."""
 LEAST_GAIN = 0.03
 """Smallest share of the squared residuals that a time must explain. Right ones explain 0.01 at most."""
 SIGNIFICANT = 10.0

@@ -142,8 +142,8 @@ def refine(
     found = equations(given)
     answer = found.answers.search(found.start)
     rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
+    rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
     if timing_can_be_found(answer, found.answers.cost) and rpm:
-        rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
         v = answer.stage.x
         if not given.refractory_us and (first := refractory_step(found.answers.cost, v, direction)):
             turn = find_refractory(found.coarse(), v, first, direction)
@@ -157,7 +157,7 @@ def refine(
             found.answers.timing = answer.stage.x - v
     answers = found.answers
     answer = checked(answers, answer)
-    accepted, reason = judge_lag(time_constant * abs(rpm) * math.tau / 60e6)
+    accepted, reason = judge_lag(time_constant * rad_per_us)
     if answer.result.accepted and not accepted:
         answer = replace(answer, result=replace(answer.result, accepted=False, verdict=reason))
     notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
