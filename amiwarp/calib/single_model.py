@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.calib import checks
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.parameters import LENS, MOTION, RATES, size_name, with_lens
-from amiwarp.calib.photometric.acceptance import LARGEST_COST_RATIO, LARGEST_STILL_COST
+from amiwarp.calib.photometric.acceptance import LARGEST_COST_RATIO, LARGEST_ROTATION_GAIN, LARGEST_STILL_COST
 from amiwarp.calib.photometric.stage import refine
 from amiwarp.calib.preparation import linear_unknowns, prepare, rotation_window, zero_time
 from amiwarp.calib.prism_speed import encoder_turns_per_period
@@ -38,7 +38,8 @@ def calibrate_model(
 ) -> Calibration:
     """Return the calibration of ``settings.model``, by sharpness and then photometrically.
 
-    If no brightness map explains the events, the camera may have rotated: the camera's rotation is then freed too.
+    If no brightness map explains the events, or a slow rotation of the camera explains much of what is left, the
+    camera's rotation is freed too.
     Raises :class:`AmiwarpError` as :func:`amiwarp.calibrate` does.
     """
     began = time.perf_counter()
@@ -47,8 +48,10 @@ def calibrate_model(
     found = _calibration_or_error(recording, settings, device, progress)
     if recording.encoder is not None and _unexplained(found):
         recording, found = _without_bad_pixels(recording, settings, found, device, progress)
-        if _unexplained(found):
-            found = _explain(recording, settings, found, device, progress)
+    if recording.encoder is not None and _unexplained(found):
+        found = _explain(recording, settings, found, device, progress)
+    elif settings.free is None and _camera_turned(found):
+        found = _with_rotation(recording, settings, found, device, progress)
     if isinstance(found, AmiwarpError):
         raise found
     _check_confirmed(found, recording.name)
@@ -103,6 +106,13 @@ def _unexplained(found: Calibration | AmiwarpError) -> bool:
     if isinstance(found, AmiwarpError):
         return isinstance(found, checks.NoSharpOptimumError)
     return found.photometric is not None and found.photometric.cost > LARGEST_STILL_COST
+
+
+def _camera_turned(found: Calibration | AmiwarpError) -> bool:
+    """Return whether a rotation of the camera explains much of the photometric residual."""
+    if isinstance(found, AmiwarpError) or found.photometric is None:
+        return False
+    return found.photometric.rotation_gain > LARGEST_ROTATION_GAIN
 
 
 def _explain(

@@ -94,6 +94,9 @@ class PhotometricSummary:
 
     The events come late by it, and more so in the dark. The mean lag is part of the phase.
     """
+    rotation_gain: float = 0.0
+    """Share of the squared residuals that a slow rotation of the camera would remove, by a linearised fit; 0 if it is
+    not significant or was not examined."""
     held: tuple[str, ...] = ()
     """Free parameters that the events do not determine. They keep the values of the sharpness stage."""
     warnings: tuple[str, ...] = ()

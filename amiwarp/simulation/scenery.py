@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 LARGEST_MOTION = 0.5
 """Largest motion of the image in a time step of the simulation [px]."""
 
+LARGEST_BEND = 0.002
+"""Largest distance of the orbit from its chord in a time step [px]. Brightness is interpolated along the chord, so that
+orbits come out too small by up to two thirds of it."""
+
 LONGEST_STEP = 2000
 """Longest time step of the simulation, even if nothing moves [us]."""
 
@@ -51,14 +55,17 @@ class ImageMotion:
 
 
 def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float = math.inf) -> int:
-    """Return the length of a time step [us] in which the image moves by at most half a pixel.
+    """Return the length of a time step [us]: in it the image moves by at most half a pixel, and nearly straight.
 
     ``world_speed``: speed of the image of a world, prism excluded [px/s]; ``longest``: upper bound of the step [us].
     """
     motion = image_motion(simulation)
     rates = simulation.camera_motion.largest_rates
-    speed = motion.prism * simulation.motion.largest_speed + float(motion.camera @ rates) + world_speed
-    step = min(float(LONGEST_STEP), longest, 1e6 * LARGEST_MOTION / max(speed, 1e-9))
+    turning = simulation.motion.largest_speed
+    speed = motion.prism * turning + float(motion.camera @ rates) + world_speed
+    bend = motion.prism * turning**2 / 8.0  # [px/s²]: the distance from the chord, per squared duration of a step
+    step = 1e6 * min(LARGEST_MOTION / max(speed, 1e-9), math.sqrt(LARGEST_BEND / max(bend, 1e-9)))
+    step = min(float(LONGEST_STEP), longest, step)
     frames = getattr(simulation.scene, "frames", None)
     if frames is not None and frames.interval_us is not None:
         step = min(step, frames.interval_us / STEPS_PER_FRAME)

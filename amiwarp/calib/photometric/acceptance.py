@@ -33,6 +33,9 @@ LARGEST_EXAMINED_COST = 0.5
 LARGEST_STILL_COST = 0.2
 """Largest cost of the photometric stage, relative to that without a brightness map, that a still camera and a correct
 encoder scale leave."""
+LARGEST_ROTATION_GAIN = 0.05
+"""Largest share of the squared residuals that a camera rotation may explain before it is freed. Cameras that turned at
+0.1 to 1 deg/s left 0.1 to 0.5; still ones 0.007 at most, whatever the noise."""
 LARGEST_COST_RATIO = 0.75
 """Ratio of the new to the previous cost up to which another explanation is accepted if the previous cost was high: a
 camera rotation, a corrected encoder scale, or a corrected lens."""

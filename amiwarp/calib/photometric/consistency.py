@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.parameters import DRIFTS, LENS
+from amiwarp.calib.parameters import DRIFTS, LENS, RATES
 from amiwarp.calib.photometric.causes import (
     CAUSES,
     FLAT_SIDE,
@@ -27,6 +27,7 @@ from amiwarp.calib.photometric.causes import (
 from amiwarp.calib.photometric.linear_fit import Estimate, LinearFit, linear_fit, masked
 from amiwarp.calib.photometric.minimum_check import size_and_phase_directions
 from amiwarp.errors import AmiwarpError
+from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.model_error import predicted_error
 
 if TYPE_CHECKING:
@@ -256,6 +257,26 @@ def slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
     step[k] = SLOPE_PX
     up, down = (place_arguments(space, space.to_values(at)) for at in (v + step, v - step))
     return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+
+
+def rotation_gain(cost: Cost, best: Vector) -> float:
+    """Return the share of the squared residuals that a slow rotation of the camera explains; 0 if not significant.
+
+    The map must be solved at the answer ``best``; it is not changed.
+    """
+    space, at = cost.space, cost.at(best)
+    columns = {name: slope(cost, space, best, k) for k, name in enumerate(space.names)}
+    half_s = max(0.5 * float(np.ptp(cost.brightness.pairs.time)), 1e-6)
+    for k, name in enumerate(RATES):
+        rate = np.zeros(3)
+        rate[k] = SLOPE_PX / space.camera.fx / half_s
+        up, down = ({**at, "camera_rotation": CameraRotation(tuple(side * rate))} for side in (1.0, -1.0))
+        columns[name] = cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+    fit = linear_fit(cost, columns)
+    estimate = fit.fit(tuple(columns))
+    if estimate.significance(len(space.names)) < SIGNIFICANT:
+        return 0.0
+    return estimate.gain - fit.fit(space.names).gain
 
 
 def testable(space: ParameterSpace) -> list[Cause]:

@@ -15,8 +15,9 @@ from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS, check_algorithm
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX
-from amiwarp.calib.photometric.acceptance import judge_lag
+from amiwarp.calib.photometric.acceptance import LARGEST_STILL_COST, judge_lag
 from amiwarp.calib.photometric.answer_search import AnswerSearch, join_runs
+from amiwarp.calib.photometric.consistency import rotation_gain
 from amiwarp.calib.photometric.correction import checked
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined
@@ -160,12 +161,14 @@ def refine(
     accepted, reason = judge_lag(time_constant * rad_per_us)
     if answer.result.accepted and not accepted:
         answer = replace(answer, result=replace(answer.result, accepted=False, verdict=reason))
+    space, still = answers.cost.space, answer.result.cost <= LARGEST_STILL_COST  # above, the rotation is freed anyway
+    gain = rotation_gain(answers.cost, answer.stage.x) if still and space.sized and not space.moving else 0.0
     notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
     result = replace(
         answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
-        refractory_us=sensor.refractory_us, time_constant_us=time_constant,
+        refractory_us=sensor.refractory_us, time_constant_us=time_constant, rotation_gain=gain,
     )  # fmt: skip
-    return result, StageSummary.of("photometric", answer.stage, answers.cost.space), answers.cost.space
+    return result, StageSummary.of("photometric", answer.stage, space), space
 
 
 def _with_slow_pixels(found: _Equations, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
