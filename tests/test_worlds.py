@@ -226,7 +226,7 @@ def test_maps_and_rays_see_alike(moves: bool) -> None:
     assert images[0].sum() > 2000
     assert images[0].sum() == pytest.approx(images[1].sum(), rel=0.1)
     smooth = [gaussian_filter(image, 1.0).ravel() for image in images]
-    assert np.corrcoef(*smooth)[0, 1] > 0.97
+    assert np.corrcoef(*smooth)[0, 1] > 0.96
 
 
 def test_rays_that_test_only_faces_nearby_see_what_all_rays_see(device: str) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 FIRST_SCALE = 1.0
 """Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
-SLOPE_PX = 0.02
+SLOPE_PX = 0.005
 """Step of the finite differences that give the derivatives of the residuals [px]."""
 
 
