@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.acceptance import judge_consistency
+from amiwarp.calib.photometric.acceptance import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
 from amiwarp.calib.photometric.causes import CAUSES
 from amiwarp.calib.photometric.consistency import Consistency, Finding
 from amiwarp.calib.photometric.linear_fit import LinearFit
@@ -19,6 +19,7 @@ from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.simulator import simulate
 
 CAMERA = Camera.from_fov(160, 120, math.radians(90.0))
@@ -31,10 +32,11 @@ def wide(texture: np.ndarray) -> Recording:
     return simulate(texture, CAMERA, PRISM, duration_s=0.17, seed=6)
 
 
-def calibrated(recording: Recording) -> Calibration:
+def calibrated(recording: Recording, **settings: Any) -> Calibration:
     return calibrate(
-        recording, model="exact", events=60_000, global_evaluations=60, photometric=PhotometricSettings(pairs=60_000)
-    )
+        recording, model="exact", events=60_000, global_evaluations=60, photometric=PhotometricSettings(pairs=60_000),
+        **settings,
+    )  # fmt: skip
 
 
 def error_px(recording: Recording, found: Calibration, camera: Camera = CAMERA) -> float:
@@ -87,6 +89,18 @@ def linear(truth: np.ndarray, noise: float, squares: int = 200) -> LinearFit:
     return LinearFit(("size", "phase", "other"), hessian, gradient, xy, float(np.sum(residual**2)))
 
 
+def test_a_slow_rotation_of_the_camera_is_noticed(texture: np.ndarray, wide: Recording) -> None:
+    """The cost alone does not tell: it is below that from which on a rotation is tried anyway."""
+    motion = CameraMotion(np.radians([1.5, 1.5, 0.0]))
+    turning = simulate(texture, CAMERA, PRISM, duration_s=0.17, camera_motion=motion, seed=6)
+    still, moved = (calibrated(recording, free=("apex", "phase")).photometric for recording in (wide, turning))
+    assert still is not None
+    assert moved is not None
+    assert still.rotation_gain < 0.2 * LARGEST_ROTATION_GAIN
+    assert moved.rotation_gain > LARGEST_ROTATION_GAIN
+    assert moved.cost < LARGEST_STILL_COST
+
+
 def test_linear_fit() -> None:
     truth = np.array([0.3, -0.2, 0.5])
     fit = linear(truth, noise=0.1)
@@ -102,7 +116,13 @@ def test_linear_fit() -> None:
 
 
 def outcome(**values: Any) -> Consistency:
-    none: dict[str, Any] = {"findings": (), "drift": (0.0, 0.0), "spread": (0.0, 0.0), "untold_px": 0.0}
+    none: dict[str, Any] = {
+        "findings": (),
+        "drift": (0.0, 0.0),
+        "spread": (0.0, 0.0),
+        "untold_px": 0.0,
+        "rotation_gain": 0.0,
+    }
     return Consistency(step=np.zeros(2), systematic=np.zeros((2, 2)), **{**none, **values})
 
 

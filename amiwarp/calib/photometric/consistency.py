@@ -96,6 +96,8 @@ class Consistency:
     """Change of the orbit's size and phase over the recording [px rms]; 0 if not significant."""
     spread: tuple[float, float]
     """Standard deviation of the orbit's size and phase between parts of the image, beyond their scatter [px]."""
+    rotation_gain: float
+    """Share of the squared residuals that a slow rotation of the camera would remove; 0 if it is not significant."""
     untold_px: float
     """Error if the other side of the prism is the flat one [px rms], if the events do not tell which it is; else 0."""
 
@@ -148,7 +150,7 @@ class Consistency:
 def check_consistency(cost: Cost, best: Vector) -> Consistency:
     """Check the answer ``best`` [px]. The map must be solved there; it is not changed."""
     space = cost.space
-    columns = _columns(cost, best)
+    columns = _columns(cost, best) | _rotation_columns(cost, best)
     causes = testable(space)
     doubtful = bool(set(LENS) & set(space.names))
     screened = causes if doubtful else [c for c in causes if c in SCREENED]
@@ -167,7 +169,8 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         systematic = systematic + _doubt(space, fit, causes)
     return Consistency(
         step=fit.fit(space.names).change, systematic=systematic, findings=tuple(findings),
-        drift=_drift(space, best, fit), spread=_spread(space, best, fit), untold_px=_untold(space, best, fit),
+        drift=_drift(space, best, fit), spread=_spread(space, best, fit),
+        rotation_gain=_rotation_gain(space, fit), untold_px=_untold(space, best, fit),
     )  # fmt: skip
 
 
@@ -259,21 +262,23 @@ def slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
     return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
 
 
-def rotation_gain(cost: Cost, best: Vector) -> float:
-    """Return the share of the squared residuals that a slow rotation of the camera explains; 0 if not significant.
-
-    The map must be solved at the answer ``best``; it is not changed.
-    """
-    space, at = cost.space, cost.at(best)
-    columns = {name: slope(cost, space, best, k) for k, name in enumerate(space.names)}
+def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by a slow rotation of the camera about each axis, if it is not free."""
+    space, at, columns = cost.space, cost.at(best), {}
     half_s = max(0.5 * float(np.ptp(cost.brightness.pairs.time)), 1e-6)
-    for k, name in enumerate(RATES):
+    for k, name in enumerate(RATES if not space.moving else ()):
         rate = np.zeros(3)
         rate[k] = SLOPE_PX / space.camera.fx / half_s
         up, down = ({**at, "camera_rotation": CameraRotation(tuple(side * rate))} for side in (1.0, -1.0))
         columns[name] = cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
-    fit = linear_fit(cost, columns)
-    estimate = fit.fit(tuple(columns))
+    return columns
+
+
+def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
+    """Return the share of the squared residuals that a slow rotation of the camera explains; 0 if not significant."""
+    if space.moving:
+        return 0.0
+    estimate = fit.fit((*space.names, *RATES))
     if estimate.significance(len(space.names)) < SIGNIFICANT:
         return 0.0
     return estimate.gain - fit.fit(space.names).gain
@@ -281,7 +286,7 @@ def rotation_gain(cost: Cost, best: Vector) -> float:
 
 def testable(space: ParameterSpace) -> list[Cause]:
     """Return the causes that can be tested: those that are not free anyway, for the exact model of a still camera."""
-    if space.model != "exact" or space.moving or not space.cartesian:
+    if space.model != "exact" or not space.cartesian:
         return []
     return [c for c in CAUSES if not set(c.names) & set(space.names)]
 

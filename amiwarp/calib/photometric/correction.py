@@ -139,7 +139,7 @@ def _final(search: AnswerSearch, answer: Answer, check: Consistency) -> Answer:
         v = v + check.step
     result = replace(
         result, parameters=space.to_values(v),
-        uncertainty=space.deviations(v, answer.covariance + systematic),
+        uncertainty=space.deviations(v, answer.covariance + systematic), rotation_gain=check.rotation_gain,
     )  # fmt: skip
     accepted, reason = judge_consistency(check.inconsistent_px(), check.likeliest())
     if result.accepted and not accepted:

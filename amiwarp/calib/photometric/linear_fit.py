@@ -6,6 +6,7 @@ is then a small linear problem. Its sums are kept for each square of pixels, who
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -89,21 +90,17 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     )
     weight, residual = (a.numpy()[:n].astype(np.float64) for a in (b.residuals.weight, b.residuals.values))
     known = np.isfinite(residual) & np.isfinite(left).all(axis=0)
-    left, weight, residual = left[:, known], weight[known], residual[known]
-    x, y = (pairs.column(name)[known].astype(np.int64) // SQUARE_PX for name in "xy")
+    x, y = (pairs.column(name)[known].astype(np.int32) // SQUARE_PX for name in "xy")
     width = int(x.max(initial=0)) + 1
-    key, square = np.unique(y * width + x, return_inverse=True)
-
-    def sums(values: Vector) -> Vector:
-        return np.asarray(np.bincount(square, weights=values, minlength=len(key)), np.float64)
-
+    square = y * width + x
+    order = np.argsort(square, kind="stable")
+    key, first = np.unique(square[order], return_index=True)
+    left, weight, residual = (a[..., known][..., order] for a in (left, weight, residual))
+    weighted = left * weight
+    parts = [slice(start, end) for start, end in itertools.pairwise([*first.tolist(), len(order)])]
     m = len(left)
-    hessian, gradient = np.empty((len(key), m, m)), np.empty((len(key), m))
-    for i, row in enumerate(left):
-        weighted = row * weight
-        gradient[:, i] = sums(weighted * residual)
-        for j in range(i + 1):
-            hessian[:, i, j] = hessian[:, j, i] = sums(weighted * left[j])
+    hessian = np.array([weighted[:, part] @ left[:, part].T for part in parts]).reshape(-1, m, m)
+    gradient = np.array([weighted[:, part] @ residual[part] for part in parts]).reshape(-1, m)
     xy = (np.stack([key % width, key // width], axis=1) + 0.5) * SQUARE_PX
     return LinearFit(tuple(columns), hessian, gradient, xy, float(np.sum(weight * residual**2)))
 

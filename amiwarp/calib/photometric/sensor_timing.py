@@ -50,43 +50,42 @@ def timing_can_be_found(answer: Answer, cost: Cost) -> bool:
     return space.sized and not space.moving and not drifts and answer.result.cost <= LARGEST_EXAMINED_COST
 
 
-def refractory_step(cost: Cost, v: Vector, direction: float) -> float:
-    """Return the significant angle per refractory period by a linearised fit at the answer ``v`` [rad]; else 0."""
-    return _significant_change(cost, v, direction * REFERENCE)
+def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]:
+    """Return the angles per refractory period and per time constant at median brightness [rad].
 
-
-def slow_step(cost: Cost, v: Vector, direction: float) -> float:
-    """Return the significant angle per time constant at median brightness, by a linearised fit [rad]; else 0."""
-    relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
-    return _significant_change(cost, v, -direction * relative)
-
-
-def _significant_change(cost: Cost, v: Vector, shift: NDArray[np.floating[Any]]) -> float:
-    """Return the significant positive factor of ``shift``, changes of the angles at the ends of pairs; else 0."""
-    cost.residuals(v, rounds=2)
-    change, significance, gain = _change(cost, v, shift)
-    return change if change > 0.0 and significance >= SIGNIFICANT and gain >= LEAST_GAIN else 0.0
-
-
-def _change(cost: Cost, v: Vector, shift: NDArray[np.floating[Any]]) -> tuple[float, float, float]:
-    """Return the factor of ``shift`` by a linearised fit, its significance, and the share that it explains.
-
-    The map must be solved at ``v``.
+    They come from linearised fits at the answer ``v``; 0 for one that is not significant.
     """
+    cost.residuals(v, rounds=2)
+    relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
     space = cost.space
     columns: dict[str, Any] = {name: slope(cost, space, v, k) for k, name in enumerate(space.names)}
+    columns["refractory"] = _shifted(cost, v, direction * REFERENCE)
+    columns["slow"] = _shifted(cost, v, -direction * relative)
+    fit = linear_fit(cost, columns)
+    before = fit.fit(space.names).gain
+    found = []
+    for name in ("refractory", "slow"):
+        estimate = fit.fit((*space.names, name))
+        change = float(estimate.change[-1])
+        tells = estimate.significance(len(v)) >= SIGNIFICANT and estimate.gain - before >= LEAST_GAIN
+        found.append(change if change > 0.0 and tells else 0.0)
+    return found[0], found[1]
+
+
+def _shifted(cost: Cost, v: Vector, shift: NDArray[np.floating[Any]]) -> Any:
+    """Return the derivative of the residuals by a factor of ``shift``, changes of the angles at the ends of pairs.
+
+    ``shift`` has shape (2, 1) or (2, pairs).
+    """
     pairs, at = cost.brightness.pairs, cost.at(v)
     none = pairs.arrays.slope
     values = np.zeros((2, pairs.arrays.stride), np.float32)
     values[:, : len(pairs)] = shift
     pairs.arrays.slope = wp.array(values.ravel(), dtype=float, device=pairs.device)
     ends = {**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD}
-    columns["time"] = cost.brightness.find_slope(*ends, 2.0 * STEP_RAD)
+    column = cost.brightness.find_slope(*ends, 2.0 * STEP_RAD)
     pairs.arrays.slope = none
-    fit = linear_fit(cost, columns)
-    estimate = fit.fit(tuple(columns))
-    gain = estimate.gain - fit.fit(space.names).gain
-    return float(estimate.change[-1]), estimate.significance(len(v)), gain
+    return column
 
 
 def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:

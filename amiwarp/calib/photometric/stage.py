@@ -15,9 +15,8 @@ from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS, check_algorithm
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX
-from amiwarp.calib.photometric.acceptance import LARGEST_STILL_COST, judge_lag
+from amiwarp.calib.photometric.acceptance import judge_lag
 from amiwarp.calib.photometric.answer_search import AnswerSearch, join_runs
-from amiwarp.calib.photometric.consistency import rotation_gain
 from amiwarp.calib.photometric.correction import checked
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined
@@ -30,10 +29,9 @@ from amiwarp.calib.photometric.pair_collection import (
 from amiwarp.calib.photometric.sensor_timing import (
     find_refractory,
     find_time_constant,
-    refractory_step,
-    slow_step,
     timing_can_be_found,
     timing_notes,
+    timing_steps,
 )
 from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.summaries import PhotometricSummary, StageSummary
@@ -146,13 +144,15 @@ def refine(
     rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
     if timing_can_be_found(answer, found.answers.cost) and rpm:
         v = answer.stage.x
-        if not given.refractory_us and (first := refractory_step(found.answers.cost, v, direction)):
-            turn = find_refractory(found.coarse(), v, first, direction)
+        pause, lag = timing_steps(found.answers.cost, v, direction)
+        if pause and not given.refractory_us:
+            turn = find_refractory(found.coarse(), v, pause, direction)
             sensor = replace(given, refractory_us=turn / rad_per_us)
             found = equations(sensor)
             answer = found.answers.search(found.start)
-        if first := slow_step(found.answers.cost, answer.stage.x, direction):
-            answer, turn = _with_slow_pixels(found, answer, first, direction)
+            _, lag = timing_steps(found.answers.cost, answer.stage.x, direction)
+        if lag:
+            answer, turn = _with_slow_pixels(found, answer, lag, direction)
             time_constant = turn / rad_per_us
         if len(v) == len(answer.stage.x):
             found.answers.timing = answer.stage.x - v
@@ -161,14 +161,12 @@ def refine(
     accepted, reason = judge_lag(time_constant * rad_per_us)
     if answer.result.accepted and not accepted:
         answer = replace(answer, result=replace(answer.result, accepted=False, verdict=reason))
-    space, still = answers.cost.space, answer.result.cost <= LARGEST_STILL_COST  # above, the rotation is freed anyway
-    gain = rotation_gain(answers.cost, answer.stage.x) if still and space.sized and not space.moving else 0.0
     notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
     result = replace(
         answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
-        refractory_us=sensor.refractory_us, time_constant_us=time_constant, rotation_gain=gain,
+        refractory_us=sensor.refractory_us, time_constant_us=time_constant,
     )  # fmt: skip
-    return result, StageSummary.of("photometric", answer.stage, space), space
+    return result, StageSummary.of("photometric", answer.stage, answers.cost.space), answers.cost.space
 
 
 def _with_slow_pixels(found: _Equations, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
