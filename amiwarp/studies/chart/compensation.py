@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib import Calibration
+    from amiwarp.events.events import Events
 
 IMAGE, FILE = "image of events", "file to file"
 """Names of the two measured jobs, an image and a file. Rows of one job can be compared and share a Pareto front."""
@@ -101,7 +102,7 @@ class Uploads:
     def __init__(self, known: KnownRecording, device: str) -> None:
         self.known, self.device = known, device
         copies = 1 if wp.get_device(device).is_cpu else max(1, MANY // len(known.events))
-        self.events = known.events if copies == 1 else _repeated(known, copies)
+        self.events = _repeated(known.events, copies)
         self.theta = np.tile(known.encoder.angle_at(known.events.t), copies)
         self.copies = copies
         self._made: dict[tuple[int, int], Any] = {}
@@ -109,14 +110,18 @@ class Uploads:
     def get(self, angles: int, share: int) -> Any:
         """Return the uploaded events with ``angles`` distinct angles per turn, every ``share``-th event."""
         if (angles, share) not in self._made:
-            theta = coarse(self.theta[::share], angles)
-            self._made[angles, share] = upload_events(self.events[::share], theta, self.device)
+            # a share of the repeated events could contain all of them
+            n = len(self.known.events)
+            theta = np.tile(coarse(self.theta[:n:share], angles), self.copies)
+            events = _repeated(self.known.events[::share], self.copies)
+            self._made[angles, share] = upload_events(events, theta, self.device)
         return self._made[angles, share]
 
 
-def _repeated(known: KnownRecording, copies: int) -> Any:
-    """Return the events repeated ``copies`` times."""
-    e = known.events
+def _repeated(e: Events, copies: int) -> Events:
+    """Return the events ``e`` repeated ``copies`` times."""
+    if copies == 1:
+        return e
     return replace(e, **{n: np.tile(getattr(e, n), copies) for n in ("x", "y", "t", "p")})
 
 
