@@ -1,10 +1,14 @@
 """The inspector's values for its page: suggested region, sharpness, residuals, event rates and state."""
 
+import asyncio
+import contextlib
 import io
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,6 +41,7 @@ from amiwarp.viewer.parameters import Knobs, Selection, Source
 from amiwarp.viewer.phase_estimate import estimate_phase
 from amiwarp.viewer.selected_calibration import calibrate_selected, cost_surface, scope_text
 from amiwarp.viewer.suggestion import suggest_region
+from amiwarp.viewer.updates import Updates
 from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
 
 TRUE = Prism(math.radians(1.0))
@@ -759,3 +764,29 @@ def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
 def test_a_calibration_is_downloaded(inspector: Inspector) -> None:
     data = json.loads(as_bytes(".json", inspector.as_calibration().save))
     assert data["parameters"]["apex"]["value"] == TRUE.apex
+
+
+class PageState(dict[str, Any]):
+    """State variables of a page, as attributes and by name."""
+
+    __getattr__ = dict.__getitem__
+    __setattr__ = dict.__setitem__
+
+
+def test_a_number_that_is_typed_during_an_update_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page sets the variable while an update is computed in a thread; the end of the update once reset it."""
+    state = PageState(apex=1.0, knob="apex", playing=True)
+
+    async def compute_while_the_user_types(work: Any) -> tuple[None, dict[str, Any]]:
+        state.apex = 2.5
+        return None, {}
+
+    panel = SimpleNamespace(
+        state=state, errors_shown=lambda what: contextlib.nullcontext(), set_knobs=lambda: None,
+        show_knobs=lambda: state.update(apex=1.0), history=SimpleNamespace(remember=lambda change: None),
+        in_thread=compute_while_the_user_types,
+    )  # fmt: skip
+    monkeypatch.setattr(Updates, "_show_prism", lambda self: None)
+    asyncio.run(Updates(panel).make({"knobs"}))  # type: ignore[arg-type]
+    assert state.apex == 2.5
+    assert state.curve_mark == 2.5
