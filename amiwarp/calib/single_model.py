@@ -46,12 +46,13 @@ def calibrate_model(
     if "photometric" not in settings.stages:
         return _calibrate_once(recording, settings, device, progress)
     found = _calibration_or_error(recording, settings, device, progress)
-    if recording.encoder is not None and _unexplained(found):
-        recording, found = _without_bad_pixels(recording, settings, found, device, progress)
-    if recording.encoder is not None and _unexplained(found):
-        found = _explain(recording, settings, found, device, progress)
-    elif settings.free is None and _camera_turned(found):
-        found = _with_rotation(recording, settings, found, device, progress)
+    if recording.encoder is not None:
+        if _unexplained(found):
+            recording, found = _without_bad_pixels(recording, settings, found, device, progress)
+        if _unexplained(found):
+            found = _explain(recording, settings, found, device, progress)
+        elif settings.free is None and _camera_turned(found):
+            found = _with_rotation(recording, settings, found, device, progress)
     if isinstance(found, AmiwarpError):
         raise found
     _check_confirmed(found, recording.name)

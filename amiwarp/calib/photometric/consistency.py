@@ -180,7 +180,7 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
     ``long …`` are the derivatives of pairs with long gaps only; ``late …`` grow with the time of the pair.
     """
     space, time = cost.space, cost.brightness.pairs.time
-    columns = {name: slope(cost, space, best, k) for k, name in enumerate(space.names)}
+    columns = free_columns(cost, best)
     middle, gap = time.mean(axis=0), time[1] - time[0]
     late = ((middle - middle.mean()) / max(float(middle.std()), 1e-9)).astype(np.float32)
     long = (gap > np.median(gap)).astype(np.float32)
@@ -262,6 +262,11 @@ def slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
     return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
 
 
+def free_columns(cost: Cost, v: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals at ``v`` by each free parameter, on the device, by name."""
+    return {name: slope(cost, cost.space, v, k) for k, name in enumerate(cost.space.names)}
+
+
 def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by a slow rotation of the camera about each axis, if it is not free."""
     space, at, columns = cost.space, cost.at(best), {}
@@ -278,14 +283,12 @@ def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
     """Return the share of the squared residuals that a slow rotation of the camera explains; 0 if not significant."""
     if space.moving:
         return 0.0
-    estimate = fit.fit((*space.names, *RATES))
-    if estimate.significance(len(space.names)) < SIGNIFICANT:
-        return 0.0
-    return estimate.gain - fit.fit(space.names).gain
+    _, significance, gain = fit.adding(space.names, RATES)
+    return gain if significance >= SIGNIFICANT else 0.0
 
 
 def testable(space: ParameterSpace) -> list[Cause]:
-    """Return the causes that can be tested: those that are not free anyway, for the exact model of a still camera."""
+    """Return the causes that can be tested: those that are not free anyway, for the exact model."""
     if space.model != "exact" or not space.cartesian:
         return []
     return [c for c in CAUSES if not set(c.names) & set(space.names)]
@@ -307,14 +310,11 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
 
 def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause], least_gain: float) -> list[Finding]:
     """Return the significant causes, ordered by the share of the residual that their correction removes."""
-    n, found = len(best), []
-    before = fit.fit(cost.space.names).gain
+    found = []
     for cause in causes:
         if not set(cause.names) <= set(fit.names):
             continue
-        estimate = fit.fit((*cost.space.names, *cause.names))
-        significance = estimate.significance(n)
-        gain = estimate.gain - before
+        estimate, significance, gain = fit.adding(cost.space.names, cause.names)
         if significance < SIGNIFICANT or gain < least_gain:
             continue
         moved, start = _corrected(cost, best, cause, estimate)

@@ -76,6 +76,14 @@ class LinearFit:
         gain = float(change @ total @ change) / max(self.squares_sum, 1e-30)
         return Estimate(change, inverse @ (parts.T @ parts) @ inverse * spare, gain)
 
+    def adding(self, names: tuple[str, ...], more: tuple[str, ...]) -> tuple[Estimate, float, float]:
+        """Return the fit of the columns ``names`` and ``more``, and what ``more`` contributes.
+
+        That is how many standard deviations they are away from 0, and the share of the sum of squares that they remove.
+        """
+        estimate = self.fit((*names, *more))
+        return estimate, estimate.significance(len(names)), estimate.gain - self.fit(names).gain
+
 
 def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     """Return the linearised problem of ``columns``, derivatives of the residuals on the device, by name.

@@ -13,7 +13,7 @@ import warp as wp
 
 from amiwarp.brightness.slow_pixels import darkness, set_lags
 from amiwarp.calib.photometric.acceptance import LARGEST_EXAMINED_COST
-from amiwarp.calib.photometric.consistency import slope
+from amiwarp.calib.photometric.consistency import free_columns
 from amiwarp.calib.photometric.linear_fit import linear_fit
 
 if TYPE_CHECKING:
@@ -53,23 +53,21 @@ def timing_can_be_found(answer: Answer, cost: Cost) -> bool:
 def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]:
     """Return the angles per refractory period and per time constant at median brightness [rad].
 
-    They come from linearised fits at the answer ``v``; 0 for one that is not significant.
+    A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant is 0.
     """
     cost.residuals(v, rounds=2)
     relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
-    space = cost.space
-    columns: dict[str, Any] = {name: slope(cost, space, v, k) for k, name in enumerate(space.names)}
+    columns = free_columns(cost, v)
     columns["refractory"] = _shifted(cost, v, direction * REFERENCE)
     columns["slow"] = _shifted(cost, v, -direction * relative)
     fit = linear_fit(cost, columns)
-    before = fit.fit(space.names).gain
-    found = []
-    for name in ("refractory", "slow"):
-        estimate = fit.fit((*space.names, name))
+
+    def angle(name: str) -> float:
+        estimate, significance, gain = fit.adding(cost.space.names, (name,))
         change = float(estimate.change[-1])
-        tells = estimate.significance(len(v)) >= SIGNIFICANT and estimate.gain - before >= LEAST_GAIN
-        found.append(change if change > 0.0 and tells else 0.0)
-    return found[0], found[1]
+        return change if change > 0.0 and significance >= SIGNIFICANT and gain >= LEAST_GAIN else 0.0
+
+    return angle("refractory"), angle("slow")
 
 
 def _shifted(cost: Cost, v: Vector, shift: NDArray[np.floating[Any]]) -> Any:
