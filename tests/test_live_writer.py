@@ -234,6 +234,18 @@ def test_a_full_disk_keeps_all_that_came_before(tmp_path, limit, flush_s):
     h5py.File(path).close()  # the file was closed properly
 
 
+@pytest.mark.parametrize("moment", ["allocate", "write_header"])
+def test_an_interrupt_during_the_start_leaves_no_file(tmp_path, monkeypatch, moment):
+    def interrupt(*_: object) -> None:
+        assert (tmp_path / "a.part.h5").exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"amiwarp.io.live_writer.{moment}", interrupt)
+    with pytest.raises(KeyboardInterrupt), live(tmp_path / "a.h5"):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
 def test_an_empty_recording(tmp_path):
     with live(tmp_path / "a.h5") as writer:
         writer.tick()

@@ -175,11 +175,11 @@ def run(
         opened = stream.open(source, line.say)
         check_angles(opened, link)
         check_size(found, opened.size, opened.name)
+        resources.enter_context(stopped_by_interrupt(stop))  # before the files: Ctrl-C leaves none unfinished
         receivers = _Receivers(
             outputs, opened, found, offset_us=clock_offset(opened, link), resources=resources, stop=stop, say=line.say
         )
         keeper = adaptive.build(found.model, link, line.say)
-        resources.enter_context(stopped_by_interrupt(stop))
         session = _session(opened, found, receivers, processing, link=link, keeper=keeper, device=device, say=line.say)
         status = _follow(session, stop, line, receivers)
     data: dict[str, Any] = {

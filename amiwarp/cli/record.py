@@ -51,7 +51,7 @@ def run(
             prism=prism.build(opened.prism), metadata={"recorded_from": opened.name},
             clock_offset_us=clock_offset(opened, link),
         )  # fmt: skip
-        with writer, stopped_by_interrupt(stop):
+        with stopped_by_interrupt(stop), writer:  # in this order, so that Ctrl-C leaves no unfinished file
             status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
     data = {"file": str(out), **summary(status, opened), "messages": list(line.messages)}
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"

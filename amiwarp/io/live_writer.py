@@ -113,15 +113,18 @@ class LiveWriter:
 
         check_output(self.path, overwrite=self._overwrite)
         try:
-            with open(self.part, "xb") as file:
-                allocate(file.fileno(), 0, self._to_finish())
+            file = open(self.part, "xb")
         except FileExistsError as error:
             what = "is being written, or was left by an interrupted recording; it can be opened like any recording"
             raise AmiwarpError(f"{self.part}: {what}; rename or delete this file") from error
         except OSError as error:
-            self.part.unlink(missing_ok=True)
-            raise AmiwarpError(f"{self.path}: cannot be created: {error.strerror}; choose another place") from error
+            raise self._not_created(error) from error
         try:
+            try:
+                with file:
+                    allocate(file.fileno(), 0, self._to_finish())
+            except OSError as error:
+                raise self._not_created(error) from error
             with errors_name(self.path, lambda: "making the file"):
                 self._file = h5py.File(self.part, "w", libver=("v110", "v110"))
                 self._reserve()
@@ -133,6 +136,9 @@ class LiveWriter:
             raise
         self._flushed_at = time.monotonic()
         return self
+
+    def _not_created(self, error: OSError) -> AmiwarpError:
+        return AmiwarpError(f"{self.path}: cannot be created: {error.strerror}; choose another place")
 
     def _create_datasets(self) -> None:
         """Create all datasets, because none can be added in single-writer mode."""
