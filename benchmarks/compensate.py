@@ -54,6 +54,8 @@ CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, FOV), Prism(APEX, INDEX)
 BAR_PX = 1e-3
 ALONE = 20_000_000
 """Number of events with which each stage is measured without the other stages."""
+SAMPLES, SAMPLE = 40, 5000
+"""Number of pieces of a written file that are compared with the truth, and events per piece."""
 COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
 MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside": np.uint8}
 
@@ -142,20 +144,23 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.perf_counter() - began
 
 
-def truth(name: str, model: Any, xy: Any, theta: Any) -> Any:
+def truth(name: str, model: Any, xy: Any, theta: Any, prism: Prism = PRISM, phase: float = PHASE) -> Any:
     """Return the true positions by the float64 oracle of the tests; for the ellipse, by its own tables in float64."""
     if name == "ellipse":
         phi = (theta + PHASE)[:, None]
         at = xy[:, 1].astype(int), xy[:, 0].astype(int)
         return xy + model.offset[at] + model.cosine[at] * np.cos(phi) + model.sine[at] * np.sin(phi)
-    return reference.place(name, CAMERA, PRISM, xy, theta, phase=PHASE)
+    return reference.place(name, CAMERA, prism, xy, theta, phase=phase)
 
 
-def error_of(name: str, model: Any, encoder: Encoder, raw: Events, moved: Events, inside: Any) -> float:
+def error_of(
+    name: str, model: Any, encoder: Encoder, raw: Events, moved: Events, inside: Any, prism: Prism = PRISM,
+    phase: float = PHASE,
+) -> float:  # fmt: skip
     """Return the largest distance to the truth [px]; infinite if times, polarities or flags differ."""
     xy = np.stack([raw.x, raw.y], axis=1).astype(np.float64)
     found = np.stack([moved.x, moved.y], axis=1)
-    away = np.linalg.norm(found - truth(name, model, xy, encoder.angle_at(raw.t)), axis=1)
+    away = np.linalg.norm(found - truth(name, model, xy, encoder.angle_at(raw.t), prism, phase), axis=1)
     same = np.array_equal(raw.t, moved.t) and np.array_equal(raw.p, moved.p)
     same &= np.array_equal(inside.astype(bool), inside_image(found, WIDTH, HEIGHT))
     return float(away.max()) if same and np.isfinite(away).all() else math.inf
@@ -259,16 +264,21 @@ def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> di
     return result
 
 
+def pieces(n: int) -> list[tuple[int, int]]:
+    """Return ranges of events that are spread over a recording of ``n``."""
+    starts = np.linspace(0, max(n - SAMPLE, 0), SAMPLES).astype(int).tolist()
+    return [(start, min(start + SAMPLE, n)) for start in starts]
+
+
 def errors(
     name: str, model: Model, encoder: Encoder, recording: Any, source: Path, out: Path, n: int
 ) -> Iterator[float]:
     """Yield the error of short pieces spread over the written file."""
     written = None if recording is None else open_recording(out).events
-    for start in np.linspace(0, max(n - 5000, 0), 40).astype(int).tolist():
-        stop = min(start + 5000, n)
+    for start, stop in pieces(n):
         if written is None:
-            raw = Events(**Bare(source).read(start, COLUMNS, 5000))
-            columns = Bare(out).read(start, MOVED, 5000)
+            raw = Events(**Bare(source).read(start, COLUMNS, SAMPLE))
+            columns = Bare(out).read(start, MOVED, SAMPLE)
             inside = columns.pop("inside")
             moved = Events(**columns)
         else:

@@ -11,7 +11,9 @@ from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
-from amiwarp.brightness.solver import BrightnessMap, Tiles
+from amiwarp.brightness.residuals import Residuals
+from amiwarp.brightness.solver import BrightnessMap
+from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric.pair_collection import van_der_corput
 from amiwarp.calib.photometric.stage import PhotometricSettings
@@ -253,3 +255,26 @@ def test_a_memory_source_without_truth(recording: Recording, calibration: Calibr
     n = len(recording.events)
     bare = replace(recording, events=MemoryEvents(recording.events.slice(0, n), *recording.events.size), truth=None)
     assert calibrate(bare, events=100_000, photometric=COARSE).parameters == calibration.parameters
+
+
+def test_sums_of_products_by_square(recording: Recording, device: str) -> None:
+    """Sums over the pairs of each square of 16 px agree with NumPy; pairs with a NaN count nowhere."""
+    width, height = recording.events.size
+    assert recording.encoder is not None
+    table = EventTable([recording.events.slice(0, 60_000)], np.zeros((height, width), np.int32), device)
+    pairs = table.pairs(recording.encoder, longest_gap_us=20_000)
+    rng = np.random.default_rng(3)
+    factors = rng.normal(size=(3, len(pairs))).astype(np.float32)
+    factors[1, ::7] = np.nan
+    weight = rng.uniform(0.1, 1.0, len(pairs)).astype(np.float32)
+    residuals = Residuals(pairs, 1)
+    residuals.weight = pairs.to_device(weight)
+    columns, rows = -(-width // 16), -(-height // 16)
+    found, squares = residuals.products_by_square([pairs.to_device(f) for f in factors], 16, columns, rows)
+    number = pairs.column("y").astype(int) // 16 * columns + pairs.column("x").astype(int) // 16
+    known = np.isfinite(factors).all(axis=0)
+    assert np.array_equal(squares, np.unique(number[known]))
+    exact = factors.astype(np.float64)
+    for k, square in enumerate(squares):
+        of = exact[:, known & (number == square)]
+        np.testing.assert_allclose(found[k], (of * weight[known & (number == square)]) @ of.T, rtol=1e-12, atol=1e-12)

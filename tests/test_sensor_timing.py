@@ -9,7 +9,8 @@ import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.brightness.slow_pixels import THRESHOLD, darkness, set_lags
-from amiwarp.brightness.solver import BrightnessMap, Tiles
+from amiwarp.brightness.solver import BrightnessMap
+from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.imaging.metrics import model_error

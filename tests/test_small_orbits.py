@@ -1,17 +1,18 @@
-"""Small orbits: the brightness map is fine enough, and its damping does not make the orbit larger."""
+"""Small orbits and thresholds: the brightness map is fine enough, and its damping does not bias the orbit."""
 
 import math
 
 import numpy as np
 import pytest
 
-from amiwarp.brightness.solver import Tiles
+from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib import calibrate
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
@@ -30,6 +31,13 @@ def error_px(recording: Recording, **photometric: float) -> float:
 
 def test_small_orbits_are_not_too_large(texture: np.ndarray) -> None:
     assert error_px(small_orbit(texture)) < 0.01
+
+
+def test_small_thresholds_do_not_change_the_orbit(texture: np.ndarray) -> None:
+    """In units of a small threshold the map is large, so that the damping of ordinary maps would flatten it."""
+    sensor = SensorModel(contrast_on=0.05, contrast_off=0.05)
+    recording = simulate(texture, CAMERA, Prism(math.radians(2.0), 1.52), duration_s=0.25, sensor=sensor, seed=4)
+    assert error_px(recording) < 0.01
 
 
 @pytest.mark.parametrize("density", [1.0, 1.5, 3.0])

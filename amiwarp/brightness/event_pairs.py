@@ -75,6 +75,12 @@ class PairSet:
         values: NDArray[np.float32] = self.arrays.time.numpy()
         return values.reshape(2, -1)[:, : len(self)]
 
+    def to_device(self, values: NDArray[Any]) -> Any:
+        """Return a value for each pair, shape (n,), as an array of the length of the pairs' columns on the device."""
+        padded = np.zeros(self.arrays.stride, np.float32)
+        padded[: len(self)] = values
+        return wp.array(padded, dtype=float, device=self.device)
+
     def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
         """Attach to each pair the change of its prism angles per unit of a drifting parameter, and return the set.
 

@@ -10,9 +10,11 @@ import numpy as np
 import warp as wp
 
 from amiwarp.kernels.conjugate_gradients import CPU_WIDTH
+from amiwarp.kernels.launch import launch
 from amiwarp.kernels.photometric import HELD
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
 from amiwarp.kernels.residual_slopes import add_clusters, magnitudes, sum_costs, sum_products
+from amiwarp.kernels.square_sums import find_squares, sum_square_products
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,6 +70,35 @@ class Residuals:
             total, number = sums.numpy()
             rows.append(total[number > 0] / 2.0**32)
         return np.array(rows)
+
+    def products_by_square(
+        self, factors: list[Any], side: int, columns: int, rows: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return sums of a · b · weight over the pairs of each square of pixels, for all a and b of ``factors``.
+
+        The factors are on the device. The squares have ``side`` pixels along each axis; there are ``columns`` x
+        ``rows`` of them. Those without pairs are left out, and so are pairs for which any factor is NaN. Return the
+        sums, shape (squares, factors, factors), and the numbers of the squares, row by row, shape (squares,).
+        """
+        n, squares = self.count, columns * rows
+        values = wp.empty((len(factors), n), dtype=float, device=self.device)
+        for k, factor in enumerate(factors):
+            wp.copy(values[k], factor, count=n)
+        square, order = (wp.empty(2 * n, dtype=int, device=self.device) for _ in "so")
+        launch(
+            find_squares, n, [self.pairs.arrays, values, side, columns, squares], [square, order], device=self.device
+        )
+        wp.utils.radix_sort_pairs(square, order, n)
+        upper = np.triu_indices(len(factors))
+        first, second = (wp.array(k, dtype=int, device=self.device) for k in upper)
+        sums = self._doubles(squares, len(first))
+        number = wp.zeros(squares, dtype=int, device=self.device)
+        inputs = [values, self.weight, square, order, n, first, second]
+        launch(sum_square_products, sums.size, inputs, [sums, number], device=self.device, smallest=CHUNKS)
+        used = np.flatnonzero(number.numpy())
+        found = np.empty((len(used), len(factors), len(factors)))
+        found[:, upper[0], upper[1]] = found[:, upper[1], upper[0]] = sums.numpy()[used]
+        return found, used
 
     def median(self, first: int | None = None) -> float:
         """Return the median absolute residual of the ``first`` pairs, or of all; NaN if there is none."""

@@ -7,8 +7,7 @@ L. L is in units of the ON threshold. See ``docs/explanation/photometric.md``.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -37,10 +36,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.brightness.event_pairs import PairSet
+    from amiwarp.brightness.tiles import Tiles
     from amiwarp.optics.models import Model
 
 DAMPING = 0.02
 """Weight of the squared map values relative to the equations. It determines unknowns that no equation does."""
+CONTRAST = 6.0
+"""Mean square of a map [thresholds²] above which its damping may decrease in inverse proportion: the same picture has
+larger values in smaller thresholds, and damping that does not follow them flattens it more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,30 +58,6 @@ class Smoothness:
     edge: float = 0.0
     """Difference of neighbouring nodes above which their link weakens (Charbonnier) [thresholds]; 0: all links have
     equal weight."""
-
-
-@dataclass(frozen=True, slots=True)
-class Tiles:
-    """Rectangular parts of the map, all of the same size, with nodes ``1 / density`` px apart."""
-
-    origin: NDArray[np.float32]
-    """Pixel coordinates (x, y) of each tile's first node [px], shape (tiles, 2)."""
-    rows: int
-    """Number of rows of nodes per tile."""
-    columns: int
-    """Number of columns of nodes per tile."""
-    density: float = 2.0
-    """Map nodes per pixel along each axis."""
-
-    @property
-    def nodes(self) -> int:
-        """Total number of map nodes."""
-        return len(self.origin) * self.rows * self.columns
-
-    def at_density(self, density: float) -> Tiles:
-        """Return tiles of the same place and size with another number of nodes per pixel along each axis."""
-        rows, columns = (math.ceil((n - 1) * density / self.density) + 1 for n in (self.rows, self.columns))
-        return replace(self, rows=rows, columns=columns, density=density)
 
 
 class BrightnessMap:
@@ -144,7 +123,8 @@ class BrightnessMap:
         """Set up damping, smoothness, and the multigrid preconditioner of a single tile."""
         linked = self.smoothness is not None
         self._prior = Prior()
-        self._prior.damping, self._prior.columns = damping, self.tiles.columns
+        self._prior.columns = self.tiles.columns
+        self._prior.damping = wp.full(1, damping, dtype=float, device=self.device)
         self._prior.linked, self._prior.held = int(linked), unknowns
         self._prior.right, self._prior.down = (self._zeros(unknowns * linked) for _ in "xy")
         self._prior.smooth = self._zeros(1)
@@ -240,6 +220,16 @@ class BrightnessMap:
         """Set the map to zero and change the weight of the smoothness prior."""
         self._image[: self.tiles.nodes].zero_()
         self._prior.smooth.fill_(smoothness)
+
+    def relax_damping(self) -> bool:
+        """Reduce the damping if the solved map has a large contrast, and return whether it has."""
+        maps = self.maps()
+        seen = maps[maps != 0.0]
+        square = float(np.mean(seen**2, dtype=np.float64)) if len(seen) else 0.0
+        if square <= CONTRAST:
+            return False
+        self._prior.damping.fill_(DAMPING * CONTRAST / square)
+        return True
 
     def prepare_projection(self) -> None:
         """Prepare :meth:`unexplained` with the weights that the last :meth:`solve` set."""

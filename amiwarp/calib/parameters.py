@@ -328,6 +328,8 @@ def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraR
 
 def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
     """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
+    if not any(name in values for name in LENS):
+        return camera
     fx = values.get("focal_length", camera.fx)
     lens = camera.distortion
     if "k1" in values:

@@ -12,7 +12,7 @@ EXTRA = wp.constant(2)  # number of unknowns that follow the map nodes: leak and
 class Prior:
     """Prior cost of a map x: damping x² plus the sum of weight (xᵢ - xⱼ)² over all links. No link leaves a tile."""
 
-    damping: float
+    damping: wp.array(dtype=float)  # one element
     linked: int  # 1 if there are links, else 0
     columns: int
     held: int  # index from which on the unknowns are fixed
@@ -24,7 +24,7 @@ class Prior:
 @wp.func
 def prior_product(prior: Prior, vector: wp.array(dtype=float), i: int) -> float:
     """Return element ``i`` of the prior's operator times a vector."""
-    total = prior.damping * vector[i]
+    total = prior.damping[0] * vector[i]
     if prior.linked == 0:
         return total
     if prior.right[i] > 0.0:
@@ -46,7 +46,7 @@ def prior_diagonal(prior: Prior, i: int) -> float:
     """
     if i >= prior.held:
         return 1.0e30
-    total = prior.damping
+    total = prior.damping[0]
     if prior.linked == 0:
         return total
     total += prior.right[i] + prior.down[i]

@@ -102,7 +102,7 @@ def restrict(
             if y >= 0 and y < fine_rows and x >= 0 and x < fine_columns:
                 total += fine[y * fine_columns + x] / float((1 + wp.abs(dy)) * (1 + wp.abs(dx)))
     coarse[i] = total
-    correction[i] = total / (diagonal[i] + prior.smooth[0] * HAT + prior.damping * four)
+    correction[i] = total / (diagonal[i] + prior.smooth[0] * HAT + prior.damping[0] * four)
 
 
 @wp.kernel

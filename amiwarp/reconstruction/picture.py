@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet
-from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
+from amiwarp.brightness.solver import BrightnessMap, Smoothness
+from amiwarp.brightness.tiles import Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_source import DeviceMemoryEvents, device_of, read_between

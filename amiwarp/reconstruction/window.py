@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.brightness.solver import Tiles
+from amiwarp.brightness.tiles import Tiles
 from amiwarp.events.device_source import read_between
 from amiwarp.events.encoder import TWO_PI
 from amiwarp.optics.camera_rotation import CameraRotation, border

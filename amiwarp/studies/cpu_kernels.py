@@ -7,7 +7,7 @@ from amiwarp.kernels.camera import PinholeParams
 from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend
 from amiwarp.kernels.iwe import read_sums
-from amiwarp.kernels.map_positions import find_places, place_blocks
+from amiwarp.kernels.map_positions import find_places, place_blocks, place_pairs
 from amiwarp.kernels.map_prior import link
 from amiwarp.kernels.multilevel import prolong
 from amiwarp.kernels.pair_chains import make_chains
@@ -23,6 +23,8 @@ from amiwarp.kernels.refraction import (
     fit_harmonics,
 )
 from amiwarp.kernels.residual_slopes import sum_costs
+from amiwarp.kernels.slow_pixels import find_levels
+from amiwarp.kernels.square_sums import find_squares
 from amiwarp.kernels.votes import turn_events
 
 EXACT_KERNELS = (
@@ -36,6 +38,9 @@ EXACT_KERNELS = (
     (apply_normal_blocks,),
     (descend,),
     (sum_costs,),
+    (find_levels, ExactParams),
+    (place_pairs, ExactParams),
+    (find_squares,),
     (compensate_blocks, ExactParams, PinholeParams),
     (link,),
     (prolong,),

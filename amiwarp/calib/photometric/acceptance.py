@@ -92,10 +92,13 @@ def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -
     if cost > LARGEST_COST:
         return False, (
             f"no brightness map of the scene explains the events ({min(100 * cost, 100):.0f} % of the residual "
-            "remains): the scene or the camera moved, light flickered, or the encoder is wrong"
+            "remains): the scene or the camera moved, light flickered, or the encoder or the lens is wrong"
         )
     if moved > 0.95 * LARGEST_MOVE_PX:
-        return False, f"the optimum is over {LARGEST_MOVE_PX:g} px away from that of sharpness"
+        return False, (
+            f"the optimum is over {LARGEST_MOVE_PX:g} px away from that of sharpness: the lens or the encoder is "
+            "wrong, or the scene or the camera moved"
+        )
     if next_step > LARGEST_NEXT_STEP_PX:
         size = f"{next_step:.2f} px" if next_step <= LARGEST_MOVE_PX else f"over {LARGEST_MOVE_PX:g} px"
         return False, (

@@ -179,11 +179,12 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
 
     ``long …`` are the derivatives of pairs with long gaps only; ``late …`` grow with the time of the pair.
     """
-    space, time = cost.space, cost.brightness.pairs.time
+    space, pairs = cost.space, cost.brightness.pairs
     columns = free_columns(cost, best)
+    time = pairs.time
     middle, gap = time.mean(axis=0), time[1] - time[0]
-    late = ((middle - middle.mean()) / max(float(middle.std()), 1e-9)).astype(np.float32)
-    long = (gap > np.median(gap)).astype(np.float32)
+    late = pairs.to_device((middle - middle.mean()) / max(float(middle.std()), 1e-9))
+    long = pairs.to_device(gap > np.median(gap))
     for name in _orbit(space):
         columns[f"long {name}"] = masked(columns[name], long)
         if not (set(DRIFTS) & set(space.names) or space.moving):

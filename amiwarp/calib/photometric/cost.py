@@ -39,6 +39,9 @@ class Cost:
     def warm_up(self, v: NDArray[np.float64]) -> None:
         """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals."""
         self.residuals(v, rounds=3, steps=2 * self.steps)
+        # a coarse map needs its damping
+        if self.brightness.tiles.density > 1.0 and self.brightness.relax_damping():
+            self.residuals(v, rounds=3, steps=2 * self.steps)
         self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
 

@@ -6,13 +6,15 @@ is then a small linear problem. Its sums are kept for each square of pixels, who
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.square_sums import multiply
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -90,31 +92,19 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
 
     The map must have been solved at the answer.
     """
-    b = cost.brightness
-    n, pairs = b.count, b.pairs
+    b, camera = cost.brightness, cost.space.camera
     b.prepare_projection()
-    left = np.array(
-        [b.unexplained(c, b.new_change(), steps=MAP_STEPS).numpy()[:n] for c in columns.values()], dtype=np.float64
+    left = [b.unexplained(c, b.new_change(), steps=MAP_STEPS) for c in columns.values()]
+    width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
+    sums, squares = b.residuals.products_by_square([*left, b.residuals.values], SQUARE_PX, width, height)
+    xy = np.stack([squares % width, squares // width], axis=1).astype(np.float64)
+    return LinearFit(
+        tuple(columns), sums[:, :-1, :-1], sums[:, :-1, -1], (xy + 0.5) * SQUARE_PX, float(sums[:, -1, -1].sum())
     )
-    weight, residual = (a.numpy()[:n].astype(np.float64) for a in (b.residuals.weight, b.residuals.values))
-    known = np.isfinite(residual) & np.isfinite(left).all(axis=0)
-    x, y = (pairs.column(name)[known].astype(np.int32) // SQUARE_PX for name in "xy")
-    width = int(x.max(initial=0)) + 1
-    square = y * width + x
-    order = np.argsort(square, kind="stable")
-    key, first = np.unique(square[order], return_index=True)
-    left, weight, residual = (a[..., known][..., order] for a in (left, weight, residual))
-    weighted = left * weight
-    parts = [slice(start, end) for start, end in itertools.pairwise([*first.tolist(), len(order)])]
-    m = len(left)
-    hessian = np.array([weighted[:, part] @ left[:, part].T for part in parts]).reshape(-1, m, m)
-    gradient = np.array([weighted[:, part] @ residual[part] for part in parts]).reshape(-1, m)
-    xy = (np.stack([key % width, key // width], axis=1) + 0.5) * SQUARE_PX
-    return LinearFit(tuple(columns), hessian, gradient, xy, float(np.sum(weight * residual**2)))
 
 
-def masked(column: Any, factor: NDArray[np.float32]) -> Any:
-    """Return a derivative on the device times a factor for each pair."""
-    values = column.numpy().copy()
-    values[: len(factor)] *= factor
-    return wp.array(values, dtype=float, device=column.device)
+def masked(column: Any, factor: Any) -> Any:
+    """Return a derivative times a factor for each pair, all on the device."""
+    out = wp.empty_like(column)
+    launch(multiply, len(column), [column, factor], [out], device=column.device)
+    return out

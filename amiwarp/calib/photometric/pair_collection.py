@@ -15,7 +15,7 @@ from amiwarp.errors import AmiwarpError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.brightness.solver import Tiles
+    from amiwarp.brightness.tiles import Tiles
     from amiwarp.calib.photometric.stage import PhotometricSettings
     from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.encoder import Encoder
@@ -30,8 +30,11 @@ FEWEST_PAIRS = 1_500
 """Smallest number of pairs of events for the photometric stage."""
 PAIRS_PER_NODE = 1.5
 """Smallest number of equations per unknown of the brightness map. A map with fewer fits any parameters."""
-FINE_PAIRS_PER_NODE = 4.2
-"""Smallest number of equations per unknown of a map with more than one node per pixel along each axis."""
+MANY_PAIRS = 100_000
+"""Number of pairs from which on fewer of them per node determine a fine map."""
+FINE_PAIRS_PER_NODE, FINE_PAIRS_PER_NODE_OF_MANY = 4.2, 3.9
+"""Smallest number of equations per unknown of a map with more than one node per pixel along each axis: of a recording
+with few pairs, and of one with :data:`MANY_PAIRS`."""
 FEWEST_TURNS = 2
 """Number of turns of the prism that are always used, if the recording has them."""
 FEWEST_TILES = 6
@@ -123,6 +126,12 @@ def van_der_corput(n: int) -> list[int]:
 def pairs_per_node(coverage: NDArray[np.float32], pairs: int) -> float:
     """Return the number of pairs of events per node of the map that they touch."""
     return pairs / max(1, int((coverage > 0.5).sum()))
+
+
+def fine_map_is_determined(coverage: NDArray[np.float32], pairs: int) -> bool:
+    """Return whether there are enough pairs for a map with more than one node per pixel along each axis."""
+    fewest = FINE_PAIRS_PER_NODE_OF_MANY if pairs >= MANY_PAIRS else FINE_PAIRS_PER_NODE
+    return pairs_per_node(coverage, pairs) >= fewest
 
 
 def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.brightness.solver import Tiles
+from amiwarp.brightness.tiles import Tiles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

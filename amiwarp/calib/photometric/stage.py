@@ -20,12 +20,7 @@ from amiwarp.calib.photometric.answer_search import AnswerSearch, join_runs
 from amiwarp.calib.photometric.correction import checked
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, determined
-from amiwarp.calib.photometric.pair_collection import (
-    FINE_PAIRS_PER_NODE,
-    check_pairs,
-    collect_pairs,
-    pairs_per_node,
-)
+from amiwarp.calib.photometric.pair_collection import check_pairs, collect_pairs, fine_map_is_determined
 from amiwarp.calib.photometric.sensor_timing import (
     find_refractory,
     find_time_constant,
@@ -44,7 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.brightness.event_pairs import PairSet
-    from amiwarp.brightness.solver import Tiles
+    from amiwarp.brightness.tiles import Tiles
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.photometric.answer_search import Answer
     from amiwarp.calib.sharpness.search import Search
@@ -207,7 +202,7 @@ def _equations(
     v = space.to_vector({**space.start, **search.best})
     cost = cost_on(tiles)
     coverage = cost.brightness.coverage(cost.scale)
-    few = pairs_per_node(coverage, len(pairs)) < FINE_PAIRS_PER_NODE
+    few = not fine_map_is_determined(coverage, len(pairs))
     noisy = cost.mean() > LARGEST_FINE_COST
     # a fine map converges too slowly for parameters that make nearly the same motion
     if tiles.density > 1.0 and (few or noisy or any(n in DEGENERATE_WITH_APEX for n in space.names)):

@@ -1,0 +1,62 @@
+"""Sums of products of derivatives and residuals over the pairs of each square of pixels."""
+
+import warp as wp
+
+from amiwarp.kernels.photometric import Pairs
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def multiply(a: wp.array(dtype=float), b: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
+    """Multiply two arrays element by element."""
+    i = start + wp.tid()
+    out[i] = a[i] * b[i]
+
+
+@wp.kernel
+def find_squares(
+    pairs: Pairs,
+    rows: wp.array2d(dtype=float),
+    side: int,
+    columns: int,
+    squares: int,
+    start: int,
+    square: wp.array(dtype=int),
+    order: wp.array(dtype=int),
+):
+    """Compute the number of the square of pixels that holds each pair.
+
+    It is ``squares`` for a pair with a NaN in ``rows``.
+    """
+    i = start + wp.tid()
+    number = int(pairs.y[i]) / side * columns + int(pairs.x[i]) / side
+    for k in range(rows.shape[0]):
+        if rows[k, i] != rows[k, i]:
+            number = squares
+    square[i] = number
+    order[i] = i
+
+
+@wp.kernel
+def sum_square_products(
+    rows: wp.array2d(dtype=float), weight: wp.array(dtype=float), square: wp.array(dtype=int),
+    order: wp.array(dtype=int), count: int, first: wp.array(dtype=int), second: wp.array(dtype=int), start: int,
+    sums: wp.array2d(dtype=wp.float64), number: wp.array(dtype=int),
+):  # fmt: skip
+    """Compute the sum of rows[a] · rows[b] · weight over the pairs of a square, for each (a, b) of first and second.
+
+    Each thread computes one sum. ``square`` is sorted; ``order`` has the numbers of its pairs. ``number`` receives the
+    number of pairs of each square.
+    """
+    thread = start + wp.tid()
+    here = thread / first.shape[0]
+    k = thread % first.shape[0]
+    begin = wp.lower_bound(square, 0, count, here)
+    end = wp.lower_bound(square, begin, count, here + 1)
+    total = wp.float64(0.0)
+    for at in range(begin, end):
+        i = order[at]
+        total += wp.float64(rows[first[k], i]) * wp.float64(rows[second[k], i]) * wp.float64(weight[i])
+    sums[here, k] = total
+    number[here] = end - begin
