@@ -19,6 +19,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
 from amiwarp.kernels.pair_chains import BLOCK
 from amiwarp.kernels.photometric import HELD, Pairs
+from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ class PairSet:
         places = wp.empty(len(self), dtype=wp.vec4, device=self.device)
         inputs = [
             model.params(self.device),
-            model_camera(model, self.device),
+            pinhole_params(model.camera) or model_camera(model, self.device),
             self.arrays,
             drift,
             camera_rotation.params(),
@@ -338,13 +339,16 @@ def _running_count(flag: Any) -> tuple[Any, int]:
 
 
 def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) -> Any:
-    """Return a pair set without pairs, whose arrays are padded with zeros to whole blocks."""
+    """Return a set of ``count`` pairs to be filled, whose arrays are padded with zeros to whole blocks."""
     out = Pairs()
     block = int(BLOCK)
     out.count, out.stride, out.weak = count, -(-count // block) * block, weak
     dtypes = {"x": wp.uint16, "y": wp.uint16, "tile": int, "on": wp.uint8}
     for name, columns in COLUMNS.items():
-        n = columns * out.stride if drifts or name != "slope" else 0
-        setattr(out, name, wp.zeros(n, dtype=dtypes.get(name, float), device=device))
+        columns = columns if drifts or name != "slope" else 0
+        values = wp.empty(columns * out.stride, dtype=dtypes.get(name, float), device=device)
+        for k in range(columns if count < out.stride else 0):
+            values[k * out.stride + count : (k + 1) * out.stride].zero_()
+        setattr(out, name, values)
     out.lag, out.offset = (wp.zeros(0, dtype=float, device=device) for _ in "lo")
     return out

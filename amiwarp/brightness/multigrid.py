@@ -11,6 +11,7 @@ import warp as wp
 
 from amiwarp.kernels import multilevel as k
 from amiwarp.kernels.conjugate_gradients import gather
+from amiwarp.kernels.launch import SMALLEST_SLICE
 
 COARSEST = 6
 """Smallest number of rows or columns of a grid; coarser grids are not made."""
@@ -43,14 +44,21 @@ class GridHierarchy:
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Add to ``program`` the step ``out`` = sum of the grids' corrections for the finest grid's ``residual``."""
         program.add(k.divide, len(out), [diagonal, residual], [out])
-        fine = residual
+        fine, on_cpu = residual, program.device.is_cpu
         for level, (rows, columns) in enumerate(self.shapes[1:], start=1):
-            coarse, correction = self._residual[level - 1], self._correction[level - 1]
+            outputs = [self._residual[level - 1], self._correction[level - 1]]
             inputs = [fine, *self.shapes[level - 1], columns, self._diagonal[level - 1], prior, 4.0**level]
-            program.add(k.restrict, rows * columns, inputs, [coarse, correction])
-            fine = coarse
+            if on_cpu:
+                program.add(k.restrict_rows, rows, inputs, outputs, smallest=SMALLEST_SLICE // (4 * columns) + 1)
+            else:
+                program.add(k.restrict, rows * columns, inputs, outputs)
+            fine = outputs[0]
         for level in range(len(self.shapes) - 1, 0, -1):
             rows, columns = self.shapes[level - 1]
             target = out if level == 1 else self._correction[level - 2]
-            inputs = [self._correction[level - 1], self.shapes[level][1], rows, columns]
-            program.add(k.prolong, rows * columns, inputs, [target])
+            inputs = [self._correction[level - 1], self.shapes[level][1]]
+            if on_cpu:
+                smallest = SMALLEST_SLICE // columns + 1
+                program.add(k.prolong_rows, rows, [*inputs, columns], [target], smallest=smallest)
+            else:
+                program.add(k.prolong, rows * columns, [*inputs, rows, columns], [target])

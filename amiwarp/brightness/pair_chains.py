@@ -25,9 +25,9 @@ class PairChains:
         """Columns of the positions: the kernels' struct ``Chains``."""
         blocks = self.blocks if device.is_cpu else 0
         for name, dtype in (("cell", int), ("x", float), ("y", float), ("weight", float)):
-            setattr(self.arrays, name, wp.zeros(2 * int(BLOCK) * blocks, dtype=dtype, device=device))
-        self.arrays.count = wp.zeros(blocks, dtype=int, device=device)
-        self.arrays.end = wp.zeros(int(BLOCK) * blocks, dtype=wp.uint8, device=device)
+            setattr(self.arrays, name, wp.empty(2 * int(BLOCK) * blocks, dtype=dtype, device=device))
+        self.arrays.count = wp.empty(blocks, dtype=int, device=device)
+        self.arrays.end = wp.empty(int(BLOCK) * blocks, dtype=wp.uint8, device=device)
 
     def join(self, geometry: Any) -> None:
         """Take the positions of ``geometry``, and join pairs that begin where the pair before them ends."""

@@ -14,7 +14,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.photometric import HELD
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
 from amiwarp.kernels.residual_slopes import add_clusters, magnitudes, sum_costs, sum_products
-from amiwarp.kernels.square_sums import find_squares, sum_square_products
+from amiwarp.kernels.square_sums import MOST_ROWS, find_squares, sum_square_products, sum_squares
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -90,11 +90,14 @@ class Residuals:
         )
         wp.utils.radix_sort_pairs(square, order, n)
         upper = np.triu_indices(len(factors))
-        first, second = (wp.array(k, dtype=int, device=self.device) for k in upper)
-        sums = self._doubles(squares, len(first))
+        sums = self._doubles(squares, len(upper[0]))
         number = wp.zeros(squares, dtype=int, device=self.device)
-        inputs = [values, self.weight, square, order, n, first, second]
-        launch(sum_square_products, sums.size, inputs, [sums, number], device=self.device, smallest=CHUNKS)
+        inputs = [values, self.weight, square, order, n]
+        if self.device.is_cpu and len(factors) <= MOST_ROWS:
+            launch(sum_squares, squares, inputs, [sums, number], device="cpu", smallest=CHUNKS)
+        else:
+            inputs += [wp.array(k, dtype=int, device=self.device) for k in upper]
+            launch(sum_square_products, sums.size, inputs, [sums, number], device=self.device, smallest=CHUNKS)
         used = np.flatnonzero(number.numpy())
         found = np.empty((len(used), len(factors), len(factors)))
         found[:, upper[0], upper[1]] = found[:, upper[1], upper[0]] = sums.numpy()[used]

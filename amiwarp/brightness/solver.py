@@ -15,21 +15,18 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.multigrid import GridHierarchy
-from amiwarp.brightness.pair_chains import FEW_BLOCKS, PairChains
+from amiwarp.brightness.pair_chains import FEW_BLOCKS
+from amiwarp.brightness.pair_positions import PairPositions
 from amiwarp.brightness.residuals import CHUNKS, Residuals
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels import map_positions as places
-from amiwarp.kernels import photometric as kernels
-from amiwarp.kernels.conjugate_gradients import dot, gather, gather_diagonal
+from amiwarp.kernels import normal_equations as kernels
+from amiwarp.kernels.conjugate_gradients import add_multiple, dot, gather, gather_diagonal
 from amiwarp.kernels.launch import launch, slice_count
 from amiwarp.kernels.map_prior import EXTRA, Prior, link
-from amiwarp.kernels.pairs import keep_nodes
-from amiwarp.kernels.photometric import Geometry, add_diagonal, subtract, weigh
+from amiwarp.kernels.photometric import Atlas
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
-from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:
@@ -88,7 +85,7 @@ class BrightnessMap:
             raise AmiwarpError("no pixel fired twice in time, so no brightness can be found; give a longer recording")
         self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
         self.pairs, self.middle_us, self.smoothness = pairs, middle_us, smoothness
-        self._atlas = kernels.Atlas()
+        self._atlas = Atlas()
         self._atlas.origin = wp.array(tiles.origin.ravel(), dtype=float, device=self.device)
         self._atlas.rows, self._atlas.columns, self._atlas.density = tiles.rows, tiles.columns, tiles.density
         self._atlas.with_leak, self._atlas.with_off = float(with_leak), int(off_excess is None)
@@ -103,7 +100,7 @@ class BrightnessMap:
             self._image[-1:].fill_(off_excess)
         self.residuals = Residuals(pairs, len(tiles.origin))
         self._scale, self._solved = self._zeros(1), False
-        self._geometry, self._chains = self._new_geometry(), PairChains(pairs.arrays.stride, self.device)
+        self._at = PairPositions(pairs, self._atlas, middle_us)
 
     def _zeros(self, n: int) -> Any:
         return wp.zeros(n, dtype=float, device=self.device)
@@ -134,46 +131,16 @@ class BrightnessMap:
         self._grids = GridHierarchy(self.tiles.rows, self.tiles.columns, self.device) if one else None
         self._z = self._zeros(unknowns * one)
 
-    def _new_geometry(self) -> Any:
-        """Allocate buffers for the positions of the pairs on the map."""
-        g = Geometry()
-        g.stride = self.pairs.arrays.stride
-        g.cell = wp.full(2 * g.stride, -1, dtype=int, device=self.device)
-        g.part = self._zeros(4 * g.stride)
-        return g
-
     # -- positions of the pairs
 
     def place(self, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
         """Compute the positions of the pairs on the map, for a model and a camera rotation about ``middle_us``."""
-        self._place(model, drift, camera_rotation, self._geometry)
-        self._chains.join(self._geometry)
-
-    def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
-        """Compute the positions of the pairs into ``out``."""
-        arrays, params = self.pairs.arrays, model.params(self.device)
-        camera_rotation = (camera_rotation or CameraRotation()).about(self.middle_us)
-        pinhole = pinhole_params(model.camera)
-        rotates = any((*camera_rotation.angular_velocity, *camera_rotation.angular_acceleration))
-        if pinhole is None or rotates or arrays.slope.shape[0] or arrays.lag.shape[0]:
-            inputs = [params, model_camera(model, self.device), arrays, self._atlas, drift, camera_rotation.params()]
-            launch(places.place_pairs, self.count, inputs, [out], device=self.device)
-            return
-        inputs = [params, pinhole, arrays, self._atlas]
-        if self.device.is_cpu:
-            launch(places.place_blocks, self._chains.blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
-        else:
-            launch(places.place_still, arrays.stride, inputs, [out], device=self.device)
+        self._at.place(model, drift, camera_rotation)
 
     def path_arguments(self, model: Model) -> list[Any]:
         """Return the kernel arguments that describe the map and the paths of the pairs' pixels over it."""
         camera = model_camera(model, self.device)
         return [model.params(self.device), camera, self.pairs.arrays, self._atlas, self._image]
-
-    @cached_property
-    def _sides(self) -> tuple[Any, Any]:
-        """Buffers for the pairs' positions at two more parameter values, for finite differences."""
-        return self._new_geometry(), self._new_geometry()
 
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float) -> Any:
         """Return the derivative of each pair's residual along a line in parameter space, for a fixed map.
@@ -181,22 +148,14 @@ class BrightnessMap:
         It is the change of the residual from the parameters ``minus`` to ``plus``, divided by their distance ``width``.
         Both are keyword arguments of :meth:`place`. The positions that :meth:`place` stored remain unchanged.
         """
-        for side, at in zip(self._sides, (plus, minus), strict=True):
-            self._place(at["model"], at["drift"], at["camera_rotation"], side)
-        out = self._zeros(self.pairs.arrays.stride)
-        inputs = [self.pairs.arrays, self._atlas, *self._sides, self._image, width]
-        launch(slope_between, self.count, inputs, [out], device=self.device)
-        return out
+        return self._at.find_slope(plus, minus, width, self._image)
 
     def keep(self, nodes: NDArray[np.bool_]) -> None:
         """Exclude pairs of two events, as noise, if either event is off the nodes for which ``nodes`` is true.
 
         ``nodes`` has shape (tiles, rows, columns).
         """
-        on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
-        inputs = [on, self.pairs.arrays.on, self._geometry.stride]
-        launch(keep_nodes, self.count, inputs, [self._geometry.cell], device=self.device)
-        self._chains.join(self._geometry)
+        self._at.keep(nodes)
 
     # -- solving
 
@@ -239,26 +198,33 @@ class BrightnessMap:
         """Return a change of the map that is zero, on the device, as a start for :meth:`unexplained`."""
         return self._zeros(len(self._image))
 
+    def add(self, change: Any, factor: float) -> None:
+        """Add a change of the map times a factor to the map."""
+        launch(add_multiple, len(change), [change, factor], [self._image], device=self.device)
+
     def unexplained(self, target: Any, change: Any, *, steps: int) -> Any:
         """Return the part of ``target`` (pairs, on the device) that no change of the map explains.
 
         This is the projection of variable projection (Golub and Pereyra 1973). It is solved by conjugate gradients that
         start from ``change``, which is replaced by the better solution.
         """
-        inputs = [self.pairs.arrays, self._atlas, self._geometry, self._projection.image]
         wp.copy(self._projection.image, change)
         wp.copy(self._projection.residual, target)
-        launch(subtract, self.count, inputs, [self._projection.residual], device=self.device)
+        self._subtract(self._projection.image, self._projection.residual)
         self._projection.run(steps)
         wp.copy(change, self._projection.image)
         rest = wp.clone(target)
-        launch(subtract, self.count, inputs, [rest], device=self.device)
+        self._subtract(change, rest)
         return rest
 
-    @property
-    def _equations(self) -> list[Any]:
-        """Kernel arguments that describe the weighted equations."""
-        return [self.pairs.arrays, self._atlas, self._geometry, self.residuals.weight]
+    def _subtract(self, vector: Any, residual: Any) -> None:
+        """Subtract the left sides of the equations, for a ``vector`` of unknowns, from ``residual``."""
+        at, given = self._at, [self.pairs.arrays, self._atlas, self._at.geometry]
+        if self.device.is_cpu:
+            inputs = [*given, at.chains.arrays, vector]
+            launch(kernels.subtract_blocks, at.chains.blocks, inputs, [residual], device="cpu", smallest=FEW_BLOCKS)
+        else:
+            launch(kernels.subtract, self.count, [*given, vector], [residual], device=self.device)
 
     @cached_property
     def _weigh(self) -> Any:
@@ -268,8 +234,21 @@ class BrightnessMap:
         return program
 
     def _add_weigh(self, program: Any) -> None:
-        inputs = [self.pairs.arrays, self._atlas, self._geometry, self._image, self._scale]
-        program.add(weigh, self.count, inputs, [self.residuals.weight, self.residuals.values])
+        inputs, out = [self._image, self._scale], [self.residuals.weight, self.residuals.values]
+        if self.device.is_cpu:
+            inputs = [self.pairs.arrays, self._atlas, self._at.geometry, self._at.chains.arrays, *inputs]
+            program.add(kernels.weigh_blocks, self._at.chains.blocks, inputs, out, smallest=FEW_BLOCKS)
+        else:
+            program.add(kernels.weigh, self.count, [self.pairs.arrays, self._atlas, self._at.geometry, *inputs], out)
+
+    def _add_sums(self, program: Any, kernel: Any, on_blocks: Any, *vectors: Any) -> None:
+        """Add a step that sums up over the weighted equations: ``on_blocks`` on a CPU, else ``kernel``."""
+        where = self._at.chains.arrays if self.device.is_cpu else self._at.geometry
+        inputs = [self.pairs.arrays, self._atlas, where, self.residuals.weight, *vectors]
+        if self.device.is_cpu:
+            program.add_slices(on_blocks, self._at.chains.blocks, inputs, self._slices, smallest=FEW_BLOCKS)
+        else:
+            program.add_slices(kernel, self.count, inputs, self._slices)
 
     @cached_property
     def _prepare(self) -> Any:
@@ -278,9 +257,9 @@ class BrightnessMap:
         if self.smoothness is not None:
             inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
             program.add(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
-        program.add_slices(add_diagonal, self.count, self._equations, self._slices)
+        self._at.chains.add_weights(program, self.residuals.weight)
+        self._add_sums(program, kernels.add_diagonal, kernels.add_diagonal_blocks)
         program.add(gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
-        self._chains.add_weights(program, self.residuals.weight)
         return program
 
     @cached_property
@@ -288,7 +267,8 @@ class BrightnessMap:
         """Program that computes the diagonals of the coarser grids for the current weights."""
         program = Program(self.device)
         if self._grids is not None:
-            self._grids.prepare(program, self._equations[1:], self.count, self._sums, self._slices)
+            equations = [self._atlas, self._at.geometry, self.residuals.weight]
+            self._grids.prepare(program, equations, self.count, self._sums, self._slices)
         return program
 
     @cached_property
@@ -325,7 +305,8 @@ class BrightnessMap:
         weak, self.pairs.arrays.weak = self.pairs.arrays.weak, 0.0
         program = Program(self.device)
         self._add_weigh(program)
-        program.add_slices(add_diagonal, self.count, self._equations, self._slices)
+        self._at.chains.add_weights(program, self.residuals.weight)
+        self._add_sums(program, kernels.add_diagonal, kernels.add_diagonal_blocks)
         out = self._zeros(len(self._image))
         program.add(gather, len(out), [self._sums], [out])
         program.launch()
@@ -359,7 +340,7 @@ class _ConjugateGradients:
 
     def _add_start(self, program: Any) -> None:
         of = self._map
-        program.add_slices(kernels.apply_transpose, of.count, [*of._equations, self.residual], of._slices)
+        of._add_sums(program, kernels.apply_transpose, kernels.apply_transpose_blocks, self.residual)
         self._add(program, cg.start_descent, [of._sums, of._prior, self.image], [of._u, of._dots])
         self._correct(program)
 
@@ -369,11 +350,7 @@ class _ConjugateGradients:
             self._add(program, cg.update_search_direction, [], [of._u, of._dots])
         else:
             self._add(program, cg.update_search_direction_with, [of._z], [of._u, of._dots])
-        if of.device.is_cpu:
-            inputs = [of.pairs.arrays, of._atlas, of._chains.arrays, of._u.direction]
-            program.add_slices(kernels.apply_normal_blocks, of._chains.blocks, inputs, of._slices, smallest=FEW_BLOCKS)
-        else:
-            program.add_slices(kernels.apply_normal, of.count, [*of._equations, of._u.direction], of._slices)
+        of._add_sums(program, kernels.apply_normal, kernels.apply_normal_blocks, of._u.direction)
         self._add(program, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
         self._add(program, cg.descend, [], [self.image, of._u, of._dots])
         self._correct(program)

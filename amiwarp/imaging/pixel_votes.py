@@ -10,7 +10,7 @@ import warp as wp
 from amiwarp.imaging.device_events import LARGEST_WEIGHT
 from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.kernels.iwe import CPU_WIDTH, add_sums, read_sums
-from amiwarp.kernels.launch import RecordedLaunch, launch, launch_slices
+from amiwarp.kernels.launch import RecordedLaunch, launch, launch_slices, run_together
 from amiwarp.kernels.pixel_votes import (
     BLOCK,
     CAPACITY,
@@ -42,9 +42,12 @@ class PixelVotes:
 
     def clear(self) -> None:
         """Discard all votes."""
-        self._sums.zero_()
+        self._clear_sums()
         self._totals = wp.empty(0, dtype=wp.int64, device="cpu")
         self._room = CAPACITY
+
+    def _clear_sums(self) -> None:
+        run_together([one.zero_ for one in self._slices])
 
     def add_events(self, inputs: list[Any], events: UploadedEvents, camera_rotation: Any | None) -> None:
         """Vote events. ``inputs``: model, camera, columns of the events and canvas, as the kernels take them."""
@@ -83,7 +86,7 @@ class PixelVotes:
             if not len(self._totals):
                 self._totals = wp.zeros(self._cells, dtype=wp.int64, device="cpu")
             launch(add_sums, self._cells, [self._sums], [self._totals], device="cpu")
-            self._sums.zero_()
+            self._clear_sums()
             self._room = CAPACITY
         self._room -= events
 

@@ -83,10 +83,11 @@ def undistort_radial_tangential(c: CameraParams, d: wp.vec2) -> wp.vec3:
 
     The result is invalid if the method does not converge inside the disc in which the distortion is one-to-one.
     """
-    p = d
+    p = wp.vec2(d[0], d[1])
     if wp.length(p) > 0.9 * c.limit:
         p = p * (0.9 * c.limit / wp.length(p))
-    for _ in range(NEWTON_STEPS):
+    steps = int(NEWTON_STEPS)  # a variable, so that Warp does not unroll the loop, which is slow to compile
+    for _ in range(steps):
         p = p - wp.inverse(jacobian_radial_tangential(c, p)) * (distort_radial_tangential(c, p) - d)
     error = wp.length(distort_radial_tangential(c, p) - d)
     if not (error < LARGEST_RESIDUAL * (1.0 + wp.length(d)) and wp.length(p) <= c.limit):
@@ -114,8 +115,9 @@ def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
     radius = wp.length(d)
     if radius < 1.0e-8:
         return wp.normalize(wp.vec3(d[0], d[1], 1.0))
-    angle = wp.min(radius, 0.9 * c.limit)
-    for _ in range(NEWTON_STEPS):
+    angle = float(wp.min(radius, 0.9 * c.limit))
+    steps = int(NEWTON_STEPS)  # a variable, so that Warp does not unroll the loop, which is slow to compile
+    for _ in range(steps):
         angle = wp.clamp(angle - (fisheye_radius(c, angle) - radius) / fisheye_slope(c, angle), 0.0, c.limit)
     if not (wp.abs(fisheye_radius(c, angle) - radius) < LARGEST_RESIDUAL * (1.0 + radius)):
         return invalid_ray()
@@ -207,13 +209,34 @@ class CameraRotationParams:
 
 
 @wp.func
+def rotation_vector(camera_rotation: CameraRotationParams, time: float) -> wp.vec3:
+    """Return the camera's rotation from time 0 to ``time`` [s], as axis times angle [rad]."""
+    return camera_rotation.velocity * time + camera_rotation.acceleration * (0.5 * time * time)
+
+
+@wp.func
 def undo_camera_rotation(
     camera: CameraParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float
 ) -> wp.vec2:
     """Return the pixel that the scene point seen at ``xy`` at ``time`` [s] has at time 0."""
-    rotation = camera_rotation.velocity * time + camera_rotation.acceleration * (0.5 * time * time)
+    rotation = rotation_vector(camera_rotation, time)
     angle = wp.length(rotation)
     if angle < 1.0e-9:
         return xy
     ray = pixel_to_ray(camera, xy)
     return ray_to_pixel(camera, wp.quat_rotate(wp.quat_from_axis_angle(rotation / angle, angle), ray))
+
+
+@wp.func
+def undo_camera_rotation(
+    camera: PinholeParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float
+) -> wp.vec2:
+    """Return the pixel at time 0, for a camera without distortion."""
+    rotation = rotation_vector(camera_rotation, time)
+    angle = wp.length(rotation)
+    if angle < 1.0e-9:
+        return xy
+    ray = wp.vec3((xy[0] - camera.cx) * camera.inverse_fx, (xy[1] - camera.cy) * camera.inverse_fy, 1.0)
+    ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / angle, angle), ray)
+    scale = wp.where(ray[2] > 1.0e-6, 1.0 / ray[2], NAN)
+    return wp.vec2(camera.fx * (ray[0] * scale) + camera.cx, camera.fy * (ray[1] * scale) + camera.cy)

@@ -74,6 +74,13 @@ def take_total(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
 
 
 @wp.kernel
+def add_multiple(vector: wp.array(dtype=float), factor: float, start: int, out: wp.array(dtype=float)):
+    """Add a vector times a factor."""
+    i = start + wp.tid()
+    out[i] = out[i] + factor * vector[i]
+
+
+@wp.kernel
 def gather(sums: wp.array2d(dtype=wp.int64), start: int, out: wp.array(dtype=float)):
     """Compute the total of each element over the slices of sums, and clear the slices."""
     i = start + wp.tid()
@@ -87,6 +94,131 @@ def gather_diagonal(sums: wp.array2d(dtype=wp.int64), prior: Prior, start: int, 
     i = start + wp.tid()
     if i < out.shape[0]:
         out[i] = take_total(sums, i) + prior_diagonal(prior, i)
+
+
+# On a CPU, a thread's range of unknowns is processed by the vectorised loops below, eight at a time. Their dot products
+# are eight partial sums, so they depend on the range only.
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    const int n = last - first;
+    int64_t fixed[512];
+    for (int at = 0; at < n; at += 512) {
+        const int m = n - at < 512 ? n - at : 512;
+        for (int i = 0; i < m; ++i) fixed[i] = 0;
+        for (int k = 0; k < sums.shape[0]; ++k) {
+            int64_t* from = (int64_t*)((char*)sums.data + (size_t)sums.strides[0] * k) + first + at;
+            for (int i = 0; i < m; ++i) {
+                fixed[i] += from[i];
+                from[i] = 0;
+            }
+        }
+        float* to = (float*)out.data + first + at;
+        for (int i = 0; i < m; ++i)
+            to[i] = (float)((double)(int32_t)(fixed[i] >> 32) + (double)(uint32_t)fixed[i] * (1.0 / 4294967296.0));
+    }
+#endif
+""")
+def take_totals(sums: wp.array2d(dtype=wp.int64), first: int, last: int, out: wp.array(dtype=float)):
+    """Store :func:`take_total` of the elements from ``first`` to ``last`` in ``out``. For CPUs."""
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    const float* p = (const float*)u.direction.data;
+    float* q = (float*)u.product.data;
+    const int n = u.direction.shape[0], columns = prior.columns;
+    const float damping = *(const float*)prior.damping.data;
+    if (prior.linked) {
+        const float* right = (const float*)prior.right.data;
+        const float* down = (const float*)prior.down.data;
+        const int low = first > columns ? first : columns, high = last < n - columns ? last : n - columns;
+        for (int i = low; i < high; ++i) {
+            const float across = right[i] * (p[i] - p[i + 1]) + right[i - 1] * (p[i] - p[i - 1]);
+            q[i] += across + down[i] * (p[i] - p[i + columns]) + down[i - columns] * (p[i] - p[i - columns]);
+        }
+        for (int i = first; i < last; ++i) {
+            if (i >= low && i < high) continue;
+            if (i + 1 < n) q[i] += right[i] * (p[i] - p[i + 1]);
+            if (i > 0) q[i] += right[i - 1] * (p[i] - p[i - 1]);
+            if (i + columns < n) q[i] += down[i] * (p[i] - p[i + columns]);
+            if (i >= columns) q[i] += down[i - columns] * (p[i] - p[i - columns]);
+        }
+    }
+    for (int i = first; i < last; ++i) q[i] += damping * p[i];
+#endif
+""")
+def add_prior_product(u: Unknowns, prior: Prior, first: int, last: int):
+    """Compute q += prior p from ``first`` to ``last``, see :func:`prior_product`. For CPUs."""
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    const float* x = (const float*)a.data;
+    const float* y = (const float*)b.data;
+    double part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    int i = first;
+    for (; i + 8 <= last; i += 8)
+        for (int k = 0; k < 8; ++k) part[k] += (double)x[i + k] * (double)y[i + k];
+    for (; i < last; ++i) part[i & 7] += (double)x[i] * (double)y[i];
+    return ((part[0] + part[4]) + (part[1] + part[5])) + ((part[2] + part[6]) + (part[3] + part[7]));
+#else
+    return 0.0;
+#endif
+""")
+def dot_range(a: wp.array(dtype=float), b: wp.array(dtype=float), first: int, last: int) -> wp.float64:
+    """Return the part of a·b from ``first`` to ``last``. For CPUs."""
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    float* x = (float*)image.data;
+    const float* p = (const float*)u.direction.data;
+    const float* q = (const float*)u.product.data;
+    const float* diagonal = (const float*)u.diagonal.data;
+    float* r = (float*)u.residual.data;
+    double part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    int i = first;
+    for (; i + 8 <= last; i += 8)
+        for (int k = 0; k < 8; ++k) {
+            x[i + k] += step * p[i + k];
+            r[i + k] -= step * q[i + k];
+            part[k] += (double)r[i + k] * (double)(r[i + k] / diagonal[i + k]);
+        }
+    for (; i < last; ++i) {
+        x[i] += step * p[i];
+        r[i] -= step * q[i];
+        part[i & 7] += (double)r[i] * (double)(r[i] / diagonal[i]);
+    }
+    return ((part[0] + part[4]) + (part[1] + part[5])) + ((part[2] + part[6]) + (part[3] + part[7]));
+#else
+    return 0.0;
+#endif
+""")
+def descend_range(image: wp.array(dtype=float), u: Unknowns, step: float, first: int, last: int) -> wp.float64:
+    """Compute :func:`descend` from ``first`` to ``last``, and return the part of r·z. For CPUs."""
+
+
+@wp.func_native("""
+    float* p = (float*)u.direction.data;
+    const float* towards = (const float*)z.data;
+    for (int i = first; i < last; ++i) p[i] = towards[i] + ratio * p[i];
+""")
+def update_range_with(z: wp.array(dtype=float), u: Unknowns, ratio: float, first: int, last: int):
+    """Compute :func:`update_search_direction_with` from ``first`` to ``last``."""
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    float* p = (float*)u.direction.data;
+    const float* r = (const float*)u.residual.data;
+    const float* diagonal = (const float*)u.diagonal.data;
+    for (int i = first; i < last; ++i) p[i] = r[i] / diagonal[i] + ratio * p[i];
+#endif
+""")
+def update_range(u: Unknowns, ratio: float, first: int, last: int):
+    """Compute :func:`update_search_direction` from ``first`` to ``last``. For CPUs."""
 
 
 @wp.func
@@ -153,7 +285,12 @@ def update_search_direction(width: int, start: int, u: Unknowns, dots: Dots):
     """Compute the search direction p = z + b p, where z = r / diagonal and b is :func:`next_ratio`."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
-    for i in range(thread * width, wp.min((thread + 1) * width, u.residual.shape[0])):
+    first = thread * width
+    last = wp.min(first + width, u.residual.shape[0])
+    if width > 1:
+        update_range(u, ratio, first, last)
+        return
+    for i in range(first, last):
         z = u.residual[i] / u.diagonal[i]
         u.direction[i] = z + ratio * u.direction[i]
 
@@ -163,8 +300,7 @@ def update_search_direction_with(z: wp.array(dtype=float), width: int, start: in
     """Compute the search direction p = z + b p for a given z, where b is :func:`next_ratio`."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
-    for i in range(thread * width, wp.min((thread + 1) * width, z.shape[0])):
-        u.direction[i] = z[i] + ratio * u.direction[i]
+    update_range_with(z, u, ratio, thread * width, wp.min((thread + 1) * width, z.shape[0]))
 
 
 @wp.kernel
@@ -172,10 +308,17 @@ def finish_product(sums: wp.array2d(dtype=wp.int64), prior: Prior, width: int, s
     """Compute q = (Aᵀ W A + prior) p from the sums, and partial sums of p·q."""
     thread = start + wp.tid()
     total = wp.float64(0.0)
-    for i in range(thread * width, wp.min((thread + 1) * width, u.direction.shape[0])):
-        q = take_total(sums, i) + prior_product(prior, u.direction, i)
-        u.product[i] = q
-        total += wp.float64(u.direction[i]) * wp.float64(q)
+    first = thread * width
+    last = wp.min(first + width, u.direction.shape[0])
+    if width > 1:
+        take_totals(sums, first, last, u.product)
+        add_prior_product(u, prior, first, last)
+        total = dot_range(u.direction, u.product, first, last)
+    else:
+        for i in range(first, last):
+            q = take_total(sums, i) + prior_product(prior, u.direction, i)
+            u.product[i] = q
+            total += wp.float64(u.direction[i]) * wp.float64(q)
     store_partial_sum(dots.pq, thread, total)
     if thread == 0:
         dots.scalars[0] = dots.scalars[1]
@@ -187,11 +330,16 @@ def descend(width: int, start: int, image: wp.array(dtype=float), u: Unknowns, d
     thread = start + wp.tid()
     step = float(dots.scalars[0] / wp.max(total_of(dots.pq, thread), wp.float64(1.0e-30)))
     total = wp.float64(0.0)
-    for i in range(thread * width, wp.min((thread + 1) * width, image.shape[0])):
-        image[i] = image[i] + step * u.direction[i]
-        r = u.residual[i] - step * u.product[i]
-        u.residual[i] = r
-        total += wp.float64(r) * wp.float64(r / u.diagonal[i])
+    first = thread * width
+    last = wp.min(first + width, image.shape[0])
+    if width > 1:
+        total = descend_range(image, u, step, first, last)
+    else:
+        for i in range(first, last):
+            image[i] = image[i] + step * u.direction[i]
+            r = u.residual[i] - step * u.product[i]
+            u.residual[i] = r
+            total += wp.float64(r) * wp.float64(r / u.diagonal[i])
     store_partial_sum(dots.rz, thread, total)
 
 
@@ -202,6 +350,11 @@ def dot(
     """Compute partial sums of a·b."""
     thread = start + wp.tid()
     total = wp.float64(0.0)
-    for i in range(thread * width, wp.min((thread + 1) * width, a.shape[0])):
-        total += wp.float64(a[i]) * wp.float64(b[i])
+    first = thread * width
+    last = wp.min(first + width, a.shape[0])
+    if width > 1:
+        total = dot_range(a, b, first, last)
+    else:
+        for i in range(first, last):
+            total += wp.float64(a[i]) * wp.float64(b[i])
     store_partial_sum(partial, thread, total)

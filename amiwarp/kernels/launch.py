@@ -3,11 +3,13 @@
 Warp itself runs each CPU launch on one thread.
 """
 
+import os
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise, takewhile
+from queue import SimpleQueue
 from threading import Lock, Thread, main_thread
 from typing import Any
 
@@ -15,6 +17,8 @@ import warp as wp
 
 from amiwarp.kernels.cpu_threads import cpu_threads
 
+_Job = tuple[Callable[[], object], "SimpleQueue[BaseException | None]"]
+"""Function to run, and the queue that gets its error, or None."""
 _specialising = Lock()
 _loading: defaultdict[str, Lock] = defaultdict(Lock)
 SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
@@ -24,6 +28,56 @@ SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice 
 def pool() -> ThreadPoolExecutor:
     """Return the shared thread pool for CPU launches, with one thread per core."""
     return ThreadPoolExecutor(cpu_threads(), thread_name_prefix="amiwarp")
+
+
+class _Helpers:
+    """Threads that run jobs for other threads. A hand-over takes a third of that to a ``ThreadPoolExecutor``."""
+
+    def __init__(self, process: int) -> None:
+        """Start without threads. ``process`` is the id of this process: a forked one has no threads."""
+        self._jobs: SimpleQueue[_Job] = SimpleQueue()
+        self._threads = 0
+        self._starting = Lock()
+
+    def put(self, jobs: list[_Job]) -> None:
+        """Queue jobs, for at least as many threads."""
+        with self._starting:
+            while self._threads < len(jobs):
+                Thread(target=self._work, name=f"amiwarp-helper-{self._threads}", daemon=True).start()
+                self._threads += 1
+        for job in jobs:
+            self._jobs.put(job)
+
+    def _work(self) -> None:
+        while True:
+            job, done = self._jobs.get()
+            error = None
+            try:
+                job()
+            except BaseException as raised:
+                error = raised
+            done.put(error)
+            del job, done, error  # so that their arrays are freed while the thread waits
+
+
+_helpers = cache(_Helpers)
+
+
+def run_together(jobs: Sequence[Callable[[], object]]) -> None:
+    """Run jobs at the same time, the first one in this thread, and wait for all of them.
+
+    A job must not call this function.
+    """
+    done: SimpleQueue[BaseException | None] = SimpleQueue()
+    if len(jobs) > 1:
+        _helpers(os.getpid()).put([(job, done) for job in jobs[1:]])
+    try:
+        jobs[0]()
+    finally:
+        errors = [done.get() for _ in jobs[1:]]
+    for error in errors:
+        if error is not None:
+            raise error
 
 
 @cache
@@ -129,7 +183,7 @@ def launch(
         inputs_ = [*inputs, first + span[0]]
         wp.launch(kernel, dim=span[1] - span[0], inputs=inputs_, outputs=list(outputs), device=device)
 
-    list(pool().map(run, ranges)) if len(ranges) > 1 else run(ranges[0])
+    run_together([partial(run, span) for span in ranges])
 
 
 def launch_slices(
@@ -154,7 +208,7 @@ def launch_slices(
         wp.launch(kernel, dim=stop - start, inputs=[*inputs, first + start], outputs=[out], device=device)
 
     jobs = list(zip(ranges, outputs, strict=False))
-    list(pool().map(run, jobs)) if len(jobs) > 1 else run(jobs[0])
+    run_together([partial(run, job) for job in jobs])
 
 
 class RecordedLaunch:

@@ -42,14 +42,20 @@ def turned(w0: float, w1: float, c: float, s: float) -> wp.vec2:
 
 
 @wp.func
+def drifted(pairs: Pairs, drift: float, k: int, i: int, w0: float, w1: float) -> wp.vec2:
+    """Return the azimuth (w0, w1) of the first (k = 0) or second event of a pair, at the given drift."""
+    angle = pairs.slope[k * pairs.stride + i] * drift
+    return turned(w0, w1, wp.cos(angle), wp.sin(angle))
+
+
+@wp.func
 def compensated_position(
     model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
     """Return the compensated position [px] of the first (k = 0) or second event of a pair, at the given drift."""
     w0, w1 = event_azimuth(model, pairs, k, i)
     if pairs.slope.shape[0] > 0:
-        angle = pairs.slope[k * pairs.stride + i] * drift
-        azimuth = turned(w0, w1, wp.cos(angle), wp.sin(angle))
+        azimuth = drifted(pairs, drift, k, i, w0, w1)
         w0 = azimuth[0]
         w1 = azimuth[1]
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
@@ -57,6 +63,20 @@ def compensated_position(
         return contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
     xy = compensate(model, camera, pixel, wp.vec2(w0, w1))
     return undo_camera_rotation(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
+
+
+@wp.func
+def compensated_position(
+    model: Any, camera: PinholeParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
+) -> wp.vec2:
+    """Return the compensated position for a camera without distortion, and pixels that are not slow."""
+    w0, w1 = event_azimuth(model, pairs, k, i)
+    if pairs.slope.shape[0] > 0:
+        azimuth = drifted(pairs, drift, k, i, w0, w1)
+        w0 = azimuth[0]
+        w1 = azimuth[1]
+    u, v = displace(model, camera, float(pairs.x[i]), float(pairs.y[i]), w0, w1)
+    return undo_camera_rotation(camera, wp.vec2(u, v), camera_rotation, pairs.time[k * pairs.stride + i])
 
 
 @wp.func
@@ -80,7 +100,7 @@ def contracted_position(
 @wp.kernel
 def find_places(
     model: Any,
-    camera: CameraParams,
+    camera: Any,
     pairs: Pairs,
     drift: float,
     camera_rotation: CameraRotationParams,
@@ -149,16 +169,47 @@ def place_still(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, s
 
 @wp.func
 def displace_block(
-    model: Any, camera: PinholeParams, pairs: Pairs, k: int, first: int, x: wp.array(dtype=float),
+    model: Any, camera: PinholeParams, pairs: Pairs, k: int, first: int, drifts: int, x: wp.array(dtype=float),
     y: wp.array(dtype=float),
 ):  # fmt: skip
-    """Compute the compensated positions of the first (k = 0) or second events of a block of pairs."""
+    """Compute the compensated positions [px] of the first (k = 0) or second events of a block of pairs.
+
+    If ``drifts`` is 1, ``x`` and ``y`` hold their azimuths (cos, sin) before.
+    """
     for j in range(BLOCK):
         i = first + j
         w0, w1 = event_azimuth(model, pairs, k, i)
+        w0 = wp.where(drifts == 1, load_float(x, j), w0)
+        w1 = wp.where(drifts == 1, load_float(y, j), w1)
         u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
         store_float(x, j, u)
         store_float(y, j, v)
+
+
+@wp.func
+def drift_block(
+    model: Any, pairs: Pairs, drift: float, k: int, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float)
+):
+    """Compute the azimuths (cos, sin) of the first (k = 0) or second events of a block of pairs, at the given drift."""
+    for j in range(BLOCK):
+        w0, w1 = event_azimuth(model, pairs, k, first + j)
+        w = drifted(pairs, drift, k, first + j, w0, w1)
+        x[j] = w[0]
+        y[j] = w[1]
+
+
+@wp.func
+def undo_rotations(
+    camera: PinholeParams, camera_rotation: CameraRotationParams, pairs: Pairs, k: int, first: int,
+    x: wp.array(dtype=float), y: wp.array(dtype=float),
+):  # fmt: skip
+    """Move the positions of a block of pairs to where they are at time 0."""
+    for j in range(BLOCK):
+        at = undo_camera_rotation(
+            camera, wp.vec2(x[j], y[j]), camera_rotation, pairs.time[k * pairs.stride + first + j]
+        )
+        x[j] = at[0]
+        y[j] = at[1]
 
 
 @wp.func
@@ -175,8 +226,20 @@ def find_nodes(
 
 
 @wp.kernel
-def place_blocks(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry):
-    """Compute the positions as :func:`place_still` does, one block of pairs per thread. For CPUs."""
+def place_blocks(
+    model: Any,
+    camera: PinholeParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    drift: float,
+    camera_rotation: CameraRotationParams,
+    start: int,
+    geometry: Geometry,
+):
+    """Compute the positions as :func:`place_pairs` does, one block of pairs per thread. For CPUs.
+
+    This kernel is for a camera without distortion, and for pixels that are not slow.
+    """
     first = (start + wp.tid()) * BLOCK
     ax = wp.zeros(shape=(64,), dtype=float)
     ay = wp.zeros(shape=(64,), dtype=float)
@@ -184,12 +247,19 @@ def place_blocks(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, 
     by = wp.zeros(shape=(64,), dtype=float)
     a = wp.zeros(shape=(64,), dtype=int)
     b = wp.zeros(shape=(64,), dtype=int)
+    drifts = wp.min(pairs.slope.shape[0], 1)
+    if drifts == 1:
+        drift_block(model, pairs, drift, 0, first, ax, ay)
+        drift_block(model, pairs, drift, 1, first, bx, by)
     if is_plain(model) == 1:
-        displace_block(plain(model), camera, pairs, 0, first, ax, ay)
-        displace_block(plain(model), camera, pairs, 1, first, bx, by)
+        displace_block(plain(model), camera, pairs, 0, first, drifts, ax, ay)
+        displace_block(plain(model), camera, pairs, 1, first, drifts, bx, by)
     else:
-        displace_block(model, camera, pairs, 0, first, ax, ay)
-        displace_block(model, camera, pairs, 1, first, bx, by)
+        displace_block(model, camera, pairs, 0, first, drifts, ax, ay)
+        displace_block(model, camera, pairs, 1, first, drifts, bx, by)
+    if wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration) > 0.0:
+        undo_rotations(camera, camera_rotation, pairs, 0, first, ax, ay)
+        undo_rotations(camera, camera_rotation, pairs, 1, first, bx, by)
     find_nodes(atlas, pairs, first, ax, ay, a)
     find_nodes(atlas, pairs, first, bx, by, b)
     for j in range(BLOCK):

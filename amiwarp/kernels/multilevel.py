@@ -105,6 +105,56 @@ def restrict(
     correction[i] = total / (diagonal[i] + prior.smooth[0] * HAT + prior.damping[0] * four)
 
 
+@wp.func_native("""
+    const int y = 2 * row;
+    const float* here = (const float*)fine.data + (size_t)y * fine_columns;
+    const float* above = y > 0 ? here - fine_columns : nullptr;
+    const float* below = y + 1 < fine_rows ? here + fine_columns : nullptr;
+    const float* node = (const float*)diagonal.data + (size_t)row * columns;
+    float* to = (float*)coarse.data + (size_t)row * columns;
+    float* corrected = (float*)correction.data + (size_t)row * columns;
+    float sum[258];
+    for (int first = 0; first < columns; first += 128) {
+        // sum[k] belongs to the fine column 2 * first - 1 + k
+        const int n = columns - first < 128 ? columns - first : 128, left = 2 * first - 1;
+        const int low = left < 0 ? 1 : 0, high = fine_columns - left < 2 * n + 1 ? fine_columns - left : 2 * n + 1;
+        for (int k = 0; k < 2 * n + 1; ++k) sum[k] = 0.0f;
+        if (y < fine_rows) for (int k = low; k < high; ++k) sum[k] = here[left + k];  // the last row may lie below
+        if (above) for (int k = low; k < high; ++k) sum[k] += 0.5f * above[left + k];
+        if (below) for (int k = low; k < high; ++k) sum[k] += 0.5f * below[left + k];
+        for (int k = 0; k < n; ++k) {
+            const float total = sum[2 * k + 1] + 0.5f * (sum[2 * k] + sum[2 * k + 2]);
+            to[first + k] = total;
+            corrected[first + k] = total / (node[first + k] + least);
+        }
+    }
+""")
+def restrict_row(
+    fine: wp.array(dtype=float), fine_rows: int, fine_columns: int, columns: int, diagonal: wp.array(dtype=float),
+    least: float, row: int, coarse: wp.array(dtype=float), correction: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute :func:`restrict` for one row of the coarser grid. ``least`` is the prior's part of the diagonal."""
+
+
+@wp.kernel
+def restrict_rows(
+    fine: wp.array(dtype=float),
+    fine_rows: int,
+    fine_columns: int,
+    columns: int,
+    diagonal: wp.array(dtype=float),
+    prior: Prior,
+    four: float,
+    start: int,
+    coarse: wp.array(dtype=float),
+    correction: wp.array(dtype=float),
+):
+    """Compute residual and correction as :func:`restrict` does, one row of the coarser grid per thread. For CPUs."""
+    least = prior.smooth[0] * HAT + prior.damping[0] * four
+    row = start + wp.tid()
+    restrict_row(fine, fine_rows, fine_columns, columns, diagonal, least, row, coarse, correction)
+
+
 @wp.kernel
 def prolong(
     coarse: wp.array(dtype=float),
@@ -124,3 +174,27 @@ def prolong(
     right = column % 2
     down = (row % 2) * columns
     fine[i] = fine[i] + 0.25 * (coarse[at] + coarse[at + right] + coarse[at + down] + coarse[at + right + down])
+
+
+@wp.func_native("""
+    const float* above = (const float*)coarse.data + (size_t)(row / 2) * columns;
+    const float* below = above + (row % 2) * columns;
+    float* to = (float*)fine.data + (size_t)row * fine_columns;
+    for (int k = 0; k < fine_columns / 2; ++k) {
+        to[2 * k] += 0.5f * (above[k] + below[k]);
+        to[2 * k + 1] += 0.25f * (above[k] + above[k + 1] + below[k] + below[k + 1]);
+    }
+    if (fine_columns % 2) to[fine_columns - 1] += 0.5f * (above[fine_columns / 2] + below[fine_columns / 2]);
+""")
+def prolong_row(
+    coarse: wp.array(dtype=float), columns: int, fine_columns: int, row: int, fine: wp.array(dtype=float)
+):  # fmt: skip
+    """Compute :func:`prolong` for one row of the finer grid."""
+
+
+@wp.kernel
+def prolong_rows(
+    coarse: wp.array(dtype=float), columns: int, fine_columns: int, start: int, fine: wp.array(dtype=float)
+):  # fmt: skip
+    """Add the correction as :func:`prolong` does, one row of the finer grid per thread. For CPUs."""
+    prolong_row(coarse, columns, fine_columns, start + wp.tid(), fine)

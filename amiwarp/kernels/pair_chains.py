@@ -79,8 +79,7 @@ def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
     const int* cell = (const int*)chains.cell.data + 128 * block;
     const float* x = (const float*)chains.x.data + 128 * block;
     const float* y = (const float*)chains.y.data + 128 * block;
-    const float* weight = (const float*)chains.weight.data + 128 * block;
-    alignas(64) float upper[256], lower[256], at[144];
+    alignas(64) float upper[256], lower[256];
     for (int j = 0; j < n; j += 8) {
         uint64_t a[8], b[8];
         for (int i = 0; i < 8; ++i) {
@@ -92,20 +91,41 @@ def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
         memcpy(upper + 2 * j, &above, 64);
         memcpy(lower + 2 * j, &below, 64);
     }
+    float* at = (float*)levels.data;
     at[15] = 0.0f;
     for (int j = 0; j < n; ++j) {
         const float u = upper[2 * j] + (upper[2 * j + 1] - upper[2 * j]) * x[j];
         const float v = lower[2 * j] + (lower[2 * j + 1] - lower[2 * j]) * x[j];
         at[16 + j] = u + (v - u) * y[j];
     }
-    float* out = (float*)values.data;
-    for (int j = 0; j < n; ++j) out[j] = weight[j] * (at[16 + j] - at[15 + j]);
 #endif
 """)
-def weighted_differences(
-    values: wp.array(dtype=float), chains: Chains, vector: wp.array(dtype=float), columns: int, block: int
-):
+def find_levels(levels: wp.array(dtype=float), chains: Chains, vector: wp.array(dtype=float), columns: int, block: int):
+    """Compute the brightness at the positions of a block, from element 16 of ``levels`` (144 elements) on.
+
+    Element 15 becomes 0. So the difference of a pair is the level at its second position minus the element before.
+    """
+
+
+@wp.func_native("""
+    const int n = (((const int*)chains.count.data)[block] + 7) & ~7;
+    const float* weight = (const float*)chains.weight.data + 128 * block;
+    const float* at = (const float*)levels.data + 16;
+    float* out = (float*)values.data;
+    for (int j = 0; j < n; ++j) out[j] = weight[j] * (at[j] - at[j - 1]);
+""")
+def weighted_differences(values: wp.array(dtype=float), levels: wp.array(dtype=float), chains: Chains, block: int):
     """Compute weight · (L(second) - L(first)) of each pair in a block, at the place of its second position."""
+
+
+@wp.func_native("""
+    const float* at = (const float*)levels.data + 16;
+    const uint8_t* end = (const uint8_t*)chains.end.data + 64 * block;
+    float* out = (float*)values.data;
+    for (int k = 0; k < 64; ++k) out[k] = at[end[k]] - at[end[k] - 1];
+""")
+def pair_differences(values: wp.array(dtype=float), levels: wp.array(dtype=float), chains: Chains, block: int):
+    """Compute L(second) - L(first) of the 64 pairs in a block, in their order."""
 
 
 @wp.func_native("""
@@ -150,3 +170,27 @@ def add_differences(
     Neighbouring positions are not added one right after the other, because a vector load waits for a store that
     overlaps it in part.
     """
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    const int n = ((const int*)chains.count.data)[block];
+    const int* cell = (const int*)chains.cell.data + 128 * block;
+    const float* x = (const float*)chains.x.data + 128 * block;
+    const float* y = (const float*)chains.y.data + 128 * block;
+    const float* weight = (const float*)chains.weight.data + 128 * block;
+    for (int j = 0; j < n; ++j) {
+        const float both = weight[j] + (j + 1 < n ? weight[j + 1] : 0.0f);
+        const float below = y[j], above = 1.0f - below, right = x[j], left = 1.0f - right;
+        const float share[4] = {above * left, above * right, below * left, below * right};
+        int64_t* to = (int64_t*)sums.data + cell[j];
+        to[0] += (int64_t)((double)(both * share[0] * share[0]) * 4294967296.0);
+        to[1] += (int64_t)((double)(both * share[1] * share[1]) * 4294967296.0);
+        to[columns] += (int64_t)((double)(both * share[2] * share[2]) * 4294967296.0);
+        to[columns + 1] += (int64_t)((double)(both * share[3] * share[3]) * 4294967296.0);
+    }
+#endif
+""")
+def add_weights(sums: wp.array(dtype=wp.int64), chains: Chains, columns: int, block: int):
+    """Add the squares of the bilinear weights of a block's positions, times the weights of the pairs that they end or
+    begin, to the sums, if no other thread writes to them."""

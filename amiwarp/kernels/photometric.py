@@ -1,17 +1,14 @@
-"""Event pairs as equations in a log-brightness map, and the operator of these equations.
+"""Event pairs as equations in a log-brightness map.
 
 The map is a set of rectangular tiles of equal shape, stored one after the other, followed by two more unknowns: the
 leak, and the excess of the OFF threshold over the ON threshold. Sums are in fixed point, as votes are, so that they do
-not depend on the order of threads. Frequent operations have two kernels: on CUDA a thread processes one pair, on a CPU
-a block of :data:`BLOCK` pairs in vectorised loops.
+not depend on the order of threads.
 """
 
 import warp as wp
 
-from amiwarp.kernels.camera import NAN
 from amiwarp.kernels.conjugate_gradients import add_fixed, add_two, to_fixed
 from amiwarp.kernels.map_prior import EXTRA
-from amiwarp.kernels.pair_chains import BLOCK, Chains, add_differences, weighted_differences
 from amiwarp.kernels.vector_code import load_float, load_int, load_uint8
 
 wp.set_module_options({"enable_backward": False})
@@ -168,6 +165,17 @@ def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int
 
 
 @wp.func
+def add_extra_diagonal(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int, weight: float):
+    """Add the squared coefficients of the leak and the OFF threshold times a weight to their sums."""
+    extra = sums.shape[0] - EXTRA
+    if atlas.with_leak > 0.0:
+        gap = pairs.time[pairs.stride + i] - pairs.time[i]
+        add_fixed(sums, extra, weight * gap * gap)
+    if atlas.with_off != 0:
+        add_fixed(sums, extra + 1, is_off(pairs, i) * weight)
+
+
+@wp.func
 def continues_previous(g: Geometry, i: int) -> bool:
     """Return whether pair i begins at the position at which pair i - 1 ends, for i > 0.
 
@@ -179,135 +187,20 @@ def continues_previous(g: Geometry, i: int) -> bool:
     return g.part[i] == g.part[g.stride + before] and g.part[g.stride + i] == g.part[2 * g.stride + before]
 
 
-# -- all equations
-
-
-@wp.kernel
-def apply_normal(
-    pairs: Pairs,
-    atlas: Atlas,
-    geometry: Geometry,
-    weight: wp.array(dtype=float),
-    vector: wp.array(dtype=float),
-    start: int,
-    sums: wp.array(dtype=wp.int64),
-):
-    """Compute sums += Aᵀ W A vector for equations A with weights W, one pair of events per thread."""
-    i = start + wp.tid()
-    if geometry.cell[i] < 0:
-        return
-    value = weight[i] * difference(vector, atlas, pairs, geometry, i)
-    add_extra(sums, atlas, pairs, i, value)
-    if i == 0 or not continues_previous(geometry, i):
-        add_to_nodes(sums, geometry.cell[i], atlas.columns, fractions_of(geometry, 0, i), -value)
-    if i + 1 < pairs.count and continues_previous(geometry, i + 1):
-        value -= weight[i + 1] * difference(vector, atlas, pairs, geometry, i + 1)
-    add_to_nodes(sums, geometry.cell[geometry.stride + i], atlas.columns, fractions_of(geometry, 1, i), value)
-
-
-@wp.kernel
-def apply_normal_blocks(
-    pairs: Pairs,
-    atlas: Atlas,
-    chains: Chains,
-    vector: wp.array(dtype=float),
-    start: int,
-    sums: wp.array(dtype=wp.int64),
-):
-    """Compute sums += Aᵀ W A vector for equations A with weights W, one block of pairs per thread. For CPUs."""
-    block = start + wp.tid()
-    values = wp.zeros(shape=(144,), dtype=float)
-    weighted_differences(values, chains, vector, atlas.columns, block)
-    if atlas.with_leak > 0.0 or atlas.with_off != 0:
-        for k in range(BLOCK):
-            i = BLOCK * block + k
-            end = int(chains.end[i])
-            values[end] += chains.weight[2 * BLOCK * block + end] * sensor_terms(vector, atlas, pairs, i)
-            add_extra(sums, atlas, pairs, i, values[end])
-    add_differences(sums, values, chains, atlas.columns, block)
-
-
-@wp.kernel
-def apply_transpose(
-    pairs: Pairs,
-    atlas: Atlas,
-    geometry: Geometry,
-    weight: wp.array(dtype=float),
-    residual: wp.array(dtype=float),
-    start: int,
-    sums: wp.array(dtype=wp.int64),
-):
-    """Compute sums += Aᵀ W residual for equations A with weights W."""
-    i = start + wp.tid()
-    transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
-
-
-@wp.kernel
-def subtract(
-    pairs: Pairs,
-    atlas: Atlas,
-    geometry: Geometry,
-    vector: wp.array(dtype=float),
-    start: int,
-    residual: wp.array(dtype=float),
-):
-    """Compute residual -= A vector for equations A; the residual is 0 for a pair off the map."""
-    i = start + wp.tid()
-    if i < pairs.count:
-        rest = residual[i] - difference(vector, atlas, pairs, geometry, i)
-        residual[i] = wp.where(geometry.cell[i] >= 0, rest, 0.0)
-
-
-@wp.kernel
-def add_diagonal(
-    pairs: Pairs,
-    atlas: Atlas,
-    geometry: Geometry,
-    weight: wp.array(dtype=float),
-    start: int,
-    sums: wp.array(dtype=wp.int64),
-):
-    """Compute sums += diag(Aᵀ W A), the preconditioner, as if the two positions of a pair shared no node."""
-    i = start + wp.tid()
-    if geometry.cell[i] < 0:
-        return
-    extra = sums.shape[0] - EXTRA
-    for k in range(2):
-        w = bilinear(fractions_of(geometry, k, i))
-        w = wp.cw_mul(w, w) * weight[i]
-        cell = geometry.cell[k * geometry.stride + i]
-        add_two(sums, cell, to_fixed(w[0]), to_fixed(w[1]))
-        add_two(sums, cell + atlas.columns, to_fixed(w[2]), to_fixed(w[3]))
-    gap = pairs.time[pairs.stride + i] - pairs.time[i]
-    if atlas.with_leak > 0.0:
-        add_fixed(sums, extra, weight[i] * gap * gap)
-    if atlas.with_off != 0:
-        add_fixed(sums, extra + 1, is_off(pairs, i) * weight[i])
-
-
-@wp.kernel
-def weigh(
-    pairs: Pairs,
-    atlas: Atlas,
-    geometry: Geometry,
-    image: wp.array(dtype=float),
-    scale: wp.array(dtype=float),
-    start: int,
-    weight: wp.array(dtype=float),
-    residual: wp.array(dtype=float),
-):
-    """Compute the residual of each equation and its Cauchy weight; NaN and 0 for a pair off the map."""
-    i = start + wp.tid()
-    if i >= pairs.count:
-        return
-    r = right_side(pairs, i) - difference(image, atlas, pairs, geometry, i)
+@wp.func
+def residual_of(pairs: Pairs, difference: float, i: int) -> float:
+    """Return the residual of an equation whose left side is ``difference``."""
+    r = right_side(pairs, i) - difference
     if pairs.offset.shape[0] > 0:
         r -= pairs.offset[i]
-    on_map = geometry.cell[i] >= 0
-    residual[i] = wp.where(on_map, r, NAN)
-    cauchy = 1.0 / (1.0 + (r / scale[0]) * (r / scale[0]))
-    if pairs.on[i] > ON:
-        cauchy = pairs.weak / (1.0 + r * r)  # the scale of residuals is one threshold, the accuracy of such pairs
-    if (pairs.on[i] & HELD) != wp.uint8(0):
-        cauchy = 0.0
-    weight[i] = wp.where(on_map, cauchy, 0.0)
+    return r
+
+
+@wp.func
+def weight_of(pairs: Pairs, r: float, scale: float, i: int) -> float:
+    """Return the Cauchy weight of an equation with residual ``r``."""
+    cauchy = 1.0 / (1.0 + (r / scale) * (r / scale))
+    on = load_uint8(pairs.on, i)
+    # the scale of the residuals of quiet pairs is one threshold, the accuracy of such pairs
+    cauchy = wp.where(on > ON, pairs.weak / (1.0 + r * r), cauchy)
+    return wp.where((on & HELD) != wp.uint8(0), 0.0, cauchy)

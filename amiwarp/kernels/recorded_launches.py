@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.cpu_threads import cpu_threads
-from amiwarp.kernels.launch import SMALLEST_SLICE, pool, slices
+from amiwarp.kernels.launch import SMALLEST_SLICE, run_together, slices
 
 BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 
@@ -57,17 +57,18 @@ class Program:
         self._stages.append([self._record(kernel, b - a, [*inputs, a], [out]) for (a, b), out in jobs])
 
     def _record(self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> Any:
-        """Load the kernel and return its recorded launch."""
+        """Load the kernel and return a function that repeats its launch."""
         kernel.module.load(self.device, block_dim=1 if self.device.is_cpu else BLOCK_DIM)
-        return wp.launch(
+        recorded = wp.launch(
             kernel, dim=n, inputs=list(inputs), outputs=list(outputs), device=self.device, block_dim=BLOCK_DIM,
             record_cmd=True,
         )  # fmt: skip
+        return recorded.launch
 
     def launch(self) -> None:
         """Run all stages once, in the order in which they were added."""
         for stage in self._stages:
-            _run_stage(stage)
+            run_together(stage)
 
     def run(self, times: int = 1) -> None:
         """Run all stages ``times`` times; on CUDA as a graph, which the first call captures."""
@@ -81,11 +82,3 @@ class Program:
             self._graph = capture.graph
         for _ in range(times):
             wp.capture_launch(self._graph)
-
-
-def _run_stage(stage: list[Any]) -> None:
-    """Run the first slice of a launch in this thread, and the others on the thread pool."""
-    others = [pool().submit(command.launch) for command in stage[1:]]
-    stage[0].launch()
-    for other in others:
-        other.result()

@@ -22,7 +22,6 @@ from amiwarp.kernels.rotations import rotate, rotate_by_deflection, sine_versine
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-HARMONIC_ANGLES = wp.constant(16)
 INVERSION_STEPS = wp.constant(8)
 
 
@@ -344,25 +343,27 @@ def deflect_points(
 def fit_harmonics(
     model: Any,
     camera: CameraParams,
+    angles: wp.array(dtype=wp.vec2),
     start: int,
     table: wp.array3d(dtype=float),
 ):
-    """Fit offset and first harmonic of the displacement of one pixel per thread, by Fourier sums over angles."""
+    """Fit offset and first harmonic of the displacement of one pixel per thread, by Fourier sums.
+
+    ``angles`` holds the (cos, sin) of evenly spaced tilt azimuths.
+    """
     pixel = start + wp.tid()
     row, col = pixel // table.shape[1], pixel % table.shape[1]
     xy = wp.vec2(float(col), float(row))
     mean = wp.vec2(0.0, 0.0)
     c = wp.vec2(0.0, 0.0)
     s = wp.vec2(0.0, 0.0)
-    angles = int(HARMONIC_ANGLES)  # a variable, so that Warp does not unroll the loop, which is slow to compile
-    for k in range(angles):
-        phi = 6.283185307179586 * float(k) / float(HARMONIC_ANGLES)
-        w = wp.vec2(wp.cos(phi), wp.sin(phi))
+    for k in range(angles.shape[0]):
+        w = angles[k]
         d = compensate(model, camera, xy, w) - xy
         mean += d
         c += d * w[0]
         s += d * w[1]
-    n = float(HARMONIC_ANGLES)
+    n = float(angles.shape[0])
     for k in range(2):
         table[row, col, k] = mean[k] / n
         table[row, col, 2 + k] = c[k] * (2.0 / n)

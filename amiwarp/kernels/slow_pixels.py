@@ -69,9 +69,10 @@ def filtered(
 ) -> float:  # fmt: skip
     """Return the output of the filter at an event."""
     width = MEMORY / float(STEPS)  # step [time constants at median light]
-    before = brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * filter.turn - filter.ahead)
-    level = before
-    for j in range(STEPS):
+    before = float(brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * filter.turn - filter.ahead))
+    level = float(before)
+    steps = int(STEPS)  # a variable, so that Warp does not unroll the loop, which takes minutes to compile for CUDA
+    for j in range(steps):
         past = MEMORY - float(j + 1) * width
         after = brightness_before(model, camera, pairs, atlas, image, k, i, past * filter.turn - filter.ahead)
         if wp.isnan(after):

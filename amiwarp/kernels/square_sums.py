@@ -60,3 +60,48 @@ def sum_square_products(
         total += wp.float64(rows[first[k], i]) * wp.float64(rows[second[k], i]) * wp.float64(weight[i])
     sums[here, k] = total
     number[here] = end - begin
+
+
+MOST_ROWS = 32  # largest number of rows for :func:`sum_squares`
+
+
+@wp.func_native("""
+#if defined(__clang__)
+    const int m = rows.shape[0], wide = (m + 7) & ~7;
+    const size_t stride = rows.strides[0] / sizeof(float);
+    const float* row = (const float*)rows.data;
+    const int* pair = (const int*)order.data;
+    double total[32 * 32] = {0}, value[32] = {0};
+    for (int at = begin; at < end; ++at) {
+        const int i = pair[at];
+        const double weight = ((const float*)weights.data)[i];
+        for (int k = 0; k < m; ++k) value[k] = row[k * stride + i];
+        for (int k = 0; k < m; ++k) {
+            const double factor = weight * value[k];
+            for (int j = 0; j < wide; ++j) total[32 * k + j] += factor * value[j];
+        }
+    }
+    double* out = (double*)((char*)sums.data + (size_t)sums.strides[0] * square);
+    for (int k = 0; k < m; ++k)
+        for (int j = k; j < m; ++j) *out++ = total[32 * k + j];
+#endif
+""")
+def add_square(
+    rows: wp.array2d(dtype=float), weights: wp.array(dtype=float), order: wp.array(dtype=int), begin: int, end: int,
+    square: int, sums: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """Compute the sums of one square over the pairs ``order[begin:end]``, for each row and those from it on."""
+
+
+@wp.kernel
+def sum_squares(
+    rows: wp.array2d(dtype=float), weight: wp.array(dtype=float), square: wp.array(dtype=int),
+    order: wp.array(dtype=int), count: int, start: int, sums: wp.array2d(dtype=wp.float64),
+    number: wp.array(dtype=int),
+):  # fmt: skip
+    """Compute the sums of :func:`sum_square_products`, one square per thread. For CPUs, and few rows."""
+    here = start + wp.tid()
+    begin = wp.lower_bound(square, 0, count, here)
+    end = wp.lower_bound(square, begin, count, here + 1)
+    add_square(rows, weight, order, begin, end, here, sums)
+    number[here] = end - begin

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 
     from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
     from amiwarp.optics.prism import Prism
+
+HARMONIC_ANGLES = 16
+"""Number of angles at which a model is approximated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +111,9 @@ class EllipseModel(PointDisplacement):
         """
         height, width = model.camera.height, model.camera.width
         table = wp.empty((height, width, 6), dtype=float, device=device)
-        inputs = [replace(model, phase=0.0).params(device), model_camera(model, device)]
+        phi = math.tau * np.arange(HARMONIC_ANGLES) / HARMONIC_ANGLES
+        angles = wp.array(np.stack([np.cos(phi), np.sin(phi)], axis=1), dtype=wp.vec2, device=device)
+        inputs = [replace(model, phase=0.0).params(device), model_camera(model, device), angles]
         launch(fit_harmonics, height * width, inputs, [table], device=device)
         offset, cosine, sine = np.split(table.numpy(), 3, axis=2)
         return cls(model.camera, offset, cosine, sine, model.phase)

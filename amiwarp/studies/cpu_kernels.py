@@ -7,12 +7,12 @@ from amiwarp.kernels.camera import PinholeParams
 from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend
 from amiwarp.kernels.iwe import read_sums
-from amiwarp.kernels.map_positions import find_places, place_blocks, place_pairs
+from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.map_prior import link
 from amiwarp.kernels.multilevel import prolong
+from amiwarp.kernels.normal_equations import apply_normal_blocks
 from amiwarp.kernels.pair_chains import make_chains
 from amiwarp.kernels.pairs import mark_spans
-from amiwarp.kernels.photometric import apply_normal_blocks
 from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
 from amiwarp.kernels.refraction import (
     CircleParams,
@@ -32,14 +32,13 @@ EXACT_KERNELS = (
     (vote_event_blocks, ExactParams, PinholeParams),
     (read_sums,),
     (mark_spans,),
-    (find_places, ExactParams),
+    (find_places, ExactParams, PinholeParams),
     (place_blocks, ExactParams),
     (make_chains,),
     (apply_normal_blocks,),
     (descend,),
     (sum_costs,),
     (find_levels, ExactParams),
-    (place_pairs, ExactParams),
     (find_squares,),
     (compensate_blocks, ExactParams, PinholeParams),
     (link,),

@@ -138,17 +138,21 @@ def _evaluate(
     answer, and points near the optimum with their rise in cost, the lowest first.
     """
     space, best = cost.space, stage.x
-    # the map is better converged now than at the start of the search, so the cost at the start is measured again
-    cost.residuals(v, rounds=2)
-    at_start = cost.mean()
+    cost.predict(best)
     cost.residuals(best, rounds=2)
     final, residual = cost.mean(), cost.brightness.residuals.median()
     slopes = cost.slopes(best, with_parts=True)
     covariance = slopes.covariance() / left**2
     of_sharpness = np.array([n not in DEGENERATE_WITH_APEX for n in space.names])
     of_prism = np.array([n not in (*DEGENERATE_WITH_APEX, *MOTION) for n in space.names])
-    leak, excess = (float(x) for x in cost.brightness.extra)  # read before the map is solved at other points
+    solved = cost.brightness.unknowns
+    leak, excess = (float(x) for x in cost.brightness.extra)
     around = cost_around_optimum(cost, best, final)
+    # the map is better converged now than at the start of the search, so the cost at the start is measured again
+    cost.residuals(v, rounds=2)
+    at_start = cost.mean()
+    cost.replace_map(solved)
+    cost.residuals(best)
     rise = around[0][1] if around else math.inf
     next_step = float(np.linalg.norm(slopes.step()[of_prism]))
     moved = float(np.linalg.norm((best - v)[of_prism]))

@@ -264,8 +264,13 @@ def slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
 
 
 def free_columns(cost: Cost, v: Vector) -> dict[str, Any]:
-    """Return the derivatives of the residuals at ``v`` by each free parameter, on the device, by name."""
-    return {name: slope(cost, cost.space, v, k) for k, name in enumerate(cost.space.names)}
+    """Return the derivatives of the residuals by each free parameter, on the device, by name.
+
+    The map must be solved at ``v``.
+    """
+    known = cost.columns
+    names = cost.space.names
+    return {n: known[n][0] if n in known else slope(cost, cost.space, v, k) for k, n in enumerate(names)}
 
 
 def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:

@@ -64,7 +64,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     given, cost = search.cost.space, search.cost
     first = answer, search.sharpest
     for left in range(MOST_CORRECTIONS, -1, -1):
-        cost.residuals(answer.stage.x, rounds=2)
+        cost.converge(answer.stage.x)
         check = check_consistency(cost, answer.stage.x)
         best = _best_correction(search, answer, check) if left else None
         if best is not None:
@@ -77,7 +77,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     unexplained = answer.result.cost > max(LARGEST_STILL_COST, LARGEST_COST_RATIO * first[0].result.cost)
     if unexplained and cost.space is not given:  # another trouble, such as a rotating camera, which is tried later
         cost.space, (answer, search.sharpest) = given, first
-        cost.residuals(answer.stage.x, rounds=2)
+        cost.converge(answer.stage.x)
         check = check_consistency(cost, answer.stage.x)
     answer = _final(search, answer, check)
     notes = (*_corrections(given, search.cost.space, answer), *check.warnings())
@@ -125,7 +125,7 @@ def _comparable_cost(search: AnswerSearch, v: NDArray[np.float64]) -> float:
     cost.renew(v)
     cost.residuals(v, rounds=2, steps=2 * cost.steps)
     mean = cost.mean()
-    cost.brightness.unknowns = present
+    cost.replace_map(present)
     return mean
 
 

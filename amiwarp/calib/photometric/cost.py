@@ -22,6 +22,10 @@ SLOPE_PX = 0.005
 """Step of the finite differences that give the derivatives of the residuals [px]."""
 
 
+PREDICTED_PX = 0.5
+"""Longest step for which the change of the brightness map is predicted [px]."""
+
+
 class Cost:
     """Robust residual of the brightness equations as a function of the search vector.
 
@@ -29,19 +33,31 @@ class Cost:
     """
 
     def __init__(self, space: ParameterSpace, brightness: BrightnessMap, steps: int) -> None:
-        self.space, self.brightness, self.steps = space, brightness, steps
+        self._space, self.brightness, self.steps = space, brightness, steps
         self.scale = FIRST_SCALE
         self.evaluations = 0
         self._solved: NDArray[np.float64] | None = None
         self._changes: list[Any] = []
         """Derivatives of the brightness map by each parameter [1/px], from which the next solution starts."""
+        self.columns: dict[str, tuple[Any, Any]] = {}
+        """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
+        change of the map explains."""
+
+    @property
+    def space(self) -> ParameterSpace:
+        """Space of the search vector."""
+        return self._space
+
+    @space.setter
+    def space(self, space: ParameterSpace) -> None:
+        self._space, self._solved, self._changes, self.columns = space, None, [], {}
 
     def warm_up(self, v: NDArray[np.float64]) -> None:
         """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals."""
-        self.residuals(v, rounds=3, steps=2 * self.steps)
+        self.residuals(v, rounds=3)
         # a coarse map needs its damping
         if self.brightness.tiles.density > 1.0 and self.brightness.relax_damping():
-            self.residuals(v, rounds=3, steps=2 * self.steps)
+            self.residuals(v, rounds=3)
         self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
 
@@ -49,9 +65,14 @@ class Cost:
         """Discard the brightness map and solve a new one at ``v``: a map is biased to the parameters of its fit."""
         unknowns = self.brightness.unknowns
         unknowns[: self.brightness.tiles.nodes] = 0.0
-        self.brightness.unknowns = unknowns
+        self.replace_map(unknowns)
         self.brightness.place(**self.at(v))
         self.brightness.solve(FIRST_SCALE, steps=2 * self.steps, rounds=3)
+
+    def replace_map(self, unknowns: NDArray[np.float32]) -> None:
+        """Replace the brightness map and the other unknowns; the residuals remain."""
+        self.brightness.unknowns = unknowns
+        self._solved, self.columns = None, {}
 
     def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
         """Return the keyword arguments of :meth:`BrightnessMap.place` for the search vector ``v``."""
@@ -61,7 +82,12 @@ class Cost:
         """Solve the brightness map at the search vector ``v``. The residuals stay on the device."""
         self.brightness.place(**self.at(v))
         self.brightness.solve(self.scale, steps=steps or self.steps, rounds=rounds)
-        self._solved = v
+        self._solved, self.columns = v, {}
+
+    def converge(self, v: NDArray[np.float64]) -> None:
+        """Solve the brightness map at ``v`` in two rounds, unless it was last solved there."""
+        if self._solved is None or not np.array_equal(self._solved, v):
+            self.residuals(v, rounds=2)
 
     def mean(self) -> float:
         """Return the mean Cauchy cost, relative to that without a map.
@@ -77,8 +103,21 @@ class Cost:
         return -self.mean()
 
     def settled(self, v: NDArray[np.float64]) -> float:
-        """Return the score at ``v`` with more solver steps: after a long step in ``v`` the map converges slowly."""
-        return self(v, steps=3 * self.steps // 2)
+        """Return the score at ``v``, with the map first changed by :meth:`predict`."""
+        self.predict(v)
+        return self(v)
+
+    def predict(self, v: NDArray[np.float64]) -> None:
+        """Change the map as its derivatives by the parameters predict for a ``v`` nearby, if :meth:`slopes` found them.
+
+        After a step in ``v`` the map would converge slowly.
+        """
+        if self._solved is None or not self._changes:
+            return
+        step = v - self._solved
+        if np.linalg.norm(step) <= PREDICTED_PX:
+            for change, moved in zip(self._changes, step, strict=True):
+                self.brightness.add(change, float(moved))
 
     def slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Slopes:
         """Return the residuals' derivatives at ``v``, minus the part that a change of the map can explain.

@@ -94,7 +94,10 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     """
     b, camera = cost.brightness, cost.space.camera
     b.prepare_projection()
-    left = [b.unexplained(c, b.new_change(), steps=MAP_STEPS) for c in columns.values()]
+    for name, column in columns.items():
+        if name not in cost.columns or cost.columns[name][0] is not column:
+            cost.columns[name] = column, b.unexplained(column, b.new_change(), steps=MAP_STEPS)
+    left = [cost.columns[name][1] for name in columns]
     width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
     sums, squares = b.residuals.products_by_square([*left, b.residuals.values], SQUARE_PX, width, height)
     xy = np.stack([squares % width, squares // width], axis=1).astype(np.float64)

@@ -29,7 +29,10 @@ def cost_around_optimum(cost: Cost, best: NDArray[np.float64], final: float) -> 
     def at(point: NDArray[np.float64]) -> float:
         if few:
             cost.renew(point)
-        cost.residuals(point, rounds=2)
+            cost.residuals(point, rounds=2)
+        else:
+            cost.predict(point)
+            cost.residuals(point, rounds=2, steps=cost.steps // 2)
         return cost.mean()
 
     reference = at(best) if few else final

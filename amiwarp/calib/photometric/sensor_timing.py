@@ -55,7 +55,7 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
 
     A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant is 0.
     """
-    cost.residuals(v, rounds=2)
+    cost.converge(v)
     relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
     columns = free_columns(cost, v)
     columns["refractory"] = _shifted(cost, v, direction * REFERENCE)

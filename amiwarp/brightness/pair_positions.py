@@ -1,0 +1,87 @@
+"""Positions of event pairs on the brightness map, for a model and a rotation of the camera."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.brightness.pair_chains import FEW_BLOCKS, PairChains
+from amiwarp.kernels import map_positions as kernels
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.pairs import keep_nodes
+from amiwarp.kernels.photometric import Geometry
+from amiwarp.kernels.residual_slopes import slope_between
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.device_camera import pinhole_params
+from amiwarp.optics.displacement import model_camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.brightness.event_pairs import PairSet
+    from amiwarp.optics.models import Model
+
+
+class PairPositions:
+    """Positions of ``pairs`` on the map of ``atlas``, the kernels' struct. Owns its buffers."""
+
+    def __init__(self, pairs: PairSet, atlas: Any, middle_us: int) -> None:
+        """Allocate the buffers. ``middle_us`` is the time to which the times of the pairs are relative [us]."""
+        self.pairs, self.device, self._atlas, self._middle_us = pairs, wp.get_device(pairs.device), atlas, middle_us
+        self.geometry = self._new_geometry()
+        """Positions: the kernels' struct ``Geometry``."""
+        self.chains = PairChains(pairs.arrays.stride, self.device)
+        """The same in chains, on a CPU."""
+
+    def _new_geometry(self) -> Any:
+        g = Geometry()
+        g.stride = self.pairs.arrays.stride
+        g.cell = wp.empty(2 * g.stride, dtype=int, device=self.device)
+        g.part = wp.empty(4 * g.stride, dtype=float, device=self.device)
+        return g
+
+    def place(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
+        """Compute the positions."""
+        self._place(model, drift, camera_rotation, self.geometry)
+        self.chains.join(self.geometry)
+
+    def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
+        """Compute the positions into ``out``."""
+        arrays, pinhole = self.pairs.arrays, pinhole_params(model.camera)
+        turn = (camera_rotation or CameraRotation()).about(self._middle_us)
+        moves = arrays.slope.shape[0] > 0 or any((*turn.angular_velocity, *turn.angular_acceleration))
+        slow = arrays.lag.shape[0] > 0
+        if pinhole is None or slow or (moves and not self.device.is_cpu):
+            inputs = [model.params(self.device), model_camera(model, self.device), arrays, self._atlas]
+            launch(kernels.place_pairs, arrays.stride, [*inputs, drift, turn.params()], [out], device=self.device)
+            return
+        inputs = [model.params(self.device), pinhole, arrays, self._atlas]
+        if self.device.is_cpu:
+            inputs += [drift, turn.params()]
+            launch(kernels.place_blocks, self.chains.blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
+        else:
+            launch(kernels.place_still, arrays.stride, inputs, [out], device=self.device)
+
+    @cached_property
+    def _sides(self) -> tuple[Any, Any]:
+        """Buffers for the positions at two more parameter values, for finite differences."""
+        return self._new_geometry(), self._new_geometry()
+
+    def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float, image: Any) -> Any:
+        """Return the derivative of the residuals for the map ``image``; see :meth:`BrightnessMap.find_slope`."""
+        for side, at in zip(self._sides, (plus, minus), strict=True):
+            self._place(at["model"], at["drift"], at["camera_rotation"], side)
+        out = wp.zeros(self.pairs.arrays.stride, dtype=float, device=self.device)
+        inputs = [self.pairs.arrays, self._atlas, *self._sides, image, width]
+        launch(slope_between, len(self.pairs), inputs, [out], device=self.device)
+        return out
+
+    def keep(self, nodes: NDArray[np.bool_]) -> None:
+        """Exclude pairs of two events that are off the ``nodes``; see :meth:`BrightnessMap.keep`."""
+        on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
+        inputs = [on, self.pairs.arrays.on, self.geometry.stride]
+        launch(keep_nodes, len(self.pairs), inputs, [self.geometry.cell], device=self.device)
+        self.chains.join(self.geometry)

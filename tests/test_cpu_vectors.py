@@ -1,0 +1,167 @@
+"""Vectorised kernels for CPUs compute what the kernels with one pair, node or unknown per thread compute."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from conftest import TRUE_PHASE, TRUE_PRISM
+
+from amiwarp.brightness.event_pairs import EventTable
+from amiwarp.brightness.solver import BrightnessMap, Smoothness
+from amiwarp.brightness.tiles import Tiles
+from amiwarp.events.recording import Recording
+from amiwarp.kernels import conjugate_gradients as cg
+from amiwarp.kernels import multilevel, normal_equations
+from amiwarp.kernels.map_prior import Prior
+from amiwarp.kernels.pair_chains import weigh_chains
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.lens import RadialTangential
+
+SCALE = 2.0**-32
+
+
+@pytest.fixture(scope="module")
+def placed(recording: Recording) -> BrightnessMap:
+    """Map over a part of the image, with all unknowns, whose pairs are placed and have random residuals."""
+    assert recording.camera is not None
+    assert recording.encoder is not None
+    width, height = recording.events.size
+    table = EventTable([recording.events.slice(0, 60_000)], np.zeros((height, width), np.int32), "cpu")
+    pairs = table.pairs(recording.encoder, longest_gap_us=60_000)
+    assert pairs.arrays.stride > len(pairs)  # the last block is not full
+    tiles = Tiles(np.array([[4.0, 3.0]], np.float32), height, width, 1.5)
+    brightness = BrightnessMap(pairs, tiles, with_leak=True, smoothness=Smoothness(0.1))
+    brightness.place(ExactModel(recording.camera, TRUE_PRISM, TRUE_PHASE))
+    rng = np.random.default_rng(1)
+    brightness.unknowns = rng.normal(size=len(brightness.unknowns)).astype(np.float32)
+    brightness.solve(1.0, steps=0)
+    return brightness
+
+
+def summed(of: BrightnessMap, kernel: Any, count: int, inputs: list[Any]) -> np.ndarray:
+    out = wp.zeros(len(of.unknowns), dtype=wp.int64, device="cpu")
+    wp.launch(kernel, count, [of.pairs.arrays, of._atlas, *inputs, 0], [out], device="cpu")
+    return np.asarray(out.numpy() * SCALE)
+
+
+@pytest.mark.parametrize("name", ["add_diagonal", "apply_transpose", "apply_normal"])
+def test_sums_over_blocks_of_pairs(placed: BrightnessMap, name: str) -> None:
+    at, weight = placed._at, placed.residuals.weight
+    wp.launch(weigh_chains, at.chains.blocks, [weight, 0], [at.chains.arrays], device="cpu")
+    vectors = {"add_diagonal": [], "apply_transpose": [placed.residuals.values], "apply_normal": [placed._image]}[name]
+    one = summed(placed, getattr(normal_equations, name), placed.count, [at.geometry, weight, *vectors])
+    blocks = getattr(normal_equations, f"{name}_blocks")
+    other = summed(placed, blocks, at.chains.blocks, [at.chains.arrays, weight, *vectors])
+    assert np.count_nonzero(one) > 1000
+    np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-4)
+
+
+def test_residuals_over_blocks_of_pairs(placed: BrightnessMap) -> None:
+    at, stride = placed._at, placed.pairs.arrays.stride
+    weight, values, rest = (wp.zeros(stride, dtype=float, device="cpu") for _ in "wvr")
+    given = [placed.pairs.arrays, placed._atlas, at.geometry]
+    wp.launch(normal_equations.weigh, placed.count, [*given, placed._image, placed._scale, 0], [weight, values],
+              device="cpu")  # fmt: skip
+    n = placed.count
+    np.testing.assert_allclose(placed.residuals.values.numpy()[:n], values.numpy()[:n], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(placed.residuals.weight.numpy()[:n], weight.numpy()[:n], rtol=1e-5, atol=1e-5)
+    assert not placed.residuals.weight.numpy()[n:].any()  # padding has no weight
+    wp.launch(normal_equations.subtract, n, [*given, placed._image, 0], [rest], device="cpu")
+    other = wp.zeros(stride, dtype=float, device="cpu")
+    placed._subtract(placed._image, other)
+    np.testing.assert_allclose(other.numpy()[:n], rest.numpy()[:n], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_steps_over_ranges_of_unknowns(linked: bool) -> None:
+    """One step of conjugate gradients with one unknown per thread, and with many."""
+    n, columns, rng = 3001, 60, np.random.default_rng(2)
+
+    def floats(*shape: int) -> np.ndarray:
+        return rng.uniform(0.5, 1.5, shape).astype(np.float32)
+
+    links = floats(2, n)
+    links[:, 3000:] = links[1, 2940:] = 0.0  # 50 rows of a map, and another unknown
+    links[0, columns - 1 :: columns] = 0.0
+    start = {name: floats(n) for name in ("diagonal", "residual", "direction", "product", "image", "z")}
+    sums = rng.integers(2**30, 2**33, (3, n))
+
+    def step(width: int) -> dict[str, np.ndarray]:
+        v = {name: wp.array(values, dtype=float, device="cpu") for name, values in start.items()}
+        u, dots, prior, parts = cg.Unknowns(), cg.Dots(), Prior(), -(-n // width)
+        for name in ("diagonal", "residual", "direction", "product"):
+            setattr(u, name, v[name])
+        for name in ("pq", "rz"):
+            setattr(dots, name, wp.full(parts, n / parts, dtype=wp.float64, device="cpu"))
+        dots.scalars = wp.array([float(n), float(n)], dtype=wp.float64, device="cpu")
+        prior.damping, prior.linked, prior.columns, prior.held = wp.full(1, 0.3, device="cpu"), int(linked), columns, n
+        prior.right, prior.down = (wp.array(links[k], device="cpu") for k in range(2))
+        left = wp.array(sums, dtype=wp.int64, device="cpu")
+        for kernel, inputs, outputs in (
+            (cg.update_search_direction, [], [u, dots]), (cg.update_search_direction_with, [v["z"]], [u, dots]),
+            (cg.finish_product, [left, prior], [u, dots]), (cg.descend, [], [v["image"], u, dots]),
+        ):  # fmt: skip
+            wp.launch(kernel, parts, [*inputs, width, 0], outputs, device="cpu")
+        product = wp.empty(parts, dtype=wp.float64, device="cpu")
+        wp.launch(cg.dot, parts, [u.residual, v["z"], width, 0], [product], device="cpu")
+        assert not left.numpy().any()
+        found = {name: values.numpy() for name, values in v.items()}
+        return found | {k: getattr(dots, k).numpy().sum(keepdims=True) for k in ("pq", "rz")} | {
+            "dot": product.numpy().sum(keepdims=True)
+        }  # fmt: skip
+
+    one, many = step(1), step(512)
+    assert not np.array_equal(one["image"], start["image"])
+    for name, values in one.items():
+        np.testing.assert_allclose(many[name], values, rtol=2e-5, atol=2e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("shape", [(77, 83), (300, 400), (301, 402), (12, 13), (13, 700)])
+def test_rows_of_grids(shape: tuple[int, int]) -> None:
+    rows, columns = shape
+    few_rows, few_columns = rows // 2 + 1, columns // 2 + 1
+    rng, prior = np.random.default_rng(3), Prior()
+    prior.smooth, prior.damping = (wp.full(1, value, dtype=float, device="cpu") for value in (0.01, 1e-6))
+    fine = wp.array(rng.normal(size=rows * columns).astype(np.float32), device="cpu")
+    diagonal = wp.array(rng.random(few_rows * few_columns).astype(np.float32), device="cpu")
+    one, other = ([wp.zeros_like(diagonal), wp.zeros_like(diagonal)] for _ in "oo")
+    inputs = [fine, rows, columns, few_columns, diagonal, prior, 4.0, 0]
+    wp.launch(multilevel.restrict, few_rows * few_columns, inputs, one, device="cpu")
+    wp.launch(multilevel.restrict_rows, few_rows, inputs, other, device="cpu")
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(b.numpy(), a.numpy(), rtol=1e-5, atol=1e-5)
+    a, b = wp.clone(fine), wp.clone(fine)
+    wp.launch(multilevel.prolong, rows * columns, [one[0], few_columns, rows, columns, 0], [a], device="cpu")
+    wp.launch(multilevel.prolong_rows, rows, [one[0], few_columns, columns, 0], [b], device="cpu")
+    np.testing.assert_allclose(b.numpy(), a.numpy(), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.3])
+@pytest.mark.parametrize("turns", [False, True])
+def test_positions_of_blocks_of_pairs(recording: Recording, drift: float, turns: bool) -> None:
+    """A camera without distortion is fast; with a distortion of zero it takes the general path."""
+    assert recording.camera is not None
+    assert recording.encoder is not None
+    width, height = recording.events.size
+    table = EventTable([recording.events.slice(0, 60_000)], np.zeros((height, width), np.int32), "cpu")
+    pairs = table.pairs(recording.encoder, longest_gap_us=60_000)
+    if drift:
+        pairs = pairs.with_slope(lambda t: t * 1e-6, 0)
+    tiles = Tiles(np.array([[4.0, 3.0]], np.float32), height, width, 1.0)
+    brightness = BrightnessMap(pairs, tiles)
+    rotation = CameraRotation((0.3, -0.2, 0.5), (1.0, 0.0, -2.0)) if turns else CameraRotation()
+    found = []
+    for camera in (recording.camera, replace(recording.camera, distortion=RadialTangential())):
+        brightness.place(ExactModel(camera, TRUE_PRISM, TRUE_PHASE), drift=drift, camera_rotation=rotation)
+        g, n = brightness._at.geometry, len(pairs)
+        cell = g.cell.numpy().reshape(2, -1)[:, :n]
+        part = g.part.numpy().reshape(2, 2, -1)[:, :, :n]
+        at = np.stack([cell % tiles.columns, cell // tiles.columns], axis=1) + part
+        found.append(np.where(cell[:, None] >= 0, at, np.nan))
+    both = np.isfinite(found).all(axis=0)
+    assert both.mean() > 0.5
+    assert (np.isfinite(found[0]) != np.isfinite(found[1])).mean() < 1e-3
+    np.testing.assert_allclose(found[0][both], found[1][both], rtol=0, atol=2e-3)
