@@ -130,9 +130,9 @@ class Bare:
 class Calibrated:
     """Stand-in for a calibration, with the attributes that the compensation needs."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, phase: float = PHASE) -> None:
         self.model_name, self.camera = name, CAMERA
-        self.model: Model = MODELS[name].from_prism(CAMERA, PRISM, PHASE)
+        self.model: Model = MODELS[name].from_prism(CAMERA, PRISM, phase)
 
     def encoder_for(self, encoder: Encoder, _first: int, _last: int) -> Encoder:
         return encoder
@@ -202,7 +202,7 @@ def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[
     def write() -> None:
         with RecordingWriter(folder / "alone.h5", width=WIDTH, height=HEIGHT, overwrite=True) as writer:
             pieces = (partial(moved_again, moved, inside, k) for k in range(len(reads)))
-            writer.fill(pieces, t_first=int(moved.t[0]), done=lambda _events, _inside: None)
+            writer.fill(pieces, count=PIECE, t_first=int(moved.t[0]), done=lambda _events, _inside: None)
 
     def drain(jobs: Iterator[Callable[[], Any]]) -> None:
         for _ in in_order(jobs):
@@ -271,7 +271,7 @@ def pieces(n: int) -> list[tuple[int, int]]:
 
 
 def errors(
-    name: str, model: Model, encoder: Encoder, recording: Any, source: Path, out: Path, n: int
+    name: str, model: Model, encoder: Encoder, recording: Any, source: Path, out: Path, n: int, phase: float = PHASE
 ) -> Iterator[float]:
     """Yield the error of short pieces spread over the written file."""
     written = None if recording is None else open_recording(out).events
@@ -287,7 +287,7 @@ def errors(
                 written.slice(start, stop),
                 written.inside(start, stop),
             )
-        yield error_of(name, model, encoder, raw, moved, inside)
+        yield error_of(name, model, encoder, raw, moved, inside, phase=phase)
 
 
 def about(device: str) -> dict[str, Any]:

@@ -263,6 +263,20 @@ def test_what_a_library_prints_is_not_taken_for_a_reply():
     assert run(f"{SERVED}:chatter") == "sound"
 
 
+@pytest.mark.parametrize("module", [SERVED, "amiwarp.no_such_module"])
+def test_a_process_that_was_started_ahead_serves_the_first_reader(module):
+    idle = borrow()  # so that none waits
+    reading_process.start_ahead(module)
+    ahead = borrow()
+    assert ahead is not idle
+    assert ahead.call(f"{SERVED}:echo", "first")[0] == "first"
+    assert ahead.call(f"{SERVED}:echo", "second")[0] == "second"
+    give_back(ahead)
+    give_back(idle)
+    assert ahead.usable
+    assert not idle.usable
+
+
 def test_one_idle_process_is_kept():
     first, second = borrow(), borrow()
     give_back(first)

@@ -469,7 +469,7 @@ def test_filled_files_are_those_of_append(tmp_path):
     seen = []
     with RecordingWriter(tmp_path / "fill.h5", width=SIZE[0], height=SIZE[1]) as writer:
         pieces = [lambda cut=cut: (events[cut], inside[cut], {}) for cut in cuts]
-        writer.fill(pieces, t_first=int(events.t[0]), done=lambda block, _flags: seen.append(len(block)))
+        writer.fill(pieces, count=CHUNK, t_first=int(events.t[0]), done=lambda block, _flags: seen.append(len(block)))
     with RecordingWriter(tmp_path / "append.h5", width=SIZE[0], height=SIZE[1]) as writer:
         writer.append(events, inside=inside)
     assert seen == [CHUNK, CHUNK, CHUNK, 77]
@@ -490,5 +490,5 @@ def test_pieces_that_do_not_follow_leave_nothing(tmp_path, order, message):
     with pytest.raises(AmiwarpError, match=message):  # noqa: PT012, SIM117
         with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
             pieces = [lambda cut=cut: (events[cut], np.ones(len(events.t[cut]), np.uint8), {}) for cut in order]
-            writer.fill(pieces, t_first=int(events.t[0]), done=lambda *_: None)
+            writer.fill(pieces, count=CHUNK, t_first=int(events.t[0]), done=lambda *_: None)
     assert_nothing_left(tmp_path)

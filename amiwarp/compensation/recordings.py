@@ -276,7 +276,8 @@ def compensate(
         if encoder is not None and n:
             first, last = recording.events.t_first, recording.events.t_last
             compensator = BlockCompensator(calibration.model, encoder, first, last, device)
-            writer.fill(compensated_pieces(recording.events, compensator), t_first=first, done=count)
+            pieces = compensated_pieces(recording.events, compensator)
+            writer.fill(pieces, count=PIECE, t_first=first, done=count)
     return CompensationSummary(done, outside, time.perf_counter() - began)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,28 +85,14 @@ def check_events(
     allow_nan: bool = False,
     after_t: int | None = None,
 ) -> None:
-    """Check one block of events: frame, order, time limits and polarities.
+    """Check one block of events: coordinates, as :func:`check_coordinates`, order, time limits and polarities.
 
-    Sensor coordinates (uint16) must lie in the frame. Compensated coordinates (float32) may lie outside it, but must be
-    finite. With ``allow_nan``, NaN is allowed too: it marks a compensated event without a position. ``after_t`` is the
-    time of the last event before the block [us]. Raises :class:`AmiwarpError`, which gives ``where`` and the index of
-    the first bad event, counted from ``first_index``.
+    ``after_t`` is the time of the last event before the block [us].
     """
     if not len(events):
         return
-
-    def fail(bad: NDArray[np.bool_], what: str) -> None:
-        index = int(np.argmax(bad))
-        x, y, t = events.x[index], events.y[index], events.t[index]
-        raise AmiwarpError(f"{where}: event {first_index + index} (x={x}, y={y}, t={t} us) {what}")
-
-    if events.x.dtype == np.uint16:
-        if int(events.x.max()) >= width or int(events.y.max()) >= height:
-            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; check the size")
-    elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
-        fail(np.isinf(events.x) | np.isinf(events.y), "has an infinite coordinate; drop it")
-    elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
-        fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
+    check_coordinates(events, width, height, where=where, first_index=first_index, allow_nan=allow_nan)
+    fail = partial(_fail, events, where, first_index)
     if bool((events.t[1:] < events.t[:-1]).any()):
         fail(np.concatenate([[False], events.t[1:] < events.t[:-1]]), "is earlier than the one before; sort by time")
     if after_t is not None and events.t[0] < after_t:
@@ -114,3 +101,28 @@ def check_events(
         fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; drop this event")
     if int(events.p.max()) > 1:
         fail(events.p > 1, "has a polarity that is neither 0 nor 1")
+
+
+def check_coordinates(
+    events: Events, width: int, height: int, *, where: str, first_index: int = 0, allow_nan: bool = False
+) -> None:
+    """Check the coordinates of one block of at least one event.
+
+    Sensor coordinates (uint16) must lie in the frame. Compensated coordinates (float32) may lie outside it, but must be
+    finite. With ``allow_nan``, NaN is allowed too: it marks a compensated event without a position. Raises
+    :class:`AmiwarpError`, which gives ``where`` and the index of the first bad event, counted from ``first_index``.
+    """
+    fail = partial(_fail, events, where, first_index)
+    if events.x.dtype == np.uint16:
+        if int(events.x.max()) >= width or int(events.y.max()) >= height:
+            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; check the size")
+    elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
+        fail(np.isinf(events.x) | np.isinf(events.y), "has an infinite coordinate; drop it")
+    elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
+        fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
+
+
+def _fail(events: Events, where: str, first_index: int, bad: NDArray[np.bool_], what: str) -> None:
+    index = int(np.argmax(bad))
+    x, y, t = events.x[index], events.y[index], events.t[index]
+    raise AmiwarpError(f"{where}: event {first_index + index} (x={x}, y={y}, t={t} us) {what}")

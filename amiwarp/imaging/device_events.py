@@ -170,13 +170,9 @@ def _folded(e: Any, n: int, bins: int) -> UploadedEvents:
     keys, unused = wp.empty(2 * n, dtype=wp.int64, device=device), wp.zeros(2 * n, dtype=int, device=device)
     launch(fold_keys, n, [e.x, e.y, e.layer, e.turn, bins], [keys], device=device)
     wp.utils.radix_sort_pairs(keys, unused, n)
-    every = keys[:n].numpy()
-    first = np.flatnonzero(np.concatenate([[True], every[1:] != every[:-1]])[:n])
-    key, count = every[first], np.diff(np.append(first, n))
-    times = -(-count // LARGEST_WEIGHT)  # more than LARGEST_WEIGHT events need several points
-    key, weight = np.repeat(key, times), np.minimum(np.repeat(count, times), LARGEST_WEIGHT)
-    last = np.cumsum(times) - 1
-    weight[last] = count - (times - 1) * LARGEST_WEIGHT
+    del unused
+    key, weight = _split(*_runs(keys[:n].numpy()))
+    del keys  # with ten million events, these arrays are hundreds of megabytes
     m = len(key)
     out = EventArrays()
     out.x, out.y, out.turn = (wp.zeros(_padded(m, device), dtype=wp.uint16, device=device) for _ in range(3))
@@ -184,3 +180,21 @@ def _folded(e: Any, n: int, bins: int) -> UploadedEvents:
     out.weight, out.azimuths, out.time = _put(weight, wp.uint8, device), e.azimuths, e.time
     launch(unfold_keys, m, [wp.array(key, dtype=wp.int64, device=device), bins], [out], device=device)
     return UploadedEvents(out, m, n, None, None)
+
+
+def _runs(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return each distinct value of a sorted array, and how often it occurs."""
+    starts = np.ones(len(keys), dtype=bool)
+    np.not_equal(keys[1:], keys[:-1], out=starts[1:])
+    first = np.flatnonzero(starts).astype(np.int32)
+    return keys[first], np.diff(first, append=np.int32(len(keys)))
+
+
+def _split(key: NDArray[np.int64], count: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Return keys and weights of points; more than :data:`LARGEST_WEIGHT` events need several points."""
+    if not len(count) or int(count.max()) <= LARGEST_WEIGHT:
+        return key, count.astype(np.uint8)
+    times = -(-count // LARGEST_WEIGHT)
+    weight = np.full(int(times.sum()), LARGEST_WEIGHT, dtype=np.uint8)
+    weight[np.cumsum(times) - 1] = count - (times - 1) * LARGEST_WEIGHT
+    return np.repeat(key, times), weight

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
@@ -55,6 +55,7 @@ def find_edges(image: NDArray[np.float32]) -> Edges:
     Steger, "An unbiased detector of curvilinear structures", PAMI 1998. Ridges weaker than :data:`WEAKEST_EDGE` are
     left out. Raises :class:`AmiwarpError` if the image has no ridge.
     """
+    from scipy import ndimage
 
     def derivative(y: int, x: int) -> NDArray[np.float64]:
         return np.asarray(ndimage.gaussian_filter(image.astype(np.float64), RIDGE_SCALE, order=(y, x)))
@@ -120,6 +121,13 @@ def edge_blur(
     >>> round(amiwarp.edge_blur(np.stack([x, y], axis=1).astype(np.float32), 40, 40), 1)
     0.5
     """
+    return edge_blurs(sharp_xy, width, height, [sharp_xy if of is None else of])[0]
+
+
+def edge_blurs(
+    sharp_xy: NDArray[np.float32], width: int, height: int, positions: Sequence[NDArray[np.float32]]
+) -> list[float]:
+    """Return the :func:`edge_blur` of the same events at several positions, across the same edges."""
     none = np.zeros(len(sharp_xy), np.uint8)
     edges = find_edges(iwe(Events(sharp_xy[:, 0], sharp_xy[:, 1], none.astype(np.int64), none), width, height))
     with np.errstate(invalid="ignore"):
@@ -133,8 +141,15 @@ def edge_blur(
     across = np.sum(away * normal, axis=1)
     along = away[:, 0] * normal[:, 1] - away[:, 1] * normal[:, 0]
     near = (np.abs(across) < STRIP_HALF_WIDTH) & (np.abs(along) <= 1.0)
-    moved = across if of is None else np.sum((np.asarray(of, np.float64)[inside] - edges.xy[label]) * normal, axis=1)
-    near &= np.isfinite(moved)
+    moved = (np.sum((np.asarray(of, np.float64)[inside] - edges.xy[label]) * normal, axis=1) for of in positions)
+    return [_blur(across, at, near & np.isfinite(at)) for at in moved]
+
+
+def _blur(across: NDArray[np.float64], moved: NDArray[np.float64], near: NDArray[np.bool_]) -> float:
+    """Return the weighted standard deviation of ``moved`` [px] over the events ``near`` an edge.
+
+    ``across`` holds the signed distances of the events from their nearest edge [px].
+    """
     weight = _edge_probability(across[near])
     if not weight.sum() > 0.0:
         raise AmiwarpError("no event is near an edge, so blur cannot be measured; give more events")

@@ -64,13 +64,6 @@ def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) 
         yield np.searchsorted(t, ms * 1000 + t_offset) + before
 
 
-def chunks_of(columns: Columns) -> Iterator[NDArray[Any]]:
-    """Yield all chunks of the first column, then all chunks of the next columns."""
-    for column in columns.values():
-        for at in range(0, len(column), CHUNK):
-            yield column[at : at + CHUNK]
-
-
 def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
     """Return names and data types of columns as text for messages."""
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())

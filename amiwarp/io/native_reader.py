@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times, check_events
+from amiwarp.events.checks import as_coordinate, as_polarity, as_times, check_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.events.recording import MetadataValue, Recording
@@ -101,7 +101,10 @@ class NativeEvents:
         start, stop = max(start, 0), min(max(stop, start, 0), self._count)
         with errors_name(self.path, lambda: f"events {start} .. {stop}"):
             x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
-            events = Events.from_arrays(x, y, self._times(start, stop), p)
+            t = self._read("t", start, stop)
+            # check_events finds times beyond the limit among sorted int64, also if adding the offset overflows.
+            t = self._since_zero(t if t.dtype == np.int64 else as_times(t))
+            events = Events(as_coordinate("x", x), as_coordinate("y", y), t, as_polarity(p))
             nan = "inside" in self._columns
             check_events(events, *self._size, where=str(self.path), first_index=start, allow_nan=nan)
         return events
@@ -167,7 +170,11 @@ class NativeEvents:
             yield from pieces
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:
-        return as_times(self._read("t", start, stop)) + self._offset
+        return self._since_zero(as_times(self._read("t", start, stop)))
+
+    def _since_zero(self, t: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return stored times with the file's offset added."""
+        return t + self._offset if self._offset else t
 
     def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         return self._columns[name].read(start, stop)

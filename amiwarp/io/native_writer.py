@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,19 +19,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import check_events
+from amiwarp.events.checks import check_coordinates, check_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.truth import EventTruth, WorldLabels
 from amiwarp.io.atomic_output import NewFile, spare_space
-from amiwarp.io.chunks import CHUNK, Codec, append_chunk, encode, in_order
+from amiwarp.io.chunk_file import ChunkedColumn, ChunkFile
+from amiwarp.io.chunks import CHUNK, Codec, encode_parts, in_order
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
     Columns,
     check_frame,
     check_lengths,
-    chunks_of,
     describe_columns,
     make_dataset,
     ms_entries,
@@ -115,7 +117,10 @@ class RecordingWriter(RecordAppender):
         self._truth_parameters, self._truth_labels = truth_parameters, truth_labels
         self._metadata = dict(metadata or {})
         self._file: Any = None
+        self._chunks: Any = None
         self._datasets: dict[str, Any] = {}
+        self._chunked: dict[str, ChunkedColumn] = {}
+        self._making = threading.Lock()
         self._new: NewFile | None = None
         self._spare = contextlib.ExitStack()
         self._pending: list[Columns] = []
@@ -129,14 +134,12 @@ class RecordingWriter(RecordAppender):
         return self._written + self._pending_count
 
     def __enter__(self) -> RecordingWriter:
-        import h5py
-
         self._new = NewFile(self.path, overwrite=self._overwrite)
         try:
             with errors_name(self.path, lambda: "making the file"):
                 self._spare.enter_context(spare_space(self._new.part.parent))
-                # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
-                self._file = h5py.File(self._new.part, "x", libver=("v110", "v110"))
+                self._chunks = ChunkFile(self._new.part)
+                self._file = self._chunks.hdf5
                 self._open_records(self._file, self._size, self._codec)
                 self._write_header()
         except BaseException:
@@ -154,7 +157,7 @@ class RecordingWriter(RecordAppender):
             with errors_name(self.path, lambda: f"finishing after {len(self)} events"):
                 self._finish()
                 self._spare.close()
-                self._file.close()
+                self._close()
                 self._new.commit()
         except BaseException:
             self._discard()
@@ -191,14 +194,7 @@ class RecordingWriter(RecordAppender):
         """
         if self._file is None:
             raise AmiwarpError(f"{self.path}: append() was called outside the writer's 'with' block; call it inside")
-        check_events(
-            events,
-            *self._size,
-            where=str(self.path),
-            first_index=len(self),
-            allow_nan=inside is not None,
-            after_t=self._t_last,
-        )
+        self._check(events, len(self), allow_nan=inside is not None, after_t=self._t_last)
         if not len(events):
             return
         with errors_name(self.path, lambda: f"after {len(self)} events"):
@@ -214,17 +210,20 @@ class RecordingWriter(RecordAppender):
         self,
         pieces: Iterable[Callable[[], FlaggedEvents]],
         *,
+        count: int,
         t_first: int,
         done: Callable[[Events, NDArray[np.uint8]], None],
     ) -> None:
-        """Write a whole recording of compensated events, with pieces computed in parallel on all cores.
+        """Write a whole recording of compensated events, with pieces computed and written in parallel on all cores.
 
         Parameters
         ----------
         pieces : iterable of callable
             Functions that return events, their ``inside`` flags, and encoded chunks of columns by name, in order.
-            Threads call them. Each piece except the last must hold whole chunks. Blosc's encoded chunks are stored as
-            they are; other columns are encoded.
+            Threads call them. Blosc's encoded chunks are stored as they are; other columns are encoded. Times and
+            polarities are not checked if both are encoded.
+        count : int
+            Number of events of each piece: a whole number of chunks. Only the last piece may be shorter.
         t_first : int
             Time of the first event [us].
         done : callable
@@ -235,34 +234,41 @@ class RecordingWriter(RecordAppender):
         AmiwarpError
             If other events were written before, or events are unsorted or outside the frame.
         """
-        if self._file is None or len(self):
-            given = "fill() was called outside the writer's 'with' block, or after append()"
+        if self._file is None or len(self) or count % CHUNK:
+            given = "fill() was called outside the writer's 'with' block, after append(), or for parts of chunks"
             raise AmiwarpError(f"{self.path}: {given}; call it inside the block, before other events")
         self._t_offset = t_first
-        with contextlib.closing(in_order(partial(self._compute, piece) for piece in pieces)) as computed:
-            for events, inside, columns, encoded in computed:
+        jobs = (partial(self._write_piece, piece, k * count) for k, piece in enumerate(pieces))
+        with contextlib.closing(in_order(jobs)) as written:
+            for events, inside in written:
                 with errors_name(self.path, lambda: f"after {len(self)} events"):
-                    if self._written % CHUNK:
-                        raise AmiwarpError("a piece before the last ends within a chunk; give whole chunks")
-                    check_events(events, *self._size, where=str(self.path), first_index=len(self), allow_nan=True,
-                                 after_t=self._t_last)  # fmt: skip
+                    if self._written % count:
+                        raise AmiwarpError(f"a piece before the last ends within a chunk; give {count} events each")
+                    self._check(events[:1], len(self), allow_nan=True, after_t=self._t_last)
                     self._index(events.t)
-                    self._store(columns, encoded)
                     self._written += len(events)
                 done(events, inside)
 
-    def _compute(self, piece: Callable[[], FlaggedEvents]) -> tuple[Events, NDArray[np.uint8], Columns, list[bytes]]:
-        """Compute and encode a piece. Runs in a thread."""
+    def _write_piece(self, piece: Callable[[], FlaggedEvents], start: int) -> tuple[Events, NDArray[np.uint8]]:
+        """Compute, encode and write a piece whose first event is event ``start``. Runs in a thread."""
         events, inside, known = piece()
         known = known if self._codec is Codec.BLOSC else {}
-        t = events.t if "events/t" in known else events.t - self._t_offset  # of an encoded column, only the size counts
-        columns = {"events/x": events.x, "events/y": events.y, "events/t": t}
-        columns |= {"events/p": events.p, "events/inside": inside}
-        encoded = (
-            known.get(name) or [encode(part, self._codec) for part in chunks_of({name: column})]
-            for name, column in columns.items()
-        )
-        return events, inside, columns, [chunk for chunks in encoded for chunk in chunks]
+        with errors_name(self.path, lambda: f"after {start} events"):
+            # The reader has checked encoded times and polarities.
+            check = check_events if known.keys() < {"events/t", "events/p"} else check_coordinates
+            check(events, *self._size, where=str(self.path), first_index=start, allow_nan=True)
+            t = events.t if "events/t" in known else events.t - self._t_offset  # only the size of an encoded one counts
+            columns = {"events/x": events.x, "events/y": events.y, "events/t": t}
+            columns |= {"events/p": events.p, "events/inside": inside}
+            for name, column in columns.items():
+                stored = iter(known.get(name, ()))
+                for at in range(0, len(column), CHUNK):
+                    part = next(stored, None)
+                    self._write_chunk(name, start + at, column[at : at + CHUNK], part)
+        return events, inside
+
+    def _check(self, events: Events, first_index: int, **how: Any) -> None:
+        check_events(events, *self._size, where=str(self.path), first_index=first_index, **how)
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder, which is written at the end.
@@ -309,22 +315,25 @@ class RecordingWriter(RecordAppender):
         if not whole:
             return
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
-        complete = {name: column[:whole] for name, column in joined.items()}
-        with contextlib.closing(
-            in_order(partial(encode, part, self._codec) for part in chunks_of(complete))
-        ) as encoded:
-            self._store(complete, encoded)
+        jobs = (
+            partial(self._write_chunk, name, self._written + at, column[at : min(at + CHUNK, whole)])
+            for name, column in joined.items()
+            for at in range(0, whole, CHUNK)
+        )
+        with contextlib.closing(in_order(jobs)) as written:
+            deque(written, maxlen=0)
         self._written += whole
         self._pending_count -= whole
         self._pending = [{name: column[whole:] for name, column in joined.items()}] if self._pending_count else []
 
-    def _store(self, columns: Columns, encoded: Iterable[bytes]) -> None:
-        """Append encoded chunks of columns to their datasets."""
-        stored = iter(encoded)
-        for name, column in columns.items():
-            dataset = self._dataset(name, column.dtype, column.shape[1:])
-            for at in range(0, len(column), CHUNK):
-                append_chunk(dataset, self._written + at, next(stored), min(CHUNK, len(column) - at))
+    def _write_chunk(self, name: str, start: int, values: NDArray[Any], stored: bytes | None = None) -> None:
+        """Encode and write the values of a chunk that begins at element ``start``. ``stored`` is the encoded chunk."""
+        parts = encode_parts(values, self._codec) if stored is None else (stored,)
+        with self._making:
+            if name not in self._chunked:
+                dataset = self._dataset(name, values.dtype, values.shape[1:])
+                self._chunked[name] = ChunkedColumn(self._chunks, dataset)
+        self._chunked[name].write(start, parts, len(values))
 
     def _extend(self, name: str, values: NDArray[Any]) -> None:
         """Append values to a small dataset through HDF5."""
@@ -357,11 +366,14 @@ class RecordingWriter(RecordAppender):
                 if values is not None:
                     self._extend(f"encoder/{name}", values)
 
+    def _close(self) -> None:
+        if self._chunks is not None:
+            self._chunks.close()
+
     def _discard(self) -> None:
         self._spare.close()
-        if self._file is not None:
-            # The file is removed even if it cannot be closed.
-            with contextlib.suppress(Exception):
-                self._file.close()
+        # The file is removed even if it cannot be closed.
+        with contextlib.suppress(Exception):
+            self._close()
         if self._new is not None:
             self._new.discard()

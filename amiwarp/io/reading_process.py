@@ -58,6 +58,7 @@ class ReadingProcess:
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             start_new_session=True,
         )
+        self._preparing = False
         self._requests: Any = self._child.stdin
         self._replies: Any = self._child.stdout
         self.close = weakref.finalize(self, _end, self._child, self.owner)
@@ -83,8 +84,16 @@ class ReadingProcess:
         self.send(function, *arguments)
         return self.receive()
 
+    def prepare(self, module: str) -> None:
+        """Let the process import a module, without waiting for it. The next call waits."""
+        self.send("amiwarp.io.reading_server:prepare", module)
+        self._preparing = True
+
     def send(self, function: str, *arguments: Any) -> None:
         """Send a call to the process; :meth:`receive` returns its result."""
+        if self._preparing:
+            self._preparing = False
+            self.receive()
         limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
         request = json.dumps({"function": function, "arguments": arguments, **limits}).encode()
         try:
@@ -150,15 +159,30 @@ def borrow() -> ReadingProcess:
     return ReadingProcess()
 
 
+def start_ahead(module: str) -> None:
+    """Start a reading process that imports ``module``, for the first reader, while this process does other things."""
+    with contextlib.suppress(OSError, AmiwarpError):  # the first reader tries again, and reports it
+        process = ReadingProcess()
+        process.prepare(module)
+        _keep_idle(process)
+
+
 def give_back(process: ReadingProcess) -> None:
     """Keep a reading process for the next reader, or end it. Starting one takes about 0.3 s."""
     if process.usable:
         with contextlib.suppress(AmiwarpError):
             process.call("amiwarp.io.reading_server:forget")
-            with _idle_lock:
-                if not _idle:
-                    _idle.append(process)
-                    return
+            _keep_idle(process)
+            return
+    process.close()
+
+
+def _keep_idle(process: ReadingProcess) -> None:
+    """Keep a process for the next reader, or end it if another one waits."""
+    with _idle_lock:
+        if not _idle:
+            _idle.append(process)
+            return
     process.close()
 
 

@@ -81,6 +81,13 @@ def _limit(cpu_s: int, memory_bytes: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (soft if hard < 0 else min(soft, hard), hard))
 
 
+def prepare(module: str) -> Reply:
+    """Import a module of which a function will be called. An error of the import is reported by that call."""
+    with contextlib.suppress(Exception):
+        importlib.import_module(module)
+    return None, []
+
+
 def keep(name: str, value: Any) -> None:
     """Keep a value between requests, until :func:`forget` is called."""
     _state[name] = value

@@ -354,7 +354,8 @@ def save(figure: Any, path: Path, *, all_colours: bool = False, overwrite: bool 
     from PIL import Image
 
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12)
+    # uncompressed: the bytes are decoded again at once
+    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.12, pil_kwargs={"compress_level": 0})
     picture = Image.open(buffer).convert("RGB")
     save_png(path, picture if all_colours else indexed(np.asarray(picture)), overwrite=overwrite)
 
@@ -373,7 +374,9 @@ def indexed(rgb: NDArray[np.uint8]) -> Any:
     """
     from PIL import Image
 
-    coloured = np.ptp(rgb.astype(np.int16), axis=2) > FAINT
+    red, green, blue = np.moveaxis(rgb, 2, 0)
+    spread = np.maximum(np.maximum(red, green), blue) - np.minimum(np.minimum(red, green), blue)
+    coloured = spread > FAINT
     index = np.rint(rgb.mean(axis=2) * ((GREYS - 1) / 255.0)).astype(np.uint8)
     palette = np.repeat(np.rint(np.linspace(0.0, 255.0, GREYS)), 3).astype(np.uint8).tolist()
     if coloured.any():

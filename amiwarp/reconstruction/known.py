@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,6 +45,8 @@ def dilated(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 def without_small_regions(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the mask without connected regions of fewer than :data:`SMALLEST_REGION` pixels."""
+    from scipy import ndimage
+
     label, count = ndimage.label(known)
     size = np.bincount(label.ravel(), minlength=count + 1)
     size[0] = 0
@@ -54,6 +55,8 @@ def without_small_regions(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def without_small_holes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the mask with holes of up to :data:`LARGEST_HOLE` pixels filled."""
+    from scipy import ndimage
+
     label, count = ndimage.label(~known)
     size = np.bincount(label.ravel(), minlength=count + 1)
     return np.asarray(known | (size[label] <= LARGEST_HOLE))

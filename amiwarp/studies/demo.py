@@ -260,11 +260,8 @@ def blurs(recording: Recording, found: Calibration, truth: ExactModel, device: A
     ideal = compensate_events(events, truth, encoder, device=device)
     raw = np.stack([events.x, events.y], axis=1).astype(np.float32)
     size = recording.events.size
-    return (
-        metrics.edge_blur(after, *size, of=raw),
-        metrics.edge_blur(after, *size),
-        metrics.edge_blur(ideal, *size),
-    )
+    before, compensated = metrics.edge_blurs(after, *size, [raw, after])
+    return before, compensated, metrics.edge_blur(ideal, *size)
 
 
 def headline(values: dict[str, Any]) -> str:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from amiwarp.imaging.sharpness_costs import gaussian
 from amiwarp.kernels import world as kernels
@@ -136,6 +135,8 @@ class MapRenderer:
         The map is interpolated, with weight ``weight`` of the later map, and rendered only where bodies move. The
         world's first three instants are the times of this map, of the earlier and of the later map.
         """
+        from scipy.ndimage import binary_dilation
+
         frame, world = self._frame, self._world
         n = frame.width * frame.height
         launch(world_maps.interpolate_maps, n, [maps, faces, *ends, weight, first], [], device=world.device)

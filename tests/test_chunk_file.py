@@ -1,0 +1,110 @@
+"""Writing of encoded chunks by several threads, and what remains of it on a full disk."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+
+from amiwarp.io.chunk_file import ChunkedColumn, ChunkFile
+from amiwarp.io.chunks import CHUNK, encode, encode_parts
+from amiwarp.io.native_layout import make_dataset
+
+assert hdf5plugin.FILTERS  # its import registers the filter
+
+
+def stored_in_any_order(path, columns):
+    """Write columns by four threads, the last chunks first."""
+    file = ChunkFile(path)
+    datasets = {name: make_dataset(file.hdf5, name, c.dtype, c.shape[1:]) for name, c in columns.items()}
+    writers = {name: ChunkedColumn(file, dataset) for name, dataset in datasets.items()}
+
+    def write(job):
+        name, start = job
+        part = columns[name][start : start + CHUNK]
+        writers[name].write(start, encode_parts(part), len(part))
+
+    jobs = [(name, start) for start in reversed(range(0, 3 * CHUNK, CHUNK)) for name in columns]
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, jobs))
+    file.hdf5["after"] = np.arange(9)
+    file.close()
+
+
+def in_two_pieces(output, data):
+    """Write data as :class:`amiwarp.io.chunk_file._Output` does, but not at once."""
+    output.write_at(data[:7], output.tell())
+    output.write_at(data[7:], output.tell() + 7)
+    output.seek(output.tell() + len(data))
+    return len(data)
+
+
+def make():
+    rng = np.random.default_rng(7)
+    n = 2 * CHUNK + 99
+    columns = {"x": rng.normal(size=n).astype(np.float32), "t": np.sort(rng.integers(0, 10**6, n))}
+    return columns | {"place": rng.normal(size=(n, 3)).astype(np.float32), "p": rng.integers(0, 2, n).astype(np.uint8)}
+
+
+@pytest.mark.parametrize("in_one_piece", [True, False])
+def test_threads_write_chunks_in_any_order(tmp_path, monkeypatch, in_one_piece):
+    """Also if HDF5 wrote the bytes of a chunk in an unknown way, so that their place is not found."""
+    if not in_one_piece:
+        monkeypatch.setattr("amiwarp.io.chunk_file._Output.write", in_two_pieces)
+    columns = make()
+    stored_in_any_order(tmp_path / "a.h5", columns)
+    with h5py.File(tmp_path / "a.h5") as file:
+        for name, column in columns.items():
+            np.testing.assert_array_equal(file[name][()], column, strict=True)
+        np.testing.assert_array_equal(file["after"][()], np.arange(9))
+
+
+def test_the_parts_of_a_chunk_are_its_bytes():
+    values = np.arange(CHUNK, dtype=np.uint8)
+    frame, checksum = encode_parts(values)
+    assert len(frame) + len(checksum) == len(encode(values))
+    assert len(checksum) == 4
+
+
+def test_an_existing_file_is_kept(tmp_path):
+    (tmp_path / "a.h5").write_bytes(b"kept")
+    with pytest.raises(FileExistsError):
+        ChunkFile(tmp_path / "a.h5")
+    assert (tmp_path / "a.h5").read_bytes() == b"kept"
+
+
+FULL = """
+import resource, sys
+import numpy as np
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events
+from amiwarp.io import RecordingWriter
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+rng, n = np.random.default_rng(0), 1 << 19
+x, y = (rng.integers(0, 240, n).astype(np.uint16) for _ in range(2))
+events = Events(x, y, np.sort(rng.integers(0, 10**6, n)), rng.integers(0, 2, n).astype(np.uint8))
+flags = np.ones(n, np.uint8)
+try:
+    with RecordingWriter(sys.argv[1], width=320, height=240) as writer:
+        if sys.argv[3] == "fill":
+            writer.fill([lambda: (events, flags, {})], count=n, t_first=0, done=lambda *_: None)
+        else:
+            writer.append(events)
+except AmiwarpError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("way", ["append", "fill"])
+@pytest.mark.parametrize("limit", [2000, 1_100_000, 1_400_000])
+def test_a_full_disk_leaves_nothing(tmp_path, way, limit):
+    path = tmp_path / "a.h5"
+    arguments = [sys.executable, "-X", "dev", "-c", FULL, path, str(limit), way]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert done.stdout.startswith(f"{path}: ")
+    assert "File too large" in done.stdout
+    assert list(tmp_path.iterdir()) == []
