@@ -36,6 +36,10 @@ def _main() -> None:
         for number in ENDING:
             if signal.getsignal(number) is signal.SIG_DFL:  # a signal that nohup ignores stays ignored
                 signal.signal(number, signal.default_int_handler)
+        if any(argument.endswith((".h5", ".hdf5")) and os.path.isfile(argument) for argument in sys.argv[1:]):
+            from amiwarp.io.reading_process import start_ahead
+
+            start_ahead("amiwarp.io.hdf5_server")  # loads HDF5 while this process loads the command
         from amiwarp.cli import app
 
         app.main()

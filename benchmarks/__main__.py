@@ -1,6 +1,7 @@
 """Speed of amiwarp and of other libraries, with the error of each timed run.
 
-    python -m benchmarks [--device cuda:0] [--only NAME …] [--events N] [--repeats R] [--picture FILE] [--out FILE.json]
+    python -m benchmarks [--device cuda:0] [--only NAME …] [--events N] [--repeats R] [--picture FILE] [--cpu NAME]
+        [--out FILE.json]
 
 The methods alternate, one pass each, so that other load on the machine affects all of them equally. The first pass
 includes compilation and is reported separately. A run of all cases at full size writes
@@ -34,7 +35,7 @@ from benchmarks.job import Job
 from benchmarks.libraries import Missing
 
 ROOT = Path(__file__).parents[1]
-LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy")
+LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy", "dv_processing")
 REST_S = 0.02
 """Pause before each pass on a CPU [s], because other libraries' idle threads spin for a while before they sleep."""
 
@@ -187,6 +188,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--events", type=int, help="events per scene; the error limits are for the default")
     parser.add_argument("--repeats", type=int, default=15, help="passes of each method; complete jobs have fewer")
     parser.add_argument("--picture", type=Path, help="scene of the recording; default: PyVista's map of the earth")
+    parser.add_argument("--cpu", metavar="NAME", help="older processor to compile for; haswell has AVX2, not AVX-512")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args(arguments)
     if not chosen(args.device, args.only):
@@ -195,13 +197,22 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     return args
 
 
+def compile_for(cpu: str) -> None:
+    """Let Warp, Numba and PyTorch compile for this processor, of which PyTorch only knows whether it has AVX-512."""
+    wp.config.cpu_compiler_flags = str(wp.config.cpu_compiler_flags).replace("-march=native", f"-target-cpu {cpu}")
+    os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = cpu, ""
+    os.environ["ATEN_CPU_CAPABILITY"] = "avx2"
+
+
 def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
+    if args.cpu:
+        compile_for(args.cpu)
     cases = chosen(args.device, args.only)
     whole = args.only is None and args.events is None and len(args.scenes) == len(SCENES)
     out = args.out or (report.FILES[kind(args.device)] if whole else None)
     picture = args.picture.name if args.picture else "earth"
-    results = about(args.device) | {"repeats": args.repeats, "picture": picture, "rows": []}
+    results = about(args.device) | {"repeats": args.repeats, "picture": picture, "cpu": args.cpu, "rows": []}
     print(json.dumps({k: v for k, v in results.items() if k != "rows"}, ensure_ascii=False), flush=True)
     for scene in args.scenes:
         of_scene = [case for case in cases if scene in case.scenes]
@@ -209,6 +220,8 @@ def main(arguments: list[str] | None = None) -> int:
             results["rows"] += measured(
                 of_scene, scene, args.device, events=args.events, repeats=args.repeats, picture=args.picture
             )
+        if args.out is not None:
+            write(args.out, results)  # so that an interrupted run keeps the scenes before
         gc.collect()
     results["load"].append(round(os.getloadavg()[0], 1))
     if out is not None:

@@ -210,6 +210,33 @@ def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> 
     return Peer(run, lambda: image.cpu().numpy(), events)
 
 
+def with_torch_index_put(events: PeerEvents, device: str) -> Peer:
+    """Prepare PyTorch as event_utils' ``events_to_image_torch`` votes: four ``index_put_`` with a row and a column."""
+    torch = library("torch")
+    if device != "cpu" and not torch.cuda.is_available():
+        raise Missing("this PyTorch has no CUDA")
+    arrays = (events.x, events.y, events.angle)
+    x, y, angle = events.keep(
+        ("torch", device), lambda: [torch.from_numpy(a.astype(np.float32)).to(device) for a in arrays]
+    )
+    radius, margin = events.radius, events.margin
+    image = torch.zeros(events.shape, device=device)
+
+    def run() -> None:
+        image.zero_()
+        u = x - radius * torch.cos(angle) + margin
+        v = y - radius * torch.sin(angle) + margin
+        i, j = torch.floor(u), torch.floor(v)
+        fx, fy = u - i, v - j
+        i, j = i.long(), j.long()
+        image.index_put_((j, i), (1 - fx) * (1 - fy), accumulate=True)
+        image.index_put_((j, i + 1), fx * (1 - fy), accumulate=True)
+        image.index_put_((j + 1, i), (1 - fx) * fy, accumulate=True)
+        image.index_put_((j + 1, i + 1), fx * fy, accumulate=True)
+
+    return Peer(run, lambda: image.cpu().numpy(), events)
+
+
 def _cupy_events(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
     """Return the module CuPy, and x, y and angle of the events on the device."""
     cupy = library("cupy")

@@ -100,13 +100,17 @@ def iwe_errors(scene: EventScene, model: str, vote: Vote, image: Floats, found: 
     votes that went to a wrong pixel. ``local``: largest ratio of a difference to the largest true value in its
     neighbourhood plus 10 events. ``exact_px``: rms distance of ``found`` to the positions of the exact model [px].
     """
-    true = images(scene, model)[vote]
-    difference = np.abs(image.astype(np.float64) - true)
     away = found - places(scene, "exact", *scene.sample())
+    errors = image_errors(images(scene, model)[vote], image)
+    return errors | {"exact_px": float(np.sqrt(np.mean(np.sum(away**2, axis=1))))}
+
+
+def image_errors(true: Array, image: Floats) -> dict[str, float]:
+    """Return the errors of an image; see :func:`iwe_errors`."""
+    difference = np.abs(image.astype(np.float64) - true)
     return {
         "rms_events": float(np.sqrt(np.mean(difference**2))),
         "max_events": float(difference.max()),
         "misplaced": float(difference.sum() / (2.0 * true.sum())),
         "local": float((difference / (10.0 + maximum_filter(true, 3))).max()),
-        "exact_px": float(np.sqrt(np.mean(np.sum(away**2, axis=1)))),
     }
